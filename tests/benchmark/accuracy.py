@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final
 
 import omnid
 from calib.kalibr import import_kalibr
@@ -18,18 +19,18 @@ from calib.rig_file import read_rig, write_rig
 from omnid.diagnostics.run_summary import summary_entries
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
+from tests.benchmark.results import Cell, Column, ResultTable
 
-HEAD = "| log | pairs | length | ATE rmse | end | heading, max | RPE | states |\n|---|---|---|---|---|---|---|---|"
+COLUMNS: Final = (Column("log"), Column("pairs"), Column("length", "%", 3), Column("ATE rmse", "mm", 2),
+                  Column("end", "mm", 2), Column("heading, max", "deg", 3), Column("RPE", "mm", 2), Column("states"))
 
 
-def row(folder: Path, overrides: Sequence[str]) -> str:
+def row(folder: Path, overrides: Sequence[str]) -> list[Cell]:
     """Return one row of the table: the errors of one log, and the shares of its states."""
     result = omnid.replay(folder / "log.mcap", rig_of(folder), overrides=overrides)
     m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
-    cells = [folder.name, str(m.pairs), f"{100 * m.length_error_ratio:+.3f} %", f"{1e3 * m.ate_rmse_m:.2f} mm",
-             f"{1e3 * m.end_error_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
-             f"{1e3 * m.rpe_translation_rmse_m:.2f} mm", summary_entries(result.counters)["states"]]
-    return f"| {' | '.join(cells)} |"
+    return [folder.name, m.pairs, 100 * m.length_error_ratio, 1e3 * m.ate_rmse_m, 1e3 * m.end_error_m,
+            math.degrees(m.heading_max_rad), 1e3 * m.rpe_translation_rmse_m, summary_entries(result.counters)["states"]]
 
 
 def rig_of(folder: Path) -> Rig:
@@ -49,9 +50,10 @@ def main() -> None:
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")
     args = parser.parse_args()
-    print(HEAD)
+    title = f"Rendered logs, {' '.join(args.overrides) or 'default settings'}"
+    table = ResultTable("accuracy", "accuracy", title, COLUMNS)
     for folder in args.folders:
-        print(row(folder, args.overrides), flush=True)
+        table.add(*row(folder, args.overrides), folder=folder)
 
 
 if __name__ == "__main__":

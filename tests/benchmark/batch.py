@@ -21,6 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from omnid.batch.tables import CSV_FILE
+from tests.benchmark.results import Column, ResultTable
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 FIRST_BYTES, STEP_BYTES = 600_000, 20_000
@@ -64,12 +65,19 @@ def same(first: Path, other: Path) -> bool:
                for name in ("est.txt", "cloud.ply") for path in first.glob(f"*/{name}"))
 
 
+def text(states: Counter[str]) -> str:
+    """Return the numbers of results by state."""
+    return ", ".join(f"{number} {state}" for state, number in states.items())
+
+
 def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--logs", type=int, default=50)
     count = parser.parse_args().logs
-    print(f"| {count} logs | time | results | repeated | same bytes |\n|---|---|---|---|---|")
+    columns = (Column(f"{count} logs"), Column("time", "s", 0), Column("results"), Column("repeated"),
+               Column("same bytes"))
+    table = ResultTable("batch", "speed", "Many logs", columns)
     with tempfile.TemporaryDirectory() as folder:
         top = Path(folder)
         logs = top / "logs"
@@ -80,15 +88,14 @@ def main() -> None:
         for jobs in (1, 2):
             taken_s, states, repeated = batch(logs, top / f"jobs{jobs}", "--jobs", str(jobs))
             equal = same(top / "jobs1", top / f"jobs{jobs}")
-            print(f"| {jobs} at a time | {taken_s:.0f} s | {dict(states)} | {repeated} | {equal} |", flush=True)
+            table.add(f"{jobs} at a time", taken_s, text(states), repeated, equal)
         if find_spec("distributed") is None:
             return
         with dask(top) as (address, workers):
             threading.Timer(KILLED_AFTER_S, workers[0].kill).start()
             taken_s, states, repeated = batch(logs, top / "dask", "--dask", address)
         equal = same(top / "jobs1", top / "dask")
-        print(f"| two dask workers, one killed after {KILLED_AFTER_S:g} s | {taken_s:.0f} s | {dict(states)} "
-              f"| {repeated} | {equal} |")
+        table.add(f"two dask workers, one killed after {KILLED_AFTER_S:g} s", taken_s, text(states), repeated, equal)
 
 
 if __name__ == "__main__":

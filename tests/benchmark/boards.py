@@ -23,6 +23,7 @@ from calib.boards.board_finder import find_board
 from calib.models.camera import Array
 from tests.benchmark.boards_near import render_near_board
 from tests.benchmark.boards_rendered import HardBoard, render_hard_board
+from tests.benchmark.results import Column, ResultTable
 
 # Tolerance of a corner in parts of its square's narrower side, or in pixels; the next edge is half a side away.
 RIGHT_PART, RIGHT_PX = 0.25, 1.0
@@ -50,6 +51,7 @@ def _corners(found: bool, corners: Array | None) -> Array | None:
     return np.asarray(corners, float).reshape(-1, 2) if found and corners is not None else None
 
 
+REMARKS = ("Wrong counts, for omnid only, also each board that is found where there is none.",)
 DETECTORS: dict[str, Detect] = {"omnid": _ours, "findChessboardCorners": _plain, "findChessboardCornersSB": _sector}
 
 
@@ -96,8 +98,11 @@ def main(arguments: list[str]) -> int:
             sums[name] += found
         outcomes = ", ".join(f"{name} {_outcomes(found)}" for name, found in outcomes_of.items())
         print(f"{rendered.name}: {outcomes}", flush=True)
+    kinds, family = ("found", "wrong", "missed"), f"boards, {'near' if args.near else 'hard'}"
+    table = ResultTable(family.replace(", ", "_"), "calibration", f"Board detection, {'near' if args.near else 'hard'}",
+                        (Column("detector"), Column("images"), *map(Column, kinds)), REMARKS)
     for name, all_of in sums.items():
-        print(f"{name}: " + ", ".join(f"{all_of[kind]} {kind}" for kind in ("found", "wrong", "missed")))
+        table.add(name, args.count, *(all_of[kind] for kind in kinds), seed=(family, args.seed))
     return 0 if meets_requirement(sums, args.count) else 1
 
 

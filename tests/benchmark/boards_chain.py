@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,6 +31,7 @@ from omnid.cli import main as omnid_main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from tests.benchmark.results import Column, ResultTable
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 from tests.simulation.logs import write_log
 from tests.simulation.recipes import build, mild_rig
@@ -97,13 +99,12 @@ def in_true_frame(found: Rig, truth: Rig) -> Rig:
                    upper=replace(found.upper, T_cam_rig=T_upper_lower @ T_lower_rig))
 
 
-def drive(folder: Path, rig: Rig) -> str:
-    """Return the drive's errors with a rig."""
+def drive(folder: Path, rig: Rig) -> tuple[float, float, float]:
+    """Return the drive's errors with a rig: length [%], ATE [mm], largest error of the heading [deg]."""
     result = omnid.replay(folder / "log.mcap", rig=rig)
     result.save_tum(folder / "estimate.txt")
     found = evaluate(read_tum(folder / "estimate.txt"), read_tum(folder / "truth.txt"))
-    return (f"length {100 * found.length_error_ratio:+.3f} %, ATE {1e3 * found.ate_rmse_m:.2f} mm, heading at most "
-            f"{np.rad2deg(found.heading_max_rad):.3f} deg off")
+    return 100 * found.length_error_ratio, 1e3 * found.ate_rmse_m, math.degrees(found.heading_max_rad)
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -116,6 +117,9 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--only", choices=("boards", "drive"), help="render and stop")
     parser.add_argument("--options", nargs="*", default=[], help="further words for `calibrate rig`, like model=omni")
     args = parser.parse_args(arguments)
+    columns = (Column("seed"), Column("calibrated by"), Column("length", "%", 3), Column("ATE", "mm", 2),
+               Column("heading, max", "deg", 3), Column("calibration"))
+    table = ResultTable("boards_chain", "calibration", "Boards, rig, drive with real mirrors", columns)
     for seed in args.seeds:
         boards, log = (args.folder / f"{kind}_a{args.amount:g}_s{seed}" for kind in ("boards", "drive"))
         if args.only != "drive":
@@ -128,15 +132,15 @@ def main(arguments: Sequence[str]) -> int:
         line = calibrate(boards, boards / "rig.toml", options)
         truth = board_rig(seed, args.amount)[0]
         found = in_true_frame(read_rig(boards / "rig.toml"), truth)
-        print(f"seed {seed}, baseline {1e3 * truth.baseline_m:.2f} mm: {line}\n    {drive(log, found)}", flush=True)
+        table.add(seed, "boards", *drive(log, found), line, seed=("rigs of boards", seed))
         if args.drives:
             room = args.folder / f"{ROOM}_a{args.amount:g}_s{seed}"
             render_drive(ROOM, seed, args.amount, room)
             again = calibrate_drive([room / "log.mcap"], read_rig(boards / "rig.toml"))
             write_rig(boards / "rig_drive.toml", again.rig)
             errors = f"{again.first_sigma_px:.3f} -> {again.adjustment.sigma_px:.3f} px"
-            print(f"    self-calibrated on a drive ({errors}, lengths "
-                  f"{100 * again.scale_change:+.3f} %): {drive(log, in_true_frame(again.rig, truth))}", flush=True)
+            table.add(seed, "boards, then a drive", *drive(log, in_true_frame(again.rig, truth)),
+                      f"{errors}, lengths {100 * again.scale_change:+.3f} %", seed=("rigs of boards", seed))
     return 0
 
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from calib import se3
 from calib.boards.board import Board
-from calib.fit.camera_fit import calibrate_camera, refine_camera_calibration
-from calib.fit.rig_fit import PairView, RigCalibration, calibrate_rig, refine_rig_calibration
+from calib.fit.boards.camera_fit import fit_camera, refine_camera_calibration
+from calib.fit.boards.rig_fit import PairView, RigCalibration, fit_rig, refine_rig_calibration
 from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
@@ -58,13 +58,13 @@ def calibrated(images: PairedImages) -> RigCalibration:
     """Calibrate a rig like `omnid calibrate rig --model omni`."""
     seen, cameras = [], []
     for side in images.sides:
-        views = find_boards(side, BOARD, thorough=True, show_progress=False)
+        views = find_boards(side, BOARD, thorough=True)
         height, width = next(iter(side.values())).shape
-        first = calibrate_camera(views, BOARD, (width, height), "omni")
+        first = fit_camera(views, BOARD, (width, height), "omni")
         cameras.append(refine_camera_calibration(first, side, "omni", "mirror").camera)
         seen.append({view.name: view for view in views})
     pairs = [PairView(name, (seen[0].get(name), seen[1].get(name))) for name in images.names]
-    found = calibrate_rig([view for view in pairs if any(view.seen)], BOARD, (cameras[0], cameras[1]))
+    found = fit_rig([view for view in pairs if any(view.seen)], BOARD, (cameras[0], cameras[1]))
     return refine_rig_calibration(found, images.sides)
 
 

@@ -30,10 +30,12 @@ from omnid.engine.graph import Graph
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.synchronise import Synchronise
 from tests.benchmark.accuracy import rig_of
 from tests.benchmark.budget_steps import STEPS, StepClock, measured_steps
+from tests.benchmark.results import Cell, Column, ResultTable
 from tests.replay.test_memory import to_and_fro
 
 REFERENCE_EVERY: Final = 10  # pairs between two runs of the reference kernels
@@ -44,7 +46,8 @@ LK_QUALITY, LK_APART_PX = 0.001, 8
 LUCAS_KANADE: Final = cv2.calcOpticalFlowPyrLK  # not the one that is timed as a step
 Image = NDArray[np.uint8]
 Labels = tuple[str, ...]
-HEAD: Final = ("| step | ms a pair | of SGBM + LK | calls a pair |\n|---|---|---|---|")
+COLUMNS: Final = (Column("step"), Column("time a pair", "ms", 2), Column("of SGBM + LK", "", 3),
+                  Column("calls a pair", "", 2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +109,8 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Bu
         sinks = Sinks({"trajectory": TrajectoryFile(Path(work) / "t"), "reference": reference},
                       {"map": MapFile(Path(work) / "m")})
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, sinks)
+        paired = graph.stage("pair", Synchronise(place.rig, config.pair), read)
+        wire(graph, paired, FrontEnd(place, config), config, sinks)
         graph.run()
     count = pairs - SKIPPED
     return Budget({path: ns * 1e-6 / count for path, ns in clock.own_ns.items()},
@@ -114,28 +118,26 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Bu
                   1e-6 * median(reference.sgbm_ns), 1e-6 * median(reference.lk_ns))
 
 
-def table(budgets: Sequence[Budget]) -> str:
-    """Return the table of the medians over the runs: stages and their steps, in the order of the flow."""
+def rows(budgets: Sequence[Budget]) -> Iterator[list[Cell]]:
+    """Yield the rows of the medians over the runs: stages and their steps, in the order of the flow."""
     sgbm_ms, lk_ms = (median(getattr(budget, name) for budget in budgets) for name in ("sgbm_ms", "lk_ms"))
     order = {step.label: number for number, step in enumerate(STEPS)}
     paths = sorted({path for budget in budgets for path in budget.own_ms if path}, key=lambda p: [order[x] for x in p])
-    lines = [HEAD, *(_row(budgets, path) for path in paths)]
+    yield from (_row(budgets, path) for path in paths)
     stages = [sum(budget.total_ms(path) for path in paths if len(path) == 1) for budget in budgets]
     ratios = [ms / (budget.sgbm_ms + budget.lk_ms) for ms, budget in zip(stages, budgets, strict=True)]
-    lines.append(f"| **all stages** | {median(stages):.2f} | {median(ratios):.3f} | |")
-    lines.append(f"| reference: StereoSGBM | {sgbm_ms:.2f} | | |")
-    lines.append(f"| reference: LK of {LK_CORNERS} corners | {lk_ms:.2f} | | |")
-    return "\n".join(lines)
+    yield ["all stages", median(stages), median(ratios), None]
+    yield ["reference: StereoSGBM", sgbm_ms, None, None]
+    yield [f"reference: LK of {LK_CORNERS} corners", lk_ms, None, None]
 
 
-def _row(budgets: Sequence[Budget], path: Labels) -> str:
-    """Return the row of a step: total of a stage in bold, own time of the steps inside."""
+def _row(budgets: Sequence[Budget], path: Labels) -> list[Cell]:
+    """Return the row of a step: total of a stage, own time of the steps inside, with their path."""
     inner = len(path) > 1
     spent = [budget.own_ms.get(path, 0.0) if inner else budget.total_ms(path) for budget in budgets]
     ratio = median(ms / (budget.sgbm_ms + budget.lk_ms) for ms, budget in zip(spent, budgets, strict=True))
     calls = median(budget.calls.get(path, 0.0) for budget in budgets)
-    label = "&nbsp;" * 3 * (len(path) - 1) + path[-1] if inner else f"**{path[0]}**"
-    return f"| {label} | {median(spent):.2f} | {ratio:.3f} | {calls:.2f} |"
+    return [" > ".join(path), median(spent), ratio, calls]
 
 
 @contextmanager
@@ -162,7 +164,10 @@ def main() -> None:
     if args.pairs < SKIPPED + 2 * REFERENCE_EVERY or args.runs < 1 or args.hz <= 0:
         parser.error(f"--pairs is at least {SKIPPED + 2 * REFERENCE_EVERY}, --runs at least 1, --hz above 0")
     with busy_processes(args.busy * (os.cpu_count() or 1)):
-        print(table([measure(args.folder, args.pairs, args.hz, args.overrides) for _ in range(args.runs)]))
+        budgets = [measure(args.folder, args.pairs, args.hz, args.overrides) for _ in range(args.runs)]
+    table = ResultTable("budget", "speed", f"Processor time of a pair, {args.hz:g} Hz by the stamps", COLUMNS)
+    for row in rows(budgets):
+        table.add(*row)
 
 
 if __name__ == "__main__":

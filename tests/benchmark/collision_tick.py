@@ -10,6 +10,7 @@ from typing import Final
 from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing, MovingPoint
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.heading_controller import Twist
+from tests.benchmark.results import Column, ResultTable
 
 TICKS: Final = 2000
 S: Final = 1_000_000_000
@@ -47,10 +48,11 @@ def receive_us(ring: ControllerRing) -> float:
 
 def main() -> None:
     """Print the table."""
-    print("| ring | straight on, a tick | on an arc, a tick | a new ring |\n|---|---|---|---|")
+    columns = ("straight on, a tick", "on an arc, a tick", "a new ring")
+    table = ResultTable("collision_tick", "speed", "Processor time of the collision monitor",
+                        (Column("ring"), *(Column(name, "us", 0) for name in columns)))
     for name, ring in RINGS.items():
-        print(f"| {name} | {tick_us(ring, Twist(0.5)):.0f} us | {tick_us(ring, Twist(0.4, 0.6)):.0f} us | "
-              f"{receive_us(ring):.0f} us |")
+        table.add(name, tick_us(ring, Twist(0.5)), tick_us(ring, Twist(0.4, 0.6)), receive_us(ring))
 
 
 if __name__ == "__main__":

@@ -21,14 +21,15 @@ from calib import se3
 from drivers.logs.log_reader import LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
+from omnid.core.rig.rig_health import RigHealth
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
-from omnid.stages.dewarp import Dewarp
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.odometry import OdometryStage
-from omnid.stages.stereo import Stereo
 from omnid.stages.synchronise import Synchronise
 from tests.benchmark.accuracy import rig_of
+from tests.benchmark.results import Column, ResultTable
 from tests.simulation.motion_samples import SensorErrors, motion_samples
 
 ERRORS = SensorErrors(distance=1.03, turn=0.95, wheel_offset_s=0.015, gyro_offset_s=-0.01,
@@ -53,9 +54,8 @@ def dark_drive(folder: Path, dark_s: tuple[float, float], errors: SensorErrors |
     T_base_rig = rig.T_base_rig
     samples: list[MotionSample] = [] if errors is None else motion_samples(
         truth.stamps_ns, T_base_rig @ truth.T @ se3.inverse(T_base_rig), errors, SENSED_SEED)
-    pairing, dewarp = Synchronise(rig, config.pair), Dewarp(shape, config.panorama)
-    stereo, stage = Stereo(shape, config.stereo_settings()), OdometryStage(shape, config.odometry)
-    drive = DarkDrive([], [], stage)
+    pairing, front_end = Synchronise(rig, config.pair), FrontEnd(shape, config, RigHealth(shape.cylinder, "off"))
+    drive = DarkDrive([], [], front_end.odometry)
     start_ns, given = int(truth.stamps_ns[0]), 0
     for frame in reader.frames():
         while given < len(samples) and samples[given].stamp_ns <= frame.stamp_ns + 20_000_000:
@@ -68,7 +68,7 @@ def dark_drive(folder: Path, dark_s: tuple[float, float], errors: SensorErrors |
         if dark:
             noise = np.random.default_rng(pair.seq).integers(0, 4, (2, *pair.lower.shape)).astype(np.uint8)
             pair = replace(pair, lower=noise[0], upper=noise[1])
-        drive.poses.append(stage.process(stereo.process(dewarp.process(pair))))
+        drive.poses.append(front_end.process(pair))
         drive.dark.append(dark)
     return drive
 
@@ -117,17 +117,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="its length, s")
     parser.add_argument("--without", action="store_true", help="no sensors")
     args = parser.parse_args(arguments)
-    print("| log | dark | driven | turned | error at its end | goal: 2 cm + 1 % | heading | error over sigma | "
-          "after it | states |\n|---|---|---|---|---|---|---|---|---|---|")
+    columns = (Column("log"), Column("dark", "s", 1), Column("driven", "m", 2), Column("turned", "deg", 0),
+               Column("error at its end", "mm", 1), Column("goal: 2 cm + 1 %", "mm", 0), Column("heading", "deg", 2),
+               Column("error over sigma", "", 1), Column("after it", "mm", 1), Column("states"))
+    sensors = "no sensors" if args.without else "with wheels and gyro"
+    table = ResultTable("darkness", "light and skew", f"Darkness {sensors}", columns)
     for folder in args.folders:
         drive = dark_drive(folder, (args.start, args.start + args.seconds), None if args.without else ERRORS)
         found = dark_result(drive, read_tum(folder / "truth.txt").T)
-        cells = [folder.name, f"{args.seconds:.1f} s", f"{found.driven_m:.2f} m",
-                 f"{math.degrees(found.turned_rad):.0f}°", f"{1e3 * found.error_m:.1f} mm",
-                 f"{1e3 * (0.02 + 0.01 * found.driven_m):.0f} mm", f"{math.degrees(found.heading_rad):.2f}°",
-                 f"{found.sigmas:.1f}", f"{1e3 * found.after_m:.1f} mm",
-                 ", ".join(f"{state} {count}" for state, count in found.states.items())]
-        print(f"| {' | '.join(cells)} |", flush=True)
+        table.add(folder.name, args.seconds, found.driven_m, math.degrees(found.turned_rad), 1e3 * found.error_m,
+                  1e3 * (0.02 + 0.01 * found.driven_m), math.degrees(found.heading_rad), found.sigmas,
+                  1e3 * found.after_m, ", ".join(f"{state} {count}" for state, count in found.states.items()),
+                  folder=folder)
 
 
 if __name__ == "__main__":

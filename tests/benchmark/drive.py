@@ -27,6 +27,7 @@ from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.building_round import building_round
+from tests.benchmark.results import Cell, Column, ResultTable
 
 Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
 NOTICED_LATE_S = 0.5  # after its end, within which slip may be noticed
@@ -102,21 +103,21 @@ def legs_offset_m(truth: np.ndarray, goals: list[Goal]) -> float:
     return float(np.linalg.norm(to - share[..., None] * along, axis=2).min(axis=1).max())
 
 
-def row(case: Case, run: SimulatedRun) -> list[str]:
+def row(case: Case, run: SimulatedRun) -> list[Cell]:
     """Return the figures of a drive."""
     x_m, y_m, heading_rad = run.ticks[-1].pose
     end = se3.inverse(run.T_world_base[0]) @ se3.transform(se3.rotation_exp([0, 0, heading_rad]), [x_m, y_m, 0.0])
-    ends = ["", "", ""]
+    ends: list[Cell] = [None, None, None]
     if case.goals:
         goal = case.goals[-1]
         error_deg = math.degrees(wrap_angle(float(se3.yaw(end)) - math.radians(goal[2])))
-        ends = [f"{100 * math.dist(end[:2, 3], goal[:2]):.1f}", f"{abs(error_deg):.2f}",
-                f"{100 * legs_offset_m(run.truth_in_odom, case.goals):.1f}"]
+        ends = [100 * math.dist(end[:2, 3], goal[:2]), abs(error_deg),
+                100 * legs_offset_m(run.truth_in_odom, case.goals)]
     state = f"{run.navigation[-1].state} {run.navigation[-1].reason}".strip() if case.goals and run.navigation else ""
     moved = np.diff([tick.pose[:2] for tick in run.ticks], axis=0)
     stops = [line for _, line in run.lines if line.startswith("the wheels stop")]
-    return [state, *ends, f"{np.linalg.norm(moved, axis=1).sum():.2f}", str(len(run.contacts)),
-            f"{run.clearance_m:.2f}", dark(case, run), slip(case, run), "; ".join(dict.fromkeys(stops))[:120]]
+    return [state, *ends, float(np.linalg.norm(moved, axis=1).sum()), len(run.contacts), run.clearance_m,
+            dark(case, run), slip(case, run), "; ".join(dict.fromkeys(stops))[:120]]
 
 
 def dark(case: Case, run: SimulatedRun) -> str:
@@ -151,32 +152,33 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--size", type=int, default=512)
     arguments = parser.parse_args()
-    heads = ("case", "seed", "end", "end error cm", "deg", "off the legs cm", "way m", "contacts", "clearance m",
-             "in the dark", "slip noticed", "stops", "s a pair")
-    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
+    columns = (Column("case"), Column("seed"), Column("end"), Column("end error", "cm", 1), Column("heading", "deg", 2),
+               Column("off the legs", "cm", 1), Column("way", "m", 2), Column("contacts"), Column("clearance", "m", 2),
+               Column("in the dark"), Column("slip noticed"), Column("stops"), Column("processor time a pair", "s", 2))
+    table = ResultTable("drive", "driving", "A simulated robot in a closed loop", columns)
     for name in [*CASES, BUILDING] if "all" in arguments.cases else arguments.cases:
         for seed in arguments.seeds:
             size = arguments.size
             cells = round_row(seed, size) if name == BUILDING else drive_row(CASES[name], seed, size)
-            print("|", " | ".join([name, str(seed), *cells]), "|", flush=True)
+            table.add(name, seed, *cells, seed=(f"drive {name}", seed))
 
 
-def drive_row(case: Case, seed: int, size_px: int) -> list[str]:
+def drive_row(case: Case, seed: int, size_px: int) -> list[Cell]:
     """Drive; return the figures."""
     robot = replace(with_slips(make_robot(size_px), case.slips), has_odometry=case.sensors, has_gyro=case.sensors)
     started_s = time.process_time()
     run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
-    return [*row(case, run), f"{(time.process_time() - started_s) / max(1, len(run.stamps_ns)):.2f}"]
+    return [*row(case, run), (time.process_time() - started_s) / max(1, len(run.stamps_ns))]
 
 
-def round_row(seed: int, size_px: int) -> list[str]:
+def round_row(seed: int, size_px: int) -> list[Cell]:
     """Drive around the building in its map; return the figures."""
     started_s = time.process_time()
     end = building_round(seed, size_px)
     way_m = np.linalg.norm(np.diff([tick.pose[:2] for tick in end.run.ticks], axis=0), axis=1).sum()
-    return [end.words, f"{100 * end.error_m:.1f}", f"{math.degrees(end.error_rad):.2f}", f"{100 * end.off_path_m:.1f}",
-            f"{way_m:.2f}", str(len(end.run.contacts)), f"{end.run.clearance_m:.2f}", "", "", end.stops,
-            f"{(time.process_time() - started_s) / end.pairs:.2f}"]
+    return [end.words, 100 * end.error_m, math.degrees(end.error_rad), 100 * end.off_path_m, float(way_m),
+            len(end.run.contacts), end.run.clearance_m, None, None, end.stops,
+            (time.process_time() - started_s) / end.pairs]
 
 
 if __name__ == "__main__":

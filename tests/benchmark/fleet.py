@@ -23,6 +23,7 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.client_session import open_client
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from tests.benchmark.results import Column, ResultTable
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint
 
 ROBOTS_IN_A_PROCESS = 10
@@ -96,10 +97,10 @@ def main() -> None:
         router.kill()
     sent = count * args.robots
     p50, p99 = (1e3 * float(np.percentile(latencies_s, part)) for part in (50, 99))
-    print(f"| robots | poses/s each | received of sent | latency p50 / p99 | router, of one core | load |\n"
-          f"|---|---|---|---|---|---|\n| {args.robots} | {args.hz:g} | {len(latencies_s)} of {sent} "
-          f"({1 - len(latencies_s) / sent:.2%} lost) | {p50:.1f} / {p99:.1f} ms | {router_share:.0%} "
-          f"| {os.getloadavg()[0]:.1f} |")
+    columns = (Column("robots"), Column("poses/s each"), Column("sent"), Column("received"),
+               Column("latency p50", "ms", 1), Column("latency p99", "ms", 1), Column("router, of one core", "%", 0))
+    table = ResultTable("fleet", "speed", "Many robots behind one router", columns)
+    table.add(args.robots, args.hz, sent, len(latencies_s), p50, p99, 100 * router_share)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
+from tests.benchmark.results import Column, ResultTable
 
 Array = NDArray[np.float64]
 
@@ -35,7 +36,8 @@ SPEED_MPS: Final = 0.5
 FALSE_M: Final = 1.0
 BESIDE_M: Final = 0.2  # of the robot's outline: what stands there may be its reason to stop
 AHEAD: Final = slice(170, 190)  # sectors of the ring
-CASES: Final = {"person at 0.8 m": 12.0, "person at 1.5 m": 12.0, "box": 12.0, "white wall": 20.0, "free": 24.0}
+CASES: Final = {"person at 0.8 m": 12.0, "person at 1.5 m": 12.0, "box": 12.0, "low box": 12.0, "plain pole": 12.0,
+                "pole": 12.0, "white wall": 20.0, "free": 24.0}
 
 
 class Drive(NamedTuple):
@@ -70,6 +72,15 @@ def world_text(case: str, rng: random.Random) -> str:
         size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), rng.uniform(0.4, 1.2)]
         lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]", f"size_m = {size}",
                   f"yaw_deg = {rng.uniform(-40, 40)}"]
+    if case == "low box":
+        size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), 0.08]
+        lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]", f"size_m = {size}",
+                  f"yaw_deg = {rng.uniform(-40, 40)}"]
+    if case.endswith("pole"):
+        side = rng.uniform(0.03, 0.06)
+        texture = "white" if case == "plain pole" else "granite"
+        lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
+                  f"size_m = [{side}, {side}, 1.8]", f'texture = "{texture}"', f"yaw_deg = {rng.uniform(-40, 40)}"]
     if case.startswith("person"):
         within_m, side = float(case.split()[2]), rng.choice((1, -1))
         at_m, aside = rng.uniform(2.3, 3.0), side * (min(left, -right) - 0.3)
@@ -132,7 +143,7 @@ def room_ahead_m(segments: Array, pose: tuple[float, float, float], radius_m: fl
 
 
 def main() -> None:
-    """Print a line for each run, and a row of the table."""
+    """Print a row for each run, and one for all."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", choices=sorted(CASES))
     parser.add_argument("--seeds", type=int, nargs=2, default=(1, 3), metavar=("FIRST", "LAST"))
@@ -140,16 +151,20 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     drives = []
+    columns = (Column("case"), Column("seed"), Column("contacts"), Column("least clearance", "m", 2), Column("stops"),
+               Column("false stops"), Column("driven", "m", 2), Column("highest speed within 1 m", "m/s", 2),
+               Column("unknown rings within 1 m"), Column("rings within 1 m"), Column("reasons"))
+    table = ResultTable(f"obstacle_stops_{arguments.case.replace(' ', '_')}", "obstacles",
+                        f"Stops of the collision monitor: {arguments.case}", columns)
     for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
         drive = run(arguments.case, seed, arguments.size, arguments.overrides)
         drives.append(drive)
-        print(f"{seed}: contacts {drive.contacts}, clearance {drive.clearance_m:.2f} m, stops {drive.stops}, false "
-              f"{drive.false_stops}, driven {drive.driven_m:.2f} m, near {drive.near_mps:.2f} m/s, unknown "
-              f"{drive.unknown[0]}/{drive.unknown[1]}; {drive.reasons}", flush=True)
-    print(f"| {arguments.case} | {len(drives)} | {sum(drive.contacts for drive in drives)} | "
-          f"{min(drive.clearance_m for drive in drives):.2f} m | {sum(drive.false_stops for drive in drives)} in "
-          f"{sum(drive.driven_m for drive in drives):.1f} m | {max(drive.near_mps for drive in drives):.2f} m/s | "
-          f"{sum(drive.unknown[0] for drive in drives)} of {sum(drive.unknown[1] for drive in drives)} |")
+        table.add(arguments.case, seed, drive.contacts, drive.clearance_m, drive.stops, drive.false_stops,
+                  drive.driven_m, drive.near_mps, *drive.unknown, drive.reasons, seed=("obstacle stops", seed))
+    table.add("all", None, sum(drive.contacts for drive in drives), min(drive.clearance_m for drive in drives),
+              sum(drive.stops for drive in drives), sum(drive.false_stops for drive in drives),
+              sum(drive.driven_m for drive in drives), max(drive.near_mps for drive in drives),
+              *(sum(drive.unknown[k] for drive in drives) for k in (0, 1)), None)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -29,6 +29,8 @@ from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.obstacles import ring_settings
+from tests.benchmark.results import Cell, Column, ResultTable
+from tests.benchmark.seeds import family_and_seed
 from tests.simulation import RECIPES, Rectangle, build
 
 Array = NDArray[np.float64]
@@ -172,19 +174,15 @@ def _kind(rectangle: Rectangle, top_m: float) -> str:
     return f"box {height}"
 
 
-def table(counts: Counts) -> str:
-    """Return the counts as a table."""
-    lines = ["| | sectors | found | unknown | missed | false alarms of ranges | error, median / p95 |",
-             "|---|---|---|---|---|---|---|"]
+def rows(counts: Counts) -> Iterator[list[Cell]]:
+    """Yield the rows of the table."""
     order = {group: i for i, group in enumerate(("distance", "surface", "light", "all"))}
     for group in sorted(counts.of, key=lambda name: (order[name.split("|")[0]], name)):
         total = sum(counts.of[group].values())
-        shares = " | ".join(f"{100 * counts.of[group][one] / total:.1f} %" for one in CLASSES)
+        shares = [100 * counts.of[group][one] / total for one in CLASSES]
         errors = np.abs(counts.errors_m.get(group, [np.nan]))
-        lines.append(f"| {group.split('|')[1]} | {total} | {shares} | "
-                     f"{100 * counts.false_alarms[group] / max(1, counts.ranges[group]):.2f} % | "
-                     f"{100 * np.median(errors):.1f} / {100 * np.quantile(errors, 0.95):.1f} cm |")
-    return "\n".join(lines)
+        yield [group.split("|")[1], total, *shares, 100 * counts.false_alarms[group] / max(1, counts.ranges[group]),
+               100 * float(np.median(errors)), 100 * float(np.quantile(errors, 0.95))]
 
 
 def main() -> None:
@@ -196,7 +194,13 @@ def main() -> None:
     counts = Counts()
     for folder in arguments.logs:
         measure(folder, arguments.overrides, counts)
-    print(table(counts))
+    columns = (Column("sectors of"), Column("number"), *(Column(one, "%", 1) for one in CLASSES),
+               Column("false alarms of ranges", "%", 2), Column("error, median", "cm", 1),
+               Column("error, p95", "cm", 1))
+    table = ResultTable("obstacles", "obstacles", "Recall of the obstacle ring", columns)
+    table.seeds = [seed for folder in arguments.logs if (seed := family_and_seed(folder.name))]
+    for row in rows(counts):
+        table.add(*row)
 
 
 if __name__ == "__main__":

@@ -10,11 +10,12 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from omnid.core.mapping.scan_grid import scan_grid
-from omnid.core.odometry.pose_estimation import StereoModel
 from omnid.core.places.particle_filter import ParticleFilter
 from omnid.core.places.place_search import PlaceSearch
 from omnid.core.places.pose_graph import optimise
+from omnid.core.types.stereo_model import StereoModel
 from omnid.formats.place_file import read_places, write_places
+from tests.benchmark.results import Column, ResultTable
 from tests.omnid.core.mapping.rooms import pose, scan_of
 from tests.omnid.core.places.graphs import laps
 from tests.omnid.core.places.test_particle_filter import CORNERED, MAPPED, drive, grid_of
@@ -64,9 +65,10 @@ def main() -> None:
             ("grid of 1,000 range scans, 0.05 m", seconds(lambda: scan_grid(scans, poses, 0.05)), ""),
             ("particle filter: one update, 1,000 particles", seconds(lambda: particles.update(scans[0]), 25), ""),
         )
-    print("| what | processor time, ms | |\n|---|---|---|")
+    table = ResultTable("place_times", "speed", "Times of the map of places",
+                        (Column("what"), Column("processor time", "ms", 1), Column("remark")))
     for name, taken_s, note in rows:
-        print(f"| {name} | {1e3 * taken_s:.1f} | {note} |")
+        table.add(name, 1e3 * taken_s, note)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final
 
 import numpy as np
 
@@ -40,6 +41,7 @@ from omnid.runs.run_result import RunResult
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
+from tests.benchmark.results import Cell, Column, ResultTable
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.replay.edited import images, save
 from tests.simulation.closed_worlds import ring, with_other_posters, with_people
@@ -50,13 +52,26 @@ NEAR_M, LEFT_M = 0.5, 4.0  # a revisit: so near to a place that was left so long
 LAP = 0.5  # share of a two_laps log that is the first lap
 SEARCHES, PERIOD_NS = 6, 200_000_000  # of a query, after which it is given up
 AFTER_CUT = 50  # pairs of a log after it was cut
-LAPS_HEAD = ("| log | rig | odometry: ATE, end | live in the map: ATE, end, ratio | at the end: ATE, ratio "
-             "| loops (false) | loop after revisit | keyframes | places: processor time |\n"
-             "|---|---|---|---|---|---|---|---|---|")
-
-SESSIONS_HEAD = ("| session | keyframes | dropped so far | loops | file | read, processor time "
-                 "| places: processor time | a pair, mean / max | localised | live ATE in the map | largest memory |\n"
-                 "|---|---|---|---|---|---|---|---|---|---|---|")
+LAPS: Final = (
+    Column("log"), Column("rig off by", "deg", 1), Column("odometry: ATE", "mm", 1), Column("its end", "mm", 1),
+    Column("live in the map: ATE", "mm", 1), Column("its end", "mm", 1), Column("ratio", "", 2),
+    Column("at the end: ATE", "mm", 1), Column("its ratio", "", 2), Column("loops"), Column("false loops"),
+    Column("loop after revisit", "m", 1), Column("keyframes"), Column("processor time of places", "%", 1))
+SESSIONS: Final = (
+    Column("session"), Column("keyframes"), Column("dropped so far"), Column("loops"), Column("file", "MB", 1),
+    Column("read, processor time", "s", 2), Column("processor time of places", "%", 1),
+    Column("a pair, mean", "ms", 1), Column("a pair, most", "ms", 0), Column("localised", "%", 1),
+    Column("live ATE in the map", "mm", 1), Column("largest memory", "MB", 0))
+KIDNAPPED: Final = (
+    Column("log"), Column("carried", "m", 1), Column("localised after", "s", 1), Column("error after that", "mm", 0),
+    Column("wrong after that"), Column("largest step of odom", "mm", 0))
+QUERIES: Final = (
+    Column("map"), Column("queries"), Column("right", "%", 1), Column("wrong"), Column("not localised"),
+    Column("time to localise, p95", "s", 1), Column("error p50", "mm", 1), Column("error, most", "mm", 1),
+    Column("heading, most", "deg", 2), Column("longest search, processor time", "ms", 0), Column("the wrong ones"))
+TABLES: Final = {"laps": ("Loops on closed drives, and places that look alike", LAPS),
+                 "queries": ("Queries in a map", QUERIES), "kidnapped": ("A log that goes on elsewhere", KIDNAPPED),
+                 "sessions": ("One map extended by session after session", SESSIONS)}
 
 
 def disturbed(rig: Rig, degrees: float, seed: int) -> Rig:
@@ -68,10 +83,10 @@ def disturbed(rig: Rig, degrees: float, seed: int) -> Rig:
 def replayed(folder: Path, degrees: float, seed: int) -> RunResult:
     """Return the run of a folder's log."""
     rig = disturbed(read_rig(folder / "rig.toml"), degrees, seed)
-    return omnid.replay(folder / "log.mcap", rig, overrides=["stereo.rig_check=off"])
+    return omnid.replay(folder / "log.mcap", rig, overrides=["rig.check=off"])
 
 
-def laps_row(folder: Path, degrees: float, seed: int) -> str:
+def laps_row(folder: Path, degrees: float, seed: int) -> list[Cell]:
     """Return one row of the table."""
     truth, started = read_tum(folder / "truth.txt"), time.process_time()
     with timed_places() as spent:
@@ -82,11 +97,9 @@ def laps_row(folder: Path, degrees: float, seed: int) -> str:
     errors = loop_errors(result.places or PlaceMap(), truth, read_rig(folder / "rig.toml"))
     false = sum(m > FALSE_M or rad > FALSE_RAD for m, rad in errors)
     after_m = after_revisit_m(truth.T, result.map_states)
-    cells = [folder.name, f"{degrees:g}°", f"{1e3 * odom.ate_rmse_m:.1f}, {1e3 * odom.end_error_m:.1f} mm",
-             f"{1e3 * live.ate_rmse_m:.1f}, {1e3 * live.end_error_m:.1f} mm, {live.ate_rmse_m / odom.ate_rmse_m:.2f}",
-             f"{1e3 * final.ate_rmse_m:.1f} mm, {final.ate_rmse_m / odom.ate_rmse_m:.2f}", f"{len(errors)} ({false})",
-             "none" if math.isnan(after_m) else f"{after_m:.1f} m", str(len(result.places or ())), f"{share:.1%}"]
-    return f"| {' | '.join(cells)} |"
+    return [folder.name, degrees, 1e3 * odom.ate_rmse_m, 1e3 * odom.end_error_m, 1e3 * live.ate_rmse_m,
+            1e3 * live.end_error_m, live.ate_rmse_m / odom.ate_rmse_m, 1e3 * final.ate_rmse_m,
+            final.ate_rmse_m / odom.ate_rmse_m, len(errors), false, after_m, len(result.places or ()), 100 * share]
 
 
 @contextmanager
@@ -187,26 +200,22 @@ def _asked(cameras: RenderedCameras, places: PlaceMap, poses: tuple[Array, Array
     return Answer(math.inf, math.inf, math.inf, longest_s)
 
 
-def queries_text(answers: Sequence[Answer]) -> str:
+def queries_row(name: str, answers: Sequence[Answer]) -> list[Cell]:
     """Return the share that was localised, and the time it took."""
     right = [answer for answer in answers if answer.is_right]
     times = sorted(answer.time_s for answer in answers)
-    text = (f"{len(answers)} queries: {len(right) / len(answers):.1%} right, "
-            f"{sum(answer.is_wrong for answer in answers)} wrong, "
-            f"{sum(math.isinf(answer.time_s) for answer in answers)} not localised; p95 of the time "
-            f"{times[int(0.95 * len(times))]:.1f} s; longest processor time of a search "
-            f"{1e3 * max(answer.work_s for answer in answers):.0f} ms")
-    for number, answer in enumerate(answers):
-        if answer.is_wrong:
-            text += f"; wrong: {number} by {answer.error_m:.3f} m, {math.degrees(answer.error_rad):.2f}°"
+    wrong = [f"{number} by {answer.error_m:.3f} m, {math.degrees(answer.error_rad):.2f} deg"
+             for number, answer in enumerate(answers) if answer.is_wrong]
+    errors: tuple[Cell, ...] = (None, None, None)
     if right:
-        text += (f"; errors p50 {1e3 * float(np.median([a.error_m for a in right])):.1f} mm, "
-                 f"max {1e3 * max(a.error_m for a in right):.1f} mm, "
-                 f"{math.degrees(max(a.error_rad for a in right)):.2f}°")
-    return text
+        errors = (1e3 * float(np.median([a.error_m for a in right])), 1e3 * max(a.error_m for a in right),
+                  math.degrees(max(a.error_rad for a in right)))
+    return [name, len(answers), 100 * len(right) / len(answers), len(wrong),
+            sum(math.isinf(answer.time_s) for answer in answers), times[int(0.95 * len(times))], *errors,
+            1e3 * max(answer.work_s for answer in answers), "; ".join(wrong)]
 
 
-def kidnapped_row(folder: Path, seed: int) -> str:
+def kidnapped_row(folder: Path, seed: int) -> list[Cell]:
     """Return the time from the cut of a log until the pose in the map is right, and the errors after that."""
     truth, taken = read_tum(folder / "truth.txt"), images(folder / "log.mcap")
     count = len(truth.stamps_ns)
@@ -220,17 +229,16 @@ def kidnapped_row(folder: Path, seed: int) -> str:
     errors = [motion_errors(a, b) for a, b in zip(result.T_map_rig_live, se3.inverse(T_true[0]) @ T_true, strict=True)]
     steps_m = np.linalg.norm(np.diff(result.T_odom_rig[:, :3, 3], axis=0), axis=1)
     after = [k for k in range(cut, len(errors)) if result.map_states[k] is MapState.LOCALIZED]
+    jump_m = float(np.linalg.norm(truth.T[begin, :3, 3] - truth.T[cut - 1, :3, 3]))
     if not after:
-        return f"| {folder.name} | not localised again | | |"
+        return [folder.name, jump_m, None, None, None, 1e3 * steps_m.max()]
     found = next((k for k in after if errors[k][0] < FALSE_M), after[-1])
     wrong = sum(errors[k][0] > FALSE_M for k in after if k > found)
-    jump_m = np.linalg.norm(truth.T[begin, :3, 3] - truth.T[cut - 1, :3, 3])
     largest_m = max(errors[k][0] for k in after if k >= found)
-    return (f"| {folder.name}, carried {jump_m:.1f} m | {0.1 * (found - cut):.1f} s | {1e3 * largest_m:.0f} mm, "
-            f"{wrong} wrong | {1e3 * steps_m.max():.0f} mm |")
+    return [folder.name, jump_m, 0.1 * (found - cut), 1e3 * largest_m, wrong, 1e3 * steps_m.max()]
 
 
-def session_rows(folder: Path, count: int) -> Iterator[str]:
+def session_rows(folder: Path, count: int) -> Iterator[list[Cell]]:
     """Yield a row for each of the sessions that extend one map; the last one has the default distances and rate."""
     truth, rig = read_tum(folder / "truth.txt"), folder / "rig.toml"
     denser = ["places.limits.keyframe_m=0.1", "places.limits.keyframe_deg=5", "places.limits.rate_hz=10"]
@@ -249,12 +257,10 @@ def session_rows(folder: Path, count: int) -> Iterator[str]:
             read_s = time.process_time() - began
             error = evaluate(Trajectory(result.stamps_ns, result.T_map_rig_live), truth)
             localised = sum(state is MapState.LOCALIZED for state in result.map_states) / len(result.map_states)
-            cells = [f"{session + 1}{'' if settings else ', default'}", str(len(places)), str(places.dropped),
-                     str(places.loops), f"{path.stat().st_size / 1e6:.1f} MB", f"{read_s:.2f} s", f"{share:.1%}",
-                     f"{1e3 * sum(spent) / len(spent):.1f} / {1e3 * max(spent):.0f} ms", f"{localised:.1%}",
-                     f"{1e3 * error.ate_rmse_m:.1f} mm",
-                     f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB"]
-            yield f"| {' | '.join(cells)} |"
+            yield [f"{session + 1}{'' if settings else ', default'}", len(places), places.dropped, places.loops,
+                   path.stat().st_size / 1e6, read_s, 100 * share, 1e3 * sum(spent) / len(spent), 1e3 * max(spent),
+                   100 * localised, 1e3 * error.ate_rmse_m,
+                   resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]
 
 
 def main() -> None:
@@ -267,24 +273,21 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7, help="sessions")
     args = parser.parse_args()
     prepare_kernels(lambda _level, _text: None)  # their compilation is no part of the shares
-    if args.what == "laps":
-        print(LAPS_HEAD)
-    if args.what == "kidnapped":
-        print("| log | localised after | error after that | largest step of odom |\n|---|---|---|---|")
+    title, columns = TABLES[args.what]
+    table = ResultTable(f"places_{args.what}", "places", title, columns)
     for folder in args.folders:
         seed = int(folder.name.rpartition("_s")[2])
         match args.what:
             case "laps":
                 for degrees in args.wrong_deg:
-                    print(laps_row(folder, degrees, seed), flush=True)
+                    table.add(*laps_row(folder, degrees, seed), folder=folder)
             case "queries":
-                print(f"{folder.name}: {queries_text(queries(folder, seed, args.count))}", flush=True)
+                table.add(*queries_row(folder.name, queries(folder, seed, args.count)), folder=folder)
             case "sessions":
-                print(SESSIONS_HEAD)
                 for row in session_rows(folder, args.runs):
-                    print(row, flush=True)
+                    table.add(*row, folder=folder)
             case "kidnapped":
-                print(kidnapped_row(folder, seed), flush=True)
+                table.add(*kidnapped_row(folder, seed), folder=folder)
 
 
 if __name__ == "__main__":

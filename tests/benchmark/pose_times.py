@@ -19,10 +19,12 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.odometry import OdometryStage
 from omnid.stages.synchronise import Synchronise
 from tests.benchmark.budget_steps import StepClock
+from tests.benchmark.results import Column, ResultTable
 from tests.replay.test_memory import to_and_fro
 
 SKIPPED = 5  # first pairs, in which caches and the first map are filled
@@ -62,13 +64,15 @@ def main() -> None:
     graph = Graph(threaded=False)
     read = graph.source("read", lambda: to_and_fro(frames, args.pairs, round(1e9 / args.hz)))
     pairs = graph.stage("pair", Synchronise(place.rig, config.pair), read)
-    wire(graph, pairs, place, config, Sinks({"times": times}))
+    wire(graph, pairs, FrontEnd(place, config), config, Sinks({"times": times}))
     graph.run()
-    print("| ms a pair | p50 | p90 | p99 | mean | pairs above 1 ms |\n|---|---|---|---|---|---|")
+    columns = (Column("time of odometry"), *(Column(name, "ms", 1) for name in ("p50", "p90", "p99", "mean")),
+               Column("pairs above 1 ms", "%", 0))
+    table = ResultTable("pose_times", "speed", "Processor time of odometry until a pose and after it", columns)
     for label, all_ms in (("until the pose", times.until_pose), ("after it", times.after_pose)):
         ms = np.array(all_ms[SKIPPED:])
         p50, p90, p99 = np.percentile(ms, [50, 90, 99])
-        print(f"| {label} | {p50:.1f} | {p90:.1f} | {p99:.1f} | {ms.mean():.1f} | {np.mean(ms > 1):.0%} |")
+        table.add(label, p50, p90, p99, ms.mean(), 100 * np.mean(ms > 1))
 
 
 if __name__ == "__main__":

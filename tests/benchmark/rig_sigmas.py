@@ -22,9 +22,9 @@ import numpy as np
 
 from calib import se3
 from calib.boards.board import BoardView
-from calib.fit.model_selection import select_calibration
-from calib.fit.rig_fit import PairView, RigCalibration
-from calib.fit.rig_selection import select_rig
+from calib.fit.boards.camera_selection import select_calibration
+from calib.fit.boards.rig_fit import PairView, RigCalibration
+from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import (
     AZIMUTHS,
     SIGMA_STEP,
@@ -41,6 +41,7 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig
 from calib.rig_frame import rig_between
 from tests.benchmark.boards_chain import BOARD, DISTANCE_M, PAIRS, board_rig, calibrate, render_boards
+from tests.benchmark.results import Column, ResultTable
 from tests.simulation.boards import board_poses_around_rig
 from tests.simulation.mirrors import MirrorCamera
 
@@ -234,9 +235,13 @@ def main(arguments: Sequence[str]) -> int:
         found.append(scores(rig, truth))
         words = " ".join(f"{value:+.2f}" for value in found[-1].values())
         print(f"seed {seed}, {type(rig.lower.camera).__name__}, {line}, {drive_uncertainty(rig)}: {words}", flush=True)
+    noise = f"corners with noise of {args.noise_px:g} px" if args.folder is None else "rendered images"
+    table = ResultTable("rig_sigmas", "calibration", f"Errors over stated standard deviations of boards, {noise}",
+                        (Column("quantity"), Column("rms", "", 2), Column("mean", "", 2)))
+    table.seeds = [("rigs of boards", seed) for seed in args.seeds]
     for name in NAMES:
         values = np.array([one[name] for one in found])
-        print(f"{name:22s} rms {np.sqrt((values**2).mean()):.2f}, mean {values.mean():+.2f}")
+        table.add(name, np.sqrt((values**2).mean()), values.mean())
     return 0
 
 

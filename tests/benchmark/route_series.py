@@ -33,6 +33,7 @@ from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import WorldOptions, load_world
 from omnid.tracking_state import MapState
+from tests.benchmark.results import Cell, Column, ResultTable
 
 Array = NDArray[np.float64]
 WORLD: Final = "building"
@@ -161,7 +162,7 @@ def changed_world(seed: int, number: int, rng: random.Random, people: bool) -> W
     return replace(load_world(WORLD, seed, options), people=walking if people else ())
 
 
-def row(lesson: Array, run: SimulatedRun, end: str) -> list[str]:
+def row(lesson: Array, run: SimulatedRun, end: str) -> list[Cell]:
     """Return the figures of a drive against the true positions (N, 2) of the lesson."""
     path = np.array([tick.pose[:2] for tick in run.ticks])
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -172,12 +173,11 @@ def row(lesson: Array, run: SimulatedRun, end: str) -> list[str]:
                           if update.reason and not update.state.is_end)
     waits |= dict.fromkeys(line for _, line in run.lines if line.startswith("the wheels stop"))
     avoided_s = sum(update.state is NavigationState.AVOIDING for update in run.navigation) * 0.1
-    p95, most = (f"{figure:.1f}" for figure in (np.percentile(off_cm[repeated], 95), off_cm[repeated].max())) \
-        if repeated.any() else ("-", "-")
-    without = f"{np.percentile(off_cm[on_path], 95):.1f}" if on_path.any() else "-"
+    p95, most = (np.percentile(off_cm[repeated], 95), off_cm[repeated].max()) if repeated.any() else (None, None)
+    without = np.percentile(off_cm[on_path], 95) if on_path.any() else None
     end_error_cm = 100 * math.dist(path[-1], lesson[-1])
-    return [end, p95, without, most, f"{avoided_s:.0f}", f"{end_error_cm:.1f}", f"{way_m[-1]:.1f}",
-            f"{run.ticks[-1].time_s:.0f}", str(len(run.contacts)), f"{run.clearance_m:.2f}", "; ".join(waits)[:300]]
+    return [end, p95, without, most, avoided_s, end_error_cm, float(way_m[-1]), run.ticks[-1].time_s,
+            len(run.contacts), run.clearance_m, "; ".join(waits)[:300]]
 
 
 def on_detour(run: SimulatedRun, way_m: Array) -> NDArray[np.bool_]:
@@ -190,7 +190,7 @@ def on_detour(run: SimulatedRun, way_m: Array) -> NDArray[np.bool_]:
     return np.asarray(way_m - last_m <= SETTLED_M)
 
 
-def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, people: bool) -> Iterator[list[str]]:
+def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, people: bool) -> Iterator[list[Cell]]:
     """Teach a route and repeat it; yield a row for each drive."""
     line = lap(length_m)
     with tempfile.TemporaryDirectory() as folder:
@@ -200,8 +200,7 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
         started_s, lesson = time.process_time(), Lesson(line)
         run = simulate(world, robot, lesson, seconds=LONGEST_S, seed=seed, config=config)
         taught = np.array([tick.pose[:2] for tick in run.ticks])
-        yield [str(seed), "lesson", *row(taught, run, lesson.end or "time is over"),
-               f"{time.process_time() - started_s:.0f}"]
+        yield [seed, "lesson", *row(taught, run, lesson.end or "time is over"), time.process_time() - started_s]
         for number in range(repeats):
             rng, started_s = random.Random(1000 * seed + number), time.process_time()
             begin = round(STARTS[number] * len(line))
@@ -211,8 +210,8 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
             world = replace(changed_world(seed, number, rng, people), start=start)
             script = repetition(line, begin)
             run = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
-            yield [str(seed), f"from {STARTS[number] * SPACING_M * len(line):.0f} m",
-                   *row(taught, run, script.end or "time is over"), f"{time.process_time() - started_s:.0f}"]
+            yield [seed, f"from {STARTS[number] * SPACING_M * len(line):.0f} m",
+                   *row(taught, run, script.end or "time is over"), time.process_time() - started_s]
 
 
 def main() -> None:
@@ -225,13 +224,15 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2, help="rays of a pixel, per axis")
     parser.add_argument("--no-people", action="store_true")
     arguments = parser.parse_args()
-    heads = ("seed", "drive", "end", "off the lesson p95 cm", "without detours", "most cm", "around obstacles s",
-             "end error cm", "way m", "s", "contacts", "clearance m", "stood or slowed", "processor s")
-    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads), flush=True)
+    columns = (Column("seed"), Column("drive"), Column("end"), Column("off the lesson p95", "cm", 1),
+               Column("p95 without detours", "cm", 1), Column("most", "cm", 1), Column("around obstacles", "s", 0),
+               Column("end error", "cm", 1), Column("way", "m", 1), Column("time", "s", 0), Column("contacts"),
+               Column("clearance", "m", 2), Column("stood or slowed"), Column("processor time", "s", 0))
+    table = ResultTable("route_series", "driving", f"Repeated route of {arguments.length:g} m", columns)
     robot = replace(make_robot(arguments.size), samples=arguments.samples)
     for seed in arguments.seeds:
         for cells in series(seed, arguments.length, arguments.repeats, robot, not arguments.no_people):
-            print("|", " | ".join(cells), "|", flush=True)
+            table.add(*cells, seed=("route", seed))
 
 
 if __name__ == "__main__":

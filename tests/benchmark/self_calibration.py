@@ -16,12 +16,13 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
 import omnid
 from calib import se3
-from calib.fit.drive_parameters import RigParameters
+from calib.fit.drive.rig_parameters import RigParameters
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.camera import Array
 from calib.models.unified import UnifiedCamera
@@ -30,10 +31,13 @@ from calib.rig_file import read_rig
 from omnid.calibration.drive import calibrate_drive
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
+from tests.benchmark.results import Cell, Column, ResultTable
 from tests.simulation.rigs import with_upper_rotated
 
-HEAD = ("| drive, trial | error before, after | model | length | ATE (rigid) | ATE (first pose) | heading, max "
-        "| said sigma | processor time |\n|---|---|---|---|---|---|---|---|---|")
+COLUMNS: Final = (
+    Column("drive"), Column("trial"), Column("error before", "px", 3), Column("error after", "px", 3), Column("misfit"),
+    Column("model"), Column("length", "%", 3), Column("ATE (rigid)", "mm", 2), Column("ATE (first pose)", "mm", 2),
+    Column("heading, max", "deg", 3), Column("stated sigma of lengths", "%", 2), Column("processor time", "s", 0))
 
 
 def perturbed(rig: Rig) -> Rig:
@@ -66,10 +70,10 @@ def parameter_scores(found: Rig, truth: Rig) -> dict[str, float]:
     return {name: errors[name] / found.covariance.sigma(name) for name in found.covariance.names if name in errors}
 
 
-def row(drive: Path, trial: Path, start: Rig, scores: list[dict[str, float]] | None = None) -> str:
+def row(drive: Path, trial: Path, start: Rig, scores: list[dict[str, float]] | None = None) -> list[Cell]:
     """Return one row of the table; add the errors of the parameters to scores."""
     started = time.process_time()
-    found = calibrate_drive([drive / "log.mcap"], start, report=lambda line: print(line, file=sys.stderr))
+    found = calibrate_drive([drive / "log.mcap"], start, progress=lambda line: print(line, file=sys.stderr))
     spent_s = time.process_time() - started
     if scores is not None:
         scores.append(parameter_scores(found.rig, read_rig(drive / "rig.toml")))
@@ -81,11 +85,9 @@ def row(drive: Path, trial: Path, start: Rig, scores: list[dict[str, float]] | N
     uncertainty = drive_uncertainty(found.rig)
     terms = " ".join(sorted({name.split()[-1] for name in found.adjustment.parameters.names if name[-2:] in
                              ("k1", "k2", "p1", "p2")})) or "as the file"
-    cells = [f"{drive.name}, {trial.name}", f"{found.first_sigma_px:.3f}, {found.adjustment.sigma_px:.3f} px"
-             + (" MISFIT" if found.is_misfit else ""), terms, f"{100 * m.length_error_ratio:+.3f} %",
-             f"{1e3 * rigid:.2f} mm", f"{1e3 * m.ate_rmse_m:.2f} mm", f"{math.degrees(m.heading_max_rad):.3f}°",
-             f"{100 * uncertainty.scale:.2f} %" if uncertainty else "", f"{spent_s:.0f} s"]
-    return f"| {' | '.join(cells)} |"
+    return [drive.name, trial.name, found.first_sigma_px, found.adjustment.sigma_px, found.is_misfit, terms,
+            100 * m.length_error_ratio, 1e3 * rigid, 1e3 * m.ate_rmse_m, math.degrees(m.heading_max_rad),
+            100 * uncertainty.scale if uncertainty else None, spent_s]
 
 
 def rigid_error_m(found: Array, truth: Array) -> float:
@@ -104,14 +106,20 @@ def main() -> None:
     parser.add_argument("--perturbed", action="store_true", help="start from the true rig with small errors")
     parser.add_argument("--sigmas", action="store_true", help="compare the errors of the parameters with their sigmas")
     args, scores = parser.parse_args(), list[dict[str, float]]()
-    print(HEAD)
+    start_name = "a true rig with small errors" if args.perturbed else args.rig
+    table = ResultTable("self_calibration", "calibration", f"Self-calibration from drives, from {start_name}", COLUMNS)
     for pair in args.pairs:
         drive, trial = map(Path, pair.split(":"))
         start = perturbed(read_rig(drive / "rig.toml")) if args.perturbed else read_rig(drive / args.rig)
-        print(row(drive, trial, start, scores if args.sigmas else None), flush=True)
-    for name in sorted({name for one in scores for name in one}):
-        values = [one[name] for one in scores if name in one]
-        print(f"{name:12s} rms {np.sqrt(np.mean(np.square(values))):.2f}: " + " ".join(f"{one:+.2f}" for one in values))
+        table.add(*row(drive, trial, start, scores if args.sigmas else None), folder=drive)
+    if scores:
+        title = "Errors over stated standard deviations of drives"
+        sigmas = ResultTable("self_calibration_sigmas", "calibration", title,
+                             (Column("parameter"), Column("rms", "", 2), Column("errors")))
+        sigmas.seeds = table.seeds
+        for name in sorted({name for one in scores for name in one}):
+            values = [one[name] for one in scores if name in one]
+            sigmas.add(name, np.sqrt(np.mean(np.square(values))), " ".join(f"{one:+.2f}" for one in values))
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from omnid.client import Unreachable, subscribe
+from tests.benchmark.results import Column, ResultTable
 from tests.omnid.transport.bus_fixtures import free_endpoint
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
@@ -75,9 +76,10 @@ def main() -> None:
     rows["`omnid run`: first pose"] = [first_pose_s() for _ in range(count)]
     for words in COMMANDS:
         rows[f"`omnid {' '.join(words)}`"] = [command_s(words) for _ in range(count)]
-    print(f"| | median of {count} | smallest, largest |\n|---|---|---|")
+    columns = (Column("what"), *(Column(name, "s", 2) for name in (f"median of {count}", "smallest", "largest")))
+    table = ResultTable("start", "speed", "Start of a program", columns)
     for name, times_s in rows.items():
-        print(f"| {name} | {statistics.median(times_s):.2f} s | {min(times_s):.2f}, {max(times_s):.2f} s |")
+        table.add(name, statistics.median(times_s), min(times_s), max(times_s))
 
 
 if __name__ == "__main__":

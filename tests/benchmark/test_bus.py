@@ -27,6 +27,7 @@ from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import decode_pose
+from tests.benchmark.results import Column, ResultTable
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, wait_until
 
 pytestmark = pytest.mark.benchmark
@@ -124,9 +125,10 @@ def test_latency_and_cost(way: str) -> None:
         cost = publish([sink], 30, 300)
         time.sleep(0.5)
         found = new_counts(listener)
-    print(f"\n{way}: one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms, "
-          f"{found['received']:.0f} of 300 poses; publishing a frame p50 {1e3 * cost.p(0.5):.2f} ms, "
-          f"p99 {1e3 * cost.p(0.99):.2f} ms")
+    columns = (Column("way"), Column("one way p50", "ms", 2), Column("one way p99", "ms", 2), Column("poses of 300"),
+               Column("publishing p50", "ms", 2), Column("publishing p99", "ms", 2))
+    table = ResultTable("bus_latency", "speed", "Poses on the bus", columns, continued=True)
+    table.add(way, found["p50_ms"], found["p99_ms"], found["received"], 1e3 * cost.p(0.5), 1e3 * cost.p(0.99))
     assert found["newest"] == 329 and found["missed"] == 0
 
 
@@ -148,8 +150,10 @@ def test_poses_pass_a_restarted_router_within_five_seconds() -> None:
         time.sleep(0.3)
         near, far = new_counts(direct), new_counts(behind)
     missed_s = far["missed"] / RATE_HZ - 3.0
-    print(f"\nrouter killed for 3 s: direct {near['missed']:.0f} of {near['received']:.0f} missed; behind the router "
-          f"poses again {missed_s:.1f} s after its restart ({time.monotonic() - back_s:.0f} s measured)")
+    columns = (Column("fault"), Column("direct: missed"), Column("direct: received"),
+               Column("behind the router: poses again after", "s", 1), Column("measured", "s", 0))
+    table = ResultTable("bus_router", "speed", "A router that is killed", columns)
+    table.add("router killed for 3 s", near["missed"], near["received"], missed_s, time.monotonic() - back_s)
     assert near["missed"] == 0 and near["newest"] == far["newest"] == 299 and missed_s < 5.0
 
 
@@ -182,10 +186,15 @@ def test_a_slow_subscriber_does_not_delay_others(scene: Path) -> None:
             daemon.terminate()
     work_ms, cost_ms = ([float(last.value("omnid: stage bus", f"{kind}_{which}_ms")) for which in ("p50", "p99")]
                         for kind in ("work", "cpu"))
-    for name, (rate_hz, p50_ms, p99_ms) in rates.items():
-        print(f"\n{name}: {rate_hz:.1f} poses/s, capture to network p50 {p50_ms:.1f} ms, p99 {p99_ms:.1f} ms")
-    print(f"to publish a pose: processor p50 {cost_ms[0]:.2f} ms, p99 {cost_ms[1]:.2f} ms; with waiting for the "
-          f"interpreter p50 {work_ms[0]:.2f} ms, p99 {work_ms[1]:.2f} ms")
+    columns = (Column("subscribers"), Column("poses/s", "", 1), Column("capture to network p50", "ms", 1),
+               Column("capture to network p99", "ms", 1))
+    table = ResultTable("bus_slow_subscriber", "speed", "A slow subscriber on the bus", columns)
+    for name, figures in rates.items():
+        table.add(name, *figures)
+    times = ResultTable("bus_publishing", "speed", "Time to publish a pose",
+                        (Column("time"), Column("p50", "ms", 2), Column("p99", "ms", 2)))
+    times.add("processor", *cost_ms)
+    times.add("with waiting for the interpreter", *work_ms)
     alone, slow = rates.values()
     assert slow[0] > 0.8 * alone[0] and cost_ms[0] < 1.0
 
@@ -236,9 +245,11 @@ def test_a_fleet_on_one_router_loses_no_pose() -> None:
         share = (cpu_s(router.pid) - before_s) / (time.monotonic() - started_s)
         time.sleep(0.5)
         found = new_counts(listener)
-    print(f"\n{FLEET} robots at {RATE_HZ:.0f} Hz: {found['received']:.0f} of {FLEET * 300} poses received, "
-          f"{found['missed']:.0f} missed; one way p50 {found['p50_ms']:.2f} ms, p99 {found['p99_ms']:.2f} ms; "
-          f"the router took {100 * share:.0f} % of a core")
+    columns = (Column("robots"), Column("poses/s each"), Column("sent"), Column("received"), Column("missed"),
+               Column("one way p50", "ms", 2), Column("one way p99", "ms", 2), Column("router, of one core", "%", 0))
+    table = ResultTable("bus_fleet", "speed", "Robots of one process behind a router", columns)
+    table.add(FLEET, RATE_HZ, FLEET * 300, found["received"], found["missed"], found["p50_ms"], found["p99_ms"],
+              100 * share)
     assert found["newest"] == 329 and found["missed"] == 0
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.benchmark.results import Column, ResultTable
 from tests.replay.live import Base, Daemon, Operator, answers, free_port, started, wait_until
 
 FOLDER, _, HZ = os.environ.get("OMNID_BENCHMARK_LOG", f"{files('omnid.sample')}:10").rpartition(":")
@@ -29,6 +30,20 @@ MOTOR_HZ = 50.0
 PERIOD_S = 5.0  # between two samples of the soak test
 GROWTH_MB = 8.0  # allowed growth from the first half to the second: noise of the allocator
 STAGES = ("lower", "upper", "pair", "dewarp", "odometry", "mapping", "bus", "bus-drive", "bus-map")
+
+
+FIGURES = ("pose p50", "pose p99", "pose max", "wheel p50", "wheel p99", "wheel max", "tick p50", "tick p99",
+           "tick p999", "tick max", "publishing cpu p50", "publishing cpu p99")
+COLUMNS = (Column("images, busy processes per core"), *(Column(name, "ms", 1) for name in FIGURES),
+           *map(Column, ("poses/s", "ticks", "missed", "lost_reports", "dropped", "load")))
+
+
+def number(text: str) -> float | str | None:
+    """Return a published figure as a number; what is none stays a text."""
+    try:
+        return float(text)
+    except ValueError:
+        return text or None
 
 
 @contextmanager
@@ -86,7 +101,8 @@ def test_latencies_and_the_deadline_of_the_motor_tick(tmp_path: Path, rate_hz: i
         time.sleep(MEASURE_S)
         found = figures(operator, os.getloadavg()[0])
         assert base.line.base.errors == 0
-    print(f"\n{rate_hz} Hz, {per_core} busy processes per core beside it: {found}")
+    table = ResultTable("live", "speed", "Latency of the live daemon", COLUMNS, continued=True)
+    table.add(f"{rate_hz} Hz, {per_core} busy", *(number(found[column.name]) for column in COLUMNS[1:]))
     assert float(found["tick p999"]) <= LATEST_MS
 
 
@@ -116,9 +132,12 @@ def test_memory_descriptors_and_threads_do_not_grow(tmp_path: Path) -> None:
     half = len(sizes) // 2
     before, after = sizes[:half], sizes[half:]
     megabytes = [size[0] for size in sizes]
-    print(f"\n{SOAK_S:.0f} s at {rate_hz} poses/s: {len(operator.poses)} poses; resident {megabytes[0]:.1f} MB, after "
-          f"half {megabytes[half]:.1f}, at the end {megabytes[-1]:.1f}, most {max(megabytes):.1f}; descriptors "
-          f"{sorted({size[1] for size in sizes})}, threads {sorted({size[2] for size in sizes})}")
+    columns = (Column("time", "s", 0), Column("poses/s", "", 1), Column("poses"),
+               *(Column(name, "MB", 1) for name in ("resident after 20 s", "after half", "at the end", "most")),
+               Column("descriptors"), Column("threads"))
+    table = ResultTable("soak", "speed", "Memory of the live daemon", columns)
+    table.add(SOAK_S, number(rate_hz), len(operator.poses), megabytes[0], megabytes[half], megabytes[-1],
+              max(megabytes), *(", ".join(map(str, sorted({size[k] for size in sizes}))) for k in (1, 2)))
     assert drives and max(size[0] for size in after) <= max(size[0] for size in before) + GROWTH_MB
     for index in (1, 2):
         assert max(size[index] for size in after) <= max(size[index] for size in before)

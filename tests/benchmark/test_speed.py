@@ -24,8 +24,10 @@ from omnid.diagnostics.run_summary import run_summary
 from omnid.engine.graph import Graph
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.synchronise import Synchronise
+from tests.benchmark.results import Column, ResultTable
 from tests.replay.test_memory import to_and_fro
 
 TWO_WALLS = Path(__file__).parents[3] / "shared" / "data" / "two_walls"
@@ -56,10 +58,13 @@ def test_pairs_per_second(tmp_path: Path, threaded: bool, hz: int) -> None:
     sinks = Sinks({"statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "t")},
                   {"map": MapFile(tmp_path / "m")})
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS, round(1e9 / hz)))
-    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), place, config, sinks)
+    wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), FrontEnd(place, config), config, sinks)
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)
     summary = run_summary(RunCounters.of(statistics, PAIRS, {}), graph.telemetry.summary())
-    print(f"\n{rate_hz:.1f} pairs/s of {hz} Hz, profile {PROFILE or 'none'}\n{summary}")
+    columns = (Column("run"), Column("pairs/s", "", 1))
+    table = ResultTable("speed", "speed", "Pairs per second of the whole pipeline", columns, continued=True)
+    table.add(f"{hz} Hz by the stamps, {'threaded' if threaded else 'inline'}, profile {PROFILE or 'none'}", rate_hz)
+    print(summary)
     assert not threaded or rate_hz >= WANTED_HZ

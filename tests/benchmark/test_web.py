@@ -21,6 +21,7 @@ import pytest
 
 from omnid.client import Pose, Robot
 from omnid.transport.bus import Bus, BusConfig
+from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.test_bus import cpu_s, publish, sink_on
 from tests.omnid.transport.bus_fixtures import free_endpoint, script, wait_until
 from tests.omnid.web.servers import ROOT, WebServer, served
@@ -70,7 +71,7 @@ def sample_daemon(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def measured(name: str, daemon: subprocess.Popen[bytes], server: WebServer, robot: Robot) -> None:
-    """Print the processor time of the daemon for a pose, and of the page's server."""
+    """Record the processor time of the daemon for a pose, and of the page's server."""
     time.sleep(WARM_UP_S)
     ages_ms: list[float] = []
     with robot.subscribe(Pose) as poses:
@@ -82,9 +83,10 @@ def measured(name: str, daemon: subprocess.Popen[bytes], server: WebServer, robo
             ages_ms.append(1e-6 * (newest.attachment.sent_ns - newest.stamp_ns))
         used_s, span_s = [cpu_s(pid) - at for pid, at in zip(pids, before, strict=True)], time.monotonic() - begin_s
     count = newest.attachment.seq - first.attachment.seq
-    print(f"\n{name}: {count / span_s:.1f} poses/s; daemon {1e3 * used_s[0] / count:.1f} ms of processor a pose, "
-          f"capture to network p50 {np.percentile(ages_ms, 50):.0f} ms; page's server {100 * used_s[1] / span_s:.1f} % "
-          f"of a core", end="")
+    columns = (Column("browsers"), Column("poses/s", "", 1), Column("daemon, processor time a pose", "ms", 1),
+               Column("capture to network p50", "ms", 0), Column("page's server, of one core", "%", 1))
+    table = ResultTable("web_processor", "speed", "Processor time of the page", columns, continued=True)
+    table.add(name, count / span_s, 1e3 * used_s[0] / count, np.percentile(ages_ms, 50), 100 * used_s[1] / span_s)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
@@ -116,8 +118,11 @@ def test_latency_and_processor_time() -> None:
                 times_ms = np.array(page.evaluate("() => window.times"))
             page.close()
             shown, drawn = (np.percentile(times_ms[:, which], (50, 99)) for which in (0, 1))
-            print(f"\nChromium and {others} others: {len(times_ms)} poses; robot's network to text p50 {shown[0]:.1f} "
-                  f"ms, p99 {shown[1]:.1f} ms; to the drawn frame p50 {drawn[0]:.1f} ms, p99 {drawn[1]:.1f} ms")
+            columns = (Column("browsers"), Column("poses"), Column("network to text p50", "ms", 1),
+                       Column("network to text p99", "ms", 1), Column("network to drawn frame p50", "ms", 1),
+                       Column("network to drawn frame p99", "ms", 1))
+            table = ResultTable("web_latency", "speed", "Latency of the page", columns, continued=True)
+            table.add(f"Chromium and {others} others", len(times_ms), *shown, *drawn)
             assert len(times_ms) > 30
 
 
@@ -126,6 +131,8 @@ def test_processor_time_at_30_hz() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server:
         sinks, seq = [sink_on(bus)], 0
+        table = ResultTable("web_poses", "speed", "The page's server at 30 poses/s, poses alone",
+                            (Column("browsers"), Column("of one core", "%", 1)))
         for browsers in (0, 1, 10):
             with script(VISITORS, f"ws://{server.host}/live", server.token, str(browsers)):
                 publish(sinks, seq, 60)
@@ -133,7 +140,7 @@ def test_processor_time_at_30_hz() -> None:
                 publish(sinks, seq + 60, 300)
                 share = (cpu_s(server.process.pid) - before_s) / (time.monotonic() - begin_s)
                 seq += 360
-            print(f"\n{browsers} browsers at 30 poses/s: the page's server takes {100 * share:.1f} % of a core", end="")
+            table.add(browsers, 100 * share)
         metrics = server.request("/metrics", headers=server.bearer).text
     assert f"omnid_poses_total {seq}\n" in metrics and "omnid_poses_missed_total 0\n" in metrics
 

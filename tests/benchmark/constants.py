@@ -1,0 +1,205 @@
+"""Table of the numeric constants of omnid/core and calib: `python -m tests.benchmark.constants [--write] [--missing]`.
+
+A constant is a module-level name in capitals whose value contains a number, or a knob of a settings class. Its comment
+is behind it, directly above it, or at the start of its block of lines. A comment that only says what the constant is
+describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives its reason. Words
+decide that: a person judges whether the reason is a good one. `--write` makes docs/constants.md, `--missing` lists what
+lacks a reason.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import re
+import tokenize
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+ROOT: Final = Path(__file__).parents[2]
+PACKAGES: Final = ("omnid/core", "calib")
+PAGE: Final = ROOT / "docs" / "constants.md"
+UNITS: Final = {
+    "PX": "px", "M": "m", "MM": "mm", "S": "s", "MS": "ms", "US": "us", "NS": "ns", "RAD": "rad", "DEG": "deg",
+    "MPS": "m/s", "RADPS": "rad/s", "HZ": "Hz", "BYTES": "bytes", "MB": "MB", "KB": "kB", "GREY": "grey levels",
+    "RATIO": "share", "SHARE": "share", "PART": "share", "SIGMA": "sigma", "SIGMAS": "sigma", "SQUARED": "squared",
+}
+# Words by which a comment says why: a cause, a source, a measurement or a trial.
+REASON: Final = re.compile(
+    r"\b(because|so that|so many that|since|therefore|otherwise|enough|too (many|few|small|large|long|short|near|far)"
+    r"|never|cannot|hardly|no (more|less)|set by|set on|set with|set to|by trial|measured|source|section|eq\.|et al|"
+    r"default|the paper|the standard|IEEE|ROS|REP|ISO|RFC|OpenCV|covers|needed|needs|stay(s)? below|as in|as for|"
+    r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact)\b"
+    r"|\(\w[\w .]* (19|20)\d\d\)|[:;] ", re.IGNORECASE)
+SOURCE: Final = re.compile(
+    r"\([A-Z][\w .&-]* (?:et al\.,? )?(?:19|20)\d\d[^)]*\)|Dang et al[^:;]*|(?:section|eq\.) [IVX()\d.A-Z]+"
+    r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+")
+SEEDS: Final = re.compile(r"[Ss]et (?:by|on|with)[^.;]*|(?:[Bb]y trial on )?(?:development )?seeds(?: [\d ,to]+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """A numeric constant or the default of a knob."""
+
+    path: str  # relative to the repository
+    line: int
+    name: str
+    value: str
+    comment: str
+    is_knob: bool = False
+
+    @property
+    def unit(self) -> str:
+        """Unit by the ending of the name, empty for a count or a share."""
+        return UNITS.get(self.name.upper().rpartition("_")[2], "")
+
+    @property
+    def has_reason(self) -> bool:
+        """True if the comment says why the value is this one."""
+        return REASON.search(self.comment) is not None
+
+    @property
+    def source(self) -> str:
+        """The publication or standard that the comment names."""
+        found = SOURCE.search(self.comment)
+        return found[0].strip("() ") if found else ""
+
+    @property
+    def seeds(self) -> str:
+        """The seeds or logs that the comment names."""
+        found = SEEDS.search(self.comment)
+        return found[0].strip() if found else ""
+
+
+def constants(root: Path = ROOT) -> list[Constant]:
+    """Return all constants of the packages, in the order of files and lines."""
+    paths = (path for package in PACKAGES for path in sorted((root / package).rglob("*.py")))
+    return [one for path in paths for one in constants_of(path.read_text(), path.relative_to(root).as_posix())]
+
+
+def constants_of(text: str, path: str) -> list[Constant]:
+    """Return the constants of one file."""
+    comments, tree = Comments(text), ast.parse(text)
+    found = [constant for node in tree.body for constant in _assigned(node, comments, text, path)]
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef):
+            found += [knob for part in node.body for knob in _knob(part, comments, path)]
+    return sorted(found, key=lambda constant: constant.line)
+
+
+class Comments:
+    """The comments of a file by line."""
+
+    def __init__(self, text: str) -> None:
+        self._lines = text.splitlines()
+        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+        self._of = {token.start[0]: token.string.lstrip("# ").strip() for token in tokens
+                    if token.type == tokenize.COMMENT}
+
+    def at(self, first: int, last: int) -> str:
+        """Return the comments of an assignment: at the start of its block, directly above it, and behind it.
+
+        A block is a run of lines without an empty one.
+        """
+        behind = [line for line in range(first, last + 1) if line in self._of]
+        above = self._comments_up(first - 1)
+        start = first
+        while start > 1 and self._lines[start - 2].strip():
+            start -= 1
+        heading = []
+        while start < first and self._lines[start - 1].lstrip().startswith("#"):
+            heading.append(start)
+            start += 1
+        return " ".join(self._of[line] for line in dict.fromkeys([*heading, *above, *behind]))
+
+    def _comments_up(self, line: int) -> list[int]:
+        """Return the lines of comments directly above, from the first one on."""
+        found = list[int]()
+        while line > 0 and self._lines[line - 1].lstrip().startswith("#"):
+            found.insert(0, line)
+            line -= 1
+        return found
+
+
+def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Iterator[Constant]:
+    """Yield the constants of a module-level assignment; a tuple of names has one value each."""
+    if isinstance(node, ast.Assign) and len(node.targets) == 1:
+        target, value = node.targets[0], node.value
+    elif isinstance(node, ast.AnnAssign) and node.value is not None:
+        target, value = node.target, node.value
+    else:
+        return
+    names = target.elts if isinstance(target, ast.Tuple) else [target]
+    parts = value.elts if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) else [value] * len(names)
+    for name, part in zip(names, parts, strict=True):
+        if isinstance(name, ast.Name) and name.id.strip("_").isupper() and has_number(part):
+            shown = " ".join((ast.get_source_segment(text, part) or "").split())
+            yield Constant(path, node.lineno, name.id, shown, comments.at(node.lineno, node.end_lineno or node.lineno))
+
+
+def has_number(value: ast.expr) -> bool:
+    """True if a number, which is no index and no part of a text, occurs in an expression."""
+    return any(isinstance(part, ast.Constant) and type(part.value) in (int, float) for part in ast.walk(value))
+
+
+def _knob(node: ast.stmt, comments: Comments, path: str) -> Iterator[Constant]:
+    """Yield the numeric default of a knob; its description is its comment."""
+    if not (isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(node.value, ast.Call)):
+        return
+    call = node.value
+    if isinstance(call.func, ast.Name) and call.func.id == "knob" and len(call.args) > 1 and has_number(call.args[0]):
+        text = str(call.args[1].value) if isinstance(call.args[1], ast.Constant) else ""
+        behind = comments.at(node.lineno, node.end_lineno or node.lineno)
+        yield Constant(path, node.lineno, node.target.id, ast.unparse(call.args[0]), f"{text} {behind}".strip(), True)
+
+
+def page(found: list[Constant]) -> str:
+    """Return the document: a summary for each room, then a table for each file."""
+    rooms = Counter(Path(one.path).parent.as_posix() for one in found)
+    lacking = Counter(Path(one.path).parent.as_posix() for one in missing(found))
+    lines = ["# Constants of omnid/core and calib", "",
+             "Made by `python -m tests.benchmark.constants --write`. A constant without a comment, or whose comment "
+             "says what it is and not why it has this value, counts as one without a reason.", "",
+             "| room | constants and settings | constants without a reason |", "|---|---|---|",
+             *(f"| `{room}` | {count} | {lacking[room]} |" for room, count in sorted(rooms.items())),
+             f"| all | {len(found)} | {sum(lacking.values())} |"]
+    for path in sorted({one.path for one in found}):
+        lines += ["", f"## `{path}`", "",
+                  "| name | value | unit | reason | source | set on |", "|---|---|---|---|---|---|"]
+        lines += [f"| `{one.name}` | `{_cell(one.value)}` | {one.unit} | {_cell(one.comment)} | {_cell(one.source)} | "
+                  f"{_cell(one.seeds)} |" for one in found if one.path == path]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def missing(found: list[Constant]) -> list[Constant]:
+    """Return the constants without a reason; settings have descriptions instead."""
+    return [one for one in found if not one.is_knob and not one.has_reason]
+
+
+def main() -> None:
+    """Print the counts; write the document or list what lacks a reason."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--write", action="store_true", help="make docs/constants.md")
+    parser.add_argument("--missing", action="store_true", help="list the constants without a reason")
+    args, found = parser.parse_args(), constants()
+    if args.write:
+        PAGE.parent.mkdir(exist_ok=True)
+        PAGE.write_text(page(found))
+    if args.missing:
+        for one in missing(found):
+            print(f"{one.path}:{one.line}: {one.name} = {one.value}  # {one.comment or 'no comment'}")
+    undescribed = sum(not one.comment for one in found)
+    print(f"{len(found)} constants and settings, {sum(one.is_knob for one in found)} of them settings; "
+          f"{undescribed} without a comment, {len(missing(found))} without a reason")
+
+
+if __name__ == "__main__":
+    main()
