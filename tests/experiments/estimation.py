@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,12 +18,12 @@ from omnid.core.odometry.paper.paper_odometry import PaperOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.formats.tum import Trajectory
-from omnid.messages import StereoDepth
 from omnid.settings import load
+from omnid.stages.dense_stereo import DenseStereo
+from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import Mapping
-from omnid.stages.odometry import OdometryMethod, OdometryStage
-from omnid.stages.stereo import Stereo
+from omnid.stages.odometry import OdometryMethod
 from tests.experiments.views import log_geometry, panoramas_of
 
 
@@ -81,20 +80,15 @@ def estimate(folder: Path, method: Method) -> tuple[Trajectory, MapPoints | None
     place, config = log_geometry(folder), method.config
     if not method.filtered:
         return _unfiltered(folder, place, config), None
-    odometry, mapping = OdometryStage(place, config.odometry), Mapping(config.mapping)
+    front_end = FrontEnd(place, config)
+    mapping = Mapping(config.mapping, front_end.dense)
     stamps_ns, poses = [], []
-    for depth in depths_of(folder, place, config):
-        update = odometry.process(depth)
+    for panoramas in panoramas_of(folder, place):
+        update = front_end.odometry.process(panoramas)
         mapping.process(update)
         stamps_ns.append(update.stamp_ns)
         poses.append(update.T_odom_rig)
     return Trajectory(np.array(stamps_ns), np.array(poses)), mapping.finish()[-1].points
-
-
-def depths_of(folder: Path, place: Geometry, config: Config) -> Iterator[StereoDepth]:
-    """Yield the disparities and points of a log, one pair at a time."""
-    stereo = Stereo(place, config.stereo_settings())
-    yield from map(stereo.process, panoramas_of(folder, place))
 
 
 def _unfiltered(folder: Path, place: Geometry, config: Config) -> Trajectory:
@@ -102,11 +96,11 @@ def _unfiltered(folder: Path, place: Geometry, config: Config) -> Trajectory:
     odometry: OdometryMethod = (UnfilteredPaperOdometry if is_paper else UnfilteredOdometry)(place, config.odometry)
     stamps_ns: list[int] = []
     poses = []
-    for depth in depths_of(folder, place, config):
-        seen = depth.panoramas
-        frame = StereoFrame(depth.seq, seen.lower, seen.upper, depth.disparity, seen.visible)
-        dt_s = (depth.stamp_ns - stamps_ns[-1]) * 1e-9 if stamps_ns else 0.0
+    stereo = DenseStereo(place, config.stereo_settings())
+    for seen in panoramas_of(folder, place):
+        frame = StereoFrame(seen.seq, seen.lower, seen.upper, stereo.compute(seen).disparity, seen.visible)
+        dt_s = (seen.stamp_ns - stamps_ns[-1]) * 1e-9 if stamps_ns else 0.0
         T_odom_rect = odometry.process(frame, dt_s).T_odom_rect
-        stamps_ns.append(depth.stamp_ns)
+        stamps_ns.append(seen.stamp_ns)
         poses.append(place.T_rig_rect @ T_odom_rect @ se3.inverse(place.T_rig_rect))
     return Trajectory(np.array(stamps_ns), np.array(poses))

@@ -22,9 +22,11 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.compiled import Kernel, inner
 from omnid.core.odometry import pose_kernels
-from omnid.core.odometry.pose_estimation import StereoModel, gauss_newton, ransac
+from omnid.core.odometry.pose_estimation import gauss_newton, ransac
 from omnid.core.stereo.triangulation import point_covariance, view
-from tests.benchmark.accuracy import HEAD, row
+from omnid.core.types.stereo_model import StereoModel
+from tests.benchmark.accuracy import COLUMNS, row
+from tests.benchmark.results import Column, ResultTable
 
 Array = NDArray[np.float64]
 Weigh = Callable[[float], float]
@@ -123,21 +125,23 @@ def errors(kind: str, weigh: Weigh, runs: int = RUNS) -> tuple[float, float, flo
 
 
 def main() -> None:
-    """Print the tables."""
+    """Measure and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="*", metavar="FOLDER")
     args = parser.parse_args()
-    print("| views | kernel | position, mm | rotation, mrad | squared distance (6) |\n|---|---|---|---|---|")
+    columns = (Column("views"), Column("kernel"), Column("position", "mm", 3), Column("rotation", "mrad", 3),
+               Column("squared distance, expected 6", "", 3))
+    table = ResultTable("mixture_views", "accuracy", "Noise as a mixture of two Gaussians: simulated views", columns)
     for kind in KINDS:
         for name, weigh in KERNELS.items():
-            values = " | ".join(f"{value:.3f}" for value in errors(kind, weigh))
-            print(f"| {kind} | {name} | {values} |", flush=True)
+            table.add(kind, name, *errors(kind, weigh))
+    if args.folders:
+        table = ResultTable("mixture_logs", "accuracy", "Noise as a mixture of two Gaussians: logs",
+                            (Column("kernel"), *COLUMNS))
     for folder in args.folders:
         for name, weigh in KERNELS.items():
             with kernel(weigh):
-                line = row(folder, ["places.enabled=false"])
-            print(*([HEAD] if folder == args.folders[0] and name == "Cauchy" else []),
-                  line.replace(folder.name, f"{folder.name}, {name}"), sep="\n", flush=True)
+                table.add(name, *row(folder, ["places.enabled=false"]), folder=folder)
 
 
 if __name__ == "__main__":

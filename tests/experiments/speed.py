@@ -20,8 +20,9 @@ from omnid.core.odometry.paper.registration import consensus, register
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.odometry.yaw_search import correlation_peaks
 from omnid.core.stereo.triangulation import triangulate
-from omnid.messages import Panoramas, StereoDepth
+from omnid.messages import Panoramas
 from omnid.settings import load
+from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.geometry import Geometry
 from omnid.stages.odometry import OdometryStage
 from tests.experiments.feature_matching import FeatureSet, descriptor_distance, mutual_matches
@@ -63,17 +64,19 @@ def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
     place, times = log_geometry(folder), Times()
     matchers = {name: stereo(place, method) for name, method in
                 (("original SAD", "sad"), ("enhanced SAD", "enhanced"), ("semi-global prior", "semiglobal"))}
-    default = OdometryStage(place, Config().odometry)
-    paper = OdometryStage(place, load(Config, overrides=("odometry.method=paper",)).odometry)
+    computed = {name: DenseDepths(matcher.compute) for name, matcher in matchers.items()}
+    default = OdometryStage(place, Config().odometry, computed["semi-global prior"])
+    paper = OdometryStage(place, load(Config, overrides=("odometry.method=paper",)).odometry, computed["enhanced SAD"])
     sift = {name: SiftOdometry(place, features) for name, features in SIFT_TASKS.items()}
     before: Panoramas | None = None
     with _one_thread():
         for now in islice(panoramas_of(folder, place), PAIRS):
-            depth = {name: _depth(times, name, stage.process, now) for name, stage in matchers.items()}
+            for name, dense in computed.items():
+                times.run(f"depth: {name}", lambda d=dense, pair=now: d.points(pair))
             if before is not None:
                 times.run("tracking alone", lambda a=before, b=now: _track(a, b))
-            times.run("motion of omnid", lambda d=depth["semi-global prior"]: default.process(d))
-            times.run("motion of the paper", lambda d=depth["enhanced SAD"]: paper.process(d))
+            times.run("motion of omnid", lambda pair=now: default.process(pair))
+            times.run("motion of the paper", lambda pair=now: paper.process(pair))
             for name, odometry in sift.items():
                 odometry.process(times, name, now)
             before = now
@@ -107,16 +110,6 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(threads)
-
-
-def _depth(times: Times, name: str, process: Callable[[Panoramas], StereoDepth], now: Panoramas) -> StereoDepth:
-    def computed() -> StereoDepth:
-        depth = process(now)
-        depth.dense()  # it is computed when it is first read
-        return depth
-
-    depth: StereoDepth = times.run(f"depth: {name}", computed)
-    return depth
 
 
 def _track(before: Panoramas, now: Panoramas) -> object:

@@ -16,8 +16,8 @@ from omnid.config import Config
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.core.stereo.triangulation import triangulate
 from omnid.messages import Panoramas
+from omnid.stages.dense_stereo import DenseStereo
 from omnid.stages.geometry import Geometry
-from omnid.stages.stereo import Stereo
 from tests.experiments import figures
 from tests.experiments.feature_matching import Detector, harris, match_pair, sift
 from tests.experiments.scenes import WALL_M
@@ -66,14 +66,14 @@ def methods(place: Geometry) -> dict[str, Matching]:
     return {**dense, **sparse}
 
 
-def stereo(place: Geometry, method: str) -> Stereo:
-    """Return omnid's stereo stage with one of its methods."""
+def stereo(place: Geometry, method: str) -> DenseStereo:
+    """Return omnid's dense stereo with one of its methods."""
     config = Config().stereo
-    return Stereo(place, replace(config, matching=replace(config.matching, method=method)))
+    return DenseStereo(place, replace(config, matching=replace(config.matching, method=method)))
 
 
-def _located(stage: Stereo, panoramas: Panoramas) -> tuple[Array, Array]:
-    depth = stage.process(panoramas)
+def _located(dense: DenseStereo, panoramas: Panoramas) -> tuple[Array, Array]:
+    depth = dense.compute(panoramas)
     return depth.pixels, depth.points
 
 

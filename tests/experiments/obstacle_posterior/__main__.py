@@ -1,0 +1,185 @@
+"""Floor, surfaces and edges against the truth: `python -m tests.experiments.obstacle_posterior CASE ... --seeds 1 3`.
+
+A base drives straight into a small room at its true poses (no odometry, no wheels), a pair each 5 cm. Directions of one
+degree whose nearest obstacle or edge lies within 4 m count as found (the ring has it, or something before it), unknown,
+or missed: the way is said to be free beyond it and a tolerance. A false obstacle lies before the nearest true one.
+Free ahead: what is said of the fan of 28 degrees ahead in the last rings, against the truth. The table of evidence
+(--reliability) has the share of cells that are free, by what the grid says of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.config import Config
+from omnid.core.compiled import declared
+from omnid.core.mapping.range_scan import azimuths
+from omnid.messages import FramePair, Panoramas
+from omnid.simulation.lockstep import with_masks
+from omnid.simulation.rendering.sensor import MountedSensor
+from omnid.simulation.robot import SimulatedRobot, make_robot
+from omnid.stages.dewarp import Dewarp
+from omnid.stages.geometry import Geometry, geometry
+from tests.experiments.obstacle_posterior.column import Columns, HeightBand, floor_plane
+from tests.experiments.obstacle_posterior.grid import CELL_M, CELLS, GridRing, ObstacleGrid
+from tests.experiments.obstacle_posterior.scenes import CASES, ObstacleScene, base_pose, obstacle_scene, render_pair
+
+Array = NDArray[np.float64]
+HEIGHTS_M: Final = (0.06, 1.7)  # above the floor: lower surfaces are floor, higher ones are passed below
+EDGE_M: Final = 0.05  # a floor that is lower by this is an edge
+NEAREST_M, MAX_RANGE_M = 0.5, 6.0  # ranges that are compared
+STEP_M: Final = 0.05
+START_M: Final = -1.2
+PERIOD_NS: Final = 100_000_000
+STANDING: Final = 8  # pairs before the base starts
+FARTHEST_M: Final = 4.0
+AHEAD_RAD: Final = 0.25
+NEIGHBOURS: Final = 2  # directions on either side that an edge may be off
+ODDS_BINS: Final = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.01)
+
+
+@dataclass(slots=True)
+class Scores:
+    """Directions of a case by class, and what was said of the way ahead."""
+
+    directions: int = 0
+    found: int = 0
+    missed: int = 0
+    false: int = 0
+    of_target: int = 0  # directions whose nearest is the thing itself
+    target_found: int = 0
+    target_missed: int = 0
+    excess_m: list[float] = field(default_factory=list)  # free ahead, more than true, within 1.5 m of it
+    milliseconds: list[float] = field(default_factory=list)
+    cells: Array = field(default_factory=lambda: np.zeros((len(ODDS_BINS) - 1, 2)))  # free and all, by odds
+
+    def row(self, case: str) -> str:
+        """Return a row of the table."""
+        share = [f"{100 * n / max(self.directions, 1):.2f} %" for n in (self.found, self.missed, self.false)]
+        target = [f"{100 * n / self.of_target:.1f} %" if self.of_target else "-"
+                  for n in (self.target_found, self.target_missed)]
+        excess = f"{100 * max(self.excess_m):.0f} cm" if self.excess_m else "-"
+        cells = " | ".join([case, *share, *target, excess, f"{np.median(self.milliseconds):.1f}"])
+        return f"| {cells} |"
+
+
+def pairs(scene: ObstacleScene, robot: SimulatedRobot, dewarp: Dewarp, steps: int, seed: int
+          ) -> Iterator[tuple[float, Panoramas]]:
+    """Yield the way and the panoramas of a drive."""
+    rng = np.random.default_rng([seed, 61])
+    sensors = [MountedSensor.of(robot.sensor, camera.visible, camera.camera.size)
+               for camera in (robot.rig.lower, robot.rig.upper)]
+    number = 0
+    for step in range(steps):
+        x_m = START_M + STEP_M * step
+        ideal = render_pair(scene, robot, base_pose(x_m, 0.0, 0.0))
+        for _ in range(STANDING if step == 0 else 1):
+            lower, upper = (sensor.expose(image, rng) for sensor, image in zip(sensors, ideal, strict=True))
+            yield x_m, dewarp.process(FramePair(number, number * PERIOD_NS, lower, upper))
+            number += 1
+
+
+def drive(case: str, seed: int, robot: SimulatedRobot, steps: int, scores: Scores) -> None:
+    """Drive into the room of a case and add to its scores."""
+    config = Config()
+    shape: Geometry = geometry(robot.rig, config.panorama)
+    columns, grid = posterior(shape)
+    scene = obstacle_scene(case, seed)
+    for x_m, panoramas in pairs(scene, robot, Dewarp(shape, config.panorama), steps, seed):
+        begin = time.thread_time()
+        evidence = columns.evidence(panoramas.lower, panoramas.upper, panoramas.visible)
+        ring = grid.update(panoramas.stamp_ns, base_pose(x_m, 0.0, 0.0), evidence)
+        scores.milliseconds.append(1e3 * (time.thread_time() - begin))
+        compare(ring, scene, x_m, scores)
+    add_cells(grid, scene, x_m, scores)
+
+
+def posterior(shape: Geometry) -> tuple[Columns, ObstacleGrid]:
+    """Return the evidence of pairs and the grid for a rig whose T_base_rig has the height above the floor."""
+    T_rect_base = shape.rig.T_rect_rig @ se3.inverse(shape.rig.T_base_rig)
+    plane = floor_plane(T_rect_base, 0.0)
+    cylinder, baseline_m = shape.cylinder, shape.rig.baseline_m
+    columns = Columns(cylinder, baseline_m, plane, HeightBand(*HEIGHTS_M, EDGE_M), (NEAREST_M, MAX_RANGE_M))
+    return columns, ObstacleGrid(T_rect_base, cylinder.focal_px * baseline_m, cylinder.focal_px, plane.height_m,
+                                 MAX_RANGE_M)
+
+
+def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) -> None:
+    """Count the directions of a ring."""
+    truth = scene.ranges_m(x_m, 0.0, azimuths())
+    near = np.where(np.isfinite(truth), truth, 0.0)
+    tolerance = 0.1 + 0.03 * near**2
+    seen = np.where(np.isnan(ring.ranges_m), np.inf, ring.ranges_m)
+    found = np.minimum.reduce([np.roll(seen, shift) for shift in (-1, 0, 1)]) <= truth + tolerance
+    missed = ~found & (ring.free_m > truth + tolerance)
+    around = np.minimum.reduce([np.roll(truth, shift) for shift in range(-NEIGHBOURS, NEIGHBOURS + 1)])
+    with np.errstate(invalid="ignore"):
+        false = np.isfinite(seen) & (seen < around - 0.1 - 0.03 * around**2)
+    counted = truth < FARTHEST_M
+    scores.directions += int(counted.sum())
+    scores.found += int((found & counted).sum())
+    scores.missed += int((missed & counted).sum())
+    scores.false += int((false & counted).sum())
+    if len(scene.target):
+        target = counted & scene.is_target(x_m, 0.0, azimuths())
+        scores.of_target += int(target.sum())
+        scores.target_found += int((found & target).sum())
+        scores.target_missed += int((missed & target).sum())
+    ahead = np.abs(azimuths()) < AHEAD_RAD
+    if truth[ahead].min() < 1.5:
+        scores.excess_m.append(float(ring.free_m[ahead].min() - truth[ahead].min()))
+
+
+def add_cells(grid: ObstacleGrid, scene: ObstacleScene, x_m: float, scores: Scores) -> None:
+    """Count the cells within 3 m by their log-odds of the floor, and those of them that are free."""
+    place = (np.arange(CELLS) + 0.5) * CELL_M
+    corner = grid.corner_m
+    px, py = np.meshgrid(place + corner[0] - x_m, place + corner[1])
+    distance = np.hypot(px, py)
+    inside = (distance < 3.0) & (distance > 0.5)
+    truth = scene.ranges_m(x_m, 0.0, np.arctan2(py[inside], px[inside]))
+    number = np.digitize(grid.floor_odds[inside], ODDS_BINS[1:-1])
+    np.add.at(scores.cells, (number, 0), distance[inside] < truth)
+    np.add.at(scores.cells, (number, 1), 1)
+
+
+def main() -> None:
+    """Print a row for each case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*", default=sorted(CASES), metavar="CASE")
+    parser.add_argument("--seeds", type=int, nargs=2, default=(1, 1), metavar=("FIRST", "LAST"))
+    parser.add_argument("--size", type=int, default=512, help="of the images, px")
+    parser.add_argument("--steps", type=int, default=40, help="of 5 cm")
+    parser.add_argument("--reliability", action="store_true", help="print the table of evidence too")
+    arguments = parser.parse_args()
+    for kernel in declared():
+        kernel.compile()
+    robot = make_robot(arguments.size)
+    robot = replace(robot, rig=with_masks(robot.rig))
+    print("| case | found | missed | false | thing found | thing missed | most free beyond, ahead | ms a pair |")
+    print("|---|---|---|---|---|---|---|---|")
+    total = np.zeros((len(ODDS_BINS) - 1, 2))
+    for case in arguments.cases:
+        scores = Scores()
+        for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
+            drive(case, seed, robot, arguments.steps, scores)
+        total += scores.cells
+        print(scores.row(case), flush=True)
+    if arguments.reliability:
+        print("| log-odds of the floor | cells | free | said |\n|---|---|---|---|")
+        for low, high, (free, count) in zip(ODDS_BINS[:-1], ODDS_BINS[1:], total, strict=True):
+            claimed = [100 / (1 + np.exp(-odds)) for odds in (low, high)]
+            print(f"| {low:g} to {high:g} | {count:.0f} | {100 * free / max(count, 1):.1f} % | "
+                  f"{claimed[0]:.0f} to {claimed[1]:.0f} % |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""Floors and walls, drawn into panoramas of two cameras above each other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from calib.panorama import Cylinder
+from omnid.core.types.panorama import PaddedPanorama
+
+HEIGHT_M, BASELINE_M = 0.9, 0.2
+CYLINDER = Cylinder(872, 253, 86.0)
+PAD_PX = 24
+T_RECT_BASE = np.eye(4)
+T_RECT_BASE[2, 3] = -HEIGHT_M
+Pattern = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def plain(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return one grey level."""
+    return np.full(np.shape(x_m), 120.0)
+
+
+def stains(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of a floor with strong stains of all directions."""
+    waves = ((31, 5), (-17, 29), (43, -37), (11, 53), (59, 23))
+    total = sum(np.sin(a * x_m + b * y_m + a) for a, b in waves)
+    return np.asarray(120.0 + 12.0 * total)
+
+
+def striped(azimuth: np.ndarray, height_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of a wall, by azimuth and height over the floor."""
+    return np.asarray(120.0 + 30.0 * np.sin(25 * height_m + np.sin(9 * azimuth)) + 20.0 * np.sin(61 * height_m + 2))
+
+
+def panoramas(floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0
+              ) -> tuple[PaddedPanorama, PaddedPanorama]:
+    """Return the lower and the upper panorama of a floor with a round wall; wall: grey of azimuth and height.
+
+    drop_m: the floor is so much lower than the base says.
+    """
+    rng = np.random.default_rng(4)
+    return tuple(_drawn(height + drop_m, floor, wall_m, wall, rng)
+                 for height in (HEIGHT_M, HEIGHT_M + BASELINE_M))  # type: ignore[return-value]
+
+
+def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, rng: np.random.Generator) -> PaddedPanorama:
+    columns, rows = np.meshgrid(np.arange(CYLINDER.width), np.arange(CYLINDER.height))
+    rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
+    with np.errstate(divide="ignore"):
+        r = np.where(rays[:, 2] < 0, -height_m / rays[:, 2], np.inf)
+    near = np.minimum(r, wall_m)
+    x, y, z = (near * rays.T[i] for i in range(3))
+    grey = np.where(r < wall_m, floor(x, y), wall(np.arctan2(y, x), height_m + z))
+    image = grey.reshape(columns.shape) + rng.normal(0.0, 1.0, columns.shape)
+    padded = np.pad(np.clip(np.rint(image), 0, 255).astype(np.uint8), ((0, 0), (PAD_PX, PAD_PX)), mode="wrap")
+    return PaddedPanorama(padded, PAD_PX, noise_grey=1.0)
