@@ -1,8 +1,9 @@
 """Attack the daemon: `python -m tests.faults [PART ...]` prints tables in Markdown and returns 1 where it did not hold.
 
 Parts: trials (each fault once, its outcome), stops (times from a cause to wheels at rest), routes (the same in the
-midst of a route, in a closed loop), commands (mutated commands), files (mutated files). The campaign is seeded and
-bounded; with the numbers of the defaults it takes some hours.
+midst of a route, in a closed loop), commands (mutated commands), files (mutated files), crowds (stops beside crowds of
+connections), floods (poses and stops beside floods of messages). The campaign is seeded and bounded; with the numbers
+of the defaults it takes some hours.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from tests.faults import hostile_commands, hostile_files, route_stops, stop_times
+from tests.faults import crowds, floods, hostile_commands, hostile_files, route_stops, stop_times
 from tests.faults.trials import TRIALS, Outcome, Setting
 from tests.simulation import build, write_log
 
@@ -24,9 +25,9 @@ BUSY_LOOP = "while True: pass"
 
 
 def scene(folder: Path) -> Path:
-    """Render a small run into the folder."""
+    """Render a small run into the folder, without its turn of 94 degrees within 0.1 s, at which commands are void."""
     run = build("two_walls", seed=3, size=256, pairs=24)
-    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=3)
+    write_log(folder, run.rig, run.poses[:22], run.scene, sensor=run.sensor, seed=3)
     return folder
 
 
@@ -59,7 +60,7 @@ def busy_processes(count: int) -> Iterator[None]:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the options."""
     result = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parts = ("trials", "stops", "routes", "commands", "files")
+    parts = ("trials", "stops", "routes", "commands", "files", "crowds", "floods")
     result.add_argument("parts", nargs="*", choices=[*parts, []], default=parts, metavar="PART", help=", ".join(parts))
     result.add_argument("--only", action="append", default=[], metavar="WORD",
                         help="of trials and stops, those whose name has the word; may be given several times")
@@ -67,6 +68,7 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument("--stops", type=int, default=200, help="stops to measure for each cause")
     result.add_argument("--commands", type=int, default=30_000, help="mutated commands to send")
     result.add_argument("--files", type=int, default=10_000, help="mutated files of each format")
+    result.add_argument("--rate", type=float, default=50_000, help="messages a second of a flood")
     result.add_argument("--busy", type=int, default=0, metavar="N", help="keep N other processes busy meanwhile")
     return result
 
@@ -91,6 +93,10 @@ def main() -> int:
             failed += hostile_commands.run(recorded, folder, args.commands, args.seed, report)
         if "files" in args.parts:
             failed += hostile_files.run(folder, args.files, args.seed, report)
+        if "crowds" in args.parts:
+            failed += crowds.run(recorded, folder, report)
+        if "floods" in args.parts:
+            failed += floods.run(recorded, folder, args.rate, args.only, report)
     return int(failed > 0)
 
 

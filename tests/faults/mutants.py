@@ -1,30 +1,38 @@
 """Faults put into the code that moves the wheels: `python -m tests.faults.mutants` lists those that no test notices.
 
-Each mutant changes one operator, number or word of omnid/core/control, omnid/controller or drivers/motors in a copy of
-the repository, where the tests of that code run. A mutant that survives is a missing test, or changes nothing that
-matters: a person judges it (tests/faults/RESULTS.md).
+Each mutant changes one operator, number or word of a folder in a copy of the repository, where the tests that call
+its function run (mutant_runner.py). Outcomes are kept in a file, so that a campaign may be stopped and go on later. A
+mutant that survives is a missing test, or changes nothing that matters: a person judges it (tests/faults/RESULTS.md).
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import json
 import random
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 ROOT: Final = Path(__file__).parents[2]
-COPIED: Final = ("omnid", "drivers", "calib", "tests", "pyproject.toml")
-TIMEOUT_S: Final = 300.0
-CONTROL_TESTS: Final = ("tests/omnid/core/control", "tests/omnid/controller", "tests/omnid/stages",
-                        "tests/omnid/transport/test_commands.py")
+COPIED: Final = ("omnid", "drivers", "calib", "tests", "systemd", "pyproject.toml")
+SURVIVED: Final = "survived"
+CONTROL_TESTS: Final = ("tests/omnid/core/control", "tests/omnid/controller",
+                        "tests/omnid/stages/test_lockstep_drive.py", "tests/omnid/transport/test_commands.py")
 MOTOR_TESTS: Final = ("tests/drivers/motors", "tests/contract", "tests/omnid/controller/test_motor.py")
-TESTS: Final = {"omnid/core/control": CONTROL_TESTS, "omnid/controller": CONTROL_TESTS, "drivers/motors": MOTOR_TESTS}
+# The tests of each folder; those that show a page in a browser, and those that are slow, are not among them.
+TESTS: Final[dict[str, tuple[str, ...]]] = {
+    "omnid/core/control": CONTROL_TESTS, "omnid/controller": CONTROL_TESTS,
+    "omnid/core/navigation": ("tests/omnid/core/navigation", "tests/omnid/stages/test_navigation_stage.py",
+                              "tests/omnid/stages/test_navigation_random_walk.py"),
+    "omnid/transport/access.py": ("tests/omnid/transport",), "omnid/web": ("tests/omnid/web",),
+    "drivers/motors": MOTOR_TESTS,
+}
 SWAPS: Final[dict[type[ast.AST], tuple[str, str]]] = {
     ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"), ast.Eq: ("==", "!="),
     ast.NotEq: ("!=", "=="), ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"),
@@ -144,23 +152,9 @@ def mutants_of(path: str, source: str) -> list[Mutant]:
 def all_mutants(folders: Sequence[str]) -> Iterator[Mutant]:
     """Yield the mutants of all files of the folders."""
     for folder in folders:
-        for path in sorted((ROOT / folder).rglob("*.py")):
+        whole = ROOT / folder
+        for path in sorted(whole.rglob("*.py")) if whole.is_dir() else [whole]:
             yield from mutants_of(str(path.relative_to(ROOT)), path.read_text())
-
-
-def survives(mutant: Mutant, copy: Path) -> bool:
-    """True if no test notices the mutant in a copy of the repository."""
-    path, source = copy / mutant.path, (ROOT / mutant.path).read_text()
-    tests = next(tests for folder, tests in TESTS.items() if mutant.path.startswith(folder))
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
-    path.write_text(mutant.apply(source))
-    try:
-        done = subprocess.run(command, cwd=copy, capture_output=True, timeout=TIMEOUT_S, check=False)
-    except subprocess.TimeoutExpired:
-        return False
-    finally:
-        path.write_text(source)
-    return done.returncode == 0
 
 
 def _compiles(source: str) -> bool:
@@ -171,24 +165,62 @@ def _compiles(source: str) -> bool:
     return True
 
 
+class Results:
+    """Outcomes in a file of JSON lines, with which a later call goes on where this one was stopped."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.outcomes: dict[str, str] = {}
+        if path.exists():
+            rows = [json.loads(line) for line in path.read_text("utf-8").splitlines() if line.endswith("}")]
+            self.outcomes = {row["mutant"]: row["outcome"] for row in rows}
+
+    def add(self, mutant: str, outcome: str) -> None:
+        """Keep the outcome of a mutant, named by its place and change."""
+        self.outcomes[mutant] = outcome
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"mutant": mutant, "outcome": outcome}) + "\n")
+
+
+def try_mutants(folder: str, mutants: Mapping[str, Mutant], limit_s: float, results: Path) -> None:
+    """Try mutants of one folder in a copy of the repository; their outcomes are added to the results."""
+    copy = results.with_suffix(".copy")
+    shutil.rmtree(copy, ignore_errors=True)
+    copy.mkdir(parents=True)
+    try:
+        for entry in COPIED:
+            (shutil.copytree if (ROOT / entry).is_dir() else shutil.copy2)(ROOT / entry, copy / entry)
+        asked = {"mutants": mutants, "tests": TESTS[folder], "limit_s": limit_s, "results": str(results)}
+        subprocess.run([sys.executable, "-m", "tests.faults.mutant_runner"], cwd=copy, input=json.dumps(asked),
+                       text=True, check=True)
+    finally:
+        shutil.rmtree(copy, ignore_errors=True)
+
+
 def main() -> int:
-    """Print the survivors of a sample of mutants."""
+    """Print the survivors of a sample of mutants of each folder, and how many there are."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.mutants", description=__doc__)
     parser.add_argument("folders", nargs="*", default=list(TESTS), help=f"default: {' '.join(TESTS)}")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--count", type=int, default=200, help="mutants to try; default: %(default)s")
+    parser.add_argument("--count", type=int, default=0, help="mutants of each folder to try; default: all")
+    parser.add_argument("--limit-s", type=float, default=30.0, help="of the tests of one mutant; default: %(default)s")
+    parser.add_argument("--results", type=Path, default=Path("mutants.jsonl"), metavar="FILE",
+                        help="the outcomes so far; mutants in it are not tried again; default: %(default)s")
     args = parser.parse_args()
-    everything = list(all_mutants(args.folders))
-    chosen = random.Random(args.seed).sample(everything, min(args.count, len(everything)))
-    survivors = 0
-    with tempfile.TemporaryDirectory() as name:
-        for entry in COPIED:
-            (shutil.copytree if (ROOT / entry).is_dir() else shutil.copy)(ROOT / entry, Path(name) / entry)
-        for mutant in chosen:
-            if survives(mutant, Path(name)):
-                survivors += 1
-                print(mutant.described((ROOT / mutant.path).read_text()), flush=True)
-    print(f"{len(chosen)} of {len(everything)} mutants tried, {survivors} survived", flush=True)
+    path = args.results.absolute()
+    for folder in args.folders:
+        everything = list(all_mutants([folder]))
+        count = min(args.count or len(everything), len(everything))
+        chosen = {mutant.described((ROOT / mutant.path).read_text("utf-8")): mutant
+                  for mutant in random.Random(args.seed).sample(everything, count)}
+        known = Results(path).outcomes
+        if missing := {name: mutant for name, mutant in chosen.items() if name not in known}:
+            try_mutants(folder, missing, args.limit_s, path)
+        outcomes = Results(path).outcomes
+        numbers = Counter(outcomes.get(name, "not tried") for name in chosen)
+        print(f"{folder}: {count} of {len(everything)} mutants, seed {args.seed}: "
+              f"{', '.join(f'{number} {outcome}' for outcome, number in sorted(numbers.items()))}")
+        print("".join(f"  {name}\n" for name in chosen if outcomes.get(name) == SURVIVED), end="", flush=True)
     return 0
 
 

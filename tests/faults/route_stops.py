@@ -80,7 +80,7 @@ def started_robot(site: Path, folder: Path) -> Iterator[Robot]:
 
 def text(operator: Operator, topic: str, words: str) -> None:
     """Send a request to the navigation."""
-    operator.send(topic, string_cdr(words))
+    operator.send(topic, string_cdr(f"{words} stamp={time.time_ns()}"))
 
 
 class RouteDrive:

@@ -31,13 +31,13 @@ def test_mutated_files_give_a_result_or_one_line(short: Path, name: str) -> None
 
 
 @pytest.mark.slow
-def test_mutated_commands_never_move_the_wheels(tmp_path: Path, scene: Path) -> None:
+def test_mutated_commands_never_move_the_wheels(tmp_path: Path, course: Path) -> None:
     rows: list[str] = []
-    assert hostile_commands.run(scene, tmp_path, 2000, 7, rows.append) == 0, rows
+    assert hostile_commands.run(course, tmp_path, 2000, 7, rows.append) == 0, rows
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", stop_times.CAUSES)
-def test_the_wheels_come_to_rest(tmp_path: Path, scene: Path, name: str) -> None:
-    times = stop_times.stop_times(scene, tmp_path / "stops", name, 2, seed=7)
+def test_the_wheels_come_to_rest(tmp_path: Path, course: Path, name: str) -> None:
+    times = stop_times.stop_times(course, tmp_path / "stops", name, 2, seed=7)
     assert len(times) == 2

@@ -35,4 +35,4 @@ def test_each_place_is_changed_once() -> None:
 
 @pytest.mark.parametrize("folder", TESTS)
 def test_there_are_mutants_of_the_code_that_moves_the_wheels(folder: str) -> None:
-    assert len(list(all_mutants([folder]))) > 100
+    assert len(list(all_mutants([folder]))) > 3

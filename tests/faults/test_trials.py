@@ -11,7 +11,7 @@ from tests.faults.trials import TRIALS, Setting
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", TRIALS)
-def test_fault(tmp_path: Path, scene: Path, fault: str) -> None:
+def test_fault(tmp_path: Path, course: Path, fault: str) -> None:
     folder = tmp_path / "in"
     folder.mkdir()
-    assert TRIALS[fault](Setting(scene, folder)).process
+    assert TRIALS[fault](Setting(course, folder)).process

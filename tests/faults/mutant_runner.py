@@ -1,0 +1,225 @@
+"""The tests of one room, collected once in a process that never runs one itself: each mutant gets a fork of it.
+
+A fork puts the changed functions into the modules that are imported already, runs the tests that called them in
+an unchanged run, the fast ones first, and ends at the first that fails. A mutant outside functions (a constant, a
+default of a class) needs its module imported again: its tests run in a new Python. The changed file also lies in the
+folder of the copy meanwhile, for tests that start programs.
+"""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import CodeType, FrameType, FunctionType
+from typing import Any, Final
+
+import pytest
+from _pytest.runner import runtestprotocol
+
+from omnid.engine import kernel_cache
+from tests.faults.mutants import SURVIVED, Mutant, Results
+
+POLL_S: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """Result of an unchanged run."""
+
+    tests: dict[str, float]  # names of the tests that passed, with their durations [s]
+    calls: dict[str, list[tuple[int, int, list[str]]]]  # of a file: first and last line of a function, its tests
+
+    def of(self, mutant: Mutant) -> list[str]:
+        """Return the tests for a mutant, the fast ones first.
+
+        A line in no function that a test has called in this process gets the tests of its file, and if there are none,
+        all: they may reach it in another process.
+        """
+        functions = self.calls.get(mutant.path, [])
+        around = [(last - first, names) for first, last, names in functions if first <= mutant.line <= last]
+        chosen = min(around)[1] if around else sorted({name for *_, names in functions for name in names})
+        return sorted(chosen or self.tests, key=self.tests.__getitem__)
+
+
+class MutantRunner:
+    """A plugin of pytest that tries mutants in the place of running the collected tests."""
+
+    def __init__(self, copy: Path, mutants: Sequence[Mutant], limit_s: float,
+                 report: Callable[[Mutant, str], None]) -> None:
+        """copy: folder of the repository that may be changed; limit_s: for the tests of one mutant."""
+        self._copy, self._mutants, self._limit_s, self._report = copy, mutants, limit_s, report
+        self._sources = {mutant.path: (copy / mutant.path).read_text("utf-8") for mutant in mutants}
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Run the tests unchanged, then try each mutant."""
+        items = {item.nodeid: item for item in session.items}
+        reached = self._unchanged(items)
+        for mutant in self._mutants:
+            names = [name for name in reached.of(mutant) if name in items]
+            # A test that has begun within the limit is given the time to end.
+            times_s = [reached.tests[name] for name in names]
+            patience_s = 10.0 + 5.0 * (min(self._limit_s, sum(times_s)) + max(times_s))
+            path = self._copy / mutant.path
+            path.write_text(mutant.apply(self._sources[mutant.path]), "utf-8")
+            try:
+                changed = changed_functions(self._sources[mutant.path], path)
+                outcome = self._in_a_fork([items[name] for name in names], changed, patience_s) if changed else (
+                    self._in_a_new_python(names, patience_s))
+            finally:
+                path.write_text(self._sources[mutant.path], "utf-8")
+            self._report(mutant, outcome)
+        return True
+
+    def _in_a_fork(self, items: Sequence[pytest.Item], changed: dict[CodeType, CodeType], patience_s: float) -> str:
+        """Return the outcome of the tests with changed functions."""
+        pid = os.fork()
+        if pid == 0:
+            _quiet()
+            replace_functions(changed)
+            os._exit(int(not _passes(items, time.monotonic() + self._limit_s)))
+        return _outcome(_waited(pid, patience_s))
+
+    def _in_a_new_python(self, names: Sequence[str], patience_s: float) -> str:
+        """Return the outcome of the tests where the file is imported again."""
+        listed = self._copy / "mutant-tests.txt"
+        listed.write_text("\n".join(names))
+        command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"@{listed}"]
+        process = subprocess.Popen(command, cwd=self._copy, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+                                   start_new_session=True)
+        return _outcome(_waited(process.pid, patience_s + 30.0))
+
+    def _unchanged(self, items: dict[str, pytest.Item]) -> Reached:
+        """Run all tests in a fork, and return what they reached; tests that fail are left out."""
+        listed = self._copy / "reached.json"
+        pid = os.fork()
+        if pid == 0:
+            _quiet()
+            listed.write_text(json.dumps(_reached(items, {str(self._copy / path): path for path in self._sources})))
+            os._exit(0)
+        _waited(pid, 3600.0)
+        return Reached(*json.loads(listed.read_text()))
+
+
+def changed_functions(source: str, path: Path) -> dict[CodeType, CodeType]:
+    """Return the code of functions before and after the change of a file; empty where more than functions changed."""
+    before, after = (compile(text, str(path), "exec", dont_inherit=True) for text in (source, path.read_text("utf-8")))
+    return _changed(before, after) or {}
+
+
+def _changed(before: CodeType, after: CodeType) -> dict[CodeType, CodeType] | None:
+    """Return the changed functions within a module or class; None where its own statements changed."""
+    inner = [[const for const in code.co_consts if isinstance(const, CodeType)] for code in (before, after)]
+    own = [(code.co_code, code.co_names, [const for const in code.co_consts if not isinstance(const, CodeType)])
+           for code in (before, after)]
+    if repr(own[0]) != repr(own[1]) or len(inner[0]) != len(inner[1]):
+        return None
+    found: dict[CodeType, CodeType] = {}
+    for old, new in zip(*inner, strict=True):
+        if old == new:
+            continue
+        is_function = bool(old.co_flags & 0x2)  # CO_NEWLOCALS: the body of a class has none
+        within = {old: new} if is_function else _changed(old, new)
+        if within is None:
+            return None
+        found |= within
+    return found
+
+
+def replace_functions(changed: dict[CodeType, CodeType]) -> None:
+    """Give all functions with one of these codes the changed one."""
+    for thing in gc.get_objects():
+        if isinstance(thing, FunctionType) and thing.__code__ in changed:
+            thing.__code__ = changed[thing.__code__]
+
+
+def _reached(items: dict[str, pytest.Item], files: dict[str, str]) -> tuple[dict[str, float], dict[str, Any]]:
+    """Run all tests; return the durations of those that pass, and the tests that called each function of the files."""
+    durations: dict[str, float] = {}
+    called: dict[CodeType, set[str]] = defaultdict(set)
+    current = [""]
+
+    def trace(frame: FrameType, event: str, argument: object) -> None:
+        if frame.f_code.co_filename in files:
+            called[frame.f_code].add(current[0])
+
+    threading.settrace(trace)
+    sys.settrace(trace)
+    for name, item in items.items():
+        current[0], begin_s = name, time.monotonic()
+        if all(report.passed or report.skipped for report in _reports(item)):
+            durations[name] = time.monotonic() - begin_s
+    sys.settrace(None)
+    calls: dict[str, list[Any]] = {path: [] for path in files.values()}
+    for code, names in called.items():
+        last = max(line for *_, line in code.co_lines() if line)
+        calls[files[code.co_filename]].append((code.co_firstlineno, last, sorted(names & durations.keys())))
+    return durations, calls
+
+
+def _passes(items: Sequence[pytest.Item], until_s: float) -> bool:
+    """True if no test fails until then."""
+    return all(report.passed or report.skipped
+               for item in items if time.monotonic() < until_s for report in _reports(item))
+
+
+def _reports(item: pytest.Item) -> Iterable[pytest.TestReport]:
+    """Run a test with its fixtures."""
+    return runtestprotocol(item, nextitem=None, log=False)
+
+
+def _quiet() -> None:
+    """Make this fork the head of its own group, whose output is lost."""
+    os.setsid()
+    null = os.open(os.devnull, os.O_RDWR)
+    for number in (0, 1, 2):
+        os.dup2(null, number)
+
+
+def _waited(pid: int, patience_s: float) -> int | None:
+    """Return the exit code of a child, which with all its children is ended after a time; None: it was ended."""
+    until_s = time.monotonic() + patience_s
+    status: int | None = None
+    while status is None and time.monotonic() < until_s:
+        found, code = os.waitpid(pid, os.WNOHANG)
+        if found:
+            status = os.waitstatus_to_exitcode(code)
+        else:
+            time.sleep(POLL_S)
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
+    if status is None:
+        os.waitpid(pid, 0)
+    return status
+
+
+def _outcome(code: int | None) -> str:
+    if code is None:
+        return "timeout"
+    return SURVIVED if code == 0 else "noticed"
+
+
+def main() -> int:
+    """Try the mutants that standard input names, in the copy of the repository that is the working directory."""
+    asked = json.load(sys.stdin)
+    results, names = Results(Path(asked["results"])), {Mutant(*row): name for name, row in asked["mutants"].items()}
+    # None of these folders calls a compiled function: not to prepare them all saves minutes in a new folder.
+    kernel_cache._state["ready"] = True
+    runner = MutantRunner(Path.cwd(), list(names), asked["limit_s"],
+                          lambda mutant, outcome: results.add(names[mutant], outcome))
+    code = pytest.main(["-p", "no:cacheprovider", "-p", "no:terminal", *asked["tests"]], plugins=[runner])
+    return int(code)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,70 @@
+"""The runner of mutants: which code is replaced, and a small campaign on a copy of its own."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+from tests.faults.mutant_runner import Reached, changed_functions, replace_functions
+from tests.faults.mutants import Mutant, Results, mutants_of
+
+ROOT = Path(__file__).parents[2]
+SOURCE = """LIMIT = 3
+
+
+class Gate:
+    def is_open(self, value):
+        return value < LIMIT
+
+
+def never(value):
+    return value > LIMIT
+"""
+TESTS = """from small import gate
+
+
+def test_the_gate():
+    assert gate.Gate().is_open(2) and not gate.Gate().is_open(3)
+"""
+
+
+def test_only_functions_that_changed_are_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "gate.py"
+    namespace: dict[str, object] = {}
+    exec(compile(SOURCE, str(path), "exec", dont_inherit=True), namespace)
+    path.write_text(SOURCE.replace("value < LIMIT", "value <= LIMIT"))
+    changed = changed_functions(SOURCE, path)
+    assert [code.co_name for code in changed] == ["is_open"]
+    replace_functions(changed)
+    assert namespace["Gate"]().is_open(3)  # type: ignore[operator]
+    path.write_text(SOURCE.replace("LIMIT = 3", "LIMIT = 4"))
+    assert changed_functions(SOURCE, path) == {}, "the module is to be imported again"
+
+
+def test_the_tests_of_the_innermost_function_run_the_fast_ones_first() -> None:
+    calls = {"a.py": [(1, 20, ["other"]), (5, 8, ["slow", "fast"])]}
+    reached = Reached({"slow": 2.0, "fast": 0.1, "other": 0.2}, calls)
+    assert reached.of(Mutant("a.py", 6, 0, 1, "")) == ["fast", "slow"]
+    assert reached.of(Mutant("a.py", 12, 0, 1, "")) == ["other"]
+    assert reached.of(Mutant("a.py", 40, 0, 1, "")) == ["fast", "other", "slow"], "outside functions"
+    assert reached.of(Mutant("b.py", 1, 0, 1, "")) == ["fast", "other", "slow"], "never called in this process"
+
+
+def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    copy, results = tmp_path / "copy", tmp_path / "results.jsonl"
+    (copy / "small").mkdir(parents=True)
+    (copy / "small" / "__init__.py").write_text("")
+    (copy / "small" / "gate.py").write_text(SOURCE)
+    (copy / "test_gate.py").write_text(TESTS)
+    mutants = {mutant.apply(SOURCE): mutant for mutant in mutants_of("small/gate.py", SOURCE)}
+    asked = {"mutants": mutants, "tests": ["test_gate.py"], "limit_s": 20.0, "results": str(results)}
+    code = ("import sys; sys.path.insert(0, sys.argv[1]); from tests.faults.mutant_runner import main; "
+            "sys.exit(main())")
+    subprocess.run([sys.executable, "-c", code, str(ROOT)], cwd=copy, input=json.dumps(asked), text=True, check=True,
+                   timeout=120, env={"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"})
+    outcomes = Results(results).outcomes
+    assert outcomes == {after: "survived" if "value < LIMIT" in after and "LIMIT = 3" in after else "noticed"
+                        for after in mutants}
+    assert (copy / "small" / "gate.py").read_text() == SOURCE, "left as it was"
