@@ -21,6 +21,7 @@ POSES = 18
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
 PUBLISHED = {"/omnid/odom", "/omnid/pose", "/omnid/map_pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status",
              "/omnid/drive", *IMAGES}
+AGREE = "the runs agree: no difference is larger than 20 mm or 0.5 deg"
 COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
 
@@ -108,10 +109,12 @@ def test_a_replay_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, 
     again = tmp_path / "again.mcap"
     assert omnid.replay(recording, "--record", again).code == 0
     code, out, err = omnid("diff", recording, again, *COMPARABLE)
-    assert code == 0, out + err
     assert "rig        the same" in out and "record.enabled: A True, B False" in out
-    if read_run_series(recording).poses.stamps_ns.tolist() == read_run_series(again).poses.stamps_ns.tolist():
-        assert "bit-identical" in out, "not a pair was dropped"
+    stamps = [read_run_series(run).poses.stamps_ns.tolist() for run in (recording, again)]
+    if stamps[0] == stamps[1]:
+        assert code == 0 and "bit-identical" in out, out + err
+    else:  # A busy computer dropped pairs: odometry may say `degraded` after a gap that the replay does not have.
+        assert out.splitlines()[-1] in {AGREE, "the runs differ: states"}, out + err
 
 
 def test_diff_finds_a_setting_that_matters(omnid: Command, tmp_path: Path, recording: Path) -> None:
