@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.kernel_store import cache_folder
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 
@@ -21,8 +23,10 @@ COURSE_PAIRS = 22  # before the turn
 def kernels(request: pytest.FixtureRequest) -> None:
     """Compile the functions of omnid once, or read them from the cache folder, before the first test.
 
-    The tests beside this file read source code only.
+    The tests beside this file read source code only. Programs that tests start use the same folder, also where a test
+    gives them another home. Of several workers one compiles, the others wait.
     """
+    os.environ["OMNID_CACHE_DIR"] = str(cache_folder())
     if any(item.path.parent != Path(__file__).parent for item in request.session.items):
         prepare_kernels(lambda level, line: None)
 

@@ -1,7 +1,7 @@
 """Functions compiled to machine code by numba: the one way in which loops over pixels and landmarks become fast.
 
 A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only: the code
-kept on disk is made again when one of them changes (engine/kernel_cache.py), and constants of other files would not be
+kept on disk is made again when one of them changes (engine/kernel_store.py), and constants of other files would not be
 noticed. There is no second version in Python. Results are the same bytes in every run: no reordering of sums
 (fastmath), no threads inside. The global lock of Python is released meanwhile.
 
@@ -11,6 +11,7 @@ numba is imported at the first compilation, not with this module: most commands 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 P = ParamSpec("P")
@@ -43,11 +44,11 @@ class Kernel(Generic[P, R]):
         """True once the function is compiled."""
         return self._compiled is not None
 
-    def compile(self, *, kept: bool = False) -> None:
-        """Compile the function for its signature; kept: read it from numba's folder, or write it there."""
+    def compile(self, folder: Path | None = None) -> None:
+        """Compile the function for its signature; folder: read it from there, or write it there."""
         dispatcher = self._dispatcher()
-        if kept:
-            dispatcher.enable_caching()
+        if folder is not None:
+            dispatcher._cache = _cache_in(folder, self.function)
         dispatcher.compile(self._types())
         dispatcher.disable_compile()  # other types are an error, not a wait of seconds
         self._compiled = dispatcher
@@ -67,6 +68,39 @@ class Kernel(Generic[P, R]):
             types.Array(kind.dtype, kind.ndim, kind.layout, readonly=name not in self.writes)
             if isinstance(kind, types.Array) else kind for kind, name in zip(arguments, names, strict=False)
         )
+
+
+class _Locator:
+    """Place where numba keeps a function: a folder that depends on neither path nor time of the source file.
+
+    The methods are those that numba.core.caching calls; numba's own locators name folders by the path of the source.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def from_function(self, function: object, file: str) -> _Locator:
+        return self
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def ensure_cache_path(self) -> None:
+        self._folder.mkdir(exist_ok=True)
+
+    def get_source_stamp(self) -> str:
+        return ""
+
+    def get_disambiguator(self) -> str:
+        return ""
+
+
+def _cache_in(folder: Path, function: Callable[..., object]) -> Any:
+    """Return numba's cache of a function in a folder."""
+    from numba.core import caching
+
+    in_folder = type("InFolder", (caching.CompileResultCacheImpl,), {"_locator_classes": [_Locator(folder)]})
+    return type("FolderCache", (caching.FunctionCache,), {"_impl_class": in_folder})(function)
 
 
 class Inner(Generic[P, R]):

@@ -29,7 +29,7 @@ from omnid.doctor.devices import access, holders, memberships
 from omnid.doctor.finding import Finding, summary
 from omnid.doctor.machine import BUILT_S, clock, compiled_functions, disk, is_synchronised, programs
 from omnid.doctor.wiring import bus, motor, rig
-from omnid.engine.kernel_cache import cache_folder
+from omnid.engine.kernel_store import cache_folder
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
