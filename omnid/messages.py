@@ -15,6 +15,7 @@ from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.tiles import ALL_LIVE, TileStates
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.stereo.photometry import Light
@@ -50,6 +51,13 @@ class Panoramas:
     times: PixelTimes = AT_ONCE
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
+    tiles: TileStates = ALL_LIVE  # the parts of the images that are dead or blind
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Pixels (H, W) that show the world in live parts of both images."""
+        lost = self.tiles.lost_pixels(self.visible.shape)
+        return self.visible if lost is None else self.visible & ~lost
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +139,8 @@ class ObstacleRing:
     free_m: NDArray[np.float32]  # (360,) up to which the floor, or something behind, was seen; 0: nothing was
     T_odom_base: Array  # (4, 4)
     moving: tuple[MovingObstacle, ...] = ()
+    # (360,) the images show nothing to rely on there: a part of them is frozen, dark, saturated or blurred
+    unwatched: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(360, bool))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,6 +13,7 @@ from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
 DARK_SHARE: Final = 0.1  # of the pairs
+LOST_PARTS_SHARE: Final = 0.1  # of the pairs
 REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
                    "use": "they were used, as pair.repeated_images says"}
 
@@ -39,6 +40,10 @@ def input_warnings(
     if statistics.dark > statistics.poses * DARK_SHARE:
         yield (f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
                "contrast; more light, a longer exposure (cameras.exposure_us) or less gain")
+    for camera, pairs in statistics.lost_parts.items():
+        if pairs > statistics.poses * LOST_PARTS_SHARE:
+            yield (f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
+                   f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver")
     lost = statistics.states[TrackingState.LOST]
     if lost > statistics.poses / 2:
         yield (f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "

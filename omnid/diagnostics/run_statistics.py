@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.obstacles.tiles import Side
 from omnid.messages import OdometryUpdate
 from omnid.tracking_state import TrackingState
 
@@ -22,6 +23,7 @@ class RunStatistics:
         self.states: Counter[str] = Counter()
         self.resets = 0
         self.dark = 0  # pairs that were too dark
+        self.lost_parts: Counter[Side] = Counter()  # pairs in which a part of a camera's image was frozen or blind
         self.newest: OdometryUpdate | None = None
         self._position: NDArray[np.float64] | None = None
 
@@ -33,6 +35,8 @@ class RunStatistics:
         self._position, self.newest = position, odometry
         self.states[odometry.state] += 1
         self.dark += odometry.light.is_too_dark
+        columns = odometry.depth.panoramas.tiles.columns
+        self.lost_parts.update(side for side, found in columns.items() if found.any())
         self.resets = odometry.reset_counter
         self.poses += 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -12,6 +13,7 @@ from calib.rig_file import rig_toml
 from drivers.frame import Camera
 from omnid.controller.link import ControllerLink
 from omnid.core.control.command_sources import PLANNER
+from omnid.diagnostics.images_status import ImagesStatus
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.motion_status import motion_status
@@ -98,7 +100,8 @@ class LiveWiring:
         received = LiveCommands(session, bus, controller, requests, self._report)
         received.subscribe(recorder, sensors, saver)
         # 5. Status.
-        status = [ladder.status, exposure.status, live_rig.status,
+        images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))
+        status = [ladder.status, images, exposure.status, live_rig.status,
                   *([received.navigation.status] if controller else ()),
                   motion_status(front_end.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
                   *([partial(places_status, stages.places)] if stages.places else ()),

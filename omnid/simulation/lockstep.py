@@ -68,6 +68,9 @@ class Moment:
 Request: TypeAlias = Setpoint | Literal["arm", "stop", "end"] | NavigationRequest
 # Sends requests as a person or a program would; called once for every pair of images.
 Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
+# Changes the pixels of a frame on its way to the stages: a fault of a camera, its driver or its mirror. The first
+# argument is the time of the frame since the start [s].
+Tamper: TypeAlias = Callable[[float, Frame], Frame]
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,9 +117,10 @@ class SimulatedRun:
 
 
 def simulate(world: World, robot: SimulatedRobot, drive: Drive, *, seconds: float, seed: int = 0,
-             config: Config | None = None, faults: Iterable[Fault] = ()) -> SimulatedRun:
+             config: Config | None = None, faults: Iterable[Fault] = (), tamper: Tamper | None = None) -> SimulatedRun:
     """Drive for so many seconds of simulated time and return the run.
 
+    tamper: changes the images; None: they are as the simulated cameras make them.
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does.
     """
@@ -124,14 +128,15 @@ def simulate(world: World, robot: SimulatedRobot, drive: Drive, *, seconds: floa
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults)).run(seconds)
+        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults), tamper).run(seconds)
     finally:
         cv2.setNumThreads(threads)
 
 
 class _Lockstep:
     def __init__(self, world: World, robot: SimulatedRobot, drive: Drive, seed: int, config: Config,
-                 faults: tuple[Fault, ...]) -> None:
+                 faults: tuple[Fault, ...], tamper: Tamper | None) -> None:
+        self._tamper = tamper
         self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
         self._rig = with_masks(robot.rig)
         self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
@@ -194,8 +199,9 @@ class _Lockstep:
         brightness = 0.0 if self._has("dark") else 1.0
         for camera in CAMERAS:
             if not self._has(f"no {camera} image"):
-                yield self._cameras.frame(camera, seq, stamp_ns, T_world_rig, self._vehicle.people,
-                                          brightness=brightness)
+                frame = self._cameras.frame(camera, seq, stamp_ns, T_world_rig, self._vehicle.people,
+                                            brightness=brightness)
+                yield frame if self._tamper is None else self._tamper(self._vehicle.time_s, frame)
 
     def _has(self, kind: str) -> bool:
         """True while there is a fault."""

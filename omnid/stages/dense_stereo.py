@@ -56,7 +56,7 @@ class DenseStereo:
                ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
         """Return columns (N,), rows (N,) and disparities (N,) [px] as seen of the matched pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
-        valid = np.pad(panoramas.visible, ((0, 0), (pad, pad)))
+        valid = np.pad(panoramas.usable, ((0, 0), (pad, pad)))
         try:
             matcher = self._idle.pop()
         except IndexError:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig, TimingConfig
+from omnid.core.obstacles.tiles import Side, TileMonitor
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import PixelTimes
@@ -26,7 +27,7 @@ class Dewarp:
     """Rectifies both images of a pair; the remap tables are computed once."""
 
     def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
-        self._noise_grey: dict[str, float] = {}  # of each camera before its gain
+        self._noise_grey: dict[Side, float] = {}  # of each camera before its gain
         self._pairs = 0
         self._pad_px = config.pad_px
         timing = timing or TimingConfig()
@@ -37,6 +38,7 @@ class Dewarp:
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
+        self._tiles = TileMonitor(self._visible)
         self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
         line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
@@ -52,15 +54,19 @@ class Dewarp:
         """Return the panoramas of a pair."""
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
-        lower, lower_light = self._panorama(pair.lower, self._lower, "lower", measured)
-        upper, upper_light = self._panorama(pair.upper, self._upper, "upper", measured)
+        lower, lower_light, lower_grey = self._panorama(pair.lower, self._lower, "lower", measured)
+        upper, upper_light, upper_grey = self._panorama(pair.upper, self._upper, "upper", measured)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
         times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
-        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion)
+        tiles = self._tiles.update(pair.stamp_ns, {"lower": lower_grey, "upper": upper_grey}, self._noise_grey)
+        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
 
-    def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: str, measured: bool
-                  ) -> tuple[PaddedPanorama, Light]:
-        """Return a panorama, brightened if it is dim; measured: measure the noise of this camera again."""
+    def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
+                  ) -> tuple[PaddedPanorama, Light, NDArray[np.uint8]]:
+        """Return a panorama, brightened if it is dim, its light, and (H, W) as the camera gave it.
+
+        measured: measure the noise of this camera again.
+        """
         smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
         remapped = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
         inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
@@ -69,7 +75,7 @@ class Dewarp:
         noise_grey = self._noise_grey[camera]
         found = light(inner, self._visible, noise_grey)
         gain = gain_of(found.level_grey)
-        return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain), found
+        return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain), found, inner
 
 
 def _blur_px(tables: tuple[Maps, ...]) -> float:

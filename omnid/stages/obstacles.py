@@ -21,6 +21,7 @@ from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.observation import observe, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
@@ -33,9 +34,9 @@ Array = NDArray[np.float64]
 
 ASSUMED_HEIGHT_M: Final = 1.1  # of the cameras, where the rig's T_base_rig does not say it
 LEAST_HEIGHT_M: Final = 0.1  # of the cameras over the floor, in a T_base_rig that says it
-# Least time between two rings; the collision monitor slows the base down by their age.
+# Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.
 SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
-    LoadLevel.FULL: 0, LoadLevel.SPARSE_MAP: 0, LoadLevel.NO_MAP: 300_000_000, LoadLevel.REDUCED: 450_000_000}
+    LoadLevel.FULL: 0, LoadLevel.SPARSE_MAP: 0, LoadLevel.NO_MAP: 250_000_000, LoadLevel.REDUCED: 300_000_000}
 
 
 def ring_settings(geometry: Geometry, config: ObstaclesConfig) -> RingSettings:
@@ -69,6 +70,7 @@ class Obstacles:
         self._geometry = geometry
         self._T_rect_base = geometry.rig.T_rect_rig @ se3.inverse(geometry.rig.T_base_rig)
         self._floor = FloorCamera(geometry.cylinder, self._T_rect_base, self._settings.floor_m)
+        self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._plane: FloorPlane | None = None
         self._is_measured = not floor_is_assumed(geometry, config)  # else no plane is known that pixels could show
         self._last_ns: int | None = None
@@ -90,13 +92,16 @@ class Obstacles:
         panoramas, view = odometry.depth.panoramas, partial(unmeasured, seen.floor_from_m)
         if self._is_measured:
             seen = with_plane(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
-            view = partial(self._floor.view, panoramas.lower, panoramas.visible)
+            view = partial(self._floor.view, panoramas.lower, panoramas.usable)
+        # What dead and blind parts of the images show is no evidence, and what was known there is no longer watched.
+        unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
+        seen = without(seen, unwatched)
         T_odom_base = of_base(odometry, self._T_base_rig)[0]
         pose = transform(planar(T_odom_base))
-        ring = self._filter.update(odometry.stamp_ns, pose, seen, view)
+        ring = without(self._filter.update(odometry.stamp_ns, pose, seen, view), unwatched)
         moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
-                            moving)
+                            moving, unwatched)
 
     def _plane_of(self, panoramas: Panoramas) -> FloorPlane:
         """Return the plane of the floor in panoramas; all of a run show the same part of the world."""
@@ -125,4 +130,4 @@ def controller_ring(ring: ObstacleRing) -> ControllerRing:
         vx, vy = np.array([obstacle.vx_mps, obstacle.vy_mps]) @ T[:2, :2]
         moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m))
     return ControllerRing(ring.stamp_ns, tuple(np.maximum(nearest, 0.0).tolist()), tuple(ring.free_m.tolist()),
-                          tuple(moving))
+                          tuple(moving), tuple(ring.unwatched.tolist()) if ring.unwatched.any() else ())

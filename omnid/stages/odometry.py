@@ -62,9 +62,9 @@ class OdometryStage:
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
         self.sensors.add(pair.motion)
         sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
-        usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.visible
+        usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
         frame = StereoFrame(pair.seq, pair.lower, pair.upper, partial(self._disparity, pair), usable,
-                            pair.times, sensed)
+                            pair.times, sensed, lost=pair.tiles.lost_pixels(pair.visible.shape))
         estimate = self._method.process(frame, dt_s)
         if estimate.step is not None and last_ns is not None:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)

@@ -28,6 +28,7 @@ MAP_FILE: Final = f"{PREFIX}map file"
 NAVIGATION: Final = f"{PREFIX}navigation"
 REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 LOAD: Final = f"{PREFIX}load"
+IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
 EXPOSURE: Final = f"{PREFIX}exposure"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
@@ -121,6 +122,11 @@ class TimeKey(NamedTuple):
 def camera_name(camera: str) -> str:
     """Return the name of a camera's entry."""
     return f"{PREFIX}{camera} camera"
+
+
+def lost_parts_key(camera: str) -> str:
+    """Return the key of the time for which a part of a camera's image has been frozen or blind."""
+    return f"{camera}_since_s"
 
 
 def stage_name(stage: str) -> str:

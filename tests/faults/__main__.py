@@ -2,8 +2,8 @@
 
 Parts: trials (each fault once, its outcome), stops (times from a cause to wheels at rest), routes (the same in the
 midst of a route, in a closed loop), commands (mutated commands), files (mutated files), crowds (stops beside crowds of
-connections), floods (poses and stops beside floods of messages). The campaign is seeded and bounded; with the numbers
-of the defaults it takes some hours.
+connections), floods (poses and stops beside floods of messages), images (drives on tampered images, in lock-step).
+The campaign is seeded and bounded; with the numbers of the defaults it takes some hours.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from tests.faults import crowds, floods, hostile_commands, hostile_files, route_stops, stop_times
+from tests.faults import crowds, floods, hostile_commands, hostile_files, images, route_stops, stop_times
 from tests.faults.trials import TRIALS, Outcome, Setting
 from tests.simulation import build, write_log
 
@@ -60,14 +60,15 @@ def busy_processes(count: int) -> Iterator[None]:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the options."""
     result = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
-    parts = ("trials", "stops", "routes", "commands", "files", "crowds", "floods")
+    parts = ("trials", "stops", "routes", "commands", "files", "crowds", "floods", "images")
     result.add_argument("parts", nargs="*", choices=[*parts, []], default=parts, metavar="PART", help=", ".join(parts))
     result.add_argument("--only", action="append", default=[], metavar="WORD",
-                        help="of trials and stops, those whose name has the word; may be given several times")
+                        help="of trials, stops and images, those whose name has the word; may be given several times")
     result.add_argument("--seed", type=int, default=1)
     result.add_argument("--stops", type=int, default=200, help="stops to measure for each cause")
     result.add_argument("--commands", type=int, default=30_000, help="mutated commands to send")
     result.add_argument("--files", type=int, default=10_000, help="mutated files of each format")
+    result.add_argument("--images", type=int, default=3, help="seeds of each case of tampered images")
     result.add_argument("--rate", type=float, default=50_000, help="messages a second of a flood")
     result.add_argument("--busy", type=int, default=0, metavar="N", help="keep N other processes busy meanwhile")
     return result
@@ -97,6 +98,8 @@ def main() -> int:
             failed += crowds.run(recorded, folder, report)
         if "floods" in args.parts:
             failed += floods.run(recorded, folder, args.rate, args.only, report)
+        if "images" in args.parts:
+            failed += images.run_all(args.only, args.images, args.seed)
     return int(failed > 0)
 
 

@@ -24,6 +24,7 @@ LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on developm
 BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on; because the rest is for lag
 # Consecutive ones without a range that make a direction unknown; by trial on development seeds.
 UNKNOWN_SECTORS: Final = 5
+BESIDE_M: Final = 0.05  # beyond the sides' room: corrections of the heading do not swing a corner so far in time_s
 MOVING_STEP_S: Final = 0.1  # of the prediction of moving obstacles; 0.15 m of a person at 1.5 m/s: fine enough
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
 MOST_MOVING: Final = 16  # so that the time of a tick is bounded (docs/results/speed.md has it with so many)
@@ -32,9 +33,12 @@ BLOCKED: Final = "an obstacle is in the way"
 NEAR: Final = "an obstacle is near"
 MOVING: Final = "a moving obstacle comes into the way"
 UNKNOWN: Final = "the way ahead is unknown"
+UNWATCHED: Final = "the images of the way ahead are frozen, dark or dirty"
+UNSEEN: Final = "the images show nothing: they are frozen, dark or dirty"
 RING_STALE: Final = "no new obstacle ring"
 REMEDY: Final = "drive back or turn away, or clear the way"
 RING_REMEDY: Final = "check the cameras and the load; see controller.collision.stale"
+IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names"
 
 
 class MovingPoint(NamedTuple):
@@ -54,6 +58,7 @@ class ControllerRing(NamedTuple):
     ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
     free_m: tuple[float, ...] = ()  # (N,) up to which an unknown direction was seen to be free; empty: 0
     moving: tuple[MovingPoint, ...] = ()
+    unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
 
 
 class Allowance(NamedTuple):
@@ -68,7 +73,7 @@ FREE: Final = Allowance(1.0, "")
 
 def remedy(reason: str) -> str:
     """Return what to do about a reason to slow down or stop."""
-    return RING_REMEDY if reason == RING_STALE else REMEDY
+    return {RING_STALE: RING_REMEDY, UNWATCHED: IMAGES_REMEDY, UNSEEN: IMAGES_REMEDY}.get(reason, REMEDY)
 
 
 class CollisionMonitor:
@@ -79,9 +84,14 @@ class CollisionMonitor:
         """deceleration_mps2: with which the base can brake."""
         self._settings, self._deceleration = settings, deceleration_mps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
+        # Nothing may be free any more where the images show nothing: no way is left ahead, but room for turns beside.
+        side_m = settings.half_width_m + settings.side_m + BESIDE_M
+        self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
         self._stamp_ns: int | None = None
         self._points: list[Point] = []  # obstacles in the frame of the ring
         self._unknown: list[Point] = []  # where the way that was seen to be free ends, nothing is known
+        self._unwatched: list[Point] = []  # around the outline, where the images show nothing
+        self._is_blind = False  # they show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
         self.reason = ""  # of the last step: why the motion was changed
@@ -97,11 +107,14 @@ class CollisionMonitor:
         self._points = [(r * math.cos((k + 0.5) * step - math.pi), r * math.sin((k + 0.5) * step - math.pi))
                         for k, r in enumerate(ring.ranges_m) if math.isfinite(r)]
         free = ring.free_m if len(ring.free_m) == count else (0.0,) * count
-        self._unknown = []
+        self._unknown, self._unwatched = [], []
+        unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
+        self._is_blind = all(unwatched)
         for k in _unknown_sectors(ring.ranges_m):
             azimuth = (k + 0.5) * step - math.pi
-            begins_m = max(free[k], self._outline.edge_m(azimuth))
-            self._unknown.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
+            begins_m = self._around.edge_m(azimuth) if unwatched[k] else max(free[k], self._outline.edge_m(azimuth))
+            ends = self._unwatched if unwatched[k] else self._unknown
+            ends.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
 
     def step(self, now_ns: int, motion: Twist) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc."""
@@ -121,10 +134,12 @@ class CollisionMonitor:
         if not settings.check or (motion.velocity_mps == 0.0 and motion.yaw_rate_radps == 0.0):
             return FREE
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        if not abs(age_s) <= settings.stale_s:
-            if settings.stale == IGNORE:
-                return FREE
-            return self._capped(motion, 0.0 if settings.stale == STOP else settings.slow_mps, RING_STALE)
+        is_stale = not abs(age_s) <= settings.stale_s
+        if is_stale and settings.stale == IGNORE:
+            return FREE
+        if is_stale or (self._is_blind and settings.stale != IGNORE):
+            return self._capped(motion, 0.0 if settings.stale == STOP else settings.slow_mps,
+                                RING_STALE if is_stale else UNSEEN)
         moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
         speed_mps = abs(motion.velocity_mps)
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
@@ -132,7 +147,11 @@ class CollisionMonitor:
         points = _within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
-            allowances.append(self._into_unknown(_within_reach(self._unknown, moved, reach_m), motion))
+            ends = _within_reach(self._unknown, moved, reach_m)
+            allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
+        if settings.stale != IGNORE and self._unwatched:
+            ends = _within_reach(self._unwatched, moved, reach_m)
+            allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
         if self._moving:
             allowances.append(self._before_moving(moved, age_s, motion))
         return min(allowances)
@@ -180,15 +199,18 @@ class CollisionMonitor:
         is_near = any(0.0 <= side * x <= far_m and abs(y) <= wide_m for x, y in points)
         return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
 
-    def _into_unknown(self, unknown: list[Point], motion: Twist) -> Allowance:
-        """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all."""
+    def _into_unknown(self, unknown: list[Point], motion: Twist, policy: str, reason: str) -> Allowance:
+        """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all.
+
+        policy: STOP or SLOW.
+        """
         if abs(motion.velocity_mps) <= TURN_MPS:
             return FREE
         least = 0.0
-        if self._settings.unknown != STOP:
+        if policy != STOP:
             least = min(1.0, self._settings.slow_mps / abs(motion.velocity_mps))
         share = max(self._share_before(unknown, motion), least)
-        return FREE if share >= 1.0 else Allowance(share, UNKNOWN)
+        return FREE if share >= 1.0 else Allowance(share, reason)
 
     def _before_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
         """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be."""

@@ -29,6 +29,8 @@ class CollisionSettings:
     slow_mps: float = knob(0.2, "speed near obstacles and into the unknown, m/s", low=0.01, high=10)
     unknown: str = knob(STOP, "at the end of the floor that was seen, where nothing is known: stop; slow drives on at "
                         "slow_mps, also into a plain wall", choices=(STOP, SLOW, IGNORE))
-    stale: str = knob(STOP, "when the newest ring of obstacles is older than stale_s, or there is none",
+    stale: str = knob(STOP, "when nothing fresh is known of the way: the newest ring of obstacles is older than "
+                      "stale_s, there is none, or its images are frozen, dark or dirty there",
                       choices=(STOP, SLOW, IGNORE))
-    stale_s: float = knob(0.8, "age of the images of the newest ring beyond which it is stale, s", low=0.1, high=10)
+    stale_s: float = knob(0.5, "no motion without evidence: the base drives by what its images of so long ago, or "
+                          "newer ones, showed, whatever the pose says, s", low=0.1, high=10)

@@ -47,6 +47,7 @@ class LocalMap:
         self.store = LandmarkStore(model, max_keyframes, max_misses)
         self.late_depths = LateDepths(self.store)
         self._last: PaddedPanorama | None = None
+        self.lost: NDArray[np.bool_] | None = None  # (H, W) of the frame, in which no landmark is searched; None: none
 
     def __len__(self) -> int:
         return len(self.store)
@@ -90,11 +91,17 @@ class LocalMap:
         return Tracks(rows[found], pixels[found], predicted[found], len(rows), count / max(1, len(rows)))
 
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
-        """Return the landmarks (M,) that a pose predicts within the panorama, and their views (M, 3) [px]."""
+        """Return the landmarks (M,) that a pose predicts in live parts of the panorama, and their views (M, 3) [px]."""
         points = se3.apply(se3.inverse(T_odom_rect), self.store.table.points)
         predicted = view(points, self._model.cylinder, self._model.baseline_m)
         bottom = self._model.cylinder.height - 1 - EDGE_ROWS
-        rows = np.flatnonzero((predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom))
+        is_inside = (predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom)
+        if self.lost is not None:
+            height, width = self.lost.shape
+            columns = np.rint(np.nan_to_num(predicted[:, 0])).astype(np.intp) % width
+            pixel_rows = np.clip(np.rint(np.nan_to_num(predicted[:, 1])), 0, height - 1).astype(np.intp)
+            is_inside &= ~self.lost[pixel_rows, columns]
+        rows = np.flatnonzero(is_inside)
         return rows, predicted[rows]
 
     def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, shift: Array

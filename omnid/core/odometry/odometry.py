@@ -77,6 +77,7 @@ class VisualOdometry:
         self.complete()
         dt_s = max(dt_s, 0.0)
         self._step = None
+        self._map.lost = frame.lost
         usable = self._static_mask.without(frame.usable)
         if self._previous is None:
             return self._start_without_map(frame, usable, dt_s)

@@ -28,6 +28,7 @@ class StereoFrame:
     sensed: SensedMotion | None = None  # since the frame before, by wheels and gyro; None: not known
     # The motion for which disparities are corrected; None: not known, so that they are as seen.
     exposure: Exposure | None = None
+    lost: NDArray[np.bool_] | None = None  # (H, W) pixels in parts that are dead or blind; None: there are none
 
     @property
     def disparity(self) -> NDArray[np.float32]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,11 +21,12 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.types.panorama import PaddedPanorama
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.diagnostics.status import TIMEOUT_S, StatusCollector, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.messages import OdometryUpdate
+from omnid.messages import OdometryUpdate, Panoramas, StereoDepth
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
@@ -100,7 +100,8 @@ class Daemon:
             self.pair.process(Frame(0, time.monotonic_ns() - round(age_s * 1e9), camera, "jpeg", data))
 
     def pose(self, state: str = "tracking", age_s: float = 0.0) -> None:
-        depth: Any = None
+        panorama = PaddedPanorama(np.zeros((4, 8), np.uint8), 1)
+        depth = StereoDepth(Panoramas(0, 0, panorama, panorama, np.ones((4, 6), bool)))
         odometry = OdometryUpdate(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
                             np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
         self.statistics.process(odometry)

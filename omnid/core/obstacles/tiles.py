@@ -1,0 +1,178 @@
+"""Live parts of images: tiles of a panorama that are dead or blind, and the directions in which nothing is known.
+
+A whole image that repeats is left out before (stages/repeated_images.py). A part of one goes on in a pair that tracks:
+a region that a driver no longer writes, dirt or a drop on a mirror, darkness, glare. Each is a property of a tile:
+
+    dead      each pixel is as in the image before, or less changed than the noise of a live image changes it,
+              twice in a row, while other tiles change. Noise changes a live tile even where nothing moves.
+    dark      its mean is not above black
+    glaring   most of its pixels are saturated
+    blurred   a column of tiles has lost its gradient energy beside the same column of the other camera, which sees the
+              same things from 0.1 to 0.4 m above or below; the median over all columns is the two cameras' own ratio
+
+The last three are blind. A direction is unknown where one tile of either camera is dead, or too many are blind.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Side = Literal["lower", "upper"]
+SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
+
+# 6 degrees: 15 columns of a panorama at scale 1 (512 px images), less than the narrowest part that matters.
+TILE_COLUMNS: Final = 60
+TILE_ROWS: Final = 4  # 63 rows at scale 1
+JUDGED_SHARE: Final = 0.5  # of a tile that shows the world; one of which less does is not judged
+IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts; one may be a glitch of a driver
+LEAST_ALIVE: Final = 0.1  # of the judged tiles that must change before others are dead: else the whole image stands
+# Mean change between two images with independent noise of sigma is 2 sigma / sqrt(pi).
+NOISE_CHANGE: Final = 1.128
+# Of it. The noise is that of the smoothest blocks, and pixels of a panorama are interpolated from compressed images:
+# in the sample log live tiles change by a fifth of it at least.
+NOISE_SHARE: Final = 0.1
+MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, and says nothing about a tile
+BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
+SATURATED_GREY, SATURATED_SHARE = 250, 0.8
+# Of the energy beside the other camera's. In live images it was 0.57 at least in the sample log and 0.31 in rendered
+# rooms and bare corridors of development seeds; a drop leaves a tenth.
+BLURRED_SHARE: Final = 0.2
+LEAST_ENERGY: Final = 2.0  # of a column, in variances of the noise: with less texture no blur is seen
+COMPARED_COLUMNS: Final = 15  # that have so much, at least: else a single poster decides what is usual
+BLIND_SHARE: Final = 0.5  # of the judged tiles of a column, of which more blind ones make its direction unknown
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileStates:
+    """State of the tiles of a pair."""
+
+    dead: dict[Side, Flags] = field(default_factory=dict)  # (TILE_ROWS, TILE_COLUMNS)
+    blind: dict[Side, Flags] = field(default_factory=dict)  # the same
+    columns: dict[Side, Flags] = field(default_factory=dict)  # (TILE_COLUMNS,) in which it shows nothing to rely on
+    since_ns: dict[Side, int] = field(default_factory=dict)  # first pair of those in a row with such columns
+
+    @property
+    def unknown(self) -> Flags:
+        """Return the columns of tiles (TILE_COLUMNS,) in which the pair shows nothing to rely on."""
+        found = np.zeros(TILE_COLUMNS, bool)
+        for columns in self.columns.values():
+            found |= columns
+        return found
+
+    def lost_pixels(self, shape: tuple[int, ...]) -> Flags | None:
+        """Return the pixels (H, W) of directions that are unknown, and of single tiles that are dead or blind.
+
+        Both panoramas share columns, but a point lies in different rows of them. None: all tiles live.
+        """
+        if not self.columns:
+            return None
+        tiles = np.repeat(self.unknown[None], TILE_ROWS, axis=0)
+        for states in (self.dead, self.blind):
+            for side in SIDES:
+                tiles |= states[side]
+        return of_pixels(tiles, (shape[0], shape[1]))
+
+
+ALL_LIVE: Final = TileStates()
+
+
+class TileMonitor:
+    """Follows the tiles of both panoramas from pair to pair."""
+
+    def __init__(self, visible: Flags) -> None:
+        """visible (H, W): pixels that show the world."""
+        self._visible = visible.astype(np.float32)
+        self._share = _means(self._visible)
+        self._judged = self._share >= JUDGED_SHARE
+        half = (visible.shape[1] // 2, visible.shape[0] // 2)
+        # Pixels at half resolution, all of which show the world, and so do those beside them.
+        shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))
+        self._half = (cv2.resize(shown.astype(np.float32), half, interpolation=cv2.INTER_AREA) >= 1).astype(np.float32)
+        self._half_share = cv2.resize(self._half, (TILE_COLUMNS, 1), interpolation=cv2.INTER_AREA)[0]
+        self._before: dict[Side, Image] = {}
+        self._since_ns = dict.fromkeys(SIDES, 0)
+        self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
+        self._faint = {side: np.zeros(TILE_COLUMNS, np.intp) for side in SIDES}  # pairs in a row with little energy
+
+    def update(self, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
+        """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey."""
+        # 1. What each camera shows by itself.
+        dead = {side: self._dead(side, images[side], noise_grey[side]) for side in SIDES}
+        blind = {side: self._dark_or_glaring(images[side]) for side in SIDES}
+        # 2. What one camera does not show that the other one does.
+        energy = {side: self._energy(images[side]) for side in SIDES}
+        for side, other in zip(SIDES, reversed(SIDES), strict=True):
+            blind[side] |= self._judged & self._blurred(side, energy[side], energy[other], noise_grey[other])
+        # 3. Directions.
+        counts = np.maximum(self._judged.sum(axis=0), 1)
+        columns = {side: dead[side].any(axis=0) | (blind[side].sum(axis=0) > BLIND_SHARE * counts) for side in SIDES}
+        for side in SIDES:
+            self._since_ns[side] = (self._since_ns[side] or stamp_ns) if columns[side].any() else 0
+        if not any(states[side].any() for states in (dead, blind) for side in SIDES):
+            return ALL_LIVE
+        return TileStates(dead, blind, columns, dict(self._since_ns))
+
+    def _dead(self, side: Side, image: Image, noise_grey: float) -> Flags:
+        """Return the tiles of a camera that do not change."""
+        before, self._before[side] = self._before.get(side), image
+        if before is None or before.shape != image.shape:
+            return np.zeros_like(self._judged)
+        change = self._mean(cv2.absdiff(image, before).astype(np.float32))
+        least = NOISE_SHARE * NOISE_CHANGE * noise_grey if noise_grey >= MEASURED_NOISE_GREY else 0.0
+        # Black and saturated pixels have no noise, and a plain one may have lost it by compression: they are not dead.
+        shows = self._judged & ~self._dark_or_glaring(image)
+        is_still = shows & (change <= least)
+        enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
+        self._still[side] = np.where(is_still & enough, self._still[side] + 1, 0)
+        return np.asarray(self._still[side] >= IN_A_ROW)
+
+    def _dark_or_glaring(self, image: Image) -> Flags:
+        saturated = self._mean((image >= SATURATED_GREY).astype(np.float32))
+        return np.asarray(self._judged & ((self._mean(image.astype(np.float32)) < BLACK_GREY)
+                                          | (saturated > SATURATED_SHARE)))
+
+    def _energy(self, image: Image) -> Floats:
+        """Return the gradient energy (TILE_COLUMNS,) of columns of tiles at half resolution, grey levels squared.
+
+        There the noise is halved, and the texture that dirt takes away is not.
+        """
+        half = cv2.resize(image, (self._half.shape[1], self._half.shape[0]), interpolation=cv2.INTER_AREA)
+        grey = half.astype(np.float32)
+        squared = np.zeros_like(grey)
+        squared[:, 1:] += (grey[:, 1:] - grey[:, :-1]) ** 2
+        squared[1:] += (grey[1:] - grey[:-1]) ** 2
+        column = cv2.resize(squared * self._half, (TILE_COLUMNS, 1), interpolation=cv2.INTER_AREA)[0]
+        return np.asarray(column / np.maximum(self._half_share, 1e-6), np.float32)
+
+    def _blurred(self, side: Side, energy: Floats, other: Floats, noise_grey: float) -> Flags:
+        """Return the columns (TILE_COLUMNS,) in which a camera shows far less than the other one does."""
+        textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
+        if textured.sum() < COMPARED_COLUMNS:
+            self._faint[side][:] = 0
+            return np.zeros(TILE_COLUMNS, bool)
+        ratio = energy / np.maximum(other, 1e-6)
+        usual = float(np.median(ratio[textured]))
+        is_faint = textured & (ratio < BLURRED_SHARE * usual)
+        self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
+        return np.asarray(self._faint[side] >= IN_A_ROW)
+
+    def _mean(self, values: Floats) -> Floats:
+        """Return the means (TILE_ROWS, TILE_COLUMNS) of values (H, W) over the pixels that show the world."""
+        return np.asarray(_means(values * self._visible) / np.maximum(self._share, 1e-6), np.float32)
+
+
+def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
+    """Return flags of the pixels (H, W) of tiles (TILE_ROWS, TILE_COLUMNS)."""
+    return np.asarray(cv2.resize(tiles.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
+
+
+def _means(values: Floats) -> Floats:
+    return np.asarray(cv2.resize(values, (TILE_COLUMNS, TILE_ROWS), interpolation=cv2.INTER_AREA), np.float32)

@@ -1,0 +1,65 @@
+"""Directions of the base in which the images show nothing to rely on, and what that makes of a ring."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.panorama import Cylinder
+from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.obstacles.observation import Observation
+from omnid.core.obstacles.tiles import TILE_COLUMNS
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# A direction of the cameras is one of the base only far away: the viewpoint may lie beside the base's origin.
+RANGES_M: Final = (0.3, 0.6, 1.2, 2.5, 5.0)
+SAMPLES: Final = 13  # across a tile of 6 degrees: two in each sector
+
+
+class Unwatched:
+    """Maps columns of tiles to sectors of the ring."""
+
+    def __init__(self, cylinder: Cylinder, T_base_rect: Array) -> None:
+        """T_base_rect (4, 4): from the rectified frame to the base."""
+        within = np.linspace(0.0, 1.0, SAMPLES)
+        columns = (np.arange(TILE_COLUMNS)[:, None] + within) * (cylinder.width / TILE_COLUMNS) - 0.5
+        pixels = np.column_stack([columns.ravel(), np.full(columns.size, cylinder.row0)])
+        direction = cylinder.rays(pixels) @ T_base_rect[:3, :3].T
+        places = np.array(RANGES_M)[:, None, None] * direction[:, :2] + T_base_rect[:2, 3]
+        turned = (np.arctan2(places[..., 1], places[..., 0]) + math.pi) * (SECTORS / (2 * math.pi))
+        sectors = np.floor(turned).astype(np.intp) % SECTORS
+        self._sectors = sectors.reshape(len(RANGES_M), TILE_COLUMNS, SAMPLES)
+
+    def sectors(self, columns: Flags) -> Flags:
+        """Return the sectors (SECTORS,) of columns of tiles (TILE_COLUMNS,)."""
+        found = np.zeros(SECTORS, bool)
+        found[self._sectors[:, columns]] = True
+        return found
+
+
+    def spans_deg(self, columns: Flags) -> list[tuple[int, int]]:
+        """Return from where to where columns of tiles lie about the base, counter-clockwise from ahead [deg]."""
+        marked = np.zeros(SECTORS, bool)
+        marked[self._sectors[-1, columns]] = True
+        if marked.all():
+            return [(0, 360)]
+        begins = np.flatnonzero(marked & ~np.roll(marked, 1))
+        ends = np.flatnonzero(marked & ~np.roll(marked, -1))
+        if len(ends) and ends[0] < begins[0]:
+            ends = np.roll(ends, -1)
+        # Sector 0 is behind.
+        return [((int(begin) - 180) % 360, (int(end) + 1 - 180) % 360) for begin, end in zip(begins, ends, strict=True)]
+
+
+def without(seen: Observation, unwatched: Flags) -> Observation:
+    """Return the ring without what is said about unwatched sectors (SECTORS,): no range, and no free floor."""
+    if not unwatched.any():
+        return seen
+    nan = np.float32(np.nan)
+    return seen._replace(ranges_m=np.where(unwatched, nan, seen.ranges_m), free_m=np.where(unwatched, 0, seen.free_m),
+                         sigma_m=np.where(unwatched, nan, seen.sigma_m), plane_m=np.where(unwatched, 0, seen.plane_m))

@@ -1,0 +1,55 @@
+"""Status of the images' parts: which ones are frozen or blind, of which camera, about the base."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.obstacles.tiles import SIDES, Side, TileStates
+from omnid.core.obstacles.unwatched import Unwatched
+from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.engine.flow import nothing
+from omnid.stages.geometry import Geometry
+from omnid.transport.codec import ERROR, OK, STALE, DiagnosticStatus
+from omnid.transport.status_names import IMAGES, lost_parts_key
+
+LIVE = "all parts are live"
+
+
+class ImagesStatus:
+    """The entry; a call makes it from the newest pair."""
+
+    def __init__(self, geometry: Geometry, statistics: RunStatistics, report: Callable[[str], object] = nothing
+                 ) -> None:
+        """report: takes a line for the log where the message changes."""
+        self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
+        self._statistics, self._report, self._message = statistics, report, LIVE
+
+    def __call__(self) -> DiagnosticStatus:
+        """Return the entry."""
+        newest = self._statistics.newest
+        if newest is None:
+            return DiagnosticStatus(IMAGES, STALE, "no pose yet", {})
+        tiles = newest.depth.panoramas.tiles
+        lost = [side for side in SIDES if side in tiles.columns and tiles.columns[side].any()]
+        message = "; ".join(self._named(side, tiles) for side in lost) or LIVE
+        if message != self._message:
+            self._report(f"images: {message}")
+        self._message = message
+        values = {lost_parts_key(side): f"{(newest.stamp_ns - tiles.since_ns[side]) * 1e-9:.0f}" for side in lost}
+        return DiagnosticStatus(IMAGES, ERROR if lost else OK, message, values)
+
+    def _named(self, side: Side, tiles: TileStates) -> str:
+        """Return what a camera does not show, such as "the upper camera is blind from 300 to 40 degrees"."""
+        columns, is_dead = tiles.columns[side], tiles.dead[side].any(axis=0)
+        parts = [f"{word} {self._directions(found)}"
+                 for word, found in (("frozen", columns & is_dead), ("blind", columns & ~is_dead)) if found.any()]
+        return f"the {side} camera is {' and '.join(parts)}"
+
+    def _directions(self, columns: NDArray[np.bool_]) -> str:
+        spans = self._unwatched.spans_deg(columns)
+        if spans == [(0, 360)]:
+            return "all around"
+        return " and ".join(f"from {begin} to {end} degrees" for begin, end in spans)

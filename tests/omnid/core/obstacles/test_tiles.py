@@ -1,0 +1,154 @@
+"""Dead and blind tiles of panoramas with a sensor's noise."""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from omnid.core.obstacles.tiles import (
+    ALL_LIVE,
+    IN_A_ROW,
+    SIDES,
+    TILE_COLUMNS,
+    TILE_ROWS,
+    Side,
+    TileMonitor,
+    TileStates,
+    of_pixels,
+)
+
+Image = NDArray[np.uint8]
+SHAPE = (256, 900)
+NOISE_GREY = {"lower": 2.0, "upper": 2.0}
+PART = slice(300, 600)  # columns: a third
+INSIDE, OUTSIDE = slice(21, 39), [*range(19), *range(41, 60)]  # tiles of it, and those that it does not touch
+
+
+class Cameras:
+    """Two cameras that look at one textured scene, which may move by columns."""
+
+    def __init__(self, noise_grey: float = 2.0, seed: int = 1) -> None:
+        self._rng, self._noise_grey = np.random.default_rng(seed), noise_grey
+        coarse = self._rng.integers(40, 200, (SHAPE[0] // 4, SHAPE[1] // 4)).astype(np.uint8)
+        self.scene = cv2.resize(coarse, SHAPE[::-1], interpolation=cv2.INTER_LINEAR)
+        self.monitor = TileMonitor(np.ones(SHAPE, bool))
+        self._stamp_ns = 0
+
+    def images(self, moved_px: int = 0) -> dict[Side, Image]:
+        """Return both images."""
+        return {side: self._noisy(np.roll(self.scene, (shift, moved_px), (0, 1)))
+                for side, shift in zip(SIDES, (0, 8), strict=True)}
+
+    def update(self, images: dict[Side, Image]) -> TileStates:
+        """Return the states after a pair, 0.1 s after the one before."""
+        self._stamp_ns += 100_000_000
+        return self.monitor.update(self._stamp_ns, images, NOISE_GREY)
+
+    def _noisy(self, image: Image) -> Image:
+        noise = self._noise_grey * self._rng.standard_normal(SHAPE)
+        return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+def frozen(cameras: Cameras, pairs: int, side: Side = "upper") -> Iterator[TileStates]:
+    """Yield the states of pairs in which the part of one camera stays as it was, while all else moves."""
+    kept = cameras.images()[side][:, PART].copy()
+    for number in range(pairs):
+        images = cameras.images(moved_px=3 * number)
+        images[side][:, PART] = kept
+        yield cameras.update(images)
+
+
+def test_a_part_that_stays_as_it_was_is_dead_at_the_second_repetition_and_live_when_it_changes() -> None:
+    """The first image of the part is no repetition."""
+    cameras = Cameras()
+    states = list(frozen(cameras, IN_A_ROW + 1))
+    assert states[-2] is ALL_LIVE
+    assert states[-1].dead["upper"][:, INSIDE].all() and not states[-1].dead["upper"][:, OUTSIDE].any()
+    assert not states[-1].dead["lower"].any()
+    assert states[-1].unknown[INSIDE].all() and not states[-1].unknown[OUTSIDE].any()
+    assert cameras.update(cameras.images(moved_px=40)) is ALL_LIVE
+
+
+def test_a_scene_that_stands_is_live_by_its_noise() -> None:
+    """Noise of the sensor differs from image to image."""
+    cameras = Cameras()
+    assert all(cameras.update(cameras.images()) is ALL_LIVE for _ in range(6))
+
+
+def test_what_a_codec_writes_again_with_hardly_any_noise_is_dead() -> None:
+    """A tenth of the pixels that change by one grey level is not the noise of a sensor."""
+    cameras = Cameras()
+    rng, kept, found = np.random.default_rng(2), cameras.images()["lower"][:, PART].copy(), ALL_LIVE
+    for number in range(IN_A_ROW + 1):
+        images = cameras.images(moved_px=3 * number)
+        images["lower"][:, PART] = kept + (rng.random(kept.shape) < 0.1)
+        found = cameras.update(images)
+    assert found.dead["lower"][:, INSIDE].all()
+
+
+def test_without_noise_a_scene_in_which_a_little_moves_is_live() -> None:
+    """Images of a simulator, or of a camera that removes noise: the base stands, somebody walks."""
+    cameras = Cameras(noise_grey=0.0)
+    for number in range(6):
+        images = cameras.images()
+        for image in images.values():
+            image[:, 30 + 4 * number : 60 + 4 * number] = 90
+        assert cameras.update(images) is ALL_LIVE
+
+
+def test_dark_and_saturated_parts_are_blind_at_once() -> None:
+    """Each of them, in one image."""
+    cameras = Cameras()
+    for grey in (4, 255):
+        images = cameras.images()
+        images["lower"][:, PART] = grey
+        states = cameras.update(images)
+        assert states.blind["lower"][:, INSIDE].all() and states.unknown[INSIDE].all(), grey
+        assert not states.unknown[OUTSIDE].any()
+
+
+def test_a_lamp_makes_no_direction_unknown() -> None:
+    """A saturated tile of four."""
+    cameras = Cameras()
+    images = cameras.images()
+    images["lower"][: SHAPE[0] // TILE_ROWS, PART] = 255
+    states = cameras.update(images)
+    assert states.blind["lower"][0, INSIDE].all() and not states.unknown.any()
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_a_part_that_only_one_camera_shows_blurred_is_blind(side: Side) -> None:
+    """A drop on its mirror: the noise stays, the texture goes."""
+    cameras, states = Cameras(), ALL_LIVE
+    for number in range(IN_A_ROW):
+        images = cameras.images(moved_px=3 * number)
+        smooth = cv2.GaussianBlur(cameras.images(moved_px=3 * number)[side], (0, 0), 9).astype(float)
+        noise = np.random.default_rng(number).normal(0, 2, SHAPE)
+        images[side][:, PART] = np.clip(np.rint(smooth + noise), 0, 255).astype(np.uint8)[:, PART]
+        states = cameras.update(images)
+    assert states.blind[side][:, INSIDE].all() and not states.unknown[OUTSIDE].any()
+
+
+def test_a_plain_part_of_the_scene_is_not_blind() -> None:
+    """Both cameras show it plain: nothing is lost on the way."""
+    cameras = Cameras()
+    cameras.scene[:, PART] = 120
+    assert all(cameras.update(cameras.images()) is ALL_LIVE for _ in range(4))
+
+
+def test_the_time_of_a_lost_part_counts_from_its_first_pair() -> None:
+    """It does not begin again from pair to pair."""
+    cameras = Cameras()
+    states = list(frozen(cameras, IN_A_ROW + 6))
+    first_ns = (IN_A_ROW + 1) * 100_000_000
+    assert {found.since_ns["upper"] for found in states if found is not ALL_LIVE} == {first_ns}
+
+
+def test_pixels_of_tiles() -> None:
+    """Each tile covers its part of the panorama."""
+    tiles = np.zeros((TILE_ROWS, TILE_COLUMNS), bool)
+    tiles[1, 20] = True
+    found = of_pixels(tiles, SHAPE)
+    assert found[64:128, 300:315].all() and found.sum() == 64 * 15

@@ -1,0 +1,57 @@
+"""Directions of the base in which the images show nothing to rely on."""
+
+import math
+
+import numpy as np
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.obstacles.observation import Observation
+from omnid.core.obstacles.tiles import TILE_COLUMNS
+from omnid.core.obstacles.unwatched import Unwatched, without
+
+CYLINDER = Cylinder(width=900, height=250, row0=80.0)
+AHEAD = np.zeros(TILE_COLUMNS, bool)
+AHEAD[27:33] = True  # 36 degrees about azimuth 0, which is in the middle of the panorama
+
+
+def test_columns_are_sectors_about_the_same_azimuth() -> None:
+    """The middle of the panorama is ahead, and azimuth falls from left to right."""
+    unwatched = Unwatched(CYLINDER, np.eye(4))
+    found = np.flatnonzero(unwatched.sectors(AHEAD))
+    assert found.min() in (161, 162) and found.max() in (197, 198) and len(found) <= 38
+    left = np.zeros(TILE_COLUMNS, bool)
+    left[14] = True
+    assert (np.flatnonzero(unwatched.sectors(left)) - 180 > 80).all()
+
+
+def test_a_viewpoint_beside_the_origin_covers_near_and_far_directions() -> None:
+    """Cameras 0.3 m to the left: what is ahead of them is to the left of the base where it is near."""
+    T_base_rect = se3.transform(np.eye(3), [0.0, 0.3, 0.9])
+    found = Unwatched(CYLINDER, T_base_rect).sectors(AHEAD)
+    for range_m in (0.6, 1.2, 4.0):
+        azimuth = math.atan2(0.3, range_m)
+        assert found[math.floor((azimuth + math.pi) * SECTORS / math.tau)], range_m
+
+
+def test_spans_are_named_counter_clockwise_from_ahead() -> None:
+    """Across ahead, across the seam behind, all around and none."""
+    unwatched = Unwatched(CYLINDER, np.eye(4))
+    (begin, end), = unwatched.spans_deg(AHEAD)
+    assert begin in (341, 342) and end in (18, 19)
+    (begin, end), = unwatched.spans_deg(np.roll(AHEAD, TILE_COLUMNS // 2))
+    assert begin in (161, 162) and end in (198, 199)
+    assert unwatched.spans_deg(np.ones(TILE_COLUMNS, bool)) == [(0, 360)]
+    assert unwatched.spans_deg(np.zeros(TILE_COLUMNS, bool)) == []
+
+
+def test_unwatched_sectors_have_neither_range_nor_free_floor() -> None:
+    """No range, no free floor, and the rest as it was."""
+    ranges = np.full(SECTORS, 2.0, np.float32)
+    seen = Observation(ranges, 0.1 * ranges, ranges, plane_m=ranges)
+    where = np.arange(SECTORS) < 90
+    found = without(seen, where)
+    assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any() and not found.plane_m[:90].any()
+    assert (found.ranges_m[90:] == 2.0).all() and (found.free_m[90:] == 2.0).all()
+    assert without(seen, np.zeros(SECTORS, bool)) is seen
