@@ -26,6 +26,8 @@ class MotorStatus:
     watchdog_expired: bool  # the controller's watchdog had stopped the wheels before this command
     fault: int  # 0 if none; else the controller's own number
     battery_v: float  # NaN if unknown
+    bumper: bool = False  # a bumper that is wired to the controller is pressed
+    cliff: bool = False  # a cliff sensor that is wired to it sees no floor
 
 
 class MotorDriver(Protocol):

@@ -14,6 +14,7 @@ from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing, remedy
 from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, Motion
@@ -76,6 +77,10 @@ class Controller:
     def stop(self, asked_ns: int) -> None:
         """Stop the wheels at the next tick, until a request to arm that arrives later."""
         self._law.stop(asked_ns)
+
+    def touch(self, contacts: ContactState) -> None:
+        """Replace the state of bumpers and cliff sensors on the bus."""
+        self._law.contacts.update(BUS, contacts)
 
     def arm(self, request: ArmRequest) -> None:
         """Ask to arm: the wheels may turn from the next tick on, by setpoints that arrive later."""
@@ -185,6 +190,7 @@ class Controller:
         self._motor_stopped = status.watchdog_expired
         self.state.expiries += status.watchdog_expired
         self.state.fault, self.state.battery_v = status.fault, status.battery_v
+        self._law.contacts.update(MOTOR, ContactState(status.bumper, status.cliff))
         if status.watchdog_expired:  # it stands: the command was not obeyed
             self._law.stand()
         self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)

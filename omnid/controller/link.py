@@ -17,6 +17,7 @@ from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import S_PER_NS, ControllerPose
 from omnid.engine.flow import nothing
 from omnid.engine.python_program import python, python_environment
@@ -41,7 +42,7 @@ class ControllerLink:
         self._report = report
         self.take_wheels: Callable[[WheelSample], object] = nothing  # called with what the motor controller reports
         self.statistics = ControllerStatistics(stats)
-        self._stop_ns = 0
+        self._stop_ns, self._contacts = 0, NO_CONTACT
         self._ended_ns = 0  # when the process was asked to end
         here, there = socket_pair()
         self._channel = Channel(here)
@@ -69,6 +70,11 @@ class ControllerLink:
     def stop(self) -> None:
         """Stop the wheels until `arm` is called later; from any thread."""
         self._stop_ns = time.monotonic_ns()
+        self._send(None)
+
+    def touch(self, contact: str, *, holds: bool) -> None:
+        """Report a bumper or a cliff sensor (BUMPER, CLIFF); as long as it holds, the base stands. From one thread."""
+        self._contacts = self._contacts.after(contact, holds=holds)
         self._send(None)
 
     def arm(self, request: ArmRequest) -> None:
@@ -112,7 +118,7 @@ class ControllerLink:
         self._channel.close()
 
     def _send(self, update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None) -> None:
-        self._channel.send(ControllerUpdate(self._stop_ns, update))
+        self._channel.send(ControllerUpdate(self._stop_ns, update, self._contacts))
 
     def _receive(self, timeout_s: float) -> object:
         """Return the next report, which is counted or logged, or NO_MESSAGE; EOFError once the process has ended."""

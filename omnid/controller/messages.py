@@ -8,6 +8,7 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.engine.realtime import RealtimeSettings
 
@@ -23,13 +24,15 @@ class ControllerStart(NamedTuple):
 
 
 class ControllerUpdate(NamedTuple):
-    """One message of the daemon: a pose, a ring, a setpoint or a request to arm, if any, and always the last stop.
+    """One message of the daemon: a pose, a ring, a setpoint or a request to arm, if any; always the last stop and the
+    contacts.
 
     So a stop arrives with the next message that does, even if its own was lost.
     """
 
     stop_ns: int  # 0: none
     update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None
+    contacts: ContactState = NO_CONTACT  # of bumpers and cliff sensors on the bus
 
 
 class StartFailed(NamedTuple):

@@ -76,6 +76,7 @@ class ControllerLoop:
 
     def _take(self, message: ControllerUpdate) -> None:
         self._controller.stop(message.stop_ns)
+        self._controller.touch(message.contacts)
         if isinstance(message.update, ControllerPose):
             self._controller.set_pose(message.update)
         elif isinstance(message.update, ControllerRing):

@@ -32,6 +32,7 @@ PLAIN_TWIST_SCHEMA = "geometry_msgs/msg/Twist"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
+BOOL_SCHEMA = "std_msgs/msg/Bool"
 _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
 SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, MAP_POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA,
            TWIST_SCHEMA, VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
@@ -301,6 +302,18 @@ def stamp_from_cdr(payload: bytes) -> int:
     message = message_from_cdr(payload, HEADER_SCHEMA)
     assert isinstance(message, ros.std_msgs__msg__Header)
     return unchecked_stamp_ns(message.stamp)
+
+
+def bool_cdr(value: bool) -> bytes:
+    """Encode a std_msgs/msg/Bool, which is the message of cmd/bumper and cmd/cliff."""
+    return message_cdr(ros.std_msgs__msg__Bool(value), BOOL_SCHEMA)
+
+
+def bool_from_cdr(payload: bytes) -> bool:
+    """Decode a Bool. Raise OmnidError for any other bytes."""
+    message = message_from_cdr(payload, BOOL_SCHEMA)
+    assert isinstance(message, ros.std_msgs__msg__Bool)
+    return bool(message.data)
 
 
 def message_from_cdr(payload: bytes, schema: str) -> object:

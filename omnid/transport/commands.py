@@ -4,6 +4,7 @@ twist is a geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z 
 the time of sending that rmw_zenoh attaches. heading is a
 geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. Both also exist for each source of
 commands, as cmd/planner/twist. stop may have any payload. arm is a std_msgs/msg/Header with the time it was sent.
+bumper and cliff are std_msgs/msg/Bool with the time of sending attached: whatever is not a fresh False is a contact.
 """
 
 from __future__ import annotations
@@ -16,9 +17,12 @@ from typing import Final, NamedTuple, Protocol
 
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
+from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
+from omnid.transport import topics
 from omnid.transport.codec import (
+    bool_from_cdr,
     heading_from_cdr,
     is_plain_twist,
     plain_twist_from_cdr,
@@ -35,11 +39,12 @@ MAX_SPEED_MPS, MAX_YAW_RATE_RADPS, MAX_HEADING_RAD = 20.0, 50.0, 1000.0  # large
 MALFORMED: Final = "malformed"
 SAME_NAME: Final = "another robot has this name"
 _ADVICE: Final = ADVICE | {
-    MALFORMED: "twist takes TwistStamped or Twist, heading Vector3Stamped, arm Header, as CDR",
+    MALFORMED: "twist takes TwistStamped or Twist, heading Vector3Stamped, arm Header, bumper and cliff Bool, as CDR",
     SAME_NAME: "change bus.robot of one of them",
     "wrong frame": "give base_link for twist, odom for heading, or none",
     "unknown topic": "see controller.sources.names",
 }
+_CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}
 _MAX_KEY: Final = 60  # characters of a key in the log
 
 
@@ -96,6 +101,9 @@ class CommandTarget(Protocol):
     def arm(self, request: ArmRequest) -> None:
         """Take a request to arm."""
 
+    def touch(self, contact: str, *, holds: bool) -> None:
+        """Take the state of a bumper or a cliff sensor."""
+
 
 class CommandReceiver:
     """Passes valid commands on and counts the others by reason; called from threads of the bus.
@@ -132,7 +140,9 @@ class CommandReceiver:
             self._target.stop()
             return
         try:
-            if key == ARM:
+            if key in _CONTACTS:
+                self._touch(key, payload, sent_ns)
+            elif key == ARM:
                 self._arm(payload, arrival_ns)
             else:
                 self._drive(key, payload, arrival_ns, sender, sent_ns)
@@ -146,6 +156,17 @@ class CommandReceiver:
         if self._report is not None:
             advice = f"; {_ADVICE[reason]}" if reason in _ADVICE else ""
             self._report(f"a command on {ascii(key)[1:-1][:_MAX_KEY]} is refused: {reason}{advice}")
+
+    def _touch(self, key: str, payload: bytes, sent_ns: int) -> None:
+        """Pass a contact on: only a Bool of False with a fresh stamp says that there is none."""
+        holds = True
+        try:
+            _check_length(payload)
+            if not bool_from_cdr(payload):
+                self._stamps.check(key, sent_ns)
+                holds = False
+        finally:
+            self._target.touch(_CONTACTS[key], holds=holds)
 
     def _arm(self, payload: bytes, arrival_ns: int) -> None:
         _check_length(payload)

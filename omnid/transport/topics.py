@@ -42,6 +42,9 @@ PUBLISHED: Final = {
 }
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
+BUMPER: Final = "cmd/bumper"
+CLIFF: Final = "cmd/cliff"
+CONTACT_TOPICS: Final = {BUMPER: codec.BOOL_SCHEMA, CLIFF: codec.BOOL_SCHEMA}
 GOAL: Final = "cmd/goal"
 PATH: Final = "cmd/path"
 NAVIGATION: Final = "cmd/navigation"
@@ -65,8 +68,8 @@ def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
     setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
     named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
-    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **NAVIGATION_TOPICS, **MAP_TOPICS,
-            **SENSOR_TOPICS, **named}
+    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **CONTACT_TOPICS, **NAVIGATION_TOPICS,
+            **MAP_TOPICS, **SENSOR_TOPICS, **named}
 
 
 def ros_name(robot: str, topic: str) -> str:

@@ -12,6 +12,7 @@ Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus 
 
     controller to host
     status   = "S," seq "," velocity "," heading "," yaw_rate "," battery "," fault "," expired
+               [ "," contact ]
     armed    = "A," time                                               the watchdog time now in force
 
 | field    | unit     | range           |                                                                          |
@@ -23,6 +24,7 @@ Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus 
 | battery  | mV       | -1 .. 100000    | -1 is unknown                                                            |
 | fault    | 1        | 0 .. 65535      | 0 is none                                                                |
 | expired  | 1        | 0, 1            | 1: the watchdog had stopped the wheels before this command               |
+| contact  | 1        | 0 .. 3          | 1: a bumper is pressed; 2: a cliff sensor sees no floor; 3: both. Absent: 0 |
 | time     | ms       | 20 .. 10000     |                                                                          |
 
 A controller with a heading input steers to the heading; one without follows the yaw rate. Velocity 0 with yaw rate 0
@@ -46,17 +48,19 @@ SEQ_COUNT = 65536
 MAX_LINE = 64  # bytes
 _CRC_START = 0xFFFF
 
-_LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,7})\*([0-9A-Fa-f]{4})\r?\n?")
+_LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
 _SEQ = (0, SEQ_COUNT - 1)
 _VELOCITY = (-10_000, 10_000)
 _HEADING = (-3142, 3142)
 _YAW_RATE = (-20_000, 20_000)
 _BATTERY = (-1, 100_000)
 _FAULT = (0, 65535)
+_CONTACT = (0, 3)
+_BUMPER, _CLIFF = 1, 2
 _TIME = (20, 10_000)
 _RANGES = {
     "V": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE),
-    "S": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE, _BATTERY, _FAULT, (0, 1)),
+    "S": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE, _BATTERY, _FAULT, (0, 1), _CONTACT),
     "W": (_TIME,),
     "A": (_TIME,),
 }
@@ -68,6 +72,7 @@ _NAMES = (
     ("battery", "mV"),
     ("fault", "(a number)"),
     ("expired", "(a flag)"),
+    ("contact", "(two bits)"),
 )
 _TIME_NAME = (("watchdog time", "ms"),)
 
@@ -142,7 +147,9 @@ def _fields(message: LineMessage) -> tuple[str, list[int]]:
             return "V", [seq, *_motion(command)]
         case StatusMessage(seq, status):
             battery = -1 if math.isnan(status.battery_v) else _milli("battery", status.battery_v)
-            return "S", [seq, *_motion(status), battery, status.fault, int(status.watchdog_expired)]
+            contact = _BUMPER * status.bumper + _CLIFF * status.cliff
+            numbers = [seq, *_motion(status), battery, status.fault, int(status.watchdog_expired)]
+            return "S", [*numbers, contact] if contact else numbers
         case WatchdogRequest(watchdog_ms):
             return "W", [watchdog_ms]
         case WatchdogReply(watchdog_ms):
@@ -166,6 +173,8 @@ def _milli(name: str, value: float) -> int:
 
 def _check(kind: str, numbers: list[int]) -> None:
     ranges = _RANGES[kind]
+    if kind == "S" and len(numbers) == len(ranges) - 1:
+        numbers = [*numbers, 0]  # firmware without contacts
     if len(numbers) != len(ranges):
         raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(ranges)}; check the firmware")
     names = _NAMES if len(ranges) > 1 else _TIME_NAME
@@ -183,10 +192,12 @@ def _message(kind: str, numbers: list[int]) -> LineMessage:
     velocity_mps, heading_rad, yaw_rate_radps = (milli / 1000 for milli in numbers[1:4])
     if kind == "V":
         return VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-    battery_mv, fault, expired = numbers[4:]
+    battery_mv, fault, expired = numbers[4:7]
+    contact = numbers[7] if len(numbers) > 7 else 0
     battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
     return StatusMessage(
-        seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v)
+        seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v,
+                         bool(contact & _BUMPER), bool(contact & _CLIFF))
     )
 
 

@@ -49,6 +49,7 @@ class SimulatedBase:
         self.unsafe_resumes = 0  # motion commands to a wheel that needed a stop first
         self.watchdog_ms = 500.0  # 0 is off
         self.fault = 0
+        self.bumper = self.cliff = False  # contacts that it reports
         self.battery_v = 12.0
         self.pose: Pose = (0.0, 0.0, 0.0)
         self.velocity_mps = self.yaw_rate_radps = 0.0

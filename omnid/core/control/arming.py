@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final, NamedTuple
 
+from omnid.core.control.contacts import LATCHING
 from omnid.core.control.safety_rules import ASKED
 from omnid.settings import knob
 
@@ -45,7 +46,8 @@ class Arming:
 
     Disarmed at the start. Each fault disarms for as long as it holds; after it, mode "manual" waits for a request,
     "automatic" arms by itself. A stop that was asked for latches in both modes: only a request that arrived after it
-    releases it, so that a request that was sent before the stop, and comes through later, does not.
+    releases it, so that a request that was sent before the stop, and comes through later, does not. A bumper and a
+    cliff sensor latch as well, and no request is accepted while they hold.
     A stale command is no fault: the operator has let go of the stick, and may go on.
     """
 
@@ -55,6 +57,7 @@ class Arming:
         self._stop_ns = 0  # arrival of the newest stop
         self._released_ns = 0  # arrival of the request that released the last one
         self._request: ArmRequest | None = None
+        self._touched = False  # a contact has latched
         self.armed = False
         self.reason = STARTED  # why it is disarmed: the first cause, or a stop; empty while armed
         self.answer = NO_ANSWER
@@ -67,7 +70,7 @@ class Arming:
     @property
     def needs_request(self) -> bool:
         """True if only a request to arm lets the wheels turn again."""
-        return not self.armed and (self.stop_asked or not self._automatic)
+        return not self.armed and (self.stop_asked or self._touched or not self._automatic)
 
     def stop(self, asked_ns: int) -> None:
         """Take the time of the newest stop; an earlier one changes nothing, so it may be repeated."""
@@ -82,6 +85,7 @@ class Arming:
 
         fault: reason that disarms and holds now; empty without one. longest_s: age at which a request is too old.
         """
+        self._touched |= fault in LATCHING
         if self.armed and fault:
             self.armed, self.reason = False, fault
         if self.stop_asked:
@@ -90,10 +94,10 @@ class Arming:
         if request is not None:
             self.answer = ArmAnswer(request.stamp_ns, self._refusal(request, fault, now_ns, longest_s))
             if not self.answer.refusal:
-                self._released_ns = request.arrival_ns
+                self._released_ns, self._touched = request.arrival_ns, False
                 self._arm()
                 return request
-        if self._automatic and not fault and not self.stop_asked:
+        if self._automatic and not fault and not self.stop_asked and not self._touched:
             self._arm()
         return None
 

@@ -15,7 +15,8 @@ OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
 MOST_SOURCES: Final = 8  # so that the table is bounded
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
-_RESERVED: Final = ("twist", "heading", "stop", "arm", "goal", "path", "navigation", "route")  # topics below cmd/
+# Topics below cmd/.
+_RESERVED: Final = ("twist", "heading", "stop", "arm", "bumper", "cliff", "goal", "path", "navigation", "route")
 
 # Reasons to refuse a command, which are counted.
 UNKNOWN_SOURCE: Final = "unknown source"

@@ -14,6 +14,7 @@ from omnid.core.control.arming import AUTOMATIC, Arming, ArmRequest, arming_knob
 from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
+from omnid.core.control.contacts import Contacts
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
     HeadingController,
@@ -128,6 +129,7 @@ class ControlLaw:
         self._pose: ControllerPose | None = None
         self.arming = Arming(settings.arming)
         self.plausibility = Plausibility(settings.trust, settings.motion)
+        self.contacts = Contacts()
         self.commands = CommandSelector(settings.sources)
         self.collision = CollisionMonitor(settings.collision, settings.limits.deceleration_mps2)
         self.motion = STOP  # that the base follows now: the next step continues from it
@@ -237,4 +239,5 @@ class ControlLaw:
             motor_failed=motor_failed,
             motor_stopped=motor_stopped,
             ending=self._ending,
+            contact=self.contacts.take(),
         )

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
 from omnid.settings import knob
 from omnid.tracking_state import TrackingState
@@ -41,6 +42,7 @@ class SafetyInputs:
     motor_stopped: bool = False  # by the motor controller itself, before the last tick
     motor_faulty: bool = False  # by its own report
     battery_empty: bool = False
+    contact: str = ""  # BUMPER or CLIFF
     disagreement: str = ""  # between commanded, reported and seen motion
     stop_asked: bool = False  # and not released by cmd/arm
     armed: bool = True
@@ -77,6 +79,8 @@ COMMAND_STALE: Final = "the command is stale"
 RULES: Final = (
     Rule(ENDS, False, lambda now, _: now.ending),
     Rule(ASKED, False, lambda now, _: now.stop_asked),
+    Rule(CLIFF, True, lambda now, _: now.contact == CLIFF),
+    Rule(BUMPER, True, lambda now, _: now.contact == BUMPER),
     Rule(FAILED, True, lambda now, _: now.motor_failed),
     Rule(STOPPED, True, lambda now, _: now.motor_stopped),
     Rule(MOTOR_FAULT, True, lambda now, _: now.motor_faulty),

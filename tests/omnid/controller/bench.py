@@ -37,6 +37,7 @@ class Wheels:
         self.silent = self.expired = self.closed = False
         self.heading_rad, self.drive = math.nan, DifferentialDrive()
         self.fault, self.battery_v = 0, math.nan  # of its reports
+        self.bumper = self.cliff = False  # of its reports
         self.velocity_mps: float | None = 0.0  # of its reports; None: as commanded
 
     def send(self, command: VelocityCommand) -> MotorStatus:
@@ -47,7 +48,8 @@ class Wheels:
         velocity_mps, yaw_rate_radps = self.drive.limited(command)
         if self.velocity_mps is not None:
             velocity_mps, yaw_rate_radps = self.velocity_mps, 0.0
-        return MotorStatus(velocity_mps, self.heading_rad, yaw_rate_radps, self.expired, self.fault, self.battery_v)
+        return MotorStatus(velocity_mps, self.heading_rad, yaw_rate_radps, self.expired, self.fault, self.battery_v,
+                           self.bumper, self.cliff)
 
     def close(self) -> None:
         """Note that it was closed."""

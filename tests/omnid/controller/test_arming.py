@@ -10,8 +10,9 @@ import pytest
 from drivers.motor import is_stop
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, OLDER_THAN_STOP, STARTED, TOO_LATE, Arming, ArmRequest
+from omnid.core.control.contacts import BUMPER, CLIFF, LATCHING, NO_CONTACT
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
-from tests.omnid.controller.bench import UNATTENDED, Bench
+from tests.omnid.controller.bench import SETTINGS, UNATTENDED, Bench
 
 
 @pytest.fixture
@@ -93,7 +94,8 @@ FAULTS: dict[str, Callable[[Bench], None]] = {
 
 
 def test_every_fault_of_the_table_is_tested() -> None:
-    assert set(FAULTS) == {rule.reason for rule in safety_rules.FAULTS}
+    """Contacts latch, and have a test of their own."""
+    assert set(FAULTS) == {rule.reason for rule in safety_rules.FAULTS} - LATCHING
 
 
 def test_is_disarmed_at_the_start(bench: Bench) -> None:
@@ -265,3 +267,35 @@ def test_an_old_stop_that_is_repeated_does_not_release_a_newer_one(mode: str) ->
     arming.request(ArmRequest(15))
     arming.step("", 30, 1.0)
     assert not arming.armed and arming.answer.refusal == OLDER_THAN_STOP
+
+
+@pytest.mark.parametrize("contact", [BUMPER, CLIFF])
+@pytest.mark.parametrize("wired", ["bus", "motor controller"])
+@pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
+def test_bumper_and_cliff_latch_in_both_modes_and_no_request_is_accepted_while_they_hold(
+        contact: str, wired: str, mode: str) -> None:
+    """As a stop that was asked for; poses and commands at every tick release nothing."""
+    bench = Bench(UNATTENDED if mode == AUTOMATIC else SETTINGS)
+    bench.drive()
+
+    def set_contact(holds: bool) -> None:
+        if wired == "bus":
+            bench.controller.touch(NO_CONTACT.after(contact, holds=holds))
+        elif contact == BUMPER:
+            bench.wheels.bumper = holds
+        else:
+            bench.wheels.cliff = holds
+
+    set_contact(True)
+    expect_stand(bench)
+    assert bench.controller.state.disarmed_by == contact and bench.controller.state.needs_request
+    bench.arm()
+    bench.tick()
+    assert bench.controller.state.arm_answer.refusal == contact and not bench.controller.state.armed
+    set_contact(False)
+    expect_stand(bench)
+    assert bench.controller.state.disarmed_by == contact
+    bench.arm()
+    bench.tick()
+    bench.drive()
+    assert bench.controller.state.armed and not is_stop(bench.last)

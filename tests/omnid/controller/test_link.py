@@ -23,6 +23,7 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import Deadlines
@@ -203,6 +204,24 @@ def test_a_stop_rides_along_with_everything_that_follows_and_needs_a_later_reque
         arm(robot)
         wait_until(lambda: state.state.armed, "the release")
         robot.drive()
+
+
+def test_a_contact_that_has_ended_and_whose_messages_were_lost_still_stops_the_base(robot: Robot) -> None:
+    """The count of contacts rides along with everything that follows, and latches without an operator, too."""
+    robot.drive()
+    send, robot.link._channel.send = robot.link._channel.send, lambda _: None  # type: ignore[method-assign]
+    robot.link.touch(BUMPER, holds=True)
+    robot.link.touch(BUMPER, holds=False)
+    robot.link._channel.send = send  # type: ignore[method-assign]
+    robot.link.send_pose(pose())
+    state = robot.link.statistics
+    wait_until(lambda: state.state.disarmed_by == BUMPER and not robot.base.drives, "the stop")
+    robot.link.touch(CLIFF, holds=True)
+    arm(robot)
+    wait_until(lambda: state.state.arm_answer.refusal == CLIFF, "the refusal while it holds")
+    robot.link.touch(CLIFF, holds=False)
+    wait_until(lambda: arm(robot) or state.state.armed, "the release")  # type: ignore[func-returns-value]
+    robot.drive()
 
 
 def arm(robot: Robot) -> None:

@@ -84,6 +84,9 @@ class Daemon:
     def stop(self) -> None:
         self.controller.stop(time.monotonic_ns())
 
+    def touch(self, contact: str, *, holds: bool) -> None:
+        """Take a contact."""
+
     def arm(self, request: ArmRequest) -> None:
         self.controller.arm(request)
 

@@ -14,8 +14,10 @@ from rosbags.typesys import Stores, get_typestore
 
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
+from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
 from omnid.transport import codec
+from omnid.transport.codec import bool_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
 from omnid.transport.stamps import StampRule
 
@@ -31,6 +33,7 @@ class AcceptedCommands:
         self.arrivals_ns: list[int] = []
         self.stops = 0
         self.arms: list[ArmRequest] = []
+        self.contacts: list[tuple[str, bool]] = []
         self.commands: list[TimedSetpoint] = []
         self.receiver = CommandReceiver(self, StampRule(STALE_S, synchronised=synchronised))
 
@@ -47,6 +50,10 @@ class AcceptedCommands:
     def arm(self, request: ArmRequest) -> None:
         """Keep a request."""
         self.arms.append(request)
+
+    def touch(self, contact: str, *, holds: bool) -> None:
+        """Keep a contact."""
+        self.contacts.append((contact, holds))
 
 
 @pytest.fixture
@@ -325,3 +332,25 @@ def test_the_arrival_is_that_of_the_message_not_of_its_decoding(
     monkeypatch.setattr("omnid.transport.commands.twist_from_cdr", decode)
     accepted.receiver.receive("cmd/twist", twist())
     assert accepted.arrivals_ns[0] < decoded_ns[0]
+
+
+@pytest.mark.parametrize(("topic", "contact"), [("cmd/bumper", BUMPER), ("cmd/cliff", CLIFF)])
+def test_only_a_false_with_a_fresh_stamp_says_that_a_contact_has_ended(topic: str, contact: str) -> None:
+    """A true counts whatever its stamp, and so does what cannot be read: a stop needs no stamp."""
+    accepted = AcceptedCommands()
+    fresh_ns, old_ns = now_ns(), now_ns(-60.0)
+    for payload, sent_ns, expected in (
+            (bool_cdr(True), fresh_ns, True), (bool_cdr(True), 0, True), (bool_cdr(True), old_ns, True),
+            (bool_cdr(False), old_ns, True), (bool_cdr(False), 0, True), (b"off", fresh_ns, True),
+            (b"", fresh_ns, True), (bytes(5000), fresh_ns, True), (bool_cdr(False), fresh_ns, False)):
+        accepted.receiver.receive(topic, payload, "bumper board", sent_ns)
+        assert accepted.contacts.pop() == (contact, expected), payload[:8]
+    assert accepted.receiver.refused == {"too old": 1, "no stamp": 1, "malformed": 2, "too long": 1}
+    assert not accepted.commands and not accepted.arms and not accepted.stops
+
+
+def test_an_old_release_that_is_sent_again_does_not_release_where_clocks_differ() -> None:
+    accepted = AcceptedCommands(synchronised=False)
+    for payload, sent_ns in ((bool_cdr(False), 10), (bool_cdr(True), 11), (bool_cdr(False), 10)):
+        accepted.receiver.receive("cmd/bumper", payload, "", sent_ns)
+    assert [holds for _, holds in accepted.contacts] == [False, True, True]

@@ -50,6 +50,7 @@ TOPICS = {
     "/omnid/cmd/goal": "geometry_msgs/msg/PoseStamped", "/omnid/cmd/path": "nav_msgs/msg/Path",
     "/omnid/cmd/navigation": "std_msgs/msg/String", "/omnid/cmd/route": "std_msgs/msg/String",
     "/omnid/cmd/map": "std_msgs/msg/String",
+    "/omnid/cmd/bumper": "std_msgs/msg/Bool", "/omnid/cmd/cliff": "std_msgs/msg/Bool",
     "/omnid/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/imu": "sensor_msgs/msg/Imu",
     "/omnid/cmd/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/cmd/imu": "sensor_msgs/msg/Imu",
     "/omnid/cmd/joint_states": "sensor_msgs/msg/JointState",

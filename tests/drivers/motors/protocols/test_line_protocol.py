@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -30,6 +31,7 @@ MESSAGES: list[LineMessage] = [
     VelocityMessage(1, VelocityCommand(0, 10.0, -3.142, 20.0)),
     StatusMessage(65535, STATUS),
     StatusMessage(12, MotorStatus(-10.0, -3.142, -20.0, False, 65535, 100.0)),
+    *(StatusMessage(9, replace(STATUS, bumper=bumper, cliff=cliff)) for bumper in (0, 1) for cliff in (0, 1)),
     WatchdogRequest(20),
     WatchdogReply(10_000),
 ]
@@ -48,6 +50,14 @@ def test_known_lines() -> None:
     assert encode(VelocityMessage(17, command)) == b"$V,17,300,-1571,50*D3E4\n"
     assert encode(StatusMessage(17, STATUS)) == with_checksum(b"S,17,250,-1500,125,12600,7,1")
     assert encode(WatchdogRequest(500)) == with_checksum(b"W,500")
+
+
+def test_the_contacts_are_an_eighth_number_that_firmware_without_them_leaves_out() -> None:
+    assert encode(StatusMessage(17, replace(STATUS, cliff=True))) == with_checksum(b"S,17,250,-1500,125,12600,7,1,2")
+    assert decode(with_checksum(b"S,17,250,-1500,125,12600,7,1")) == StatusMessage(17, STATUS)
+    for wrong in (b"4", b"-1", b"0,0"):
+        with pytest.raises(ProtocolError):
+            decode(with_checksum(b"S,17,250,-1500,125,12600,7,1," + wrong))
 
 
 @pytest.mark.parametrize("message", MESSAGES)

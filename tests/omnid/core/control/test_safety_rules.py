@@ -17,6 +17,8 @@ GOOD = SafetyInputs(pose_age_s=0.1, pose_state="tracking", command_age_s=0.1, la
 CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are reported
     safety_rules.ENDS: {"ending": True},
     safety_rules.ASKED: {"stop_asked": True},
+    safety_rules.CLIFF: {"contact": safety_rules.CLIFF},
+    safety_rules.BUMPER: {"contact": safety_rules.BUMPER},
     safety_rules.FAILED: {"motor_failed": True},
     safety_rules.STOPPED: {"motor_stopped": True},
     safety_rules.MOTOR_FAULT: {"motor_faulty": True},
