@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import operator
 import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -22,6 +23,7 @@ from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from omnid.config import Config, load_config
 from omnid.config_use import unused_settings
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
@@ -49,13 +51,15 @@ def replay(
     method: Literal["default", "paper"] | None = None,
     lower: str | None = None,
     upper: str | None = None,
+    progress: Callable[[int, int | None], object] | None = None,
 ) -> RunResult:
     """Run a recorded log through the stages and return poses, covariances, map, counters, timings and warnings.
 
     log: an MCAP file, or the folder of `ros2 bag record -s mcap`. rig: a rig.toml or a Rig; None: the one attached to
     the log. config: a TOML file or a Config; None: the defaults. overrides: settings such as "stereo.min_range_m=0.5"
     over those of the file. method: odometry.method. lower, upper: topics of the images; None: those of the rig, else
-    by their names. A motor.port of the configuration is driven as by `omnid replay`.
+    by their names. A motor.port of the configuration is driven as by `omnid replay`. progress: called some times a
+    second, in a thread of the run, with the number of pairs so far and the expected one, None where it is not known.
 
     All poses and the map stay in memory (see PoseCollector: about 50 MB an hour at 30 Hz). Ctrl-C ends the run and
     raises KeyboardInterrupt. Raises OmnidError for input that cannot be used; RunFailedError, which is one, holds the
@@ -66,11 +70,31 @@ def replay(
         loaded = _config(config, settings)
         ignored = unused_settings(loaded, "replay", settings)
         options = ReplayOptions(rig=rig if rig is None or isinstance(rig, Rig) else Path(rig), topics=(lower, upper),
-                                collect=True)
+                                collect=True,
+                                progress=None if progress is None else partial(_Progress, progress))
         result = run_log(Path(log), loaded, options)
     if result.signal:
         signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
     return replace(result, warnings=(*ignored, *result.warnings))
+
+
+class _Progress:
+    """Hands the progress of a run to the caller's function."""
+
+    period_s = 0.2
+
+    def __init__(self, report: Callable[[int, int | None], object], statistics: RunStatistics, expected: int | None
+                 ) -> None:
+        self._report, self._statistics, self._expected = report, statistics, expected
+
+    def __call__(self) -> None:
+        """Report now."""
+        newest = self._statistics.newest
+        self._report(0 if newest is None else newest.seq + 1, self._expected)
+
+    def close(self) -> None:
+        """Report the end."""
+        self()
 
 
 class Odometry:

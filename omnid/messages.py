@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.mapping.keyframe_grid import KeyframeScans
@@ -79,7 +80,7 @@ class StereoDepth:
     exposure: Exposure | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class OdometryUpdate:
     """Pose and velocity of the rig with covariances, and the depth they were estimated from."""
 
@@ -98,6 +99,18 @@ class OdometryUpdate:
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
     is_keyframe: bool = False  # odometry needs its dense depth in any case
+
+    def __repr__(self) -> str:
+        """Return one line: number, state, position, heading and sigma of the position."""
+        x_m, y_m, z_m = self.position
+        sigma_mm = 1e3 * math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+        return (f"<pose {self.seq}: {self.state}, x {x_m:+.3f} y {y_m:+.3f} z {z_m:+.3f} m, "
+                f"heading {math.degrees(se3.yaw(self.T_odom_rig)):+.2f} deg, sigma {sigma_mm:.1f} mm>")
+
+    @property
+    def position(self) -> Array:
+        """Position (3,) of the rig in odom, m: the last column of T_odom_rig."""
+        return self.T_odom_rig[:3, 3]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

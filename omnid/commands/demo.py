@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         return _drive(args)
     from omnid.config import load_config
     from omnid.formats.tum import read_tum
-    from omnid.recordings.evaluation import evaluate, format_metrics
+    from omnid.recordings.evaluation import evaluate
     from omnid.runs.replay import ReplayOptions
 
     _make_folder(args.output)
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
         code = replay_and_print(log, config, options, quiet=args.quiet)
         if code == 0:
-            print(f"\nagainst the truth:\n{format_metrics(evaluate(read_tum(tum), read_tum(truth)))}")
+            print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
     print(f"\nfiles: {', '.join(str(path) for _, path in options.files)}")
     return code
 

@@ -26,11 +26,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from omnid.formats.tum import read_tum
-    from omnid.recordings.evaluation import evaluate, format_metrics
+    from omnid.recordings.evaluation import evaluate
 
     metrics = evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3, args.align)
     if args.json:
         print_json(metrics)
     else:
-        print(format_metrics(metrics))
+        print(metrics)
     return 0

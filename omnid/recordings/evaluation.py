@@ -32,6 +32,22 @@ class Metrics:
     heading_max_rad: float
     heading_end_rad: float  # signed, positive: the estimate is rotated too far left
 
+    def __str__(self) -> str:
+        """Return aligned lines for a terminal, in m, mm, per cent and degrees."""
+        length = (f"{self.length_estimate_m:.4f} m, truth {self.length_truth_m:.4f} m "
+                  f"({_percent(self.length_error_ratio)})")
+        position = f"rmse {_mm(self.ate_rmse_m)}, max {_mm(self.ate_max_m)}, end {_mm(self.end_error_m)}"
+        heading = (f"rmse {_deg(self.heading_rmse_rad)}, max {_deg(self.heading_max_rad)}, "
+                   f"end {_deg(self.heading_end_rad)}")
+        rows = [
+            ("associated poses", f"{self.pairs} ({self.coverage:.1%} of the truth)"),
+            ("path length", length),
+            ("position error (ATE)", position),
+            ("heading error", heading),
+            ("step error (RPE)", f"rmse {_mm(self.rpe_translation_rmse_m)}, {_deg(self.rpe_rotation_rmse_rad)}"),
+        ]
+        return "\n".join(f"{name:<21} {value}" for name, value in rows)
+
 
 def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01, alignment: str = "origin") -> Metrics:
     """Compare an estimate with the truth, both T_world_rig of the same rig frame in any two worlds.
@@ -50,21 +66,6 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     T_true = truth.T[of_truth]
     T_estimate = aligned(estimate.T[of_estimate], T_true, alignment)
     return _metrics(T_estimate, T_true, of_truth.size / truth.stamps_ns.size)
-
-
-def format_metrics(metrics: Metrics) -> str:
-    """Return the metrics as aligned lines for a terminal, in m, mm, per cent and degrees."""
-    m = metrics
-    length = f"{m.length_estimate_m:.4f} m, truth {m.length_truth_m:.4f} m ({_percent(m.length_error_ratio)})"
-    heading = f"rmse {_deg(m.heading_rmse_rad)}, max {_deg(m.heading_max_rad)}, end {_deg(m.heading_end_rad)}"
-    rows = [
-        ("associated poses", f"{m.pairs} ({m.coverage:.1%} of the truth)"),
-        ("path length", length),
-        ("position error (ATE)", f"rmse {_mm(m.ate_rmse_m)}, max {_mm(m.ate_max_m)}, end {_mm(m.end_error_m)}"),
-        ("heading error", heading),
-        ("step error (RPE)", f"rmse {_mm(m.rpe_translation_rmse_m)}, {_deg(m.rpe_rotation_rmse_rad)}"),
-    ]
-    return "\n".join(f"{name:<21} {value}" for name, value in rows)
 
 
 def _mm(distance_m: float) -> str:

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import import_module
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.run_statistics import RunCounters
 from omnid.engine.telemetry import SummaryRow
 from omnid.errors import OmnidError
 from omnid.formats.ply import write_ply
-from omnid.formats.tum import tum_row
+from omnid.formats.tum import Trajectory, read_tum, tum_row
+from omnid.recordings.evaluation import Metrics, evaluate
 from omnid.runs.place_maps import RigPlaces
 from omnid.tracking_state import MapState, TrackingState
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class RunResult:
     """Poses, map, counters, timings and warnings of a run.
 
@@ -47,6 +52,46 @@ class RunResult:
     map_states: tuple[MapState, ...] = ()  # (N,)
     places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
     rig_places: RigPlaces | None = None  # the map of places that the run was given, extended
+
+    def __repr__(self) -> str:
+        """Return one line: poses, span, length, states, map points and warnings."""
+        span_s = 1e-9 * float(self.stamps_ns[-1] - self.stamps_ns[0]) if len(self.stamps_ns) else 0.0
+        length_m = float(np.linalg.norm(np.diff(self.T_odom_rig[:, :3, 3], axis=0), axis=1).sum())
+        states = ", ".join(f"{count} {state}" for state, count in Counter(self.states).most_common())
+        points = "no map" if self.map is None else f"{len(self.map.xyz)} map points"
+        return (f"<RunResult: {self.counters.poses} poses{f' ({states})' if states else ''}, {span_s:.1f} s, "
+                f"{length_m:.2f} m, {points}, {len(self.warnings)} warnings>")
+
+    def evaluate(self, truth: str | PathLike[str] | Trajectory, *, tolerance_s: float = 0.01,
+                 alignment: str = "origin") -> Metrics:
+        """Return the errors of the poses against a true trajectory, as `omnid eval` prints them.
+
+        truth: a TUM file, or a Trajectory of T_world_rig. tolerance_s: largest difference of the stamps of two poses.
+        alignment: "origin" (the first poses coincide), "rigid" or "scale" (all positions do, least squares).
+
+        Raises OmnidError for a file that cannot be read and for fewer than two poses at the same times.
+        """
+        true = truth if isinstance(truth, Trajectory) else read_tum(Path(truth))
+        return evaluate(Trajectory(self.stamps_ns, self.T_odom_rig), true, tolerance_s, alignment)
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas.DataFrame with a row for each pose, indexed by its time (UTC).
+
+        Columns: x, y, z [m] and qx, qy, qz, qw of T_odom_rig; sigma_m and sigma_rad, square roots of the largest
+        variance of position and rotation; state. Raises OmnidError where pandas is not installed.
+        """
+        try:
+            pandas = import_module("pandas")
+        except ImportError as error:
+            raise OmnidError("to_dataframe: pandas is not installed: pip install 'omnid[pandas]'") from error
+        T, count = self.T_odom_rig, len(self.stamps_ns)
+        quaternions = np.reshape([se3.quaternion(R) for R in T[:, :3, :3]], (count, 4))
+        sigmas = {name: np.sqrt(np.linalg.eigvalsh(self.covariances[:, at, at])[:, -1])
+                  for name, at in (("sigma_m", slice(0, 3)), ("sigma_rad", slice(3, 6)))}
+        columns = {**dict(zip("xyz", T[:, :3, 3].T, strict=True)),
+                   **dict(zip(("qx", "qy", "qz", "qw"), quaternions.T, strict=True)), **sigmas,
+                   "state": [str(state) for state in self.states]}
+        return pandas.DataFrame(columns, index=pandas.DatetimeIndex(self.stamps_ns, tz="UTC", name="time"))
 
     def save_tum(self, path: str | PathLike[str]) -> None:
         """Write the trajectory: a row `t x y z qx qy qz qw` for each pose (s, m, unit quaternion).

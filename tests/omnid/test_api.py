@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from drivers.logs.log_reader import LogReader
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.ply import read_ply
-from omnid.formats.tum import tum_row
+from omnid.formats.tum import Trajectory, tum_row
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunFailedError
 from omnid.stages.synchronise import Synchronise
@@ -99,6 +100,42 @@ def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -
         timing = result.timings[stage]
         assert timing.n >= PAIRS and 0 < timing.p50_ms <= timing.p99_ms <= timing.max_ms
     assert not {"statistics", "collect-poses"} & result.timings.keys()
+
+
+def test_a_result_and_a_pose_print_as_one_line(result: omnid.RunResult, scene: Path, pairs: list[Pair]) -> None:
+    length_m = result.counters.length_m
+    assert repr(result) == str(result) == (
+        f"<RunResult: {PAIRS} poses ({PAIRS} tracking), {1e-9 * np.ptp(result.stamps_ns):.1f} s, {length_m:.2f} m, "
+        f"{len(result.map.xyz) if result.map is not None else 0} map points, 0 warnings>")
+    pose = omnid.Odometry(scene / "rig.toml").process(*pairs[0])
+    assert re.fullmatch(r"<pose 0: tracking, x \+0\.000 y \+0\.000 z \+0\.000 m, heading [+-]0\.00 deg, sigma .* mm>",
+                        str(pose))
+    assert np.array_equal(pose.position, pose.T_odom_rig[:3, 3])
+
+
+def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: Path) -> None:
+    result.save_tum(tmp_path / "truth.tum")
+    metrics = result.evaluate(tmp_path / "truth.tum")
+    assert metrics.pairs == PAIRS and metrics.ate_max_m < 1e-6 and "position error (ATE)" in str(metrics)
+    longer = Trajectory(result.stamps_ns, result.T_odom_rig.copy())
+    longer.T[:, :3, 3] *= 1.25
+    assert result.evaluate(longer).length_error_ratio == pytest.approx(1 / 1.25 - 1)
+
+
+def test_a_result_is_a_table(result: omnid.RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    table = result.to_dataframe()
+    assert len(table) == PAIRS and table.index[0].value == result.stamps_ns[0]
+    assert np.array_equal(table[["x", "y", "z"]].to_numpy(), result.T_odom_rig[:, :3, 3])
+    assert set(table["state"]) == {"tracking"} and (table["sigma_m"].to_numpy()[1:] > 0).all()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(OmnidError, match=r"pip install 'omnid\[pandas\]'"):
+        result.to_dataframe()
+
+
+def test_a_replay_reports_its_progress(scene: Path) -> None:
+    seen: list[tuple[int, int | None]] = []
+    omnid.replay(scene / "log.mcap", rig=scene / "rig.toml", progress=lambda *counts: seen.append(counts))
+    assert seen[-1] == (PAIRS, PAIRS) and [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
 def test_replay_takes_settings_a_rig_and_a_method(scene: Path, result: omnid.RunResult) -> None:
