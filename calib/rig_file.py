@@ -25,14 +25,25 @@ from calib.validation import ValidatedTable, read_bytes, require_schema, toml_ta
 
 SCHEMA = 1
 SIDES = ("lower", "upper")
+LOG_BEGINNINGS = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG")
+OTHER_CALIBRATIONS = (".yaml", ".yml", ".json", ".txt")  # as of Kalibr, Basalt, OCamCalib
 TIME_KEYS = ("upper_delay_s", "line_time_s")
 # Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
 TRANSLATION_DECIMALS = 12
 
 
 def read_rig(path: Path) -> Rig:
-    """Read the rig of a `rig.toml`; a mask's image is read from the same folder."""
-    return parse_rig(read_bytes(path), path.parent, str(path))
+    """Read the rig of a `rig.toml`; a mask's image is read from the same folder. CalibError says what to do."""
+    if not path.exists():
+        raise CalibError(f"{path}: there is no such rig: `omnid calibrate import` or `omnid calibrate rig` makes one")
+    text = read_bytes(path)
+    if text.startswith(LOG_BEGINNINGS):
+        raise CalibError(f"{path}: a log, but a rig.toml was expected: without --rig the one attached to the log is "
+                         "used")
+    if path.suffix in OTHER_CALIBRATIONS:
+        raise CalibError(f"{path}: a rig.toml was expected: `omnid calibrate import {path} -o rig.toml` makes one of "
+                         "this file")
+    return parse_rig(text, path.parent, str(path))
 
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import logging
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from omnid.commands.examples import add_examples
 from omnid.version import __version__
@@ -19,14 +21,39 @@ COMMANDS = ("run", "simulate", "replay", "demo", "eval", "calibrate", "cameras",
             "motor", "config", "install-service")
 MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
 WRONG_INPUT = 2
+# What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.
+_CHOICE = re.compile(r"argument (?P<name>.*): invalid choice: '(?P<found>.*)' \(choose from (?P<all>.*)\)", re.DOTALL)
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line."""
+    """A parser whose errors are one line, which proposes the word that was probably meant."""
+
+    def parse_known_args(  # type: ignore[override]  # the overloads of argparse differ only in the namespace's type
+        self, args: Sequence[str] | None = None, namespace: Any = None
+    ) -> tuple[Any, list[str]]:
+        """Parse as argparse does, but refuse unknown words here, where the help of this very command is known."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            options = [option for action in self._actions for option in action.option_strings]
+            self.error(f"unknown argument {unknown[0]}{_did_you_mean(unknown[0].partition('=')[0], options)}")
+        return found, unknown
 
     def error(self, message: str) -> NoReturn:
         """Print the error and end the program."""
-        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}: see {self.prog} --help\n")
+        wrong = _CHOICE.fullmatch(message)
+        if wrong:
+            choices = [choice.strip("' ") for choice in wrong["all"].split(",")]
+            among = _did_you_mean(wrong["found"], choices) or f": expected one of {', '.join(choices)}"
+            name = wrong["name"] if wrong["name"].startswith("-") else "unknown command"
+            message = f"{name} {wrong['found']!r}{among}"
+        colon = "" if message.endswith("?") else ":"
+        self.exit(WRONG_INPUT, f"omnid: {' '.join(message.split())}{colon} see {self.prog} --help\n")
+
+
+def _did_you_mean(word: str, known: Sequence[str]) -> str:
+    """Return the question for the nearest of the known words, or an empty text."""
+    nearest = difflib.get_close_matches(word[:80], known, n=1, cutoff=0.6)
+    return f": did you mean {nearest[0]}?" if nearest else ""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

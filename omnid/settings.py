@@ -84,6 +84,9 @@ def knob(
     return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices), finite)})
 
 
+MAX_UNIT_LETTERS = 3  # of the unit at the end of a key, such as mps: it says nothing about what is meant
+
+
 @dataclass(frozen=True, slots=True)
 class _Keys:
     """The keys that exist and those of earlier versions: makes the errors for all others."""
@@ -106,13 +109,28 @@ class _Keys:
         return None
 
     def unknown(self, path: _Path) -> OmnidError:
-        """Return the error for a key that never existed; it proposes a similar one of the section, else of all."""
-        depth = len(path)
-        neighbours = {other[depth - 1]: other[:depth] for other in self.known if other[: depth - 1] == path[:-1]}
-        for candidates in (neighbours, {other[-1]: other for other in self.known}):
-            for nearest in difflib.get_close_matches(path[-1][:80], candidates, n=1, cutoff=0.6):
-                return OmnidError(f"unknown key {_dotted(path)}: did you mean {_dotted(candidates[nearest])}?")
-        return OmnidError(f"unknown key {_dotted(path)}: known are {', '.join(map(_dotted, neighbours.values()))}")
+        """Return the error for a key that never existed; it proposes similar ones of the section, else of the file."""
+        neighbours = [other[: len(path)] for other in self.known if other[: len(path) - 1] == path[:-1]]
+        family = [other for other in self.known if other[0] == path[0]]
+        near = (_alike(path, neighbours) or _alike(path, family) or _sharing_a_word(path, family)
+                or _alike(path, self.known))
+        if near:
+            return OmnidError(f"unknown key {_dotted(path)}: did you mean {' or '.join(map(_dotted, near))}? "
+                              "`omnid config` explains each key")
+        names = ", ".join(map(_dotted, dict.fromkeys(neighbours)))
+        return OmnidError(f"unknown key {_dotted(path)}: known are {names}")
+
+
+def _alike(path: _Path, candidates: Sequence[_Path]) -> list[_Path]:
+    """Return the key whose last word is spelled most like that of a path, as a list of none or one."""
+    last = {other[-1]: other for other in candidates}
+    return [last[name] for name in difflib.get_close_matches(path[-1][:80], last, n=1, cutoff=0.7)]
+
+
+def _sharing_a_word(path: _Path, candidates: Sequence[_Path]) -> list[_Path]:
+    """Return at most three keys whose last part has a word of the path's last part, such as `velocity`."""
+    words = {word for word in path[-1][:80].split("_") if len(word) > MAX_UNIT_LETTERS}
+    return [other for other in candidates if words & set(other[-1].split("_"))][:3]
 
 
 def load(

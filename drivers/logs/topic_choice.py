@@ -33,6 +33,9 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[s
     choice is ambiguous.
     """
     images = {name: kind for name, kind in topics.items() if _is_image(name, kind)}
+    if not topics:
+        raise DriverError(f"no messages can be read in {log}: `omnid log info` says whether it was cut, and "
+                          "`omnid log recover` saves what is left of it")
     if not images:
         raise DriverError(
             f"no image topics in {log}: found {_listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
@@ -136,4 +139,4 @@ def _listed(names: Iterable[str]) -> str:
     every = sorted(names)
     shown = [name if name.isprintable() else ascii(name) for name in every[:_MAX_LISTED]]
     more = f" and {len(every) - _MAX_LISTED} more" if len(every) > _MAX_LISTED else ""
-    return (", ".join(shown) or "no topics at all") + more
+    return ", ".join(shown) + more

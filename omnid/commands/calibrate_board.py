@@ -23,9 +23,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Write the PDF."""
+    from calib.boards.board_pose import ambiguous_orders
     from omnid.calibration.printable_board import board_pdf
+    from omnid.errors import OmnidError
 
     board, options = board_of(args), shlex.join(options_of(args))
+    if len(ambiguous_orders(board)) > 1:
+        columns, rows = args.corners
+        raise OmnidError(f"--corners {columns}x{rows}: such a board looks the same when it is turned: give one even "
+                         f"and one odd number, such as {columns}x{rows + 1}")
     args.output.write_bytes(board_pdf(board, args.paper, options))
     print(f"{args.output}: {board}; print it at 100 % on {args.paper}, measure the line of 100 mm, then: "
           f"omnid calibrate rig LOG {options} -o rig.toml")

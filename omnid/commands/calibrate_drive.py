@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 if TYPE_CHECKING:
+    from calib.rig import Rig
     from omnid.calibration.drive import DriveCalibration
 
 # Error of the landmarks with the new rig, in parts of that with the old one. Free parameters always lower the error a
@@ -27,8 +29,9 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     """Add `drive` to `omnid calibrate`."""
     parser = actions.add_parser("drive", help="a better rig.toml from ordinary drives with turns, without a board")
     parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="drives with turns; 100 to 350 pairs")
-    parser.add_argument("--rig", type=Path, required=True, metavar="FILE", help="the rig.toml to start from; a nominal "
-                        "one will do: mirror data sheet, centre of the images, baseline by ruler")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml to start from; a nominal one will do: "
+                        "mirror data sheet, centre of the images, baseline by ruler; default: the one attached to the "
+                        "first log")
     parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
     parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
     parser.add_argument("--distance-m", type=float, metavar="M", help="straight distance from the first to the last "
@@ -38,19 +41,19 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0 where the rig was written, 1 where the drive did not make it better."""
+    """Return 0: the rig was written, or it is as good as the drives can make it, which is said."""
     from omnid.calibration.drive import calibrate_drive
     from omnid.engine.kernel_cache import prepare_kernels
     from omnid.engine.logging_setup import log
 
     _check(args)
     prepare_kernels(log)
-    found = calibrate_drive(args.logs, read_rig(args.rig), (args.lower, args.upper),
+    found = calibrate_drive(args.logs, _start(args), (args.lower, args.upper),
                             lambda line: print(line, file=sys.stderr))
     print("\n".join(describe(found)))
     if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px and not args.distance_m:
-        print(f"{args.rig} fits these drives as well as any rig: nothing was written")
-        return 1
+        print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig: nothing was written")
+        return 0
     rig = found.rig
     if args.distance_m:
         rig = found.at_distance(args.distance_m)
@@ -64,9 +67,21 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _start(args: argparse.Namespace) -> Rig:
+    """Return the rig to start from."""
+    from drivers.logs.log_reader import LogReader
+    from omnid.runs.log_rig import attached_rig
+
+    if args.rig is not None:
+        return read_rig(args.rig)
+    with closing(LogReader(args.logs[0], args.lower, args.upper)) as reader:
+        return attached_rig(reader, args.logs[0])
+
+
 def _check(args: argparse.Namespace) -> None:
     inputs = [("the log that is read", log) for log in args.logs]
-    check_outputs([("--output", args.output)], [*inputs, ("the rig that is read", args.rig)])
+    rigs = [("the rig that is read", args.rig)] if args.rig is not None else []
+    check_outputs([("--output", args.output)], [*inputs, *rigs])
     if args.distance_m is not None and not (math.isfinite(args.distance_m) and args.distance_m > 0):
         raise OmnidError(f"--distance-m {args.distance_m}: expected a distance above 0 m")
     if args.distance_m is not None and len(args.logs) > 1:

@@ -76,6 +76,8 @@ def _must_be_writable(path: Path) -> None:
 
 
 def _kalibr(args: argparse.Namespace) -> Rig:
+    if args.camchain.suffix == ".toml":
+        raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
     if args.transform or args.baseline is not None or args.view:
         raise OmnidError(f"{args.camchain}: --transform, --baseline and --view go with OCamCalib files; a Kalibr file "
                          "holds its transforms")

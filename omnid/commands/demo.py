@@ -7,7 +7,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 
 from omnid.commands.config import add_settings
-from omnid.commands.replay import replay_and_print
+from omnid.commands.replay import Output, replay_and_print
 
 DRIVE_S = 90.0  # of simulated time at most
 
@@ -21,6 +21,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         "it; takes a minute or two, and writes drive.png with both true paths")
     parser.add_argument("--seed", type=int, default=1, help="with --drive: of the world and its noise; default "
                         "%(default)s")
+    parser.add_argument("--verbose", action="store_true", help="print all counters, and the times of all stages")
     parser.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_settings(parser)
     parser.set_defaults(run=run)
@@ -38,16 +39,15 @@ def run(args: argparse.Namespace) -> int:
     _make_folder(args.output)
     tum = args.output / "trajectory.tum"
     options = ReplayOptions(tum=tum, cloud=args.output / "map.ply", plan=args.output / "plan.png",
-                            record=args.output / "log.mcap", publish=True, bus_optional=True, realtime=True,
+                            record=args.output / "log.mcap", publish=True, bus_optional=True, paced=True,
                             settings=args.config)
     config = load_config(args.config, ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3",
                                        *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
-        code = replay_and_print(log, config, options, quiet=args.quiet)
+        code = replay_and_print(log, config, options, Output(args.quiet, args.verbose))
         if code == 0:
             print(f"\nagainst the truth:\n{evaluate(read_tum(tum), read_tum(truth))}")
-    print(f"\nfiles: {', '.join(str(path) for _, path in options.files)}")
     return code
 
 

@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 from shutil import get_terminal_size
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
@@ -58,6 +58,7 @@ def _add_computation(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same results")
     group.add_argument("--realtime", action="store_true",
                        help="at the speed of the recording; late messages are dropped")
+    group.add_argument("--verbose", action="store_true", help="print all counters, and the times of all stages")
     group.add_argument("--quiet", action="store_true", help="do not show the progress")
 
 
@@ -69,15 +70,24 @@ def run(args: argparse.Namespace) -> int:
 
     options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), span_s=_span_of(args), tum=args.tum,
                             map_tum=args.map_tum, cloud=args.cloud, plan=args.plan, record=args.record,
-                            publish=args.publish, inline=args.inline, realtime=args.realtime, settings=args.config)
+                            publish=args.publish, inline=args.inline, paced=args.realtime, drops=args.realtime,
+                            settings=args.config)
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
-    return replay_and_print(args.log, config, options, quiet=args.quiet, as_json=args.json)
+    return replay_and_print(args.log, config, options, Output(args.quiet, args.verbose, args.json))
 
 
-def replay_and_print(log: Path, config: Config, options: ReplayOptions, *, quiet: bool, as_json: bool = False) -> int:
-    """Replay a log, print its warnings and its summary, and return the exit code; quiet: without progress."""
+class Output(NamedTuple):
+    """What is printed of a run."""
+
+    quiet: bool = False  # no progress
+    verbose: bool = False  # all counters, and the times of the stages
+    as_json: bool = False
+
+
+def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
+    """Replay a log, print its warnings and its summary, and return the exit code."""
     from dataclasses import replace
 
     from omnid.diagnostics.progress import Progress
@@ -85,28 +95,31 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, *, quiet
     from omnid.runs.run_result import RunFailedError
 
     try:
-        result = run_log(log, config, options if quiet else replace(options, progress=Progress))
+        result = run_log(log, config, options if output.quiet else replace(options, progress=Progress))
     except RunFailedError as error:
-        _print_result(error.result, options, as_json)
+        _print_result(error.result, options, output)
         raise
-    _print_result(result, options, as_json)
+    _print_result(result, options, output)
     return 128 + result.signal if result.signal else int(result.counters.no_pose)
 
 
-def _print_result(result: RunResult, options: ReplayOptions, as_json: bool) -> None:
+def _print_result(result: RunResult, options: ReplayOptions, output: Output) -> None:
     """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout."""
-    from omnid.diagnostics.run_summary import run_summary
+    from omnid.diagnostics.run_summary import folded_entry, run_summary
     from omnid.sinks.files import on_stdout
 
     for warning in result.warnings:
         print(f"omnid: warning: {warning}", file=sys.stderr)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
-    if as_json:
+    if output.as_json:
         print_json({"counters": result.counters, "timings": dict(result.timings), "warnings": result.warnings,
                     "signal": result.signal}, stream)
         return
     columns = get_terminal_size().columns if stream.isatty() else 0
-    print(run_summary(result.counters, result.timings.values(), columns), file=stream)
+    print(run_summary(result.counters, result.timings.values(), columns, verbose=output.verbose), file=stream)
+    if options.files:
+        written = ", ".join(str(path) for _, path in options.files)
+        print("\n".join(folded_entry("written", written, columns)), file=stream)
 
 
 def _span_of(args: argparse.Namespace) -> tuple[float, float]:

@@ -27,6 +27,7 @@ from omnid.messages import (
 from omnid.runs.route_map import RunRouteMap
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
+from omnid.sinks.simulated_wheels import SimulatedWheels
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.grid import MapGrid
@@ -69,8 +70,8 @@ class RunParts:
 
     known_places: PlaceMap | None = None  # the map to begin with; None: the run's own, where it is consumed
     localize_only: bool = False  # the known map stays as it is
-    # LiveDrive: its commands are published and recorded. ReplayDrive: the lock-step commands are.
-    drive: LiveDrive | ReplayDrive | None = None
+    # LiveDrive: its commands are published and recorded. The others belong to a replay: the lock-step commands are.
+    drive: LiveDrive | ReplayDrive | SimulatedWheels | None = None
     navigation: NavigationParts | None = None
     load: Load = full_load
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
@@ -200,12 +201,15 @@ def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: Navigat
 
 
 def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config,
-              drive: LiveDrive | ReplayDrive | None) -> Stream[VelocityCommand]:
-    """Join the controller; return its commands. It never waits for a stage: it has a process of its own."""
+              drive: LiveDrive | ReplayDrive | SimulatedWheels | None) -> Stream[VelocityCommand]:
+    """Join the controller; return its commands. It never waits for a stage: that of a motor has its own process."""
     if isinstance(drive, LiveDrive):
         graph.sink("controller", drive, odometry, policy=NEWEST, depth=1)
         return graph.source("drive", drive.commands, wake=drive.end)
-    if drive is not None:
+    if isinstance(drive, ReplayDrive):
         graph.sink("controller", drive, odometry)
     period_s = 1.0 / config.motor.rate_hz
-    return graph.stage("drive", LockstepDrive(config.controller, period_s, geometry.rig.T_base_rig), odometry)
+    commands = graph.stage("drive", LockstepDrive(config.controller, period_s, geometry.rig.T_base_rig), odometry)
+    if isinstance(drive, SimulatedWheels):
+        graph.sink("wheels", drive, commands)
+    return commands

@@ -18,6 +18,7 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import WHOLE, LogReader
 from drivers.motion import MotionSample
 from omnid.config import Config
+from omnid.controller.motor import SIMULATED
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.rig.rig_health import RigContradictedError
 from omnid.diagnostics.run_statistics import RunStatistics
@@ -45,6 +46,7 @@ from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_trajectory
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
+from omnid.sinks.simulated_wheels import SimulatedWheels
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
@@ -80,7 +82,8 @@ class ReplayOptions:
     publish: bool = False
     bus_optional: bool = False  # without a bus, warn and go on
     inline: bool = False
-    realtime: bool = False
+    paced: bool = False  # at the pace of the log's stamps, as far as the computer holds it; else as fast as it can
+    drops: bool = False  # a stage that is late drops messages, as on the robot; else what comes before it waits
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
     observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
@@ -114,7 +117,7 @@ class _Replay:
         self._poses = PoseCollector()
         self._map_poses = MapPoseCollector()
         self._map: Slot[MapUpdate] = Slot()
-        self._drive: ReplayDrive | None = None
+        self._drive: ReplayDrive | SimulatedWheels | None = None
         self._warnings: list[str] = []
 
     def run(self) -> RunResult:
@@ -122,7 +125,7 @@ class _Replay:
         if self._options.map_tum and not self._config.places.enabled:
             raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
         prepare_kernels(log_line)
-        graph = Graph(policy=NEWEST if self._options.realtime else LOSSLESS, threaded=not self._options.inline,
+        graph = Graph(policy=NEWEST if self._options.drops else LOSSLESS, threaded=not self._options.inline,
                       depth=self._config.graph.depth)
         with opencv_threads(self._config.graph.opencv_threads), ExitStack() as outputs:
             session = Session(self._config, graph, outputs, self._warnings.append)
@@ -180,7 +183,7 @@ class _Replay:
         return read_rig(rig) if isinstance(rig, Path) else rig
 
     def _messages(self, graph: Graph, reader: LogReader, pairing: Synchronise) -> Stream[Frame | MotionSample]:
-        if not self._options.realtime:
+        if not self._options.paced:
             return graph.source("read", reader.messages)
         clock = PlaybackClock()
 
@@ -221,7 +224,9 @@ class _Replay:
     def _parts(self, session: Session, geometry: Geometry) -> RunParts:
         """Return the wheels of the run, and the map that it begins with."""
         options, config = self._options, self._config
-        if config.motor.port:
+        if config.motor.port == SIMULATED:
+            self._drive = SimulatedWheels(config.motor)
+        elif config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
             self._drive = ReplayDrive(controller, config.controller.setpoint.setpoint(), geometry.rig.T_base_rig)
         return RunParts(known_places=options.places, localize_only=options.localize_only, drive=self._drive,

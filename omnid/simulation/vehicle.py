@@ -17,11 +17,11 @@ from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
+from drivers.motors.simulated.lockstep_motor import LockstepMotor
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.lockstep_motor import LockstepMotor
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
 from omnid.simulation.world import World

@@ -62,7 +62,7 @@ def test_pairs_per_second(tmp_path: Path, threaded: bool, hz: int) -> None:
     started_s = time.perf_counter()
     graph.run()
     rate_hz = PAIRS / (time.perf_counter() - started_s)
-    summary = run_summary(RunCounters.of(statistics, PAIRS, {}), graph.telemetry.summary())
+    summary = run_summary(RunCounters.of(statistics, PAIRS, {}), graph.telemetry.summary(), verbose=True)
     columns = (Column("run"), Column("pairs/s", "", 1))
     table = ResultTable("speed", "speed", "Pairs per second of the whole pipeline", columns, continued=True)
     table.add(f"{hz} Hz by the stamps, {'threaded' if threaded else 'inline'}, profile {PROFILE or 'none'}", rate_hz)

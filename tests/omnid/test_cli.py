@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.cli import COMMANDS, _parser
+from omnid.cli import COMMANDS, _parser, main
 from omnid.commands.examples import EXAMPLES
 
 
@@ -58,3 +58,17 @@ def test_the_list_of_commands_loads_no_opencv() -> None:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     lines = done.stdout.splitlines()
     assert lines[-1] == "False" and all(any(line.strip().startswith(name) for line in lines) for name in COMMANDS)
+
+
+@pytest.mark.parametrize(("words", "line"), [
+    (["repaly"], "unknown command 'repaly': did you mean replay? see omnid --help"),
+    (["calibrate", "rg"], "unknown command 'rg': did you mean rig? see omnid calibrate --help"),
+    (["replay", "x", "--metod", "paper"], "unknown argument --metod: did you mean --method? see omnid replay --help"),
+    (["replay", "x", "--method", "papr"], "--method 'papr': did you mean paper? see omnid replay --help"),
+    (["eval", "a", "b", "c"], "unknown argument c: see omnid eval --help"),
+])
+def test_a_mistyped_word_is_named_with_the_nearest_one(words: list[str], line: str,
+                                                       capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2 and capsys.readouterr().err == f"omnid: {line}\n"

@@ -39,8 +39,8 @@ class Command:
         return Result(code, *self._capsys.readouterr())
 
     def replay(self, log: Path, *words: object, rig: Path | None = None) -> Result:
-        """Run `omnid replay` without progress."""
-        return self("replay", log, *(["--rig", rig] if rig else []), "--quiet", *words)
+        """Run `omnid replay` without progress, with all counters."""
+        return self("replay", log, *(["--rig", rig] if rig else []), "--quiet", "--verbose", *words)
 
     def refused(self, *words: object) -> str:
         """Return the line with which the command refuses its input; fail if there is any other output."""

@@ -229,3 +229,19 @@ def test_refuses_wrong_arguments_in_one_line(omnid: Command) -> None:
 def test_refuses_a_missing_motor_before_the_run(omnid: Command, tmp_path: Path, scene: Path) -> None:
     error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--motor", tmp_path / "tty")
     assert "motor port" in error
+
+
+def test_other_files_than_a_rig_say_what_to_do_with_them(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    log, camchain = scene / "log.mcap", tmp_path / "camchain.yaml"
+    camchain.write_text("cam0: {}\n")
+    assert f"`omnid calibrate import {camchain} -o rig.toml`" in omnid.refused("replay", log, "--rig", camchain)
+    assert "without --rig the one attached to the log is used" in omnid.refused("replay", log, "--rig", log)
+    assert "`omnid calibrate import` or" in omnid.refused("replay", log, "--rig", tmp_path / "absent.toml")
+    rig = scene / "rig.toml"
+    assert f"use it as it is, --rig {rig}" in omnid.refused("calibrate", "import", rig, "-o", tmp_path / "out.toml")
+
+
+def test_a_log_that_was_cut_names_the_command_that_recovers_it(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes((scene / "log.mcap").read_bytes()[:2000])
+    assert "`omnid log recover`" in omnid.refused("replay", cut, "--rig", scene / "rig.toml")

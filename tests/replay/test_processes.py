@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.transport.codec import OdometryRecord, odometry_from_cdr
 from tests.conftest import PAIRS
-from tests.replay.command import Command, rows
+from tests.replay.command import Command, Result, rows
 from tests.replay.edited import images, save
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -73,7 +73,7 @@ def paused(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     pytest.param(signal.SIGHUP, 129, [], marks=pytest.mark.slow)])
 def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, code: int, manner: list[str]) -> None:
     tum, ply, log = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "out.mcap"
-    command = replaying(paused, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, *manner)
+    command = replaying(paused, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, "--verbose", *manner)
     with started(command) as process:
         wait_until(lambda: tum.exists() and tum.read_bytes().count(b"\n") >= 3)
         process.send_signal(number)
@@ -83,7 +83,9 @@ def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, 
     written = len(rows(tum))
     assert 3 <= written < PAIRS and len(read_ply(ply).xyz) > 0
     with log.open("rb") as file:
-        assert sum(1 for _ in make_reader(file).iter_messages(["/omnid/odom"])) == written
+        recorded = sum(1 for _ in make_reader(file).iter_messages(["/omnid/odom"]))
+    # In real time a recorder that is late drops messages, and says so; nothing else is missing.
+    assert written - Result(process.returncode, out, err).count("queue") <= recorded <= written
 
 
 def test_another_process_receives_the_poses(tmp_path: Path, scene: Path, unused_tcp_port: int) -> None:
@@ -134,16 +136,22 @@ def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
         out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 2 and "omnid: warning: motor on" in err, err
     assert err.splitlines()[-1].startswith("omnid: the motor controller does not answer any more"), err
-    assert out.startswith("pairs "), "the result until then is printed"
+    assert out.startswith("poses "), "the result until then is printed"
     assert len(rows(tum)) >= 3
 
 
-def test_demo(tmp_path: Path) -> None:
+def test_demo_waits_for_a_busy_computer_and_loses_nothing(tmp_path: Path) -> None:
+    """Each core has something else to do meanwhile."""
     command = [sys.executable, "-m", "omnid", "demo", "--quiet", "--output", str(tmp_path / "out")]
-    with started(command) as process:
-        out, err = process.communicate(timeout=2 * PATIENCE_S)
-    assert process.returncode == 0, err
-    assert "against the truth" in out and "commands sent, 0 errors" in out
+    endless = [sys.executable, "-c", "while True: pass"]
+    with ExitStack() as others:
+        for _ in range(os.cpu_count() or 1):
+            others.enter_context(started(endless))
+        with started(command) as process:
+            out, err = process.communicate(timeout=4 * PATIENCE_S)
+    assert process.returncode == 0 and err == "", err
+    assert "against the truth" in out and "commands sent, 0 errors, 0 stops" in out
+    assert out.splitlines()[0] == "poses     99 of 99 pairs of images"
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"trajectory.tum", "map.ply", "plan.png", "log.mcap"}
 
 
@@ -175,13 +183,13 @@ def test_runs_with_a_closed_stream(tmp_path: Path, scene: Path, closed: str) -> 
         out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0 and len(rows(tum)) == PAIRS
     assert "\r" not in err, "there is no terminal, so no bar"
-    assert out.startswith("pairs ") if closed == "2" else not out
+    assert out.startswith("poses ") if closed == "2" else not out
 
 
 def test_a_trajectory_on_stdout_is_the_only_output_there(scene: Path) -> None:
     with started(replaying(scene, "--quiet", "--tum", "/dev/stdout")) as process:
         out, err = process.communicate(timeout=PATIENCE_S)
-    assert process.returncode == 0 and err.startswith("pairs ")
+    assert process.returncode == 0 and err.startswith("poses ")
     assert [len(line.split()) for line in out.splitlines()] == [8] * PAIRS
 
 

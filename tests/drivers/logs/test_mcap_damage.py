@@ -163,9 +163,9 @@ def test_ignores_a_corrupt_summary(tmp_path: Path) -> None:
         (MAGIC[:5], "starts with"),
         (b"\x89PNG\r\n\x1a\n" + bytes(50), r"starts with b'\\x89PNG"),
         (b"SQLite format 3\0" + bytes(50), "file is not a database"),
-        (b"#ROSBAG V2.0\n" + bytes(50), "no topics at all"),
+        (b"#ROSBAG V2.0\n" + bytes(50), "`omnid log recover`"),
         (zstandard.compress(bytes(50)), "zstd -d"),
-        (MAGIC, "no topics at all"),
+        (MAGIC, "`omnid log recover`"),
     ],
 )
 def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:

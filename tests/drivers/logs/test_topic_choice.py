@@ -61,7 +61,7 @@ def test_prefers_compressed_images_and_ignores_depth() -> None:
 @pytest.mark.parametrize(
     ("topics", "wanted", "message"),
     [
-        ({}, {}, "no image topics in log: found no topics at all"),
+        ({}, {}, "no messages can be read in log: `omnid log info`"),
         ({"/imu": "sensor_msgs/msg/Imu", "/tf": ""}, {}, "no image topics in log: found /imu, /tf"),
         (
             {"/lower/a": IMAGE, "/imu": "x/msg/Y"},

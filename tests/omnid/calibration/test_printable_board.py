@@ -12,6 +12,8 @@ import pypdfium2
 import pytest
 from numpy.typing import NDArray
 
+from omnid.cli import main
+
 DPI = 254.0  # 10 px a millimetre
 PX_PER_MM = DPI / 25.4
 
@@ -59,8 +61,15 @@ def test_markers_are_read_and_true_to_scale(
 
 
 def test_a_board_that_does_not_fit_names_a_paper_that_does(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "omnid", "calibrate", "board", "--corners", "12x12", "--square-mm", "50", "-o",
+    command = [sys.executable, "-m", "omnid", "calibrate", "board", "--corners", "12x13", "--square-mm", "50", "-o",
                tmp_path / "board.pdf"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and "does not fit on a4" in done.stderr and "--paper a0" in done.stderr
     assert not (tmp_path / "board.pdf").exists()
+
+
+def test_a_board_that_looks_the_same_when_turned_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]
+                                                            ) -> None:
+    words = ("calibrate", "board", "--corners", "6x6", "--square-mm", "25", "-o", str(tmp_path / "board.pdf"))
+    assert main(words) == 2 and not (tmp_path / "board.pdf").exists()
+    assert "--corners 6x6: such a board looks the same when it is turned" in capsys.readouterr().err
