@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
-from omnid.commands.replay import replay_and_print
+from omnid.commands.replay import Output, replay_and_print
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -72,7 +72,7 @@ def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
 
     log = Log(args.log, robot=args.robot, topic=args.topic, replay=args.replay, rig=args.rig,
               topics=(args.lower, args.upper), settings=args.config)
-    return show_log(log, config, place, partial(replay_and_print, quiet=args.quiet))
+    return show_log(log, config, place, partial(replay_and_print, output=Output(quiet=args.quiet)))
 
 
 def _robot(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
