@@ -71,14 +71,14 @@ def replay(
         ignored = unused_settings(loaded, "replay", settings)
         options = ReplayOptions(rig=rig if rig is None or isinstance(rig, Rig) else Path(rig), topics=(lower, upper),
                                 collect=True,
-                                progress=None if progress is None else partial(_Progress, progress))
+                                progress=None if progress is None else partial(_CallbackProgress, progress))
         result = run_log(Path(log), loaded, options)
     if result.signal:
         signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
     return replace(result, warnings=(*ignored, *result.warnings))
 
 
-class _Progress:
+class _CallbackProgress:
     """Hands the progress of a run to the caller's function."""
 
     period_s = 0.2

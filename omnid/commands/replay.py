@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 class Output(NamedTuple):
-    """What is printed of a run."""
+    """The parts of a run that are printed."""
 
     quiet: bool = False  # no progress
     verbose: bool = False  # all counters, and the times of the stages
