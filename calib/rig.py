@@ -12,6 +12,9 @@ from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
 from calib.rig_covariance import RigCovariance
 
 MIN_BASELINE_M = 1e-3
+# A T_base_rig with the cameras on the floor states no height: as the identity, which it is where none was measured.
+LEAST_HEIGHT_M = 0.1
+MAX_HEIGHT_M = 10.0
 MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
 
 
@@ -49,7 +52,10 @@ class MountedCamera:
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """The lower and the upper camera; T_base_rig is the rig's pose on the robot; covariance None if unknown."""
+    """The lower and the upper camera; T_base_rig is the rig's pose on the robot; covariance None if unknown.
+
+    The base frame is at the floor, unless its user says otherwise; the identity: the pose on the robot is not stated.
+    """
 
     lower: MountedCamera
     upper: MountedCamera
@@ -71,6 +77,23 @@ class Rig:
     def baseline_m(self) -> float:
         """Return the distance of the two viewpoints [m]."""
         return float(np.linalg.norm(self.upper.viewpoint - self.lower.viewpoint))
+
+    def height_m(self, floor_m: float = 0.0) -> float | None:
+        """Return the height [m] of the lower viewpoint above the floor; None where T_base_rig does not state it.
+
+        floor_m: height of the floor in the base frame.
+        """
+        height_m = float((self.T_base_rig[:3, :3] @ self.lower.viewpoint + self.T_base_rig[:3, 3])[2]) - floor_m
+        return height_m if height_m >= LEAST_HEIGHT_M else None
+
+    def at_height(self, height_m: float) -> Rig:
+        """Return the rig with its lower viewpoint at a height above the base's origin."""
+        if not LEAST_HEIGHT_M <= height_m <= MAX_HEIGHT_M:
+            raise CalibError(f"height of the cameras: expected {LEAST_HEIGHT_M:g} to {MAX_HEIGHT_M:g} m from the floor "
+                             f"to the lower viewpoint, found {height_m:g}")
+        T_base_rig = self.T_base_rig.copy()
+        T_base_rig[2, 3] = height_m - float(T_base_rig[2, :3] @ self.lower.viewpoint)
+        return replace(self, T_base_rig=T_base_rig)
 
     def with_upper_moved(self, turn: Array, direction: Array, longer_m: float = 0.0) -> Rig:
         """Return the rig with its upper camera moved in the rectified frame, the lower one kept.

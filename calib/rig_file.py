@@ -116,7 +116,9 @@ def _open_no_link(path: str, flags: int) -> int:
 
 def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
     """Return the text of a `rig.toml`; images: file names of mask images by side, others are embedded."""
-    parts = [f"schema = {SCHEMA}\nT_base_rig = {_matrix(rig.T_base_rig)}\n"]
+    parts = [f"schema = {SCHEMA}\n"]
+    if not np.array_equal(rig.T_base_rig, np.eye(4)):  # else it is not stated
+        parts.append(f"T_base_rig = {_matrix(rig.T_base_rig)}\n")
     for side, mounted, topic in zip(SIDES, (rig.lower, rig.upper), rig.topics, strict=True):
         parts.append(camera_text(side, mounted.camera, topic))
         parts.append(f"T_rig_{side} = {_matrix(_on_grid(se3.inverse(mounted.T_cam_rig)))}\n")

@@ -176,8 +176,6 @@ class MappingConfig:
     max_sigma_m: float = knob(0.15, "largest sigma of a point that enters the map, m", low=0.001, high=100)
     min_frames: int = knob(6, "frames that must have observed a voxel that is written; fewer in a short run",
                            low=1, high=1000)
-    heights_m: tuple[float, float] = knob((-1.0, 1.5), "heights of obstacles in the keyframes' range scans and in the "
-                                          "grid, m above the base", low=-1000, high=1000)
     path_poses: int = knob(10_000, "vertices of the path in the plan view; when full, every second one is dropped",
                            low=100, high=10_000_000)
 
@@ -285,6 +283,7 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType({
     "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
     "stereo.rig_check": "rig.check",
     "live.check_s": "rig.check_s",
+    "mapping.heights_m": "obstacles.ring.heights_m, which are above the floor",
 })
 
 

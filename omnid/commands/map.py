@@ -185,12 +185,15 @@ def run_merge(args: argparse.Namespace) -> int:
 
 def run_export(args: argparse.Namespace) -> int:
     """Write the files that are asked for."""
+    import numpy as np
+
     from omnid.core.places import place_views
     from omnid.errors import OmnidError
     from omnid.formats.grid_map import write_grid
     from omnid.formats.place_file import read_places
     from omnid.formats.ply import write_ply
     from omnid.sinks.files import check_outputs, write_plan
+    from omnid.stages.floor import ADVICE
 
     named = (("--ply", args.ply), ("--plan", args.plan), ("--grid", args.grid))
     outputs = [(option, path) for option, path in named if path is not None]
@@ -202,6 +205,10 @@ def run_export(args: argparse.Namespace) -> int:
     check_outputs([*outputs, *images], [("the map that is read", args.map)])
     places, rig = read_places(args.map)
     if args.grid:
+        if not any(np.isfinite(keyframe.scan).any() for keyframe in places.keyframes.values()):
+            print(f"omnid: warning: {args.grid}: all cells are unknown: the map is of an earlier version, or was built "
+                  f"without the height of the cameras above the floor: {ADVICE}, and build the map again",
+                  file=sys.stderr)
         write_grid(args.grid, place_views.grid(places, rig, args.cell))
     if args.ply or args.plan:
         points = place_views.landmarks(places, rig)

@@ -26,9 +26,12 @@ from omnid.formats import place_rows
 from omnid.formats.place_rows import BadRowError
 from omnid.formats.whole_file import replacement
 
-VERSION: Final = 3  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+VERSION: Final = 4  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
-WITHOUT_TAGS: Final = 2  # the version before, which is read as well
+# Earlier versions that are read as well. Scans before version 4 had heights above the base, not above the floor, and
+# passed over low obstacles before a wall: they are read as unknown.
+WITHOUT_TAGS: Final = 2
+WITHOUT_FLOOR: Final = 3
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
 MAX_VALUE_BYTES: Final = 1 << 20  # of one value in the database
@@ -97,7 +100,7 @@ def _version_of(path: Path) -> int:
     if len(header) < 100 or not header.startswith(MAGIC) or int.from_bytes(header[68:72]) != APPLICATION_ID:
         raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
     version = int.from_bytes(header[60:64])
-    if version not in (WITHOUT_TAGS, VERSION):
+    if version not in (WITHOUT_TAGS, WITHOUT_FLOOR, VERSION):
         raise OmnidError(f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
                          "`omnid map build`, or update omnid")
     if size > MAX_FILE_BYTES:
@@ -137,7 +140,7 @@ class _Reader:
 
     def __init__(self, database: sqlite3.Connection, version: int) -> None:
         self._database, self.version = database, version
-        schema = SCHEMA if version == VERSION else SCHEMA_2
+        schema = SCHEMA_2 if version == WITHOUT_TAGS else SCHEMA
         bound_work(database, MAX_INSTRUCTIONS)
         found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(schema) + 1))
         if found != schema:
@@ -157,7 +160,7 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
     heads = list(reader.rows("map", 1))
     if not heads:
         raise BadRowError("the table map is empty")
-    has_tags = reader.version == VERSION
+    has_tags = reader.version != WITHOUT_TAGS
     head = place_rows.read_map_row(heads[0] if has_tags else place_rows.head_of_version_2(heads[0]))
     keyframes = [place_rows.read_keyframe_row(row, head.rig) for row in reader.rows("keyframe", MAX_KEYFRAMES)]
     links = [place_rows.read_link_row(row) for row in reader.rows("link", MAX_LINKS)]
@@ -169,6 +172,8 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
             raise BadRowError(f"expected {expected} {name}, found {found}")
     _check([(keyframe, T_map_rect) for keyframe, T_map_rect, _ in keyframes], links)
     for keyframe, T_map_rect, use in keyframes:
+        if reader.version != VERSION:
+            keyframe.scan.fill(np.nan)
         places.keyframes[keyframe.id], places.poses[keyframe.id] = keyframe, T_map_rect
         if use != UNUSED:
             places.uses[keyframe.id] = use

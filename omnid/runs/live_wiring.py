@@ -38,9 +38,9 @@ from omnid.runs.session import TICKERS, Session
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
 from omnid.sinks.recorder import Recorder
+from omnid.stages.floor import ADVICE
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
-from omnid.stages.obstacles import ASSUMED_HEIGHT_M, floor_is_assumed
 from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
@@ -85,9 +85,9 @@ class LiveWiring:
         sinks = self._sinks(live_rig, bus)
         if recorder is not None:
             sinks = replace(sinks, recording=RecordingSink(recorder, tuple(frames), config.record.queue))
+        self._warn_of_unstated_height()
         parts = run_places.known_to(RunParts(load=lambda: ladder.level, map_every_s=config.live.cloud_s))
         if controller:
-            self._warn_of_assumed_floor()
             sinks.rings["controller-ring"] = RingToController(controller)
             parts = replace(parts, drive=LiveDrive(controller, rig.T_base_rig, requests.end),
                             navigation=self._navigation(controller, requests))
@@ -120,14 +120,11 @@ class LiveWiring:
         return Sinks(poses={**poses, **live_rig.pose_sinks},
                      bus=BusSink(bus, session.encoder(self._geometry.rig, config.live.cloud_points)))
 
-    def _warn_of_assumed_floor(self) -> None:
-        """Warn where the wheels depend on a floor that was never measured."""
-        config = self._session.config
-        needs_floor = config.obstacles.enabled and config.controller.collision.check
-        if needs_floor and floor_is_assumed(self._geometry, config.obstacles):
-            self._session.warn(
-                f"the rig has no height above the floor in T_base_rig: obstacles are looked for with a floor "
-                f"{ASSUMED_HEIGHT_M} m below the lower camera; measure it, or set obstacles.ring.floor_m")
+    def _warn_of_unstated_height(self) -> None:
+        """Warn where the rig does not state its height: until the images show the floor, nothing is called free."""
+        if self._geometry.rig.height_m(self._session.config.obstacles.ring.floor_m) is None:
+            self._session.warn("the rig states no height of the cameras: the floor is looked for in the images; "
+                               f"until it is found, map, grid and obstacles call nothing free; {ADVICE}")
 
     def _saver(self, run_places: RunPlaces, places: Places | None) -> MapSaver | None:
         """Return what saves the map of places now and then; None where it stays as it is."""

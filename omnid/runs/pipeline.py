@@ -28,6 +28,7 @@ from omnid.runs.route_map import RunRouteMap
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.simulated_wheels import SimulatedWheels
+from omnid.stages.floor import CameraFloor
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.grid import MapGrid
@@ -109,6 +110,13 @@ class WiredStages(NamedTuple):
     front_end: FrontEnd
     mapping: Mapping | None
     places: Places | None
+    obstacles: Obstacles | None = None
+
+    @property
+    def floor(self) -> CameraFloor | None:
+        """The floor that the run uses; None where it needs none."""
+        user = self.places or self.obstacles
+        return None if user is None else user.floor
 
 
 def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Config, sinks: Sinks,
@@ -122,7 +130,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Co
     mapping, maps = _mapping(graph, odometry, front_end, config, sinks, parts)
     places, in_map = _places(graph, odometry, front_end, config, sinks, parts)
     grids = _grids(graph, in_map, geometry, config, parts) if sinks.take_all else None
-    rings = _rings(graph, odometry, front_end, config, sinks, parts)
+    obstacles, rings = _rings(graph, odometry, front_end, config, sinks, parts)
     updates = _navigation(graph, geometry, config, parts.navigation, places,
                           [odometry, *(stream for stream in (in_map, rings) if stream)])
     named = {"bus-map": maps, "bus-places": in_map, "bus-grid": grids, "bus-scan": rings, "bus-navigation": updates}
@@ -135,7 +143,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Co
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(front_end, mapping, places)
+    return WiredStages(front_end, mapping, places, obstacles)
 
 
 def _mapping(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
@@ -174,15 +182,15 @@ def _grids(graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry,
 
 
 def _rings(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
-           parts: RunParts) -> Stream[ObstacleRing] | None:
+           parts: RunParts) -> tuple[Obstacles | None, Stream[ObstacleRing] | None]:
     """Join the obstacle ring; None where it is not consumed."""
     if not config.obstacles.enabled or not (sinks.rings or sinks.take_all or parts.navigation):
-        return None
+        return None, None
     obstacles = Obstacles(front_end.geometry, config.obstacles, front_end.dense, parts.load)
     rings = graph.stage("obstacles", obstacles, odometry)
     for name, sink in sinks.rings.items():
         graph.sink(name, sink, rings)
-    return rings
+    return obstacles, rings
 
 
 def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: NavigationParts | None,

@@ -63,6 +63,8 @@ class RunReport:
         if statistics.poses or not self._session.signal:
             if self._has_motion and self._motion().message:
                 yield f"wheels and gyro: {self._motion().message}"
+            if self._stages.floor is not None and self._stages.floor.summary():
+                yield self._stages.floor.summary()
             health = self._stages.front_end.health
             yield from input_warnings(self._pairing, health, statistics, self._session.config.pair)
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,46 +13,41 @@ from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.floor import Floor
 from omnid.core.frames import of_base
+from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.floor_plane import FloorPlane
-from omnid.core.obstacles.floor_view import FloorCamera, unmeasured
+from omnid.core.obstacles.floor_view import FloorCamera
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.observation import observe, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
-from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
+from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-
-ASSUMED_HEIGHT_M: Final = 1.1  # of the cameras, where the rig's T_base_rig does not say it
-LEAST_HEIGHT_M: Final = 0.1  # of the cameras over the floor, in a T_base_rig that says it
+# Ring of a pair while the floor is not known.
+UNKNOWN: Final = np.full(SECTORS, np.nan, np.float32)
+NOT_FREE: Final = np.zeros(SECTORS, np.float32)
 # Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.
 SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
     LoadLevel.FULL: 0, LoadLevel.SPARSE_MAP: 0, LoadLevel.NO_MAP: 250_000_000, LoadLevel.REDUCED: 300_000_000}
 
 
-def ring_settings(geometry: Geometry, config: ObstaclesConfig) -> RingSettings:
-    """Return the settings with the height of the floor; where the base is the rig itself, with an assumed one."""
-    if not floor_is_assumed(geometry, config):
-        return config.ring
-    return replace(config.ring, floor_m=viewpoint(geometry)[2] - ASSUMED_HEIGHT_M)
+class _FloorTables(NamedTuple):
+    """Parts that depend on the floor only, computed once for each estimate of it."""
 
-
-def floor_is_assumed(geometry: Geometry, config: ObstaclesConfig) -> bool:
-    """True if T_base_rig has the cameras on the floor, as one that was never measured."""
-    return bool(viewpoint(geometry)[2] - config.ring.floor_m < LEAST_HEIGHT_M)
-
-
-def viewpoint(geometry: Geometry) -> Array:
-    """Return the lower viewpoint (3,) in the base frame."""
-    return np.asarray((geometry.rig.T_base_rig @ geometry.T_rig_rect)[:3, 3])
+    floor: Floor
+    T_floor_rig: Array  # (4, 4)
+    view: Array  # (3,) viewpoint in the level frame
+    camera: FloorCamera
+    plane: FloorPlane
 
 
 class Obstacles:
@@ -61,18 +55,13 @@ class Obstacles:
 
     def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths, load: Load = full_load) -> None:
         """dense: computes the depth of a pair that is due."""
-        self._T_base_rig = geometry.rig.T_base_rig
-        self._load, self._dense = load, dense
+        self._load, self._dense, self._geometry = load, dense, geometry
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
-        self._settings = ring_settings(geometry, config)
+        self._settings = config.ring
         self._filter, self._tracker = RingFilter(self._settings), MovingTracker()
-        self._view = viewpoint(geometry)
-        self._geometry = geometry
-        self._T_rect_base = geometry.rig.T_rect_rig @ se3.inverse(geometry.rig.T_base_rig)
-        self._floor = FloorCamera(geometry.cylinder, self._T_rect_base, self._settings.floor_m)
+        self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
+        self._tables: _FloorTables | None = None
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
-        self._plane: FloorPlane | None = None
-        self._is_measured = not floor_is_assumed(geometry, config)  # else no plane is known that pixels could show
         self._last_ns: int | None = None
         self._resets = 0
 
@@ -86,30 +75,35 @@ class Obstacles:
             self._filter.clear()
             self._tracker.clear()
             self._resets = odometry.reset_counter
-        depth = self._dense.of(odometry.depth)
-        points = se3.apply(self._T_base_rig, depth.points)
-        seen = observe(points, np.sqrt(depth.variance_m2), self._view, self._settings)
-        panoramas, view = odometry.depth.panoramas, partial(unmeasured, seen.floor_from_m)
-        if self._is_measured:
-            seen = with_plane(seen, self._plane_of(panoramas).free_m(panoramas.lower, panoramas.upper))
-            view = partial(self._floor.view, panoramas.lower, panoramas.usable)
-        # What dead and blind parts of the images show is no evidence, and what was known there is no longer watched.
+        depth, panoramas = self._dense.of(odometry.depth), odometry.depth.panoramas
+        T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
+        self.floor.add(depth)
+        if self.floor.floor is None:
+            return ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
+        at = self._tables_of(self.floor.floor, panoramas)
+        points = se3.apply(at.T_floor_rig, depth.points)
+        seen = observe(points, np.sqrt(depth.variance_m2), at.view, self._settings, at.floor.sigma_m)
+        seen = with_plane(seen, at.plane.free_m(panoramas.lower, panoramas.upper))
+        # What dead and blind parts of the images show is no evidence, and what was known there is no longer watched.
         seen = without(seen, unwatched)
-        T_odom_base = of_base(odometry, self._T_base_rig)[0]
-        pose = transform(planar(T_odom_base))
+        pose, view = transform(planar(T_odom_base)), partial(at.camera.view, panoramas.lower, panoramas.usable)
         ring = without(self._filter.update(odometry.stamp_ns, pose, seen, view), unwatched)
         moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
                             moving, unwatched)
 
-    def _plane_of(self, panoramas: Panoramas) -> FloorPlane:
-        """Return the plane of the floor in panoramas; all of a run show the same part of the world."""
-        if self._plane is None:
+    def _tables_of(self, floor: Floor, panoramas: Panoramas) -> _FloorTables:
+        """Return the tables of a floor; all panoramas of a run show the same part of the world."""
+        if self._tables is None or self._tables.floor is not floor:
             geometry = self._geometry
-            self._plane = FloorPlane(geometry.cylinder, self._T_rect_base, self._settings.floor_m,
-                                     geometry.rig.baseline_m, panoramas.visible)
-        return self._plane
+            T_floor_rig = self.floor.T_floor_rig(floor)
+            T_rect_floor = geometry.rig.T_rect_rig @ se3.inverse(T_floor_rig)
+            self._tables = _FloorTables(
+                floor, T_floor_rig, se3.apply(T_floor_rig, geometry.rig.lower.viewpoint[None])[0],
+                FloorCamera(geometry.cylinder, T_rect_floor),
+                FloorPlane(geometry.cylinder, T_rect_floor, geometry.rig.baseline_m, panoramas.visible))
+        return self._tables
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         """True if a pair is to give a ring: at the rate, and for a keyframe, whose depth is there, after half of it."""

@@ -7,14 +7,16 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import Config
-from omnid.core.mapping.range_scan import RangeScan, range_scan
+from omnid.core.mapping.range_scan import RangeScan
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import OdometryUpdate, PlaceUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
+from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
+from omnid.stages.keyframe_scan import keyframe_scan
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -39,9 +41,8 @@ class Places:
         self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places,
                                        localize_only=localize_only)
         self._T_rig_rect = geometry.T_rig_rect
-        height_m = float((geometry.rig.T_base_rig @ self._T_rig_rect)[2, 3])
-        low_m, high_m = config.mapping.heights_m
-        self._heights_m = (low_m - height_m, high_m - height_m)  # of obstacles, in the rectified frame
+        self._ring = config.obstacles.ring
+        self.floor = CameraFloor(geometry.rig, config.obstacles.ring.floor_m)
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._to_rect = se3.adjoint(self._T_rect_rig)
@@ -112,4 +113,6 @@ class Places:
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""
-        return range_scan(se3.apply(self._T_rect_rig, self._dense.of(depth).points), self._heights_m)
+        dense = self._dense.of(depth)
+        self.floor.add(dense)
+        return keyframe_scan(dense, self.floor, self._T_rig_rect, self._ring)

@@ -22,13 +22,10 @@ from numpy.typing import NDArray
 from calib.rig_file import read_rig
 from omnid.config import load_config
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.settings import RingSettings
 from omnid.formats.tum import read_tum
 from omnid.messages import ObstacleRing
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.sinks.encoder import Outgoing
-from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.obstacles import ring_settings
 from tests.benchmark.results import Cell, Column, ResultTable
 from tests.benchmark.seeds import family_and_seed
 from tests.simulation import RECIPES, Rectangle, build
@@ -145,24 +142,16 @@ def measure(folder: Path, overrides: list[str], counts: Counts) -> None:
         raise SystemExit(f"{folder}: expected a folder NAME_sN with NAME one of {', '.join(sorted(RECIPES))}")
     rig, truth = read_rig(folder / "rig.toml"), read_tum(folder / "truth.txt")
     config = load_config(None, ["places.enabled=false", *overrides])
-    shape = geometry(rig, config.panorama)
     found = RingCollector()
     run_log(folder / "log.mcap", config,
             ReplayOptions(rig=rig, inline=True, observer=lambda geometry, telemetry: found))
     scene = build(match[1], int(match[3]), pairs=len(truth.T)).scene
-    segments = Segments(scene.rectangles, _band(shape, ring_settings(shape, config.obstacles), float(truth.T[0, 2, 3])))
+    segments = Segments(scene.rectangles, config.obstacles.ring.heights_m)
     poses = dict(zip(truth.stamps_ns.tolist(), truth.T @ np.linalg.inv(rig.T_base_rig), strict=True))
     for ring in found.rings[1:]:
         T = poses[ring.stamp_ns]
         yaw = float(np.arctan2(T[1, 0], T[0, 0]))
         compare(ring, segments.ring(float(T[0, 3]), float(T[1, 3]), yaw), "dim" if match[2] else "bright", counts)
-
-
-def _band(shape: Geometry, settings: RingSettings, rig_height_m: float) -> tuple[float, float]:
-    """Return the heights of obstacles in the world, whose floor is at 0."""
-    base_m = rig_height_m - float(shape.rig.T_base_rig[2, 3])
-    low, high = settings.heights_m
-    return base_m + settings.floor_m + low, base_m + settings.floor_m + high
 
 
 def _kind(rectangle: Rectangle, top_m: float) -> str:

@@ -95,7 +95,8 @@ def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -
     assert counters.states[omnid.TrackingState.TRACKING] == PAIRS and not any(counters.drops.values())
     steps = np.diff(result.T_odom_rig[:, :3, 3], axis=0)
     assert counters.length_m == pytest.approx(np.linalg.norm(steps, axis=1).sum())
-    assert result.warnings == () and result.signal == 0
+    assert result.signal == 0
+    assert len(result.warnings) == 1 and "height of the cameras" in result.warnings[0]  # the rig does not state it
     for stage in ("pair", "dewarp", "odometry", "mapping"):
         timing = result.timings[stage]
         assert timing.n >= PAIRS and 0 < timing.p50_ms <= timing.p99_ms <= timing.max_ms
@@ -240,7 +241,7 @@ def test_without_collection_counters_and_no_arrays(tmp_path: Path, scene: Path) 
 def test_settings_that_a_replay_ignores_are_warnings_or_errors(tmp_path: Path, scene: Path) -> None:
     (tmp_path / "omnid.toml").write_text("[live]\nstatus_s = 2.0\n")
     found = omnid.replay(scene / "log.mcap", scene / "rig.toml", config=tmp_path / "omnid.toml")
-    assert len(found.warnings) == 1 and "live.status_s" in found.warnings[0]
+    assert "live.status_s" in found.warnings[0]
     with pytest.raises(OmnidError, match=r"live\.status_s"):
         omnid.replay(scene / "log.mcap", scene / "rig.toml", overrides=["live.status_s=2.0"])
 

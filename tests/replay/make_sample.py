@@ -21,6 +21,7 @@ from calib.rig_file import rig_toml
 from drivers.frame import Frame, gray
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_writer import LogWriter
+from omnid.formats.tum import read_tum
 
 SIDE_PX = 512
 QUALITY = 70  # 198 images in less than 7.5 MB
@@ -34,7 +35,9 @@ def main() -> None:
     parser.add_argument("target", type=Path, help="folder of the package")
     parser.add_argument("--quality", type=int, default=QUALITY, help="of the JPEGs")
     args = parser.parse_args()
-    rig = reduced(import_kalibr(args.source / "camchain.yaml"))
+    # The floor of the world is at z = 0, and the truth is the pose of the lower viewpoint.
+    height_m = float(read_tum(args.source / "truth.txt").T[0, 2, 3])
+    rig = reduced(import_kalibr(args.source / "camchain.yaml")).at_height(height_m)
     reader = LogReader(args.source / "log.mcap")
     with LogWriter(args.target / "log.mcap", {"rig.toml": rig_toml(rig).encode()}, compression="none") as writer:
         for frame in reader.frames():

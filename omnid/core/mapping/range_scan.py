@@ -1,4 +1,4 @@
-"""Range scan of a keyframe: the nearest obstacle in each direction, as a planar laser scanner would see it."""
+"""Range scan: the nearest obstacle in each direction, as a planar laser scanner would see it."""
 
 from __future__ import annotations
 
@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 SECTORS: Final = 360  # one a degree: 5 cm at 3 m, the size of a cell, is fine enough
-# Of the points of a sector that are nearer than its obstacle, as some matches are false; by trial on development
-# seeds.
-NEAREST_SHARE: Final = 0.2
-MIN_POINTS: Final = 3  # of a sector; fewer may be false matches
-MAX_RANGE_M: Final = 12.0  # by trial on development seeds
+MAX_RANGE_M: Final = 12.0  # of keyframes; by trial on development seeds
 # Longest gap that is filled between two sectors of one surface; 0.2 m at 3 m: too narrow for a person.
 FILLED_SECTORS: Final = 4
 SURFACE_RATIO: Final = 1.15  # of the ranges on both sides of such a gap, at most; by trial on development seeds
@@ -26,24 +22,6 @@ RangeScan = NDArray[np.float32]  # (SECTORS,) m, from azimuth -pi on; NaN: nothi
 def azimuths() -> Array:
     """Return the azimuths (SECTORS,) [rad] of the sectors' middles."""
     return np.asarray((np.arange(SECTORS) + 0.5) * (2 * math.pi / SECTORS) - math.pi)
-
-
-def range_scan(points: Array, heights_m: tuple[float, float]) -> RangeScan:
-    """Return the ranges of the nearest obstacles among points (N, 3) [m] of a frame with z up, between two heights."""
-    x, y, z = points.T
-    ranges = np.hypot(x, y)
-    usable = (z >= heights_m[0]) & (z <= heights_m[1]) & (ranges < MAX_RANGE_M) & (ranges > 0)
-    ranges = ranges[usable]
-    turned = (np.arctan2(y[usable], x[usable]) + math.pi) * (SECTORS / (2 * math.pi))
-    sector = np.floor(turned).astype(np.intp) % SECTORS
-    order = np.lexsort((ranges, sector))
-    count = np.bincount(sector, minlength=SECTORS)
-    first = np.cumsum(count) - count
-    known = count >= MIN_POINTS
-    chosen = first[known] + np.floor(NEAREST_SHARE * count[known]).astype(np.intp)
-    scan = np.full(SECTORS, np.nan, np.float32)
-    scan[known] = ranges[order[chosen]]
-    return fill_gaps(scan)
 
 
 def fill_gaps(scan: RangeScan) -> RangeScan:

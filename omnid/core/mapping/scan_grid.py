@@ -68,10 +68,12 @@ class ScanGrid:
         seen |= (hit | free) > 0
 
     def grid(self) -> Grid:
-        """Return occupied, free and unknown cells."""
+        """Return occupied, free and unknown cells; none is free beside an occupied one, known to a cell."""
         cells = np.full(self._odds.shape, UNKNOWN, np.int8)
-        cells[self._seen & (self._odds <= FREE_UNTIL)] = FREE
-        cells[self._seen & (self._odds >= OCCUPIED_FROM)] = OCCUPIED
+        is_occupied = self._seen & (self._odds >= OCCUPIED_FROM)
+        near = cv2.dilate(is_occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+        cells[self._seen & (self._odds <= FREE_UNTIL) & ~near] = FREE
+        cells[is_occupied] = OCCUPIED
         x, y = (self._first * self._cell_m).tolist()
         return Grid(cells, self._cell_m, (x, y))
 

@@ -43,20 +43,22 @@ GAP_BINS: Final = 2  # without floor that are passed over
 class FloorPlane:
     """Compares pairs with the plane of the floor; everything that only depends on the rig is computed once."""
 
-    def __init__(self, cylinder: Cylinder, T_rect_base: Array, floor_m: float, baseline_m: float, visible: Flags
-                 ) -> None:
-        """T_rect_base (4, 4): from the base to the rectified frame; visible (H, W): pixels that show the world."""
-        T_base_rect = se3.inverse(T_rect_base)
+    def __init__(self, cylinder: Cylinder, T_rect_floor: Array, baseline_m: float, visible: Flags) -> None:
+        """T_rect_floor (4, 4): from the level frame of the base, with the floor at z = 0, to the rectified frame.
+
+        visible (H, W): pixels that show the world.
+        """
+        T_floor_rect = se3.inverse(T_rect_floor)
         columns = np.arange(0, cylinder.width, COLUMN_STEP)
         rows = np.arange(cylinder.height)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(float)
         rays = cylinder.rays(grid)
-        fall = rays @ T_base_rect[2, :3]
+        fall = rays @ T_floor_rect[2, :3]
         with np.errstate(divide="ignore"):
-            r = np.where(fall < 0, (floor_m - T_base_rect[2, 3]) / fall, np.inf)  # from the axis of the cylinder
+            r = np.where(fall < 0, -T_floor_rect[2, 3] / fall, np.inf)  # from the axis of the cylinder
         upper = grid[:, 1] + cylinder.focal_px * baseline_m / r
         with np.errstate(invalid="ignore"):
-            place = se3.apply(T_base_rect, rays * np.where(np.isfinite(r), r, np.nan)[:, None])
+            place = se3.apply(T_floor_rect, rays * np.where(np.isfinite(r), r, np.nan)[:, None])
         distance = np.hypot(place[:, 0], place[:, 1])
         below = np.clip(np.rint(upper), 0, cylinder.height - 1).astype(np.intp)
         at = grid.astype(np.intp)

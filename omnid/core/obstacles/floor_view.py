@@ -29,15 +29,15 @@ class FloorView(NamedTuple):
 
 
 class FloorCamera:
-    """Looks up places of the floor in lower panoramas; the base is taken to stand upright on the floor."""
+    """Looks up places of the floor in lower panoramas."""
 
-    def __init__(self, cylinder: Cylinder, T_rect_base: Array, floor_m: float) -> None:
-        """T_rect_base (4, 4): from the base to the rectified frame; floor_m: height of the floor in the base frame."""
-        self._cylinder, self._T_rect_base, self._floor_m = cylinder, T_rect_base, floor_m
+    def __init__(self, cylinder: Cylinder, T_rect_floor: Array) -> None:
+        """T_rect_floor (4, 4): from the level frame of the base, with the floor at z = 0, to the rectified frame."""
+        self._cylinder, self._T_rect_floor = cylinder, T_rect_floor
 
     def view(self, panorama: PaddedPanorama, visible: Flags, places: Array) -> FloorView:
-        """Return the brightness at places (N, 2) [m] in the base frame; visible (H, W): pixels that show the world."""
-        points = se3.apply(self._T_rect_base, np.column_stack([places, np.full(len(places), self._floor_m)]))
+        """Return the brightness at places (N, 2) [m] of the level frame; visible (H, W): pixels that show the world."""
+        points = se3.apply(self._T_rect_floor, np.column_stack([places, np.zeros(len(places))]))
         pixels = self._cylinder.pixels(points).astype(np.float32)
         columns, rows = np.rint(pixels).astype(np.intp).T
         inside = (rows >= 0) & (rows < self._cylinder.height)
@@ -52,9 +52,3 @@ class FloorCamera:
         grey = cv2.remap(smooth.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         grey = grey.ravel()[: len(places)]
         return FloorView(np.where(in_view, grey, np.nan).astype(np.float32), in_view, panorama.noise_grey)
-
-
-def unmeasured(from_m: float, places: Array) -> FloorView:
-    """Return the view of cameras whose height is not known: floor from from_m on, but not where in the images."""
-    in_view = np.hypot(places[:, 0], places[:, 1]) > from_m
-    return FloorView(np.full(len(places), np.nan, np.float32), in_view, math.inf)

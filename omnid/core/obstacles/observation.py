@@ -44,16 +44,17 @@ class HeightBand(NamedTuple):
     is_floor: NDArray[np.bool_]  # (N,)
 
 
-def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings) -> Observation:
-    """Return the ring of points (N, 3) [m] in the base frame, with their sigmas (N,) along the rays.
+def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float = 0.0
+            ) -> Observation:
+    """Return the ring of points (N, 3) [m] in the level frame of the base, whose z is the height above the floor.
 
-    view (3,): the viewpoint in the base frame.
+    sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; floor_sigma_m: of the floor.
     """
     ranges = np.hypot(points[:, 0], points[:, 1])
     turned = (np.arctan2(points[:, 1], points[:, 0]) + math.pi) * (SECTORS / (2 * math.pi))
     sector = np.floor(turned).astype(np.intp) % SECTORS
     usable = (ranges > NEAREST_M) & np.isfinite(sigma_m)
-    band = by_height(points, sigma_m, view, settings)
+    band = by_height(points, sigma_m, view, settings, floor_sigma_m)
     chosen = band.is_obstacle & usable
     found, sigma, seen_beyond = _nearest(sector[chosen], ranges[chosen], sigma_m[chosen], settings)
     found = fill_gaps(found)
@@ -72,14 +73,14 @@ def with_plane(seen: Observation, plane_m: Array) -> Observation:
     return seen._replace(free_m=free_m.astype(np.float32), plane_m=plane_m.astype(np.float32))
 
 
-def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings) -> HeightBand:
-    """Tell obstacles from floor among points (N, 3), for sigmas (N,) along rays from a viewpoint (3,)."""
-    low, high = (settings.floor_m + height for height in settings.heights_m)
+def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float) -> HeightBand:
+    """Tell obstacles from floor among points (N, 3); the arguments are those of `observe`."""
+    low, high = settings.heights_m
     away = points - view
     across2 = away[:, 0] ** 2 + away[:, 1] ** 2
     rise2 = away[:, 2] ** 2
     of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
-    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + math.radians(settings.tilt_deg) ** 2 * across2)
+    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + math.radians(settings.tilt_deg) ** 2 * across2 + floor_sigma_m**2)
     z = points[:, 2]
     return HeightBand((z - margin > low) & (z + margin < high), z - margin <= low)
 

@@ -12,9 +12,11 @@ from omnid.settings import knob
 class RingSettings:
     """Heights, ranges and support of obstacles."""
 
-    floor_m: float = knob(0.0, "height of the floor in the base frame, m", low=-10, high=10)
+    floor_m: float = knob(0.0, "height of the floor in the base frame, m; used where the rig states "
+                          "the height of its cameras (T_base_rig)", low=-10, high=10)
     heights_m: tuple[float, float] = knob((0.1, 1.7), "heights above the floor between which a point is an obstacle, "
-                                          "m: lower ones are floor, higher ones are passed below", low=-10, high=10)
+                                          "of the ring and of the map, m: lower ones are floor, higher ones are passed "
+                                          "below", low=-10, high=10)
     tilt_deg: float = knob(0.5, "sigma of the tilt of the base against the floor: the margin above the floor grows "
                            "with the range", low=0, high=10)
     max_range_m: float = knob(6.0, "longest range of an obstacle, m", low=0.5, high=50)

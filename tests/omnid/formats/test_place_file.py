@@ -70,6 +70,15 @@ def test_a_map_of_the_version_before_is_read(tmp_path: Path) -> None:
     assert len(read_places(path)[0]) == 4
 
 
+def test_scans_of_versions_before_heights_above_the_floor_are_unknown(tmp_path: Path) -> None:
+    path, places = tmp_path / "a.omap", some_places(4)
+    write_places(path, places, RIG)
+    assert np.isfinite(read_places(path)[0].keyframes[2].scan).any()
+    changed(path, "PRAGMA user_version = 3")
+    read = read_places(path)[0]
+    assert len(read) == 4 and all(np.isnan(keyframe.scan).all() for keyframe in read.keyframes.values())
+
+
 def head_of(path: Path) -> tuple[object, ...]:
     """The row of the table map."""
     with closing(sqlite3.connect(path)) as database:
@@ -164,7 +173,7 @@ def changed(path: Path, *statements: str) -> Path:
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
-        ("PRAGMA user_version = 1", "version 1, expected 3"),
+        ("PRAGMA user_version = 1", "version 1, expected 4"),
         ("UPDATE keyframe SET stamp_ns = 5 WHERE id = 2", "the checksum of row 3 of keyframe"),
         ("UPDATE link SET inliers = 5", "the checksum of row 1 of link"),
         ("DELETE FROM keyframe WHERE id = 3", "expected 4 keyframes, found 3"),
@@ -187,7 +196,7 @@ def test_a_map_that_was_changed_is_refused(tmp_path: Path, statement: str, messa
 def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
     path = tmp_path / "a.omap"
     endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x FROM n"
-    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 3",
+    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 4",
             *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map", "tag", "tag_view")))
     with pytest.raises(OmnidError, match="tables are not those"):
         read_places(path)

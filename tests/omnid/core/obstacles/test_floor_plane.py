@@ -27,7 +27,7 @@ VISIBLE = np.ones((CYLINDER.height, CYLINDER.width), bool)
 
 def free_m(floor: Pattern, wall_m: float = 9.0, wall: Pattern = plain) -> np.ndarray:
     """Return the free ranges of drawn panoramas."""
-    plane = FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, VISIBLE)
+    plane = FloorPlane(CYLINDER, T_RECT_BASE, BASELINE_M, VISIBLE)
     return plane.free_m(*panoramas(floor, wall_m, wall))
 
 
@@ -52,12 +52,12 @@ def test_floor_is_seen_neither_in_the_dark_nor_where_the_robot_hides_it() -> Non
     assert (free_m(lambda x, y: 0.02 * worn(x, y)) == 0).all()
     masked = VISIBLE.copy()
     masked[:, : CYLINDER.width // 2] = False  # azimuths from 0 to pi
-    plane = FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, masked)
+    plane = FloorPlane(CYLINDER, T_RECT_BASE, BASELINE_M, masked)
     free = plane.free_m(*panoramas(worn, 9.0, plain))
     assert (free[(azimuths() > 0.1) & (azimuths() < 3.0)] == 0).all() and np.median(free[azimuths() < -0.1]) > 2.0
     behind = panoramas(lambda x, y: np.where(np.hypot(x, y) < 1.6, 120.0, worn(x, y)), 9.0, plain)
-    assert (FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, VISIBLE).free_m(*behind) == 0).all(), "after a gap"
-    nothing = FloorPlane(CYLINDER, T_RECT_BASE, 0.0, BASELINE_M, np.zeros_like(VISIBLE))
+    assert (FloorPlane(CYLINDER, T_RECT_BASE, BASELINE_M, VISIBLE).free_m(*behind) == 0).all(), "after a gap"
+    nothing = FloorPlane(CYLINDER, T_RECT_BASE, BASELINE_M, np.zeros_like(VISIBLE))
     assert (nothing.free_m(*panoramas(worn, 9.0, plain)) == 0).all()
 
 
@@ -71,7 +71,7 @@ def test_an_obstacle_ends_the_floor_that_is_seen_otherwise() -> None:
 
 def test_the_view_of_the_floor_is_its_brightness_from_where_the_camera_sees_it_on() -> None:
     lower, _ = panoramas(lambda x, y: 100 + 20 * np.sin(2 * x) + 30 * np.cos(2 * y), 9.0, plain)
-    camera = FloorCamera(CYLINDER, T_RECT_BASE, 0.0)
+    camera = FloorCamera(CYLINDER, T_RECT_BASE)
     angle, distance = np.meshgrid(np.linspace(-3.1, 3.1, 40), np.linspace(0.85, 2.4, 20))
     places = np.column_stack([(distance * np.cos(angle)).ravel(), (distance * np.sin(angle)).ravel()])
     seen = camera.view(lower, VISIBLE, places)

@@ -12,13 +12,14 @@ from omnid.errors import OmnidError
 
 FLOOR_M = -1.2
 VIEW = np.zeros(3)
-SETTINGS = RingSettings(floor_m=FLOOR_M)
+SETTINGS = RingSettings()
 
 
 def seen(*parts: np.ndarray, sigma_of_m2: float = 0.01, settings: RingSettings = SETTINGS) -> Observation:
     """Return the observation of points, whose sigma is so many metres per square metre of range."""
     points = np.vstack(parts)
-    return observe(points, sigma_of_m2 * (points**2).sum(axis=1), VIEW, settings)
+    above_floor = points - [0.0, 0.0, FLOOR_M]
+    return observe(above_floor, sigma_of_m2 * (points**2).sum(axis=1), VIEW - [0.0, 0.0, FLOOR_M], settings)
 
 
 def arc(range_m: float, degrees: tuple[float, float], heights_m: tuple[float, float], count: int = 2000) -> np.ndarray:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.floor_view import FloorView, unmeasured
+from omnid.core.obstacles.floor_view import FloorView
 from omnid.core.obstacles.free_space import CELL_M, END_M, MISSED_NS, ROBOT_M
 from omnid.core.obstacles.observation import Observation, with_plane
 from omnid.core.obstacles.ring_filter import RingFilter
@@ -333,13 +332,6 @@ def test_a_shadow_hides_no_floor_that_both_cameras_see_as_a_plane() -> None:
     plane = with_plane(NOTHING, np.where(azimuths() > 0.1, 2.0, 0.0))
     shadow = drive.go(5, plane)
     assert shadow.free_m[192:200].min() > 1.9 and shadow.free_m[168:178].max() < 1.0
-
-
-def test_without_the_height_of_the_cameras_floor_is_free_in_view_as_long_as_stereo_sees_it() -> None:
-    ring, view = RingFilter(SETTINGS), partial(unmeasured, 1.0)
-    step(ring, 0, pose(), floor_beside(0), view)
-    assert step(ring, S, pose(), NOTHING, view).free_m[AHEAD].min() > 2.5
-    np.testing.assert_allclose(step(ring, 2 * S, pose(), NOTHING, view).free_m[AHEAD], 1.0, atol=0.1)
 
 
 def test_assumed_floor_in_view_is_not_kept_by_its_looks() -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.mapping.range_scan import range_scan
+from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.localisation import MapLocaliser, MapPose, OdometryFrame
@@ -44,7 +44,7 @@ def odometry(frames: Sequence[StereoFrame], poses: Array = POSES, resets: int = 
             A = se3.adjoint(se3.inverse(step))
             T, covariance = T @ step, A @ covariance @ A.T + COVARIANCE
         found.append(OdometryFrame(stereo, (start + k) * 200_000_000, T, covariance, False, resets, True,
-                                   lambda: range_scan(np.zeros((0, 3)), (-1.0, 1.0))))
+                                   lambda: np.full(SECTORS, np.nan, np.float32)))
     return found
 
 

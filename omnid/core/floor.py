@@ -1,0 +1,183 @@
+"""The plane of the floor below the cameras, from the points of stereo.
+
+About the lower viewpoint, in the axes of the base, the floor is z = -h + a x + b y. With the residual
+e_i = z_i + h - a x_i - b y_i and its noise sigma_i, a point within a span S of the floor has the density
+
+    p N(e_i; sigma_i) + (1 - p) ((1 - FALSE) Phi(e_i / sigma_i) + FALSE) / S
+
+A part p lies on the floor, the others stand on it, evenly over S (walls, furniture), and few are false. So little may
+lie below the floor: a table is none. The prior of a and b is 0 +- 1 degree. h is searched on a grid, with S = h;
+then expectation maximisation (Dempster, Laird, Rubin 1977) finds h, a, b, p and the noise's scale, with S = SPAN_M.
+The evidence for a floor is the log of the ratio of the likelihoods with it (p) and without (p = 0). Points of one
+surface share their errors: POINTS_ALIKE of them count as one. The evidence of pairs adds up.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from calib import se3
+
+Array = NDArray[np.float64]
+
+TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base that stands on its wheels
+HEIGHTS_M: Final = np.arange(0.1, 3.0, 0.02)  # that are searched; finer than the noise that the prior's tilt adds
+SPAN_M: Final = 0.3  # about the floor, in which points are compared with it
+FALSE: Final = 0.05  # of the points: those of false matches
+FIRST_PART: Final = 0.1  # on the floor, in the search: of a narrow corridor
+STEEP: Final = math.tan(math.radians(15))  # below the horizon; flatter rays measure the floor's height badly
+LARGEST_SIGMA_M: Final = 0.1  # of a point that is used
+UNEVEN_M: Final = 0.005  # of a floor that is not quite even
+NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise; on floors it was 0.3 to 0.9
+MOST_POINTS: Final = 2000  # more of a pair say the same
+ITERATIONS: Final = 40
+CONVERGED: Final = 1e-5  # m, rad
+# Fitted on rendered logs (the sample, rooms 601, two_walls 601): pairs scatter by 6 mm and 0.3 degrees.
+POINTS_ALIKE: Final = 20.0
+LEAST_EVIDENCE: Final = 5.0  # of a run: 150 to 1
+LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
+SECTORS: Final = 36
+LEAST_SECTORS: Final = 12  # in which the floor is seen
+# Of the rig and of stereo, which many pairs do not average out; the same logs: -12 to +8 mm.
+RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])  # m, rad, rad
+LARGEST_SCATTER_M: Final = 0.05  # between the pairs of one floor; more: they contradict one another
+MOST_PAIRS: Final = 12  # then the floor stays as it is, and costs nothing any more
+RENEWED_AT: Final = (3, 6, MOST_PAIRS)  # pairs; what depends on the floor is computed again then
+
+
+class Floor(NamedTuple):
+    """The plane z = -height_m + a x + b y about the lower viewpoint in base axes; sigmas of height and of a and b."""
+
+    height_m: float
+    a: float = 0.0
+    b: float = 0.0
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
+
+    @property
+    def tilt_rad(self) -> float:
+        """Angle between the floor's normal and z of the base."""
+        return math.atan(math.hypot(self.a, self.b))
+
+    def T_floor_base(self, view: Array) -> Array:
+        """Return the transform (4, 4) from the base to its level frame: z is the height above the floor, the origin
+        below or above that of the base. view (3,): the lower viewpoint in the base frame.
+        """
+        up = np.array([-self.a, -self.b, 1.0]) / math.hypot(self.a, self.b, 1.0)
+        R = se3.rotation_exp(np.array([up[1], -up[0], 0.0]) * (self.tilt_rad / max(math.hypot(up[0], up[1]), 1e-12)))
+        return se3.transform(R, np.array([0.0, 0.0, self.height_m * up[2] - up @ view]))
+
+
+class _Points(NamedTuple):
+    """Points that may lie on the floor, about the viewpoint."""
+
+    xyz: Array  # (N, 3) m
+    sigma_m: Array  # (N,) along z
+
+
+class FloorFit(NamedTuple):
+    """The floor of one pair, and the evidence for it."""
+
+    floor: Floor
+    evidence: float
+
+
+def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
+    """Return the floor among points (N, 3) [m] about the lower viewpoint in base axes; None where it is not seen.
+
+    variance_m2 (N,): along the rays.
+    """
+    # 1. The points far enough below the horizon, and their noise along z.
+    seen = _usable(points, variance_m2)
+    if len(seen.xyz) < SECTORS:
+        return None
+    # 2. The likeliest height of a level floor; its tilt is noise that grows with the range.
+    across = np.hypot(seen.xyz[:, 0], seen.xyz[:, 1])
+    on, off = _densities(seen.xyz[:, 2] + HEIGHTS_M[:, None], np.hypot(seen.sigma_m, TILT_SIGMA_RAD * across),
+                         HEIGHTS_M[:, None])
+    best = np.argmax(np.log(FIRST_PART * on + (1 - FIRST_PART) * off).sum(axis=1))
+    # 3. Height, tilt, part on the floor and noise, by the points about the floor.
+    A = np.column_stack([-np.ones(len(across)), seen.xyz[:, :2]])
+    q, part, scale = np.array([HEIGHTS_M[best], 0.0, 0.0]), FIRST_PART, 1.0
+    prior = np.diag([0.0, TILT_SIGMA_RAD**-2, TILT_SIGMA_RAD**-2])
+    for _ in range(ITERATIONS):
+        e = seen.xyz[:, 2] - A @ q
+        near = np.abs(e) < SPAN_M
+        on, off = _densities(e, scale * seen.sigma_m, SPAN_M)
+        share = np.where(near, part * on / (part * on + (1 - part) * off), 0.0)
+        weight = share / (scale * seen.sigma_m) ** 2 / POINTS_ALIKE
+        information = A.T @ (weight[:, None] * A) + prior
+        total, before = float(share.sum()), q
+        if total < 1.0:
+            return None
+        q = np.linalg.solve(information, A.T @ (weight * seen.xyz[:, 2]))
+        part = total / int(near.sum())
+        scale = float(np.clip(math.sqrt(share @ ((seen.xyz[:, 2] - A @ q) / seen.sigma_m) ** 2 / total), *NOISE_SCALES))
+        if np.abs(q - before).max() < CONVERGED:
+            break
+    # 4. The evidence, and the directions in which the floor is seen.
+    evidence = float(np.log((part * on + (1 - part) * off) / off)[near].sum()) / POINTS_ALIKE
+    x, y = seen.xyz[share > 0.5, :2].T
+    sectors = len(np.unique(np.floor(np.arctan2(y, x) * (SECTORS / (2 * math.pi)))))
+    if evidence < LEAST_OF_PAIR or sectors < LEAST_SECTORS or q[0] < HEIGHTS_M[0]:
+        return None
+    sigma = np.hypot(np.sqrt(np.diag(np.linalg.inv(information))), RIG_SIGMAS)
+    return FloorFit(Floor(float(q[0]), float(q[1]), float(q[2]), float(sigma[0]), float(sigma[1:].max())), evidence)
+
+
+class FloorEstimator:
+    """The floor of a run: the medians of what its first pairs show, then constant."""
+
+    def __init__(self) -> None:
+        self._fits: list[FloorFit] = []
+        self.floor: Floor | None = None  # None: not seen, or the pairs contradict one another
+
+    @property
+    def is_final(self) -> bool:
+        """True if more pairs change nothing."""
+        return len(self._fits) >= MOST_PAIRS
+
+    def add(self, points: Array, variance_m2: Array) -> None:
+        """Add a pair: see `fit_floor`."""
+        found = None if self.is_final else fit_floor(points, variance_m2)
+        if found is None:
+            return
+        self._fits.append(found)
+        is_evident = sum(fit.evidence for fit in self._fits) > LEAST_EVIDENCE
+        if is_evident and (self.floor is None or len(self._fits) in RENEWED_AT):
+            self.floor = _median(np.array([fit.floor for fit in self._fits]))
+
+
+def _median(fits: Array) -> Floor | None:
+    """Return the median of floors (K, 5); None where they scatter.
+
+    Errors of pairs are not independent: their number makes the sigma no smaller than that of one pair.
+    """
+    middle = np.median(fits, axis=0)
+    scatter = 1.4826 * np.median(np.abs(fits - middle), axis=0)  # of a normal distribution
+    if scatter[0] > LARGEST_SCATTER_M:
+        return None
+    height_m, a, b, sigma_m, sigma_rad = middle.tolist()
+    return Floor(height_m, a, b, math.hypot(sigma_m, scatter[0]), math.hypot(sigma_rad, scatter[1:3].max()))
+
+
+def _usable(points: Array, variance_m2: Array) -> _Points:
+    """Return the points below the horizon whose noise is small enough, at most MOST_POINTS."""
+    across, fall = np.hypot(points[:, 0], points[:, 1]), -points[:, 2]
+    steep = (fall > HEIGHTS_M[0]) & (fall > STEEP * across)
+    xyz, fall, across = points[steep], fall[steep], across[steep]
+    sigma = np.hypot(np.sqrt(variance_m2[steep]) * fall / np.hypot(across, fall), UNEVEN_M)
+    kept = np.flatnonzero(sigma < LARGEST_SIGMA_M)  # False for NaN
+    kept = kept[:: max(1, -(-len(kept) // MOST_POINTS))]
+    return _Points(xyz[kept], sigma[kept])
+
+
+def _densities(e: Array, sigma_m: Array, span_m: Array | float) -> tuple[Array, Array]:
+    """Return the densities of points with residuals e on the floor, and of others."""
+    on = np.exp(-0.5 * (e / sigma_m) ** 2) / (math.sqrt(2 * math.pi) * sigma_m)
+    return on, ((1 - FALSE) * ndtr(e / sigma_m) + FALSE) / span_m

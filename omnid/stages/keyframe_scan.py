@@ -1,0 +1,35 @@
+"""Range scan of a keyframe: the nearest obstacles above the floor, as the obstacle ring finds them in one pair."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, RangeScan
+from omnid.core.obstacles.observation import observe
+from omnid.core.obstacles.settings import RingSettings
+from omnid.messages import DensePoints
+from omnid.stages.floor import CameraFloor
+
+Array = NDArray[np.float64]
+
+
+def keyframe_scan(depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Array, settings: RingSettings
+                  ) -> RangeScan:
+    """Return the ranges (SECTORS,) by azimuth in the rectified frame, turned level; all unknown without a floor."""
+    floor = camera_floor.floor
+    if floor is None:
+        return np.full(SECTORS, np.nan, np.float32)
+    T_floor_rig = camera_floor.T_floor_rig(floor)
+    T_floor_rect = T_floor_rig @ T_rig_rect
+    # The level frame below the lower viewpoint, with the heading of the rectified frame.
+    heading = se3.rotation_exp(np.array([0.0, 0.0, float(se3.yaw(T_floor_rect))]))
+    T_floor_level = se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0]))
+    points = se3.apply(se3.inverse(T_floor_level) @ T_floor_rig, depth.points)
+    view = np.array([0.0, 0.0, T_floor_rect[2, 3]])
+    settings = replace(settings, max_range_m=MAX_RANGE_M)
+    ranges = observe(points, np.sqrt(depth.variance_m2), view, settings, floor.sigma_m).ranges_m
+    return np.where(np.isfinite(ranges), ranges, np.float32(np.nan))
