@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from omnid.api import Odometry, replay
     from omnid.calibration.camera import calibrate_camera
     from omnid.calibration.drive import calibrate_drive
+    from omnid.calibration.height import calibrate_height
     from omnid.calibration.rig import calibrate_rig
     from omnid.config import Config, load_config
     from omnid.errors import OmnidError
@@ -33,12 +34,12 @@ if TYPE_CHECKING:
     from omnid.tracking_state import TrackingState
 
 __all__ = ["Board", "Config", "Odometry", "OdometryUpdate", "OmnidError", "RunResult", "TrackingState", "__version__",
-           "calibrate_camera", "calibrate_drive", "calibrate_rig", "load_config", "replay"]
+           "calibrate_camera", "calibrate_drive", "calibrate_height", "calibrate_rig", "load_config", "replay"]
 _MODULES = {"Board": "calib.boards.board", "Config": "omnid.config", "Odometry": "omnid.api",
             "OdometryUpdate": "omnid.messages", "OmnidError": "omnid.errors", "RunResult": "omnid.runs.run_result",
             "TrackingState": "omnid.tracking_state", "calibrate_camera": "omnid.calibration.camera",
-            "calibrate_drive": "omnid.calibration.drive", "calibrate_rig": "omnid.calibration.rig",
-            "load_config": "omnid.config", "replay": "omnid.api"}
+            "calibrate_drive": "omnid.calibration.drive", "calibrate_height": "omnid.calibration.height",
+            "calibrate_rig": "omnid.calibration.rig", "load_config": "omnid.config", "replay": "omnid.api"}
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of this package
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig_file import read_rig, write_rig
+from omnid.commands.height_option import add_height, height_of, with_height
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -36,6 +37,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
     parser.add_argument("--distance-m", type=float, metavar="M", help="straight distance from the first to the last "
                         "image of a single log: sets the baseline's length, which is kept otherwise")
+    add_height(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the rig.toml to write")
     parser.set_defaults(run=run)
 
@@ -59,8 +61,9 @@ def run(args: argparse.Namespace) -> int:
         rig = found.at_distance(args.distance_m)
         print(f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance "
               f"({found.distance_m:.3f} m before)")
+    rig = with_height(rig, args)
     write_rig(args.output, rig)
-    print(f"{args.output}: written")
+    print(f"{args.output}: written, {height_of(rig)}")
     if found.is_misfit:
         print(f"{args.output}: warning: the model does not describe these cameras; calibrate with a board, and check "
               "the mirrors", file=sys.stderr)

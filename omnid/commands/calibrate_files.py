@@ -17,6 +17,7 @@ from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
+from omnid.commands.height_option import add_height, height_of, with_height
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -42,6 +43,7 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
                          "the upper one; both cameras look up and are equally oriented")
     parser.add_argument("--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly "
                         "through a lens")
+    add_height(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
 
 
@@ -56,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     """Import or export a rig, and print one line about it."""
     _must_be_writable(args.output)
     if args.action == "import":
-        rig = _kalibr(args) if args.camchain else _ocam(args)
+        rig = with_height(_kalibr(args) if args.camchain else _ocam(args), args)
         write_rig(args.output, rig)
         print(f"{args.output}: {describe(rig)}")
     else:
@@ -121,13 +123,13 @@ def _left_out(rig: Rig) -> str:
 
 
 def describe(rig: Rig) -> str:
-    """Return one line about a rig: models, sizes, fields of view, baseline, rotation between the cameras, topics."""
+    """Return one line about a rig: cameras, topics, baseline, rotation between the cameras, height."""
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
     lower, upper = (_describe(mounted, topic)
                     for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True))
     return (f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
-            f"{rotation_deg:.2f} deg")
+            f"{rotation_deg:.2f} deg, {height_of(rig)}")
 
 
 def _describe(mounted: MountedCamera, topic: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from calib.camera_file import read_camera
@@ -11,6 +12,7 @@ from calib.models.ocam import VIEWS
 from omnid.calibration.rig import GivenCameras, calibrate_rig
 from omnid.commands.board_options import add_board_options, board_of
 from omnid.commands.calibrate_camera import MODEL_HELP, print_result, progress_of
+from omnid.commands.height_option import add_height, height_of, with_height
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -35,6 +37,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--mask", action="store_true", help="also find hub and struts, and write the masks to PNGs in "
                         "the folder of the rig's file; they may be edited")
     parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and panoramas")
+    add_height(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
     parser.set_defaults(run=run)
@@ -49,10 +52,12 @@ def run(args: argparse.Namespace) -> int:
     found = calibrate_rig(args.images, board, topics=(args.lower, args.upper), cameras=given,
                           refine_cameras=args.refine_cameras, model=args.model, view=args.view, with_struts=args.mask,
                           expected_baseline_m=expected_m, progress=progress_of(args))
+    found = replace(found, rig=with_height(found.rig, args))
     found.save(args.output)
     if args.report:
         found.save_report(args.report)
     print_result(args.output, found)
+    print(f"{args.output}: {height_of(found.rig)}")
     return 0
 
 

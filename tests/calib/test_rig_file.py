@@ -49,6 +49,25 @@ def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.toml", "rig.upper.png"][:1 + masks]
 
 
+def test_a_pose_on_the_robot_that_is_not_stated_is_left_out_and_one_without_a_height_states_none(rig: Rig) -> None:
+    unstated = replace(rig, T_base_rig=np.eye(4))
+    assert "T_base_rig" not in rig_toml(unstated) and parse_rig(rig_toml(unstated)).height_m() is None
+    shifted = replace(rig, T_base_rig=se3.transform(np.eye(3), [0.3, 0.0, -float(rig.lower.viewpoint[2])]))
+    assert "T_base_rig" in rig_toml(shifted) and shifted.height_m() is None
+    assert shifted.height_m(floor_m=-1.2) == pytest.approx(1.2)
+
+
+def test_a_stated_height_is_that_of_the_lower_viewpoint(rig: Rig) -> None:
+    for height_m in (0.3, 1.2):
+        found = parse_rig(rig_toml(rig.at_height(height_m)))
+        assert found.height_m() == pytest.approx(height_m)
+        assert se3.apply(found.T_base_rig, found.lower.viewpoint[None])[0, 2] == pytest.approx(height_m)
+        np.testing.assert_allclose(found.T_base_rig[:2], rig.T_base_rig[:2])
+    for height_m in (0.0, -1.0, 30.0, np.nan):
+        with pytest.raises(CalibError, match="height of the cameras: expected"):
+            rig.at_height(height_m)
+
+
 def test_file_contains_the_camera_poses(omni_rig: Rig, around: Array) -> None:
     """A round trip does not detect T_rig_upper written as its inverse; a transformed point does."""
     import tomllib

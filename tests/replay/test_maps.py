@@ -40,6 +40,19 @@ def omap(built: Path, tmp_path: Path) -> Path:
     return tmp_path / "place.omap"
 
 
+def test_a_map_without_the_height_of_the_cameras_warns_and_has_no_free_cell(
+    omnid: Command, omap: Path, tmp_path: Path
+) -> None:
+    places, rig = read_places(omap)
+    for number, expected in enumerate((True, False)):
+        result = omnid("map", "export", omap, "--grid", tmp_path / f"{number}.yaml")
+        assert result.code == 0 and (b"\xfe" in (tmp_path / f"{number}.pgm").read_bytes()) == expected
+        assert ("warning" not in result.err) == expected and ("all cells are unknown" in result.err) != expected
+        for keyframe in places.keyframes.values():
+            keyframe.scan.fill(np.nan)
+        write_places(omap, places, rig)
+
+
 def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
     omnid: Command, scene: Path, omap: Path, tmp_path: Path
 ) -> None:

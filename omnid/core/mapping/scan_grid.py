@@ -14,6 +14,7 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.core.mapping.range_scan import SURFACE_RATIO, RangeScan, azimuths
@@ -27,8 +28,9 @@ HIT: Final = 9
 MISS: Final = 4  # and takes from one that it sees through; 1.5 to 1; by trial on development seeds
 LIMITS: Final = (-20, 35)  # tenths of log odds: nine free views clear a wall that was seen often
 OCCUPIED_FROM: Final = 14  # tenths of log odds: two hits more than misses
-FREE_UNTIL: Final = -4  # tenths of log odds: one miss
+FREE_UNTIL: Final = -8  # tenths of log odds: two misses, as false matches let single views see through a wall
 SHORTER: Final = 0.02  # 1/m: the free space of a range r ends r^2 times it before the obstacle, as the noise of stereo
+EDGE_SECTORS: Final = 2  # to each side, in which the nearest range ends the free space: so far off may an edge be
 SHIFT: Final = 4  # fractional bits of the corners that are drawn; a sixteenth of a cell is enough
 
 
@@ -59,7 +61,9 @@ class ScanGrid:
         odds, seen = self._odds[top:bottom, left:right], self._seen[top:bottom, left:right]
         free, hit = np.zeros(odds.shape, np.uint8), np.zeros(odds.shape, np.uint8)
         # A cell's middle is an integer for OpenCV. Sectors without range are a corner at the robot: not seen.
-        seen_through = np.where(known, np.maximum(scan - self._cell_m - SHORTER * scan**2, 0.0), 0.0)
+        nearest = minimum_filter1d(np.where(known, scan, np.inf), 2 * EDGE_SECTORS + 1, mode="wrap")
+        nearest = np.where(known, nearest, 0.0)
+        seen_through = np.maximum(nearest - self._cell_m - SHORTER * nearest**2, 0.0)
         corners = np.rint((centre + seen_through[:, None] * direction - [left, top] - 0.5) * 2**SHIFT).astype(np.int32)
         cv2.fillPoly(free, [corners], 1, shift=SHIFT)
         _draw_hits(hit, scan, ends - [left, top])

@@ -42,6 +42,14 @@ def test_an_obstacle_that_has_gone_is_cleared_and_a_new_one_appears() -> None:
     assert near(grid, 1.0, 1.0) == {FREE} and OCCUPIED in near(grid, 1.0, -0.7)
 
 
+def test_no_free_cell_touches_an_occupied_one() -> None:
+    scans = [scan_of(np.concatenate([ROOM, box((1, 1), (1.3, 1.3))]), T, 0.02, n) for n, T in enumerate(PATH)]
+    grid = scan_grid(scans, PATH, 0.05)
+    occupied = np.pad(grid.cells == OCCUPIED, 1)
+    near_occupied = np.any([np.roll(occupied, (dy, dx), (0, 1)) for dx in (-1, 0, 1) for dy in (-1, 0, 1)], axis=0)
+    assert occupied.sum() > 100 and not (grid.cells[near_occupied[1:-1, 1:-1]] == FREE).any()
+
+
 def test_the_map_moves_with_its_keyframes() -> None:
     scans = [scan_of(ROOM, T) for T in PATH]
     moved = pose(1.0, 2.0, np.pi / 2)

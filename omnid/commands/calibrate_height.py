@@ -1,0 +1,58 @@
+"""`omnid calibrate height`: height and tilt of the cameras by the floor that they see."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from calib.rig_file import read_rig
+from omnid.calibration.image_pairs import open_log
+from omnid.commands.height_option import height, height_of
+from omnid.runs.log_rig import attached_rig
+from omnid.sinks.files import check_outputs
+
+
+def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    """Add `height` to `omnid calibrate`."""
+    parser = actions.add_parser("height", help="the height of the cameras above the floor, and their tilt, from a log")
+    parser.add_argument("log", type=Path, metavar="LOG", help="a log in which the floor is seen all around")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
+    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
+    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
+    parser.add_argument("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the "
+                        "file of --rig")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the height; return 1, and write nothing, where the ruler contradicts it."""
+    from omnid.calibration.height import calibrate_height
+    from omnid.engine.kernel_cache import prepare_kernels
+    from omnid.engine.logging_setup import log
+
+    if args.output:
+        check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
+    prepare_kernels(log)
+    topics = args.lower, args.upper
+    rig = read_rig(args.rig) if args.rig else None
+    if rig is None:
+        reader = open_log(args.log, topics, None)
+        try:
+            rig = attached_rig(reader, args.log)
+        finally:
+            reader.close()
+    found = calibrate_height(args.log, rig, topics)
+    print(found)
+    print(f"the rig so far: {height_of(rig)}")
+    if args.ruler_m is not None:
+        contradiction = found.contradiction(args.ruler_m)
+        if contradiction:
+            print(f"omnid: {contradiction}; nothing was written", file=sys.stderr)
+            return 1
+        print(f"{args.ruler_m:.3f} m by ruler agrees")
+    if args.output:
+        found.save(args.output)
+        print(f"{args.output}: written")
+    return 0

@@ -1,0 +1,94 @@
+"""Height and tilt of a rig by the floor of a rendered log: the command, the API, the ruler."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import omnid
+from calib import se3
+from calib.rig import Rig
+from calib.rig_file import read_rig
+from omnid.calibration.height import HeightCalibration, on_floor
+from omnid.core.floor import Floor
+from omnid.simulation.rendering.rigs import make_rig
+from tests.omnid.commands.test_calibrate import omnid as command
+
+HEIGHT_M = 1.2  # of rendered rigs: tests/simulation/paths.py
+
+
+@pytest.fixture(scope="module")
+def found(scene: Path) -> HeightCalibration:
+    return omnid.calibrate_height(scene / "log.mcap", read_rig(scene / "rig.toml"))
+
+
+def test_the_height_is_found_within_its_sigma(found: HeightCalibration) -> None:
+    assert abs(found.floor.height_m - HEIGHT_M) < 2 * found.floor.sigma_m < 0.08
+    assert found.rig.height_m() == pytest.approx(found.floor.height_m) and found.before.height_m() is None
+    assert f"{found.floor.height_m:.3f} m (sigma" in str(found)
+
+
+def test_a_tilted_rig_is_found_tilted(scene: Path) -> None:
+    """By 1.5 degrees, more than the sigma of the prior, which draws it towards 0."""
+    T_base_rig = se3.transform(se3.rotation_exp(np.deg2rad([0.0, 1.5, 0.0])), np.array([0.2, 0.0, 0.7]))
+    rig = replace(read_rig(scene / "rig.toml"), T_base_rig=T_base_rig)
+    floor = omnid.calibrate_height(scene / "log.mcap", rig).floor
+    assert abs(floor.height_m - HEIGHT_M) < 0.05 and floor.a < -np.deg2rad(0.3)
+    assert np.hypot(floor.a + np.deg2rad(1.5), floor.b) < 2.5 * floor.sigma_rad
+
+
+@pytest.mark.parametrize("sigma_deg", [0.1, 2.0])
+def test_a_rig_is_levelled_where_its_tilt_is_more_than_its_noise(sigma_deg: float) -> None:
+    T_base_rig = se3.transform(se3.rotation_exp(np.deg2rad([0.0, 1.5, 0.0])), np.array([0.2, 0.1, 0.0]))
+    rig = replace(make_rig(), T_base_rig=T_base_rig)
+    floor = Floor(HEIGHT_M, -np.tan(np.deg2rad(1.5)), 0.0, 0.01, np.deg2rad(sigma_deg))
+    found = on_floor(rig, floor).T_base_rig
+    up = np.array([0.0, 0.0, 1.0]) if sigma_deg < 1 else T_base_rig[2, :3]
+    np.testing.assert_allclose(found[2, :3], up, atol=1e-3)
+    np.testing.assert_allclose(found[:3, 3], [0.2, 0.1, HEIGHT_M], atol=0.02)
+
+
+def calibration(rig: Rig, height_m: float) -> HeightCalibration:
+    """Return a result with a floor that is known to a centimetre."""
+    return HeightCalibration(rig, rig.at_height(height_m), Floor(height_m, sigma_m=0.01), 10)
+
+
+def test_a_ruler_that_says_otherwise_names_the_baseline_that_would_fit() -> None:
+    found = calibration(make_rig(baseline_m=0.2), 1.2)
+    assert not found.contradiction(1.17) and not found.contradiction(1.23)
+    assert "200.0 mm in the rig, 220.0 mm would fit" in found.contradiction(1.32)
+    assert found.contradiction(1.1)
+
+
+def test_the_command_writes_the_rig_unless_the_ruler_contradicts(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], found: HeightCalibration
+) -> None:
+    words = ("height", scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
+    assert command(*words, "--ruler-m", found.floor.height_m + 0.3) == 1
+    assert "nothing was written" in capsys.readouterr().err and not (tmp_path / "rig.toml").exists()
+    assert command(*words, "--ruler-m", f"{found.floor.height_m:.2f}") == 0
+    out = capsys.readouterr().out
+    assert str(found) in out and "no height of the cameras" in out and "by ruler agrees" in out
+    assert read_rig(tmp_path / "rig.toml").height_m() == pytest.approx(found.floor.height_m)
+
+
+def test_a_log_without_a_floor_ends_with_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("omnid.core.floor.LEAST_EVIDENCE", np.inf)
+    with pytest.raises(omnid.OmnidError, match="the floor is not seen in"):
+        omnid.calibrate_height(scene / "log.mcap", read_rig(scene / "rig.toml"))
+
+
+def test_commands_that_make_a_rig_take_its_height(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+                                                  ) -> None:
+    words = ("import", scene / "camchain.yaml", "-o", tmp_path / "rig.toml")
+    assert command(*words) == 0 and "no height of the cameras" in capsys.readouterr().out
+    assert "T_base_rig" not in (tmp_path / "rig.toml").read_text()
+    assert command(*words, "--height-m", "1.2") == 0 and "cameras 1.200 m above the floor" in capsys.readouterr().out
+    assert read_rig(tmp_path / "rig.toml").height_m() == pytest.approx(1.2)
+    for wrong in ("0", "-1", "high", "nan", "1200"):
+        with pytest.raises(SystemExit):
+            command(*words, "--height-m", wrong)
+        assert "--height-m: expected 0.1 to 10 m" in capsys.readouterr().err
