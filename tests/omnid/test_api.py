@@ -107,7 +107,7 @@ def test_a_result_and_a_pose_print_as_one_line(result: omnid.RunResult, scene: P
     length_m = result.counters.length_m
     assert repr(result) == str(result) == (
         f"<RunResult: {PAIRS} poses ({PAIRS} tracking), {1e-9 * np.ptp(result.stamps_ns):.1f} s, {length_m:.2f} m, "
-        f"{len(result.map.xyz) if result.map is not None else 0} map points, 0 warnings>")
+        f"{len(result.map.xyz) if result.map is not None else 0} map points, 1 warnings>")
     pose = omnid.Odometry(scene / "rig.toml").process(*pairs[0])
     assert re.fullmatch(r"<pose 0: tracking, x \+0\.000 y \+0\.000 z \+0\.000 m, heading [+-]0\.00 deg, sigma .* mm>",
                         str(pose))
