@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from typing import Final
 
 from omnid.commands.json_output import add_json, print_json
+
+# Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
+# that is lost half of the way is below.
+ANOTHER_DRIVE: Final = 0.25
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -29,6 +35,10 @@ def run(args: argparse.Namespace) -> int:
     from omnid.recordings.evaluation import evaluate
 
     metrics = evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3, args.align)
+    if metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
+        print(f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
+              f"{metrics.length_truth_m:.2f} m: is this the truth of the same drive, in the same frame of the robot?",
+              file=sys.stderr)
     if args.json:
         print_json(metrics)
     else:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.json_output import add_json, print_json
+from omnid.utc import utc
 
 if TYPE_CHECKING:
     from drivers.logs.mcap_info import LogInfo
@@ -94,7 +95,7 @@ def _described(found: LogInfo) -> Iterator[str]:
     if found.span_ns is not None:
         first_ns, last_ns = found.span_ns
         duration_s = max(0.0, (last_ns - first_ns) / 1e9)
-        yield f"time         {_utc(first_ns)} to {_utc(last_ns)}, {duration_s:.3f} s"
+        yield f"time         {utc(first_ns)} to {utc(last_ns)}, {duration_s:.3f} s"
     yield f"messages     {found.messages}"
     listed = ", ".join(f"{_shown(name)} ({_bytes(size)})" for name, size in found.attachments.items())
     yield f"attachments  {listed or 'none'}"
@@ -140,13 +141,3 @@ def _bytes(size: int) -> str:
         if size >= factor:
             return f"{size / factor:.1f} {unit}"
     return f"{size} bytes"
-
-
-def _utc(stamp_ns: int) -> str:
-    """Return the time of day, or the seconds if the stamp is not a plausible Unix time."""
-    from datetime import UTC, datetime
-
-    seconds, rest_ns = divmod(stamp_ns, 10**9)
-    if seconds > 2**33:
-        return f"{seconds} s"
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}.{rest_ns // 10**6:03}Z"

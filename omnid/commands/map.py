@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +13,7 @@ from omnid.commands.json_output import add_json, print_json
 from omnid.commands.listen import add_robot, config_of
 from omnid.commands.map_option import add_tags_option, tag_settings
 from omnid.commands.map_tags import add_align, add_tags
+from omnid.utc import utc
 
 if TYPE_CHECKING:
     from omnid.core.places.place_rig import PlaceRig
@@ -229,7 +229,7 @@ def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
     per_keyframe = path.stat().st_size / max(1, sizes.keyframes)
     yield f"map          {path}"
     yield f"size         {path.stat().st_size / 1e6:.1f} MB, {per_keyframe / 1e3:.0f} kB a keyframe"
-    yield f"time         {_utc(sizes.first_stamp_ns)} to {_utc(sizes.last_stamp_ns)}"
+    yield f"time         {utc(sizes.first_stamp_ns)} to {utc(sizes.last_stamp_ns)}"
     yield f"sessions     {sizes.sessions}"
     yield f"keyframes    {sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped"
     yield f"loops        {sizes.loops}"
@@ -240,9 +240,3 @@ def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
         yield f"parts        {sizes.parts}, between which no pose is known"
     yield (f"rig          {rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of "
            f"{rig.cylinder.width} x {rig.cylinder.height} px")
-
-
-def _utc(stamp_ns: int) -> str:
-    """Return the time of day, or the seconds if the stamp is not a plausible Unix time."""
-    seconds = stamp_ns // 10**9
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%SZ}" if 0 < seconds < 2**33 else f"{seconds} s"

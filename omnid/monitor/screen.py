@@ -64,7 +64,7 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
         yield f"  {_position(state.pose)}"
         yield (f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
                f"inliers {details.inliers} of {details.tracked}; resets {details.resets}")
-        yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  dropped {dropped}"
+        yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {dropped}"
     for status in sorted(state.statuses.values(), key=_importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield plain(f"  {_LEVELS[status.level % 4]:7s} {short_name(status.name):16s} {status.message}  {values}")

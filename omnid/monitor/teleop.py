@@ -91,20 +91,22 @@ def teleoperate(bus: BusConfig) -> int:
     """Drive the robot until `q`; return the exit code. OmnidError without a terminal, or where it cannot be reached."""
     if not sys.stdin.isatty():
         raise OmnidError("omnid drive needs a keyboard: run it in a terminal")
-    with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
+    with raw_keys() as keys, Robot(settings=bus, timeout_s=CONNECT_S) as robot, \
+            robot.subscribe(Diagnostics) as statuses:
         driver, stick = driver_of(robot), Stick(limits_of(robot))
         print(HELP)
-        with raw_keys() as keys:
-            try:
-                status = ""
-                while not stick.quit:
-                    stick.press(read_keys(keys), time.monotonic())
-                    report = statuses.newest()
-                    status = status if report is None else _status_line(report)
-                    _act(driver, stick, status)
-            finally:
-                driver.twist(0.0, 0.0)
-                print()
+        pressed_s = -math.inf  # keys that were typed while it connected still stop, arm and quit; motions are over
+        try:
+            status = ""
+            while not stick.quit:
+                stick.press(read_keys(keys), pressed_s)
+                pressed_s = time.monotonic()
+                report = statuses.newest()
+                status = status if report is None else _status_line(report)
+                _act(driver, stick, status)
+        finally:
+            driver.twist(0.0, 0.0)
+            print()
     return 0
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from html import escape
 from pathlib import Path
 from typing import Final
@@ -22,6 +21,7 @@ from omnid.report.poses import MAX_KEPT
 from omnid.report.report_data import ReportData
 from omnid.report.timeline import timeline
 from omnid.report.truth_comparison import TruthComparison, compare_with_truth
+from omnid.utc import utc
 from omnid.version import __version__
 
 _MOST_CROSSES: Final = 40
@@ -69,16 +69,8 @@ def report_html(path: Path, data: ReportData, true: Trajectory | None = None) ->
 def _head(path: Path, data: ReportData) -> list[str]:
     found, frames = data.info, data.frames
     facts = (f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
-             f"{data.topic}, from {_utc(data.poses.start_ns)}.")
+             f"{data.topic}, from {utc(data.poses.start_ns)}.")
     return [f"<h1>Run of {escape(data.robot)}</h1><p class='sub'>{escape(facts)}</p>"]
-
-
-def _utc(stamp_ns: int) -> str:
-    """Return date and time; seconds where a stamp is not a Unix time after 2001."""
-    seconds, rest_ns = divmod(stamp_ns, 10**9)
-    if not 10**9 <= seconds < 2**33:
-        return f"{seconds}.{rest_ns // 10**6:03} s"
-    return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S}.{rest_ns // 10**6:03} UTC"
 
 
 def _warnings(data: ReportData, true: Trajectory | None) -> list[str]:

@@ -134,9 +134,9 @@ def path_in_map(data: ReportData) -> list[tuple[float, float]]:
 
 
 def in_map(data: ReportData, clock: Clock) -> list[str]:
-    """Return the section with the map of places: its sizes, and the correction of odometry by it."""
+    """Return the section with the map of places: its sizes, and the correction of odometry, where there was one."""
     history, statuses = data.map_poses, data.statuses
-    if not history.path.vertices:
+    if not path_in_map(data):
         return []
     values = statuses.values(PLACES)
     rows = [(escape(name.replace("_", " ")), escape(value)) for name, value in values.items()]

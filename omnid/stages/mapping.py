@@ -20,7 +20,7 @@ from omnid.tracking_state import TrackingState
 Array = NDArray[np.float64]
 Position: TypeAlias = tuple[float, float]  # x, y [m]
 
-MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run
+MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run; one where there are fewer than 4
 FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2  # less motion shows the same points again
 STANDING_NS = 1_000_000_000  # between two pairs of the same view that enter the map
@@ -95,6 +95,7 @@ class Mapping:
 
     def _update(self, seq: int, stamp_ns: int) -> MapUpdate:
         """Return the voxels that enough frames have seen: false matches seldom repeat in the same place."""
-        enough = min(self._config.min_frames, max(MIN_VOXEL_FRAMES, self._frames // FRAMES_PER_VOXEL_FRAME))
+        least = min(MIN_VOXEL_FRAMES, max(1, self._frames // 2))
+        enough = min(self._config.min_frames, max(least, self._frames // FRAMES_PER_VOXEL_FRAME))
         return MapUpdate(seq, stamp_ns, self._map.points(enough),
                          np.array(self._path.with_end(), float).reshape(-1, 2))

@@ -60,11 +60,11 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
 def _failure(config: BusConfig, cause: str) -> OmnidError:
     if config.mode == "client":
         endpoints = ", ".join(config.connect)
-        return Unreachable(f"bus cannot reach {endpoints}: {cause}; start the robot or router there, or change "
-                           "bus.connect")
+        return Unreachable(f"bus cannot reach {endpoints}: start the robot or router there, or change bus.connect "
+                           f"({cause})")
     endpoints = ", ".join(config.listen)
-    return EndpointTaken(f"bus cannot listen on {endpoints}: {cause}; stop the other program there or change "
-                         "bus.listen")
+    return EndpointTaken(f"bus cannot listen on {endpoints}: stop the other program there or change bus.listen "
+                         f"({cause})")
 
 
 def router_in_place(config: BusConfig) -> BusConfig | None:

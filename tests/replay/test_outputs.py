@@ -217,3 +217,19 @@ def test_the_papers_method_selects_the_enhanced_sad_unless_the_matching_is_set(
         assert result.code == 0, result.err
     trajectories = {name: (tmp_path / name).read_bytes() for name in cases}
     assert trajectories["option"] == trajectories["file"] != trajectories["other"]
+
+
+def test_a_log_of_two_pairs_gives_its_points(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """So short a log cannot ask for several views of a point."""
+    ply = tmp_path / "map.ply"
+    result = omnid.replay(scene / "log.mcap", "--seconds", 0.15, "--cloud", ply, rig=scene / "rig.toml")
+    assert result.code == 0 and result.count("poses") == 2
+    assert len(read_ply(ply).xyz) > 100
+
+
+def test_a_truth_of_another_drive_is_asked_about(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    other = tmp_path / "other.txt"
+    other.write_text("".join(f"{line.split()[0]} {0.5 * row:.3f} 0 0 0 0 0 1\n"
+                             for row, line in enumerate((scene / "truth.txt").read_text().splitlines())))
+    assert "is this the truth of the same drive" in omnid("eval", scene / "truth.txt", other).err
+    assert omnid("eval", scene / "truth.txt", scene / "truth.txt").err == ""

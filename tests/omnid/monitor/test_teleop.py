@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -49,6 +51,12 @@ def test_any_other_key_ends_the_motion(stick: Stick, key: bytes) -> None:
 def test_letters(stick: Stick) -> None:
     stick.press(b"aq", 0.0)
     assert stick.arm_asked and stick.quit and not stick.stop_asked
+
+
+def test_keys_that_were_typed_while_it_connected_stop_and_arm_and_move_nothing(stick: Stick) -> None:
+    stick.press(UP + b"a ", -math.inf)
+    assert stick.arm_asked and stick.stop_asked
+    assert stick.twist(0.0) == (0.0, 0.0) and not stick.commands(0.0)
 
 
 def test_needs_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
