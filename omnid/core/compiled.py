@@ -19,6 +19,8 @@ R = TypeVar("R")
 
 # error_model: a division by zero gives inf or NaN as in numpy.
 OPTIONS: Final = {"nogil": True, "error_model": "numpy", "fastmath": False, "parallel": False}
+# Functions that only compiled functions call need no entries for Python and C, which take a tenth of all compilation.
+UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 KERNEL_FILES: Final = "*_kernels.py"
 
 _declared: list[Kernel[Any, Any]] = []
@@ -56,7 +58,7 @@ class Kernel(Generic[P, R]):
     def _dispatcher(self) -> Any:
         import numba
 
-        return numba.njit(**OPTIONS)(self.function)
+        return numba.njit(**OPTIONS, no_cfunc_wrapper=True)(self.function)
 
     def _types(self) -> tuple[Any, ...]:
         """Return the types of the arguments: arrays that are not written may be read-only ones."""
@@ -121,7 +123,11 @@ class Inner(Generic[P, R]):
         import numba
 
         if self._dispatcher is None:
-            self._dispatcher = numba.njit(**OPTIONS)(self.function)
+            self._dispatcher = numba.njit(**OPTIONS, **UNWRAPPED)(self.function)
+            # An argument such as 0 counts as an integer, not as a type of its own, which would be compiled once more.
+            template_for = self._dispatcher.get_call_template
+            self._dispatcher.get_call_template = lambda args, kws: template_for(
+                tuple(map(numba.types.unliteral, args)), kws)
         return self._dispatcher._numba_type_
 
 

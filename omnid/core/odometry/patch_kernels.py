@@ -38,10 +38,12 @@ def fit(templates: Image, cells: Image, groups: Indices, noise_grey: float, shif
         fits: Flags) -> None:
     """Write shift (N, 2), covariance (N, 2, 2) and fits (N,) of `patch_fit.fit_patches`."""
     count, reach = len(templates), (cells.shape[1] - WINDOW_PX) // 2
-    designs = np.zeros((count, 3, WINDOW_PX, LANES), np.float32)
-    template = np.zeros((WINDOW_PX + 2, LANES + 2), np.float32)
-    cell = np.zeros((cells.shape[1], cells.shape[1] + LANES + 1), np.float32)
+    designs = np.empty((count, 3, WINDOW_PX, LANES), np.float32)
+    template = np.empty((WINDOW_PX + 2, LANES + 2), np.float32)
+    cell = np.empty((cells.shape[1], cells.shape[1] + LANES + 1), np.float32)
     lanes = np.empty((9, LANES), np.float32)
+    clear(template)
+    clear(cell)
     sums, normals, ratio = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty(count)
     for n in range(count):
         write_design(templates[n], template, designs[n])
@@ -54,22 +56,25 @@ def fit(templates: Image, cells: Image, groups: Indices, noise_grey: float, shif
         normal = normals[n]
         trace = normal[0, 0] + normal[1, 1]
         determinant = normal[0, 0] * normal[1, 1] - normal[0, 1] ** 2
-        shift[n], covariance[n], fits[n] = 0.0, 0.0, False
+        shift[n, 0], shift[n, 1], fits[n] = 0.0, 0.0, False
+        covariance[n, 0, 0], covariance[n, 0, 1], covariance[n, 1, 0], covariance[n, 1, 1] = 0.0, 0.0, 0.0, 0.0
         if normal[2, 2] <= PIXELS * MIN_CONTRAST**2 or determinant <= MIN_DETERMINANT * trace**2:
             continue
         invert(normal, prior, inverse)
-        copy_of(cells[n], 0, cell)
+        for row in range(cells.shape[1]):
+            for column in range(cells.shape[1]):
+                cell[row, column] = np.float32(cells[n, row, column]) - MIDDLE_GREY
         residual = solve(designs[n], cell, lanes, reach, sums[n], normal, inverse, prior * gain[n], shift[n], solution)
         fits[n] = max(abs(shift[n, 0]), abs(shift[n, 1])) < reach and LEAST_GAIN < solution[2] < LARGEST_GAIN
         write_covariance(inverse, residual, min(max(solution[2], LEAST_GAIN), LARGEST_GAIN), covariance[n])
 
 
 @inner
-def copy_of(image: Image, first: int, into: Floats) -> None:
-    """Write the greys of a square of an image, from pixel (first, first) on, less MIDDLE_GREY."""
-    for row in range(into.shape[0]):
-        for column in range(into.shape[0]):
-            into[row, column] = np.float32(image[first + row, first + column]) - MIDDLE_GREY
+def clear(values: Floats) -> None:
+    """Set all values (M, N) to zero."""
+    for row in range(values.shape[0]):
+        for column in range(values.shape[1]):
+            values[row, column] = 0.0
 
 
 @inner
@@ -78,7 +83,10 @@ def write_design(image: Image, template: Floats, design: Floats) -> None:
 
     The window is the middle of the image (T, T). template (WINDOW + 2, LANES + 2): room for it and its border.
     """
-    copy_of(image, image.shape[0] // 2 - WINDOW_PX // 2 - 1, template)
+    first = image.shape[0] // 2 - WINDOW_PX // 2 - 1
+    for row in range(WINDOW_PX + 2):
+        for column in range(WINDOW_PX + 2):
+            template[row, column] = np.float32(image[first + row, first + column]) - MIDDLE_GREY
     for row in range(WINDOW_PX):
         above, here, below = template[row], template[row + 1], template[row + 2]
         for lane in range(LANES):
@@ -94,7 +102,7 @@ def write_design(image: Image, template: Floats, design: Floats) -> None:
 @inner
 def write_products(design: Floats, lanes: Floats, sums: Array, normal: Array) -> None:
     """Write the sums (3,) of the design's rows, and their products (3, 3) about the means; lanes (9, LANES): room."""
-    lanes[:] = 0.0
+    clear(lanes)
     for row in range(WINDOW_PX):
         for lane in range(LANES):
             across, down, grey = design[0, row, lane], design[1, row, lane], design[2, row, lane]
@@ -140,7 +148,9 @@ def centred_energy(cell: Image, reach: int) -> float:
 @inner
 def group_medians(ratio: Array, groups: Indices) -> Array:
     """Return for each patch (N,) the median ratio of its group, within the range of gains."""
-    gain, chosen = np.zeros(len(ratio)), np.empty(len(ratio))
+    gain, chosen = np.empty(len(ratio)), np.empty(len(ratio))
+    for n in range(len(ratio)):
+        gain[n] = 0.0
     for n in range(len(ratio)):
         if gain[n] > 0:
             continue
@@ -149,11 +159,27 @@ def group_medians(ratio: Array, groups: Indices) -> Array:
             if groups[k] == groups[n]:
                 chosen[count] = ratio[k]
                 count += 1
-        median = min(max(np.median(chosen[:count]), LEAST_GAIN), LARGEST_GAIN)
+        median = min(max(median_of(chosen, count), LEAST_GAIN), LARGEST_GAIN)
         for k in range(n, len(ratio)):
             if groups[k] == groups[n]:
                 gain[k] = median
     return gain
+
+
+@inner
+def median_of(values: Array, count: int) -> float:
+    """Return the median of the first values, which are sorted (Shell 1959); np.median takes two seconds to compile."""
+    gap = count // 2
+    while gap > 0:
+        for n in range(gap, count):
+            value, place = values[n], n
+            while place >= gap and values[place - gap] > value:
+                values[place] = values[place - gap]
+                place -= gap
+            values[place] = value
+        gap //= 2
+    middle = count // 2
+    return float(values[middle] if count % 2 else (values[middle - 1] + values[middle]) / 2)
 
 
 @inner
@@ -184,7 +210,9 @@ def solve(design: Floats, cell: Floats, lanes: Floats, reach: int, sums: Array, 
         fx, fy = x - left, y - top
         nw, ne = np.float32((1 - fy) * (1 - fx)), np.float32((1 - fy) * fx)
         sw, se = np.float32(fy * (1 - fx)), np.float32(fy * fx)
-        lanes[:5] = 0.0
+        for product in range(5):
+            for lane in range(LANES):
+                lanes[product, lane] = 0.0
         for row in range(WINDOW_PX):
             above = cell[reach + top + row, reach + left :]
             below = cell[reach + top + row + 1, reach + left :]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
-from omnid.core.odometry.patch_kernels import LANES, WINDOW_PX
+from omnid.core.odometry.patch_kernels import LANES, WINDOW_PX, clear
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -35,14 +35,20 @@ def sample(image: Image, chosen: Indices, centres: Array, points: Array, slopes:
     centres (N, 2) [px] in the image, shift (N, 2) [px] of the templates' middle pixels from the centres in the current
     panorama, whose viewpoint is height_m above the lower one.
     """
-    H, normal, greys = np.empty((3, 3)), np.empty(3), np.zeros(AROUND_PX * AROUND_PX, np.float32)
-    columns, rows = np.zeros((TEMPLATE_PX, LANES), np.float32), np.zeros((TEMPLATE_PX, LANES), np.float32)
+    H, normal, greys = np.empty((3, 3)), np.empty(3), np.empty(AROUND_PX * AROUND_PX, np.float32)
+    columns, rows = np.empty((TEMPLATE_PX, LANES), np.float32), np.empty((TEMPLATE_PX, LANES), np.float32)
+    clear(columns)
+    clear(rows)
+    for k in range(len(greys)):
+        greys[k] = ZERO
     weights, first, found = np.empty((8, LANES), np.float32), np.empty(LANES, np.int32), np.empty(LANES, np.float32)
     for n in chosen:
         # A place that is NaN or absurd has no template; it would lead out of the image's memory.
         if not (max(abs(shift[n, 0]), abs(shift[n, 1])) <= 1.0 and abs(centres[n, 0]) < FARTHEST_PX
                 and abs(centres[n, 1]) < FARTHEST_PX):
-            templates[n] = 0
+            for row in range(TEMPLATE_PX):
+                for column in range(TEMPLATE_PX):
+                    templates[n, row, column] = 0
             continue
         write_normal(points[n], slopes[n], baseline_m, normal)
         height = write_homography(points[n], normal, T_curr_ref[n], height_m, H)
@@ -202,7 +208,8 @@ def write_cubic(greys: Floats, columns: Floats, rows: Floats, x: np.float32, y: 
         weights[4, lane], weights[7, lane] = -HALF * v * q * q, -HALF * q * v * v
         weights[5, lane] = ONE + v * v * (INNER_CUBE * v - INNER_SQUARE)
         weights[6, lane] = ONE + q * q * (INNER_CUBE * q - INNER_SQUARE)
-    found[:] = ZERO
+    for lane in range(LANES):
+        found[lane] = ZERO
     for k in range(4):
         for lane in range(LANES):
             at = np.uint64(first[lane] + k * AROUND_PX)

@@ -91,8 +91,8 @@ def gauss_newton(landmarks: Array, views: Array, W: Array, derivatives: Array, p
         accumulate(landmarks, views, W, derivatives, prior, camera, T, error, H, g, squared)
     factorise(H, factor)
     for a in range(size):
-        g[:] = 0.0
-        g[a] = 1.0
+        for b in range(size):
+            g[b] = 1.0 if a == b else 0.0
         solve(factor, g, inverse[a])
 
 
@@ -104,8 +104,11 @@ def accumulate(landmarks: Array, views: Array, W: Array, derivatives: Array, pri
     step: [t; r] on the left of T; change (K,): of the shared error.
     """
     size = len(g)
-    H[:], g[:] = 0.0, 0.0
-    J, e, J_white, e_white = np.zeros((3, size)), np.empty(3), np.zeros((3, size)), np.empty(3)
+    for a in range(size):
+        g[a] = 0.0
+        for b in range(size):
+            H[a, b] = 0.0
+    J, e, J_white, e_white = np.empty((3, size)), np.empty(3), np.empty((3, size)), np.empty(3)
     for n in range(len(landmarks)):
         linearise(landmarks[n], views[n], camera, T, J, e)
         for k in range(6, size):
@@ -153,11 +156,13 @@ def left_multiply_exp(twist: Array, T: Array) -> None:
     else:
         a, b = math.sin(angle) / angle, 2 * (math.sin(angle / 2) / angle) ** 2
         c = (angle - math.sin(angle)) / (angle2 * angle)
-    W = np.zeros((3, 3))
+    W, R, V, before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 4))
+    W[0, 0], W[1, 1], W[2, 2] = 0.0, 0.0, 0.0
     W[0, 1], W[0, 2], W[1, 2] = -wz, wy, -wx
     W[1, 0], W[2, 0], W[2, 1] = wz, -wy, wx
-    R, V, before = np.empty((3, 3)), np.empty((3, 3)), T.copy()
     for i in range(3):
+        for j in range(4):
+            before[i, j] = T[i, j]
         for j in range(3):
             square = W[i, 0] * W[0, j] + W[i, 1] * W[1, j] + W[i, 2] * W[2, j]
             one = 1.0 if i == j else 0.0

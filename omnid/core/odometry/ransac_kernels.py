@@ -33,18 +33,20 @@ def ransac(landmarks: Array, views: Array, seen: Array, camera: CameraNumbers, t
     """
     count = len(landmarks)
     usable, bearing = np.empty(count, np.int64), np.empty((count, 2))
-    found = 0
+    found, most, state = 0, 0, seed | np.uint64(1)
     for n in range(count):
+        consensus[n] = False
         azimuth = math.pi - (views[n, 0] + 0.5) / camera[0]
         bearing[n, 0], bearing[n, 1] = math.cos(azimuth), math.sin(azimuth)
         if math.isfinite(seen[n, 0]) and math.isfinite(seen[n, 1]) and math.isfinite(seen[n, 2]):
             usable[found] = n
             found += 1
-    consensus[:], best[:] = False, np.eye(4)
+    T, agree = np.empty((4, 4)), np.empty(count, np.bool_)
+    for i in range(4):
+        for j in range(4):
+            best[i, j] = T[i, j] = 1.0 if i == j else 0.0
     if found < 3:
         return
-    T, agree = np.eye(4), np.empty(count, np.bool_)
-    most, state = 0, seed | np.uint64(1)
     for hypothesis in range(1, RANSAC_BATCH * RANSAC_BATCHES + 1):
         a, b, c, state = triple(found, state)
         if not rigid_motion(landmarks, seen, usable[a], usable[b], usable[c], T):
@@ -52,7 +54,11 @@ def ransac(landmarks: Array, views: Array, seen: Array, camera: CameraNumbers, t
         inliers = consensus_of(landmarks, views, bearing, camera, threshold_px, T, agree, most)
         if inliers > most:
             most = inliers
-            best[:], consensus[:] = T, agree
+            for i in range(3):
+                for j in range(4):
+                    best[i, j] = T[i, j]
+            for n in range(count):
+                consensus[n] = agree[n]
         if hypothesis % RANSAC_BATCH == 0 and (1 - (most / count) ** 3) ** hypothesis < RANSAC_MISSED:
             return
 
@@ -81,7 +87,7 @@ def below(count: int, state: np.uint64) -> tuple[int, np.uint64]:
     state ^= state << _SHIFTS[1]
     state ^= state >> _SHIFTS[2]
     share = float((state * _MULTIPLIER) >> _HIGH_BITS) * _UNIT
-    return min(int(share * count), count - 1), state
+    return min(math.floor(share * count), count - 1), state
 
 
 @inner

@@ -126,8 +126,9 @@ def project(upper: Image, design: Array, column: float, row: float, upright: flo
     On a plane the disparity is linear in the row, and a sine wave of the azimuth: upright is its amplitude where the
     slope along the column is zero.
     """
-    right[:] = 0.0
     energy, total = 0.0, 0.0
+    for a in range(UNKNOWNS):
+        right[a] = 0.0
     for x in range(SIDE_PX):
         azimuth = (x - HALF_PX) / focal_px
         wave = upright * (math.cos(azimuth) - 1) + along * focal_px * math.sin(azimuth)

@@ -19,7 +19,7 @@ BINS_PER_RAD = np.float32(BINS / (2 * np.pi))
 ATAN = (np.float32(0.9998660), np.float32(-0.3302995), np.float32(0.1801410), np.float32(-0.0851330),
         np.float32(0.0208351))
 QUARTER, HALF, FULL = np.float32(BINS / 4), np.float32(BINS / 2), np.float32(BINS)  # turns, in directions
-TINY = np.float32(1e-20)
+ZERO, TINY = np.float32(0), np.float32(1e-20)
 
 
 @compiled("(f4[:, :, ::1], f4[:, ::1], u1[:, ::1])", writes=("descriptors",))
@@ -29,9 +29,10 @@ def describe(patches: Floats, weights: Floats, descriptors: NDArray[np.uint8]) -
     weights (CELLS, SAMPLES): of the samples of a row or column in each cell.
     """
     length, direction = np.empty(SAMPLES, np.float32), np.empty(SAMPLES, np.float32)
-    of_row, found = np.empty((CELLS, BINS), np.float32), np.empty((CELLS, CELLS, BINS), np.float32)
+    of_row, found = np.empty((CELLS, BINS), np.float32), np.empty(CELLS * CELLS * BINS, np.float32)
     for n in range(len(patches)):
-        found[:] = 0
+        for k in range(len(found)):
+            found[k] = ZERO
         for row in range(SAMPLES):
             write_gradients(patches[n, row : row + 3], length, direction)
             write_row(length, direction, weights, of_row)
@@ -40,8 +41,8 @@ def describe(patches: Floats, weights: Floats, descriptors: NDArray[np.uint8]) -
                 if weight > 0:
                     for cell in range(CELLS):
                         for k in range(BINS):
-                            found[down, cell, k] += weight * of_row[cell, k]
-        write_bytes(found.reshape(CELLS * CELLS * BINS), descriptors[n])
+                            found[(down * CELLS + cell) * BINS + k] += weight * of_row[cell, k]
+        write_bytes(found, descriptors[n])
 
 
 @inner
@@ -61,7 +62,9 @@ def write_gradients(rows: Floats, length: Floats, direction: Floats) -> None:
 @inner
 def write_row(length: Floats, direction: Floats, weights: Floats, of_row: Floats) -> None:
     """Write the histograms (CELLS, BINS) of a row of samples."""
-    of_row[:] = 0
+    for cell in range(CELLS):
+        for k in range(BINS):
+            of_row[cell, k] = ZERO
     for column in range(SAMPLES):
         # A gradient counts in the two directions beside its own, and in the cells around it.
         low = int(direction[column])

@@ -106,11 +106,16 @@ def cast(rays: Floats, origins: Floats, spacing: Floats, index: Numbers, starts:
     (1, 3, 4) where all are the same; seen (M, R): tile may see rectangle. surfaces (R, SURFACE_COLUMNS), in that frame.
     pyramids (R, 2): first level, number of levels; levels (L, 3): first texel, height, width.
     """
-    largest = np.diff(starts).max()
+    largest = starts[0]
+    for tile in range(len(starts) - 1):
+        largest = max(largest, starts[tile + 1] - starts[tile])
     moving = len(poses) > 1 or origins.shape[1] > 1
-    turned, moved = np.zeros((3, largest), np.float32), np.zeros((3, largest), np.float32)
+    turned, moved = np.empty((3, largest), np.float32), np.empty((3, largest), np.float32)
     nearest, distance = np.empty(largest, np.int32), np.empty(largest, np.float32)
-    places = np.zeros((3, largest), np.float32)
+    places = np.empty((3, largest), np.float32)
+    for k in range(3):
+        for i in range(largest):
+            moved[k, i] = ZERO
     for tile in range(len(starts) - 1):
         low, high = starts[tile], starts[tile + 1]
         count = high - low
@@ -120,7 +125,8 @@ def cast(rays: Floats, origins: Floats, spacing: Floats, index: Numbers, starts:
             turn(poses, index[1, low:high], rays[:, low:high],
                  origins[:, low:high] if origins.shape[1] > 1 else origins, turned, moved)
             ray = turned[0, :count], turned[1, :count], turned[2, :count]
-        nearest[:count], distance[:count] = -1, FAR_M
+        for i in range(count):
+            nearest[i], distance[i] = -1, FAR_M
         for k in range(len(surfaces)):
             if seen[tile, k]:
                 take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count])
