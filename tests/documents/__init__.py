@@ -1,0 +1,1 @@
+"""Tools that make parts of the documents, and their tests."""

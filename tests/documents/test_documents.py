@@ -1,0 +1,135 @@
+"""The documents: links lead somewhere, commands exist, made parts are fresh, README is short."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+import omnid
+from omnid.cli import COMMANDS, _parser
+from omnid.config import Config
+from omnid.transport.topics import PUBLISHED, command_topics, ros_name
+from tests.documents import configuration, hardware
+from tests.documents.site_hooks import DOCS, ROOT, pages, prose_and_code
+
+README_WORDS = 800
+GIF_BYTES, STILL_BYTES = 1_000_000, 60_000
+NOT_ON_THE_SITE = {"constants.md"}
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def documents() -> list[Path]:
+    """Return README, the pages and what they include."""
+    return sorted({ROOT / source for source in pages() if source.endswith(".md")} - {DOCS / "constants.md"})
+
+
+@cache
+def anchors(path: Path) -> set[str]:
+    """Return the anchors of the headings of a document."""
+    heads = [re.sub(r"[`*]", "", line.lstrip("# ")) for line, is_code in prose_and_code(path.read_text("utf-8"))
+             if not is_code and line.startswith("#")]
+    return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+def commands() -> Iterator[tuple[str, str, str]]:
+    """Yield the document, the name and the arguments of each command of omnid in blocks of code."""
+    for path in documents():
+        for line, is_code in prose_and_code(path.read_text("utf-8")):
+            if is_code:
+                for name, rest in re.findall(r"(?:^|bin/|sudo |&& )omnid ([a-z]\S*)([^&#]*)", line.strip()):
+                    yield path.name, name, rest
+
+
+def options(parser: argparse.ArgumentParser) -> set[str]:
+    """Return the options of a command and of its own commands."""
+    inner = [choice for action in parser._actions if isinstance(action, argparse._SubParsersAction)
+             for choice in action.choices.values()]
+    return {option for action in parser._actions for option in action.option_strings}.union(*map(options, inner))
+
+
+def test_readme_is_short_and_says_at_once_what_was_not_tried() -> None:
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert len(text.split()) <= README_WORDS
+    assert "no real robot" in text.splitlines()[2]
+
+
+@pytest.mark.parametrize("path", documents(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_links_lead_to_files_and_headings(path: Path) -> None:
+    lost = []
+    for line, is_code in prose_and_code(path.read_text("utf-8")):
+        for target in [] if is_code else LINK.findall(re.sub(r"`[^`]*`", "", line)):
+            name, _, anchor = target.partition("#")
+            aim = path if not name else path.parent / name
+            if "://" not in target and not (aim.exists() and (not anchor or anchor in anchors(aim))):
+                lost.append(target)
+    assert lost == []
+
+
+def test_commands_in_documents_and_their_options_exist() -> None:
+    found = list(commands())
+    assert len(found) > 50
+    assert [(name, command) for name, command, _ in found if command not in COMMANDS] == []
+    known = {command: options(_parser([command])) for command in {command for _, command, _ in found}}
+    assert [(name, command, option) for name, command, rest in found for option in re.findall(r"(?<=\s)--[a-z-]+", rest)
+            if option not in known[command]] == []
+
+
+def test_each_page_is_in_the_navigation_once() -> None:
+    def leaves(entry: object) -> Iterator[str]:
+        if isinstance(entry, str):
+            yield entry
+        else:
+            for inner in entry.values() if isinstance(entry, dict) else entry:  # type: ignore[attr-defined]
+                yield from leaves(inner)
+
+    shown = list(leaves(YAML(typ="safe").load(ROOT / "mkdocs.yml")["nav"]))
+    assert sorted(shown) == sorted({path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")} - NOT_ON_THE_SITE)
+
+
+def test_the_page_of_settings_is_fresh() -> None:
+    shown = configuration.PAGE.read_text("utf-8")
+    assert shown == configuration.page(), "run `python -m tests.documents.configuration`"
+
+
+def test_the_tables_of_the_hardware_are_fresh() -> None:
+    text = hardware.PAGE.read_text("utf-8")
+    assert hardware.page(text) == text, "run `python -m tests.documents.hardware`"
+
+
+def test_the_error_of_a_range_follows_from_that_of_the_disparity() -> None:
+    f_px, t_m, r_m, step_px = 260.0, 0.2, 4.0, 1e-4
+    disparity_px = f_px * t_m / r_m
+    moved_m = r_m - f_px * t_m / (disparity_px + step_px)
+    assert hardware.sigma_m(r_m, step_px, f_px, t_m) == pytest.approx(moved_m, rel=1e-3)
+
+
+def test_the_public_api_is_on_its_page() -> None:
+    shown = set(re.findall(r"^::: [\w.]*?(\w+)$", (DOCS / "api.md").read_text("utf-8"), re.MULTILINE))
+    assert set(omnid.__all__) - {"__version__"} <= shown
+
+
+def test_images_are_small() -> None:
+    for path in (DOCS / "images").iterdir():
+        assert path.stat().st_size < (GIF_BYTES if path.suffix == ".gif" else STILL_BYTES), path.name
+
+
+def test_nav2_uses_topics_that_exist() -> None:
+    folder = DOCS / "ros2"
+    text = "".join((folder / name).read_text("utf-8") for name in ("nav2.launch.py", "nav2_params.yaml"))
+    known = {ros_name("omnid", name) for name in (*PUBLISHED, *command_topics(Config().controller.sources.names))}
+    used = set(re.findall(r"/omnid/[\w/]+", text))
+    assert {"/omnid/scan", "/omnid/map", "/omnid/odom", "/omnid/cmd/planner/twist"} <= used <= known
+    compile((folder / "nav2.launch.py").read_text("utf-8"), "nav2.launch.py", "exec")
+    parameters = YAML(typ="safe").load(folder / "nav2_params.yaml")
+    assert not re.search(r": [&*]\w", text), "ROS 2 reads no anchors of YAML"
+    base = Config().controller.collision
+    outline = f"[[{base.front_m}, {base.half_width_m}]"
+    for name in ("local_costmap", "global_costmap"):
+        assert parameters[name][name]["ros__parameters"]["footprint"].startswith(outline)
+    assert parameters["controller_server"]["ros__parameters"]["enable_stamped_cmd_vel"] is False
