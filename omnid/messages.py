@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
@@ -99,6 +100,7 @@ class OdometryUpdate:
     light: Light = field(default_factory=Light)
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
     is_keyframe: bool = False  # odometry needs its dense depth in any case
+    witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
 
     def __repr__(self) -> str:
         """Return one line: number, state, position, heading and sigma of the position."""

@@ -17,7 +17,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Twist
-from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, Motion
+from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Motion
 from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport
 from omnid.core.control.safety_rules import ENDS
 from omnid.core.control.velocity_limits import STOP
@@ -143,8 +143,9 @@ class Controller:
         """Keep the reason to drive slowly; report the start of one that a person should look at."""
         before, self.state.slowed_by = self.state.slowed_by, self._law.plausibility.slowed_by
         self.state.slowed += bool(self.state.slowed_by and not before)
-        if self.state.slowed_by == MOTION_DOUBTFUL != before:
-            self._report(f"the wheels turn slowly: {MOTION_DOUBTFUL}")
+        slowed_by = self.state.slowed_by
+        if slowed_by in (MOTION_DOUBTFUL, *WITNESSES) and slowed_by != before:
+            self._report(f"the wheels turn slowly: {slowed_by}{self._detail(slowed_by)}")
 
     def _report_obstacles(self) -> None:
         """Keep the collision monitor's reason to slow down or stop; count and report the stops."""
@@ -164,7 +165,12 @@ class Controller:
             if reason != ENDS:
                 latched = f"; {UNTIL_ARMED}" if self._law.arming.needs_request else ""
                 advice = f"; {ADVICE}" if reason in DISAGREEMENTS else ""
-                self._report(f"the wheels stop: {reason}{advice}{latched}")
+                self._report(f"the wheels stop: {reason}{self._detail(reason)}{advice}{latched}")
+
+    def _detail(self, reason: str) -> str:
+        """Return by how much images, wheels and gyro differ, where that is the reason."""
+        witness = self._law.plausibility.witness
+        return f" {witness.detail}" if witness.reason == reason and witness.detail else ""
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""

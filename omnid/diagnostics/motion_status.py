@@ -7,6 +7,7 @@ from collections.abc import Callable
 from drivers.imu.witmotion import WitMotionGyro
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET, MotionSensors
 from omnid.stages.motion_inbox import MotionInbox
+from omnid.stages.odometry import OdometryStage
 from omnid.transport.codec import OK, WARN, DiagnosticStatus
 from omnid.transport.sensor_receiver import SensorReceiver
 from omnid.transport.status_names import MOTION, REFUSED_PREFIX
@@ -15,9 +16,10 @@ WRONG_WHEELS = "wheels contradict the cameras: check motor.drive (radius, track,
 SLIP = "wheels slip"
 
 
-def motion_status(sensors: MotionSensors, inbox: MotionInbox, receiver: SensorReceiver | None = None,
+def motion_status(odometry: OdometryStage, inbox: MotionInbox, receiver: SensorReceiver | None = None,
                   gyro: WitMotionGyro | None = None) -> Callable[[], DiagnosticStatus]:
-    """Return a function that returns the entry: what comes, and what was estimated of its errors."""
+    """Return a function that returns the entry: what comes, what was estimated of its errors, and which one differs."""
+    sensors = odometry.sensors
 
     def status() -> DiagnosticStatus:
         values = {"wheel_samples": str(inbox.wheels), "gyro_samples": str(inbox.gyro), "dropped": str(inbox.dropped),
@@ -28,7 +30,10 @@ def motion_status(sensors: MotionSensors, inbox: MotionInbox, receiver: SensorRe
             values |= {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(receiver.refused.items())}
         if gyro is not None:
             values |= {"imu_broken": str(gyro.broken), "imu_restarts": str(gyro.restarts)}
-        text = WRONG_WHEELS if not sensors.wheels_are_sane else SLIP if sensors.is_slipping else ""
+        witness = odometry.witness
+        text = f"{witness.reason} {witness.detail}".strip()
+        if not sensors.wheels_are_sane or sensors.is_slipping:
+            text = SLIP if sensors.wheels_are_sane else WRONG_WHEELS
         return DiagnosticStatus(MOTION, WARN if text else OK, text, values)
 
     return status

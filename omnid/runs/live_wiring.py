@@ -103,7 +103,7 @@ class LiveWiring:
         images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))
         status = [ladder.status, images, exposure.status, live_rig.status,
                   *([received.navigation.status] if controller else ()),
-                  motion_status(front_end.odometry.sensors, pairing.motion, sensors.receiver, sensors.gyro),
+                  motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
                   *([partial(places_status, stages.places)] if stages.places else ()),
                   *(part.status for part in (bus, recorder, saver) if part)]
         sources = StatusSources(graph.telemetry, states, pairing, session.statistics, self._latency.to_pose,

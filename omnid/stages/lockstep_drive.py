@@ -77,4 +77,4 @@ def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -
     sigma_mps, sigma_radps = (math.sqrt(max(0.0, float(covariance[axis, axis]))) for axis in (0, 5))
     finite = all(map(math.isfinite, (heading_rad, velocity_mps, rate_radps)))
     return ControllerPose(odometry.stamp_ns, heading_rad, rate_radps, odometry.state if finite else TrackingState.LOST,
-                          velocity_mps, sigma_mps, sigma_radps, odometry.reset_counter)
+                          velocity_mps, sigma_mps, sigma_radps, odometry.reset_counter, odometry.witness)

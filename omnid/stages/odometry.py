@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import OdometryConfig
+from omnid.core.control.motion_monitor import Witness
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.motion_sensors import MotionSensors
+from omnid.core.odometry.motion_agreement import MotionAgreement
+from omnid.core.odometry.motion_sensors import BIAS, MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
@@ -50,17 +52,25 @@ class OdometryStage:
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
-        self.sensors = MotionSensors(se3.inverse(geometry.rig.T_base_rig @ self._T_rig_rect))
+        T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
+        self._to_base = se3.adjoint(T_base_rect)
+        self.sensors, self._agreement = MotionSensors(se3.inverse(T_base_rect)), MotionAgreement()
 
     def _features(self) -> float:
         """Return the share of the landmarks that the next keyframe is to have."""
         return REDUCED_FEATURES if self._load() >= LoadLevel.REDUCED else 1.0
+
+    @property
+    def witness(self) -> Witness:
+        """That of images, wheels and gyro which differs from the others now."""
+        return self._agreement.result
 
     def process(self, pair: Panoramas) -> OdometryUpdate:
         """Return the pose at a pair."""
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
         self.sensors.add(pair.motion)
+        self._agreement.add(pair.motion, float(self.sensors.values[BIAS][2]))
         sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
         frame = StereoFrame(pair.seq, pair.lower, pair.upper, partial(self._disparity, pair), usable,
@@ -68,13 +78,15 @@ class OdometryStage:
         estimate = self._method.process(frame, dt_s)
         if estimate.step is not None and last_ns is not None:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
+            seen = self._to_base @ se3.log(estimate.step[0])
+            self._agreement.add_step(last_ns, pair.stamp_ns, float(seen[0]), float(seen[5]))
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         return OdometryUpdate(
             pair.seq, pair.stamp_ns, T_odom_rig, self._in_rig(estimate.covariance),
             self._to_rig @ estimate.velocity, self._in_rig(estimate.velocity_covariance),
             _state(estimate.state, pair), estimate.resets, estimate.inliers, estimate.tracked,
             StereoDepth(pair, _moving(estimate.exposure)), estimate.features, pair.light, pair.motion,
-            estimate.is_keyframe,
+            estimate.is_keyframe, self._agreement.result,
         )
 
     def after(self) -> None:

@@ -24,7 +24,7 @@ from omnid.core.control.heading_controller import (
     wrap_angle,
 )
 from omnid.core.control.heading_goal import HeadingGoal
-from omnid.core.control.motion_monitor import Motion, MotionSettings
+from omnid.core.control.motion_monitor import AGREE, Motion, MotionSettings, Witness
 from omnid.core.control.plausibility import Plausibility
 from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
 from omnid.core.control.trust import TrustSettings
@@ -91,6 +91,7 @@ class ControllerPose(NamedTuple):
     velocity_sigma_mps: float = 0.0
     yaw_rate_sigma_radps: float = 0.0
     resets: int = 0  # how often odometry has lost its map and begun again
+    witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
 
     @property
     def motion(self) -> Motion:
@@ -144,7 +145,7 @@ class ControlLaw:
         """Replace the pose."""
         self._pose_jumped |= self._pose is not None and self._jumps(self._pose, pose)
         self._pose = pose
-        self.plausibility.add_pose(pose.stamp_ns, pose.state, pose.motion, pose.resets)
+        self.plausibility.add_pose(pose.stamp_ns, pose.state, pose.motion, pose.resets, pose.witness)
 
     def set_ring(self, ring: ControllerRing) -> None:
         """Replace the obstacle ring."""

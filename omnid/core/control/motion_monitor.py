@@ -34,8 +34,27 @@ REST_S: Final = 2.0
 NOT_SEEN: Final = "the images do not show the commanded motion"
 NOT_COMMANDED: Final = "the images show a motion that was not commanded"
 NOT_FOLLOWED: Final = "the wheels do not follow the commands"
-DISAGREEMENTS: Final = (NOT_SEEN, NOT_COMMANDED, NOT_FOLLOWED)
+COMPARED: Final = (NOT_SEEN, NOT_COMMANDED, NOT_FOLLOWED)
+# Slow disagreement of images, wheels and gyro, in time, distance or turn (core/odometry/motion_agreement.py).
+IMAGES_DIFFER: Final = "the images disagree with wheels and gyro"
+WHEELS_DIFFER: Final = "the wheels disagree with images and gyro"
+GYRO_DIFFERS: Final = "the gyro disagrees with images and wheels"
+IMAGES_OR_WHEELS: Final = "images and wheels disagree"
+IMAGES_OR_GYRO: Final = "images and gyro disagree"
+WITNESSES: Final = (IMAGES_DIFFER, WHEELS_DIFFER, GYRO_DIFFERS, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
+DISAGREEMENTS: Final = (*COMPARED, *WITNESSES)
 ADVICE: Final = "check wheels, cameras, motor.drive, baseline and T_base_rig of the rig; see controller.motion"
+
+
+class Witness(NamedTuple):
+    """Account of the motion (images, wheels, gyro) that differs slowly from the others."""
+
+    reason: str = ""  # one of WITNESSES; empty: all agree
+    detail: str = ""  # by how much
+    is_fault: bool = False  # False: a doubt
+
+
+AGREE: Final = Witness()
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +117,7 @@ class MotionMonitor:
         self._driven_ns: int | None = None  # the newest tick with a commanded motion
         self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # they have reported a motion: some controllers never do
-        self._unexplained = {reason: [0.0, 0.0] for reason in DISAGREEMENTS}  # m, rad
+        self._unexplained = {reason: [0.0, 0.0] for reason in COMPARED}  # m, rad
         self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
 
     @property

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from omnid.core.control.heading_controller import Twist
-from omnid.core.control.motion_monitor import Motion, MotionMonitor, MotionSettings
+from omnid.core.control.motion_monitor import AGREE, Motion, MotionMonitor, MotionSettings, Witness
 from omnid.core.control.safety_rules import SafetyInputs
 from omnid.core.control.trust import MotorTrust, PoseTrust, TrustSettings
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -31,17 +31,19 @@ class Plausibility:
         self._settings = trust
         self._pose, self._motor = PoseTrust(trust), MotorTrust(trust)
         self._monitor = MotionMonitor(motion)
-        self._degraded = False
+        self._degraded, self._checks = False, motion.check
+        self.witness = AGREE  # of the newest pose
 
     @property
     def slowed_by(self) -> str:
         """The reason to drive slowly; empty without one."""
         if self._degraded:
             return POSE_DEGRADED
-        return MOTION_DOUBTFUL if self._monitor.doubtful else ""
+        return MOTION_DOUBTFUL if self._monitor.doubtful else self.witness.reason
 
-    def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int) -> None:
+    def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, witness: Witness = AGREE) -> None:
         """Take the next pose; a lost one says nothing about the motion."""
+        self.witness = witness if self._checks else AGREE
         self._degraded = state == TrackingState.DEGRADED
         self._pose.add_pose(stamp_ns, (seen.velocity_sigma_mps, seen.yaw_rate_sigma_radps), resets)
         if state != TrackingState.LOST:
@@ -60,7 +62,7 @@ class Plausibility:
         """Return the inputs of the safety rules with these; a reset counts for one step."""
         return replace(inputs, pose_reset=self._pose.take_reset(), pose_unsure=self._pose.unsure,
                        motor_faulty=self._motor.faulty, battery_empty=self._motor.battery_empty,
-                       disagreement=self._monitor.reason)
+                       disagreement=self._monitor.reason or (self.witness.reason if self.witness.is_fault else ""))
 
     def slowed(self, wanted: Twist, limits: VelocityLimits) -> Twist:
         """Return the wanted motion within the limits, which are lower where there is a reason to drive slowly."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from omnid.core.control.contacts import BUMPER, CLIFF
-from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
+from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN, WITNESSES
 from omnid.settings import knob
 from omnid.tracking_state import TrackingState
 
@@ -73,6 +73,11 @@ NOT_ARMED: Final = "not armed"
 IDLE: Final = "no command"
 COMMAND_STALE: Final = "the command is stale"
 
+
+def _disagree(reason: str) -> Rule:
+    return Rule(reason, True, lambda now, _: now.disagreement == reason)
+
+
 # The first rule that holds is reported. A NaN is a reason, and so is an age as far below 0 as it may be above: no pose
 # comes from the future. The end and a stop are no faults: nothing follows the end, and a stop latches in any mode. A
 # heading that jumps is none either: odometry has closed a gap, and only setpoints from before it are void.
@@ -90,9 +95,7 @@ RULES: Final = (
     Rule(POSE_LOST, True, lambda now, _: now.pose_state == TrackingState.LOST),
     Rule(POSE_RESET, True, lambda now, _: now.pose_reset),
     Rule(POSE_UNSURE, True, lambda now, _: now.pose_unsure),
-    Rule(NOT_FOLLOWED, True, lambda now, _: now.disagreement == NOT_FOLLOWED),
-    Rule(NOT_SEEN, True, lambda now, _: now.disagreement == NOT_SEEN),
-    Rule(NOT_COMMANDED, True, lambda now, _: now.disagreement == NOT_COMMANDED),
+    *map(_disagree, (NOT_FOLLOWED, NOT_SEEN, NOT_COMMANDED, *WITNESSES)),
     Rule(POSE_JUMPED, False, lambda now, _: now.pose_jumped),
     Rule(NOT_ARMED, False, lambda now, _: not now.armed),
     Rule(IDLE, False, lambda now, _: now.command_age_s == float("inf")),

@@ -14,6 +14,7 @@ from omnid.core.control.arming import AUTOMATIC, ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import HeadingLimits, Setpoint
+from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.control.safety_rules import Deadlines
 from omnid.core.control.trust import TrustSettings
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -74,9 +75,10 @@ class Bench:
         return self.wheels.commands[-1]
 
     def send_pose(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
-            age_s: float = 0.0, velocity_mps: float = math.nan, sigma_mps: float = 0.0, resets: int = 0) -> None:
+            age_s: float = 0.0, velocity_mps: float = math.nan, sigma_mps: float = 0.0, resets: int = 0,
+            witness: Witness = AGREE) -> None:
         self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state,
-                                                velocity_mps, sigma_mps, resets=resets))
+                                                velocity_mps, sigma_mps, resets=resets, witness=witness))
 
     def send_setpoint(self, setpoint: Setpoint = AHEAD, source: str = OPERATOR, sender: str = "") -> None:
         self.now_ns += 1

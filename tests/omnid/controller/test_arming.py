@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 import pytest
 
@@ -11,8 +13,18 @@ from drivers.motor import is_stop
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, OLDER_THAN_STOP, STARTED, TOO_LATE, Arming, ArmRequest
 from omnid.core.control.contacts import BUMPER, CLIFF, LATCHING, NO_CONTACT
-from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN
-from tests.omnid.controller.bench import SETTINGS, UNATTENDED, Bench
+from omnid.core.control.motion_monitor import (
+    ADVICE,
+    COMPARED,
+    DISAGREEMENTS,
+    NOT_COMMANDED,
+    NOT_FOLLOWED,
+    NOT_SEEN,
+    WITNESSES,
+    MotionSettings,
+    Witness,
+)
+from tests.omnid.controller.bench import LIMITS, SETTINGS, UNATTENDED, Bench
 
 
 @pytest.fixture
@@ -66,6 +78,11 @@ def run_away(bench: Bench) -> None:
     bench.wheels.velocity_mps = None
 
 
+def differ(bench: Bench, reason: str) -> None:
+    bench.send_pose(witness=Witness(reason, is_fault=True))
+    bench.tick()
+
+
 def drive_until_stopped(bench: Bench, velocity_mps: float = math.nan, sigma_mps: float = 0.0) -> None:
     """Drive with poses of this velocity until a fault stops the wheels."""
     for _ in range(100):
@@ -90,6 +107,7 @@ FAULTS: dict[str, Callable[[Bench], None]] = {
     NOT_FOLLOWED: run_away,
     NOT_SEEN: lambda bench: drive_until_stopped(bench, velocity_mps=0.0),
     NOT_COMMANDED: lambda bench: drive_until_stopped(bench, velocity_mps=1.2),
+    **{reason: partial(differ, reason=reason) for reason in WITNESSES},
 }
 
 
@@ -202,7 +220,7 @@ def test_refuses_to_arm_while_a_fault_holds(bench: Bench, reason: str) -> None:
         bench.send_pose()
         bench.arm()
         bench.tick()
-    elif reason in (safety_rules.BATTERY_EMPTY, safety_rules.POSE_UNSURE, *DISAGREEMENTS):  # of a drive
+    elif reason in (safety_rules.BATTERY_EMPTY, safety_rules.POSE_UNSURE, *COMPARED):  # of a drive
         bench.drive()
         FAULTS[reason](bench)
         bench.send_pose(sigma_mps=1.0)
@@ -299,3 +317,23 @@ def test_bumper_and_cliff_latch_in_both_modes_and_no_request_is_accepted_while_t
     bench.tick()
     bench.drive()
     assert bench.controller.state.armed and not is_stop(bench.last)
+
+
+def test_a_doubt_slows_the_base_down_and_says_what_differs_and_by_how_much(driving: Bench) -> None:
+    """Half of the limits of speed; with the check of motion off, nothing."""
+    doubt = Witness(WITNESSES[0], "by 0.5 s")
+    for _ in range(20):
+        driving.send_pose(witness=doubt)
+        driving.send_setpoint()
+        driving.tick()
+    assert 0.0 < driving.last.velocity_mps == pytest.approx(0.5 * LIMITS.velocity_mps)
+    assert driving.lines[-1] == f"the wheels turn slowly: {doubt.reason} by 0.5 s"
+    driving.send_pose(witness=doubt._replace(is_fault=True))
+    driving.tick()
+    assert driving.lines[-1].startswith(f"the wheels stop: {doubt.reason} by 0.5 s; {ADVICE}")
+    unchecked = Bench(replace(SETTINGS, motion=MotionSettings(check=False)))
+    unchecked.drive()
+    unchecked.send_pose(witness=doubt._replace(is_fault=True))
+    unchecked.send_setpoint()
+    unchecked.tick()
+    assert unchecked.controller.state.armed and unchecked.last.velocity_mps == 0.3

@@ -1,0 +1,260 @@
+"""Do images, wheels and gyro show the same motion at the same time? Slow disagreement, over metres and seconds.
+
+Images that come late, play slowly, or are of a rig of another size track well, and so do wheels of another radius: each
+of them is consistent in itself. Three accounts of the same drive are not:
+
+    distance  of images and wheels
+    turn      of images, wheels and gyro, each with each
+
+1. Delay. For lags l from -0.5 to 1.5 s, J(l) = min_s sum (s D(start - l, end - l) - seen)^2 over the steps of the last
+   10 s, D the motion by a sensor. The smallest J(l) is compared with the smallest one within 0.3 s of 0: their
+   difference in variances of the residuals is the evidence (a likelihood ratio). A steady motion has none.
+2. Scale. The sums of both over the newest 3 m or 10 s, whichever is shorter, at the likeliest lag within 0.3 s.
+
+The account that two others contradict, which agree, is named; of two it is not known which one is wrong. A
+part of a limit is a doubt. Once all have stood for STILL_S everything is forgotten: a person may arm and try again.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.motion import MotionSample, WheelSample
+from omnid.core.control.motion_monitor import (
+    AGREE,
+    GYRO_DIFFERS,
+    IMAGES_DIFFER,
+    IMAGES_OR_GYRO,
+    IMAGES_OR_WHEELS,
+    WHEELS_DIFFER,
+    Witness,
+)
+
+Array = NDArray[np.float64]
+
+# A delay of 0.3 s is 0.15 m at 0.5 m/s, what the collision monitor keeps as distance; 10 % of 3 m is twice that.
+WINDOW_S, WINDOW_M, SCALE_SHARE, ALLOWED_LAG_S = 10.0, 3.0, 0.1, 0.3
+# Lags that are looked at: buffers of cameras hold up to a second or so, because drivers keep a handful of images.
+LEAST_LAG_S, MOST_LAG_S, LAG_STEP_S = -0.5, 1.5, 0.05
+# Sigma of the lag of clocks that are in order, because motors follow commands and exposures last; motion within it may
+# be shown by one account before the other.
+LAG_SIGMA_S: Final = 0.1
+DOUBT_SHARE: Final = 0.5  # of a limit, from which on the base drives slowly; by trial on development seeds
+# The same of the newest second alone: 0.1 m, and a third of the way, as of images that play at half of the speed.
+SOON_S, SOON_M, SOON_SHARE = 1.0, 0.1, 1 / 3
+LEAST_M: Final = 0.05  # that counts, because an allowed delay moves a base of 0.2 m/s so far
+TURN_RAD: Final = np.radians(5.0)  # because a gyro's bias is estimated to less than half a degree a second
+# Wheels whose diameters differ by 0.7 %, as those of the simulation, turn by 4 degrees over 3 m: that is no doubt yet.
+WHEEL_TURN_RAD: Final = np.radians(15.0)
+# Sigmas of a step beside those that its residuals show: roughness of floor and images; by trial on development seeds.
+STEP_M, STEP_RAD = 0.003, 0.003
+EVIDENCE: Final = 50.0  # log-likelihood ratio, doubled: seven sigma, because a lag is looked for in each pair
+WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, because slip makes both of them large
+LATE_S: Final = 0.5  # for which a lag must be found before it is a fault, because the newest steps are the most noisy
+SCALES: Final = (0.3, 3.0)  # of the motion in the search of a lag, because images may be slow as well as late
+STILL_S, STILL_M, STILL_RAD = 2.0, 0.02, 0.04  # because 1 cm/s and a degree a second are noise of a base that stands
+LEAST_SAMPLE_S: Final = 0.01  # between two that are kept, because floods must not shorten what is remembered
+LONGEST_GAP_S: Final = 0.3  # between two samples, because the motion in a longer gap is not known
+MOST_KEPT: Final = 2048  # samples and steps, because WINDOW_S and MOST_LAG_S at LEAST_SAMPLE_S have 1150
+LEAST_STEPS: Final = 8  # that are compared, because fewer show no delay
+EVERY_S: Final = 0.1  # between two comparisons, because each takes a millisecond
+
+
+class _Step(NamedTuple):
+    """Motion of the base from pair to pair, by the cameras."""
+
+    start_s: float
+    end_s: float
+    distance_m: float
+    turn_rad: float
+
+
+class _Finding(NamedTuple):
+    """Comparison of one account with the images, or of wheels with the gyro."""
+
+    lag_s: float = 0.0  # of the images; beyond the allowed ones where there is evidence
+    excess: float = 0.0  # difference of the sums in parts of its limit; 1 and more is a fault
+    text: str = ""
+
+    @property
+    def differs(self) -> bool:
+        """True if it is at least a doubt."""
+        return abs(self.lag_s) > ALLOWED_LAG_S or self.excess >= DOUBT_SHARE
+
+
+class _Travel:
+    """Integral of one rate over the newest MOST_KEPT samples."""
+
+    def __init__(self) -> None:
+        self._times: deque[float] = deque(maxlen=MOST_KEPT)
+        self._totals: deque[float] = deque(maxlen=MOST_KEPT)
+        self._rate = 0.0
+
+    def add(self, time_s: float, rate: float) -> None:
+        """Add a sample; late ones are left out."""
+        if not np.isfinite(rate):
+            return
+        if self._times and time_s - self._times[-1] > LONGEST_GAP_S:
+            self.clear()
+        if self._times and time_s - self._times[-1] < LEAST_SAMPLE_S:
+            return
+        before_s = self._times[-1] if self._times else time_s
+        total = self._totals[-1] if self._totals else 0.0
+        self._times.append(time_s)
+        self._totals.append(total + (rate + self._rate) / 2 * (time_s - before_s))
+        self._rate = rate
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._times.clear()
+        self._totals.clear()
+
+    def between(self, starts_s: Array, ends_s: Array) -> Array:
+        """Return the motion from starts to ends, arrays of one shape; NaN where no samples cover it."""
+        if len(self._times) < 2:
+            return np.full(starts_s.shape, np.nan)
+        times, totals = np.array(self._times), np.array(self._totals)
+        at = (np.interp(when, times, totals, np.nan, np.nan) for when in (starts_s, ends_s))
+        start, end = at
+        return np.asarray(end - start)
+
+
+class MotionAgreement:
+    """Follows the accounts; memory and work are bounded."""
+
+    def __init__(self) -> None:
+        self._steps: deque[_Step] = deque(maxlen=MOST_KEPT)
+        self._wheels_m, self._wheels_rad, self._gyro_rad = _Travel(), _Travel(), _Travel()
+        self._lags_s = np.arange(LEAST_LAG_S, MOST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
+        self._zero_ns: int | None = None
+        self._compared_s = -np.inf
+        self._late_since_s: float | None = None
+        self.result = AGREE
+
+    def add(self, samples: Iterable[MotionSample], gyro_bias_radps: float) -> None:
+        """Add samples of wheels and gyro."""
+        for sample in samples:
+            at_s = self._seconds(sample.stamp_ns)
+            if isinstance(sample, WheelSample):
+                self._wheels_m.add(at_s, sample.velocity_mps)
+                self._wheels_rad.add(at_s, sample.yaw_rate_radps)
+            else:
+                self._gyro_rad.add(at_s, sample.z_radps - gyro_bias_radps)
+
+    def add_step(self, start_ns: int, end_ns: int, distance_m: float, turn_rad: float) -> None:
+        """Add the motion of the base from one pair to the next, as the cameras saw it; compare."""
+        step = _Step(self._seconds(start_ns), self._seconds(end_ns), distance_m, turn_rad)
+        self._steps.append(step)
+        while self._steps and self._steps[0].end_s < step.end_s - WINDOW_S:
+            self._steps.popleft()
+        if step.end_s - self._compared_s < EVERY_S:
+            return
+        self._compared_s = step.end_s
+        if self._stand():
+            while self._steps and self._steps[0].end_s < step.end_s - STILL_S:
+                self._steps.popleft()
+            self._late_since_s, self.result = None, AGREE
+        elif len(self._steps) >= LEAST_STEPS:
+            self.result = self._compare(step.end_s)
+
+    def _compare(self, now_s: float) -> Witness:
+        """Return the account that differs, and whether it is a fault."""
+        starts_s, ends_s, seen_m, seen_rad = np.array(self._steps).T
+        distance = self._finding((starts_s, ends_s), seen_m, self._wheels_m, (STEP_M, LEAST_M, "m"))
+        of_wheels = self._finding((starts_s, ends_s), seen_rad, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
+        of_gyro = self._finding((starts_s, ends_s), seen_rad, self._gyro_rad, (STEP_RAD, TURN_RAD, "rad"))
+        by_gyro = self._gyro_rad.between(starts_s, ends_s)
+        between = self._finding((starts_s, ends_s), by_gyro, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
+        # The larger one of distance and turn of the wheels; a lag counts as a fault.
+        wheels = max((distance, of_wheels), key=lambda found: (found.differs, found.excess, abs(found.lag_s)))
+        if not wheels.differs and not of_gyro.differs:
+            self._late_since_s = None
+            return AGREE
+        if wheels.differs and of_gyro.differs:
+            reason, found = IMAGES_DIFFER, max(wheels, of_gyro, key=lambda found: found.excess)
+        elif wheels.differs:
+            # The gyro knows nothing of distances.
+            reason = WHEELS_DIFFER if of_wheels.differs and of_gyro is not _UNKNOWN else IMAGES_OR_WHEELS
+            found = wheels
+        else:
+            is_alone = of_wheels is not _UNKNOWN and between.excess >= of_wheels.excess
+            reason, found = GYRO_DIFFERS if is_alone else IMAGES_OR_GYRO, of_gyro
+        is_late = abs(found.lag_s) > ALLOWED_LAG_S
+        self._late_since_s = (self._late_since_s or now_s) if is_late else None
+        is_long = self._late_since_s is not None and now_s - self._late_since_s >= LATE_S
+        return Witness(reason, found.text, bool(is_long or found.excess >= 1.0))
+
+    def _finding(self, span_s: tuple[Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
+                 ) -> _Finding:
+        """Compare the motion seen (N,) in steps with that of a sensor. limits: noise of a step, least sum, unit."""
+        noise, least, unit = limits
+        by_lag = travel.between(span_s[0] - self._lags_s[:, None], span_s[1] - self._lags_s[:, None])
+        near = int(np.argmin(np.abs(self._lags_s)))
+        # 1. Delay; the newest steps have no samples of later times yet.
+        known = np.isfinite(by_lag).all(axis=0) & np.isfinite(seen)
+        if known.sum() >= LEAST_STEPS:
+            best, near, is_late = self._lag(by_lag[:, known], seen[known], noise)
+            if is_late:
+                lag_s = float(self._lags_s[best])
+                return _Finding(lag_s, 0.0, f"by {abs(lag_s):.1f} s")
+        # 2. Scale.
+        known = np.isfinite(by_lag[near]) & np.isfinite(seen)
+        if known.sum() < LEAST_STEPS:
+            return _UNKNOWN
+        moved, seen = by_lag[near, known][::-1], seen[known][::-1]  # the newest first
+        path = np.cumsum(np.abs(moved))
+        count = int(np.searchsorted(path, WINDOW_M)) + 1 if unit == "m" else len(path)
+        length = float(path[min(count, len(path)) - 1])
+        difference = abs(float((moved[:count] - seen[:count]).sum()))
+        is_whole = count <= len(path) or span_s[1][-1] - span_s[0][0] >= WINDOW_S - LEAST_STEPS * EVERY_S
+        limit = max(SCALE_SHARE * (length if is_whole else WINDOW_M), least) if unit == "m" else max(
+            SCALE_SHARE * length, least)
+        steps_s = span_s[1][known] - span_s[0][known]
+        limit += LAG_SIGMA_S * float((np.abs(seen[::-1]) / np.maximum(steps_s, LEAST_SAMPLE_S)).max())
+        if unit == "m":
+            soon = int(np.searchsorted(span_s[1][-1] - span_s[1][known][::-1], SOON_S))
+            lacking = abs(float((moved[:soon] - seen[:soon]).sum()))
+            if lacking > max(SOON_M, SOON_SHARE * float(np.abs(moved[:soon]).sum())) and difference < limit:
+                return _Finding(0.0, max(DOUBT_SHARE, difference / limit), f"by {lacking:.2f} m in {SOON_S:.0f} s")
+        shown = f"{difference:.2f} m in {length:.1f} m" if unit == "m" else f"{np.degrees(difference):.0f} degrees"
+        return _Finding(0.0, difference / limit, f"by {shown}")
+
+    def _lag(self, by_lag: Array, seen: Array, noise: float) -> tuple[int, int, bool]:
+        """Return the best lag, the best one that is allowed, and whether the evidence for the other is strong."""
+        power = (by_lag**2).sum(axis=1)
+        scale = np.clip((by_lag @ seen) / np.maximum(power, 1e-12), *SCALES)
+        squares = ((scale[:, None] * by_lag - seen) ** 2).sum(axis=1)
+        is_allowed = np.abs(self._lags_s) <= ALLOWED_LAG_S + LAG_STEP_S / 2
+        best = int(np.argmin(squares))
+        variance = squares[best] / len(seen) + noise**2
+        # Of a steady motion any lag is as good: without evidence it is near 0.
+        likely = squares + variance * (self._lags_s / LAG_SIGMA_S) ** 2
+        near = int(np.flatnonzero(is_allowed)[np.argmin(likely[is_allowed])])
+        is_strong = squares[near] - squares[best] > EVIDENCE * variance and squares[near] > WORSE * squares[best]
+        return best, near, bool(is_strong and not is_allowed[best])
+
+    def _stand(self) -> bool:
+        """True if images and wheels have shown no motion for STILL_S."""
+        now_s = self._steps[-1].end_s
+        if self._steps[0].start_s > now_s - STILL_S:
+            return False
+        newest = [step for step in self._steps if step.end_s > now_s - STILL_S]
+        starts_s, ends_s = np.array([now_s - STILL_S]), np.array([now_s - LAG_STEP_S])
+        ways_m = (sum(step.distance_m for step in newest), *self._wheels_m.between(starts_s, ends_s))
+        turns_rad = (sum(step.turn_rad for step in newest), *self._wheels_rad.between(starts_s, ends_s))
+        # Wheels that say nothing (NaN) have not moved.
+        return not any(abs(way) > STILL_M for way in ways_m) and not any(abs(turn) > STILL_RAD for turn in turns_rad)
+
+    def _seconds(self, stamp_ns: int) -> float:
+        """Return the time since the first stamp."""
+        if self._zero_ns is None:
+            self._zero_ns = stamp_ns
+        return (stamp_ns - self._zero_ns) * 1e-9
+
+
+_UNKNOWN: Final = _Finding()
