@@ -138,6 +138,7 @@ def test_finds_logs(tmp_path: Path) -> None:
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.touch()
+    (tmp_path / "a/circle").symlink_to(tmp_path)
     everything = [str(tmp_path / name) for name in ("a/1.mcap", "a/2.mcap", "b", "c/x.bag")]
     assert find_logs([str(tmp_path)]) == everything
     assert find_logs([str(tmp_path / "*/*.mcap"), str(tmp_path / "a/1.mcap")]) == everything[:2]

@@ -5,10 +5,13 @@ from __future__ import annotations
 import http.client
 import json
 import math
+import os
 import shutil
 import signal
 import socket
 import ssl
+import subprocess
+import sys
 import time
 import zlib
 from collections.abc import Iterator, Sequence
@@ -371,6 +374,8 @@ def test_tls(tmp_path: Path) -> None:
     with served("--connect", free_endpoint(), "--tls-certificate", tmp_path / "page.pem", "--tls-key",
                 tmp_path / "page.key") as server:
         assert server.url.startswith("https://")
+        half = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S)
+        half.sendall(b"\x16\x03\x01")  # the first bytes of a handshake that does not go on
         context = ssl.create_default_context(cafile=str(tmp_path / "page.pem"))
         context.check_hostname = False
         connection = http.client.HTTPSConnection("127.0.0.1", server.port, timeout=PATIENCE_S, context=context)
@@ -380,6 +385,34 @@ def test_tls(tmp_path: Path) -> None:
         connection.close()
         with pytest.raises((OSError, http.client.HTTPException)):
             server.request("/")
+        with half:
+            assert half.recv(100) == b"", "the place is free again"
+
+
+def test_the_journal_gets_no_token(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    status = os.fstat(writer)
+    environment = os.environ | {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
+    command = [sys.executable, "-m", "omnid", "web", "--listen", "127.0.0.1:0", "--connect", free_endpoint()]
+    refused = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment, text=True)
+    assert refused.returncode == 2 and "the journal would keep it: name a --token-file" in refused.stderr
+    token = tmp_path / "token"
+    with os.fdopen(reader) as journal, subprocess.Popen([*command, "--token-file", token], stdout=writer,
+                                                        stderr=subprocess.DEVNULL, env=environment) as process:
+        line = journal.readline()
+        process.kill()
+        os.close(writer)
+        assert "(the token is in the file of --token-file)" in line and "token=" not in line
+        assert token.read_text().strip() not in line + journal.read()
+
+
+def test_a_browser_that_logs_out_needs_the_token_again(server: WebServer) -> None:
+    cookie = server.cookie()
+    assert server.request("/", headers=cookie).status == 200
+    own = {**cookie, "Origin": f"http://{server.host}"}
+    assert server.request("/logout", "POST", own).status == 303
+    assert server.request("/", headers=cookie).status == 401
+    assert server.request("/", headers=server.cookie()).status == 200, "the token itself is still good"
 
 
 def test_on_the_network_a_warning_says_that_the_token_can_be_read() -> None:
