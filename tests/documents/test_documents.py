@@ -131,5 +131,10 @@ def test_nav2_uses_topics_that_exist() -> None:
     base = Config().controller.collision
     outline = f"[[{base.front_m}, {base.half_width_m}]"
     for name in ("local_costmap", "global_costmap"):
-        assert parameters[name][name]["ros__parameters"]["footprint"].startswith(outline)
+        costmap = parameters[name][name]["ros__parameters"]
+        scan = costmap["obstacle_layer"]["scan"]
+        assert costmap["footprint"].startswith(outline)
+        # A scan is at the height 0, give or take the tilt of the base: nav2's default range of heights is 0 to 0.
+        assert scan["min_obstacle_height"] < 0 < scan["max_obstacle_height"]
+        assert costmap["obstacle_layer"]["min_obstacle_height"] < 0
     assert parameters["controller_server"]["ros__parameters"]["enable_stamped_cmd_vel"] is False
