@@ -84,7 +84,7 @@ def _write(name: str, image: Image, width_px: int) -> None:
     print(f"{name}: {(FOLDER / name).stat().st_size / 1e3:.0f} kB")
 
 
-def drive(seed: int = 1) -> None:
+def drive(seconds: float = DRIVE_S, seed: int = 1) -> None:
     """Write drive.gif: panorama above, plan with what the robot has seen and both paths below."""
     from PIL import Image as PillowImage
 
@@ -92,7 +92,7 @@ def drive(seed: int = 1) -> None:
     script = TeachAndRepeat(lambda line: print(line, flush=True))
     with tempfile.TemporaryDirectory() as folder:
         config = load_config(None, [f"places.map={folder}/demo.omap", f"navigation.routes={folder}/routes"])
-        run = simulate(world, robot, script, seconds=DRIVE_S, seed=seed, config=config)
+        run = simulate(world, robot, script, seconds=seconds, seed=seed, config=config)
     print("end:", script.end)
     cameras = SimulatedCameras(with_masks(robot.rig), robot.sensor, world, seed, robot.samples)
     images = [PillowImage.fromarray(frame).quantize(32, dither=PillowImage.Dither.NONE)
