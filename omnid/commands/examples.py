@@ -28,6 +28,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
                       "calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml"),
     "calibrate check": ("calibrate check drive.mcap --rig rig.toml",),
     "calibrate drive": ("calibrate drive drive.mcap --rig rig.toml -o better.toml",),
+    "calibrate height": ("calibrate height drive.mcap --rig rig.toml --ruler-m 0.92 -o rig.toml",),
     "calibrate import": ("calibrate import camchain.yaml -o rig.toml",),
     "calibrate export": ("calibrate export rig.toml --format kalibr -o camchain.yaml",),
     "cameras": ("cameras", "cameras --snapshot views --config /etc/omnid/omnid.toml",
