@@ -1,9 +1,9 @@
 """The tests of one room, collected once in a process that never runs one itself: each mutant gets a fork of it.
 
 A fork puts the changed functions into the modules that are imported already, runs the tests that called them in
-an unchanged run, the fast ones first, and ends at the first that fails. A mutant outside functions (a constant, a
-default of a class) needs its module imported again: its tests run in a new Python. The changed file also lies in the
-folder of the copy meanwhile, for tests that start programs.
+an unchanged run, those of its file's own test module first, then the fast ones, and ends at the first that fails. A
+mutant outside functions (a constant, a default of a class) needs its module imported again: all tests of its file run
+in a new Python. The changed file also lies in the folder of the copy meanwhile, for tests that start programs.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ import pytest
 from _pytest.runner import runtestprotocol
 
 from omnid.engine import kernel_cache
-from tests.faults.mutants import SURVIVED, Mutant, Results
+from tests.faults.mutants import SURVIVED, UNFINISHED, Mutant, Results
 
 POLL_S: Final = 0.02
+UNFINISHED_CODE: Final = 77  # of a fork; pytest itself uses 0 to 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,16 +41,19 @@ class Reached:
     tests: dict[str, float]  # names of the tests that passed, with their durations [s]
     calls: dict[str, list[tuple[int, int, list[str]]]]  # of a file: first and last line of a function, its tests
 
-    def of(self, mutant: Mutant) -> list[str]:
-        """Return the tests for a mutant, the fast ones first.
+    def of(self, mutant: Mutant, *, in_function: bool = True) -> list[str]:
+        """Return the tests for a mutant: those of its file's own test module first, then the fast ones.
 
         A line in no function that a test has called in this process gets the tests of its file, and if there are none,
-        all: they may reach it in another process.
+        all: they may reach it in another process. in_function: False where more than a function changes, although one
+        (a lambda in a table) may be in the same line.
         """
         functions = self.calls.get(mutant.path, [])
         around = [(last - first, names) for first, last, names in functions if first <= mutant.line <= last]
-        chosen = min(around)[1] if around else sorted({name for *_, names in functions for name in names})
-        return sorted(chosen or self.tests, key=self.tests.__getitem__)
+        every = sorted({name for *_, names in functions for name in names})
+        chosen = (min(around)[1] if around and in_function else every) or list(self.tests)
+        own = f"test_{Path(mutant.path).name}::"
+        return sorted(chosen, key=lambda name: (own not in name, self.tests[name]))
 
 
 class MutantRunner:
@@ -66,14 +70,14 @@ class MutantRunner:
         items = {item.nodeid: item for item in session.items}
         reached = self._unchanged(items)
         for mutant in self._mutants:
-            names = [name for name in reached.of(mutant) if name in items]
-            # A test that has begun within the limit is given the time to end.
-            times_s = [reached.tests[name] for name in names]
-            patience_s = 10.0 + 5.0 * (min(self._limit_s, sum(times_s)) + max(times_s))
             path = self._copy / mutant.path
             path.write_text(mutant.apply(self._sources[mutant.path]), "utf-8")
             try:
                 changed = changed_functions(self._sources[mutant.path], path)
+                names = [name for name in reached.of(mutant, in_function=bool(changed)) if name in items]
+                # A test that has begun within the limit is given the time to end.
+                times_s = [reached.tests[name] for name in names]
+                patience_s = 10.0 + 5.0 * (min(self._limit_s, sum(times_s)) + max(times_s))
                 outcome = self._in_a_fork([items[name] for name in names], changed, patience_s) if changed else (
                     self._in_a_new_python(names, patience_s))
             finally:
@@ -87,7 +91,7 @@ class MutantRunner:
         if pid == 0:
             _quiet()
             replace_functions(changed)
-            os._exit(int(not _passes(items, time.monotonic() + self._limit_s)))
+            os._exit(_tried(items, time.monotonic() + self._limit_s))
         return _outcome(_waited(pid, patience_s))
 
     def _in_a_new_python(self, names: Sequence[str], patience_s: float) -> str:
@@ -167,10 +171,14 @@ def _reached(items: dict[str, pytest.Item], files: dict[str, str]) -> tuple[dict
     return durations, calls
 
 
-def _passes(items: Sequence[pytest.Item], until_s: float) -> bool:
-    """True if no test fails until then."""
-    return all(report.passed or report.skipped
-               for item in items if time.monotonic() < until_s for report in _reports(item))
+def _tried(items: Iterable[pytest.Item], until_s: float) -> int:
+    """Run the tests until one fails; return 0 if all pass, UNFINISHED_CODE where the time is over before the last."""
+    for item in items:
+        if time.monotonic() >= until_s:
+            return UNFINISHED_CODE
+        if not all(report.passed or report.skipped for report in _reports(item)):
+            return 1
+    return 0
 
 
 def _reports(item: pytest.Item) -> Iterable[pytest.TestReport]:
@@ -206,7 +214,7 @@ def _waited(pid: int, patience_s: float) -> int | None:
 def _outcome(code: int | None) -> str:
     if code is None:
         return "timeout"
-    return SURVIVED if code == 0 else "noticed"
+    return {0: SURVIVED, UNFINISHED_CODE: UNFINISHED}.get(code, "noticed")
 
 
 def main() -> int:

@@ -50,6 +50,14 @@ def test_the_tests_of_the_innermost_function_run_the_fast_ones_first() -> None:
     assert reached.of(Mutant("a.py", 12, 0, 1, "")) == ["other"]
     assert reached.of(Mutant("a.py", 40, 0, 1, "")) == ["fast", "other", "slow"], "outside functions"
     assert reached.of(Mutant("b.py", 1, 0, 1, "")) == ["fast", "other", "slow"], "never called in this process"
+    assert reached.of(Mutant("a.py", 6, 0, 1, ""), in_function=False) == ["fast", "other", "slow"], "beside a lambda"
+
+
+def test_the_tests_of_the_own_module_run_first() -> None:
+    names = {"tests/test_b.py::fast": 0.1, "tests/test_a.py::slow": 2.0, "tests/test_a.py::quick": 1.0}
+    reached = Reached(names, {"a.py": [(1, 9, list(names))]})
+    assert reached.of(Mutant("a.py", 2, 0, 1, "")) == ["tests/test_a.py::quick", "tests/test_a.py::slow",
+                                                       "tests/test_b.py::fast"]
 
 
 def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

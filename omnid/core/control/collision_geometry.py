@@ -50,7 +50,8 @@ class Outline(NamedTuple):
             edges = ((self.front_m - x_m, 1.0, 0.0), (self.rear_m + x_m, -1.0, 0.0),
                      (self.half_width_m - y_m, 0.0, 1.0), (self.half_width_m + y_m, 0.0, -1.0))
             _, dx, dy = min(edges)
-        return dx * vx + dy * vy < -TINY
+        # A speed, not its product with the distance: a point at the edge is approached as any other.
+        return dx * vx + dy * vy < -TINY * math.hypot(dx, dy)
 
 
 def contact_s(outline: Outline, motion: Twist, x_m: float, y_m: float) -> float:

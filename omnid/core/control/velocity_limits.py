@@ -52,9 +52,9 @@ class VelocityLimits:
         if goal_mps >= speed_mps:
             speed_mps = min(goal_mps, speed_mps + self.acceleration_mps2 * dt_s)
         else:
-            floor_mps = max(goal_mps, 0.0)
-            left_s = max(0.0, dt_s - (speed_mps - floor_mps) / self.deceleration_mps2)
-            slowed_mps = max(floor_mps, speed_mps - self.deceleration_mps2 * dt_s)
+            # The time left after a stand; without one it has no effect, as the goal is not beyond it.
+            left_s = max(0.0, dt_s - speed_mps / self.deceleration_mps2)
+            slowed_mps = max(goal_mps, 0.0, speed_mps - self.deceleration_mps2 * dt_s)
             speed_mps = max(min(goal_mps, slowed_mps), slowed_mps - self.acceleration_mps2 * left_s)
         return math.copysign(1.0, last_mps) * speed_mps
 

@@ -78,3 +78,4 @@ def test_refuses_unknown_sources_and_keeps_the_newest_of_reordered_commands(sele
 def test_refuses_names_that_are_no_topics(names: tuple[str, ...]) -> None:
     with pytest.raises(OmnidError, match=r"controller\.sources\.names"):
         SourceSettings(names)
+    assert SourceSettings(("a",)).names == ("a",) and len(SourceSettings(tuple("abcdefgh")).names) == 8

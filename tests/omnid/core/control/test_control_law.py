@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+import random
 
 from omnid.core.control.arming import AUTOMATIC
 from omnid.core.control.collision_monitor import ControllerRing
@@ -10,6 +12,8 @@ from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.safety_rules import IDLE, POSE_JUMPED
+from omnid.core.control.velocity_limits import VelocityLimits
 
 TICK_NS, TICK_S = 20_000_000, 0.02
 START_NS = 10**12
@@ -31,3 +35,64 @@ def test_the_way_since_the_images_of_the_ring_counts() -> None:
         fastest_mps = max(fastest_mps, law.motion.velocity_mps)
     assert law.motion.velocity_mps == 0.0 and fastest_mps > 0.15
     assert 0.3 < driven_m <= WALL_M - collision.front_m - collision.stop_m + 0.02
+
+
+def law_with(first: ControllerPose) -> ControlLaw:
+    """Return a law that drives, without obstacles and without a comparison of motions, from a pose."""
+    settings = ControllerSettings(arming=AUTOMATIC).of_log
+    law = ControlLaw(settings, START_NS)
+    law.set_pose(first)
+    law.step(first.stamp_ns, TICK_S)
+    law.set_command(TimedSetpoint(first.stamp_ns + 1, Setpoint(0.3)))
+    law.step(first.stamp_ns + 1, TICK_S)
+    assert law.reason == ""
+    return law
+
+
+def between_rad(one_rad: float, other_rad: float) -> float:
+    """Return the angle between two directions."""
+    return abs(cmath.phase(cmath.exp(1j * (one_rad - other_rad))))
+
+
+def test_a_heading_jumps_where_the_base_cannot_have_turned_so_far() -> None:
+    """By more than 0.3 rad beyond a turn from a stand, and beyond one at the rate of the last pose, to either side.
+
+    Each case lies shortly within or beyond one of the two terms; many headings cross pi, and some poses are older.
+    """
+    limits = VelocityLimits()
+    rng, counts = random.Random(8), {True: 0, False: 0}
+    for _ in range(1500):
+        passed_s = rng.choice((-1, 1)) * rng.randrange(0, 400) * 1e-3
+        before = ControllerPose(START_NS + 10**9, rng.uniform(-math.pi, math.pi), rng.uniform(-1.2, 1.2), "tracking")
+        turn_rad = 0.3 + limits.yaw_rate_radps * abs(passed_s)
+        brake_rad = 0.3 + limits.yaw_acceleration_radps2 * passed_s**2 / 2
+        base_rad, bound_rad = rng.choice(((0.0, turn_rad), (before.yaw_rate_radps * passed_s, brake_rad)))
+        heading_rad = before.heading_rad + base_rad + rng.choice((-1, 1)) * (bound_rad + rng.choice((-0.01, 0.01, 0.3)))
+        pose = before._replace(stamp_ns=before.stamp_ns + round(passed_s * 1e9),
+                               heading_rad=math.remainder(heading_rad, math.tau))
+        terms = (between_rad(pose.heading_rad, before.heading_rad) - turn_rad,
+                 between_rad(pose.heading_rad, before.heading_rad + before.yaw_rate_radps * passed_s) - brake_rad)
+        law = law_with(before)
+        law.set_pose(pose)
+        law.step(before.stamp_ns + 2, TICK_S)
+        jumps = min(terms) > 0.0
+        assert (law.reason == POSE_JUMPED) == jumps, (before, pose, terms)
+        counts[jumps] += 1
+    assert min(counts.values()) > 300
+
+
+def test_a_setpoint_of_the_very_instant_of_a_reason_to_stop_is_void() -> None:
+    law = ControlLaw(ControllerSettings(arming=AUTOMATIC).of_log, START_NS)
+    law.set_pose(ControllerPose(START_NS, 0.0, 0.0, "tracking"))
+    law.set_command(TimedSetpoint(START_NS, Setpoint(0.3)))
+    assert law.step(START_NS, TICK_S).reason == IDLE
+    law.set_command(TimedSetpoint(START_NS + 1, Setpoint(0.3)))
+    assert law.step(START_NS + 1, TICK_S).reason == ""
+
+
+def test_where_the_images_are_those_of_a_log_neither_motion_nor_obstacles_are_compared() -> None:
+    settings = ControllerSettings()
+    for of in (settings.of_log, settings.of_replay):
+        assert not of.motion.check and not of.collision.check
+    assert settings.motion.check and settings.collision.check and settings.without_obstacles.motion.check
+    assert settings.of_replay.arming == AUTOMATIC

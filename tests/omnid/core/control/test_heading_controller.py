@@ -111,6 +111,11 @@ def test_stops_at_once_where_time_or_previous_motion_are_not_finite(value: float
     assert CONTROLLER.step(setpoint, 0.0, DT_S, Twist(0.5, value)) == Twist()
 
 
+def test_a_late_tick_allows_no_larger_step_than_one_of_a_fifth_of_a_second() -> None:
+    motion = CONTROLLER.step(Setpoint(0.5, None, 1.0), 0.0, 9.0, Twist())
+    assert (motion.velocity_mps, motion.yaw_rate_radps) == pytest.approx((0.5 * 0.2, 3.0 * 0.2))
+
+
 def test_changes_nothing_in_no_time() -> None:
     for dt_s in (0.0, -1.0):
         assert CONTROLLER.step(Setpoint(-0.5, 3.0), 0.0, dt_s, Twist(0.2, 0.1)) == Twist(0.2, 0.1)

@@ -11,9 +11,9 @@ from omnid.core.control.heading_controller import HeadingLimits, wrap_angle
 from omnid.core.control.heading_goal import HeadingGoal, longest_lead_rad
 from omnid.core.control.velocity_limits import VelocityLimits
 
-HEADING = HeadingLimits(yaw_rate_radps=1.0, yaw_acceleration_radps2=4.0)
+HEADING = HeadingLimits(yaw_rate_radps=0.8, yaw_acceleration_radps2=4.0)
 LIMITS = VelocityLimits(yaw_rate_radps=1.2, yaw_acceleration_radps2=2.0)
-LONGEST_RAD = 0.15 + 1 / (2 * 2)
+LONGEST_RAD = 0.15 * 0.8 + 0.8**2 / (2 * 2)
 
 
 @pytest.fixture
@@ -72,9 +72,9 @@ def test_goals_are_wrapped(goal: HeadingGoal, side: int) -> None:
 
 
 def test_a_base_that_turns_too_fast_is_to_hold_its_heading(goal: HeadingGoal) -> None:
-    goal.update(0.0, 1.05)
+    goal.update(0.0, 0.87)
     assert goal.towards(0.2) == pytest.approx(0.2), "a little more than the limit is lag"
-    for rate_radps, turn_rad, expected_rad in ((1.2, 0.2, 0.0), (-1.2, -0.2, 0.0), (-1.2, 0.2, 0.2)):
+    for rate_radps, turn_rad, expected_rad in ((0.89, 0.2, 0.0), (-0.89, -0.2, 0.0), (-1.2, 0.2, 0.2)):
         goal.stay()
         goal.update(0.0, rate_radps)
         assert goal.towards(turn_rad) == pytest.approx(expected_rad)

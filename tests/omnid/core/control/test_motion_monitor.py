@@ -176,7 +176,7 @@ def test_can_be_switched_off_and_remembers_little() -> None:
     monitor, history = run(steady(0.3), 10.0, World(seen=still), replace(MotionSettings(), check=False))
     assert not any(doubtful or reason for _, doubtful, reason in history)
     monitor = MotionMonitor(MotionSettings())
-    for tick in range(50_000):
+    for tick in range(6_000):
         monitor.add_command(tick * 5_000_000, Twist(0.3))
         monitor.add_report(tick * 5_000_000, Motion(0.3, 0.0))
     assert len(monitor._commanded) == len(monitor._reported) < 4096

@@ -73,6 +73,34 @@ def test_brakes_to_zero_before_it_accelerates_backwards() -> None:
     assert LIMITS.step(Twist(0.8, 0.0), Twist(-0.1, 0.0), 0.1).velocity_mps == pytest.approx(0.5 * 0.05)
 
 
+def integrated(wanted: Twist, last: Twist, dt_s: float, steps: int = 2000) -> Twist:
+    """Return the motion after a time by small steps, each of which may brake, or speed up, or turn faster by its part.
+    """
+    step_s, v, w = dt_s / steps, last.velocity_mps, last.yaw_rate_radps
+    goal_mps, goal_radps = max(-0.8, min(0.8, wanted.velocity_mps)), max(-1.5, min(1.5, wanted.yaw_rate_radps))
+    for _ in range(steps):
+        brakes = v * goal_mps < 0.0 or abs(goal_mps) < abs(v)
+        change = (2.0 if brakes else 0.5) * step_s
+        v = goal_mps if abs(goal_mps - v) <= change else v + math.copysign(change, goal_mps - v)
+        turn = 3.0 * step_s
+        w = goal_radps if abs(goal_radps - w) <= turn else w + math.copysign(turn, goal_radps - w)
+    return Twist(v, w)
+
+
+def test_is_as_fast_as_the_limits_allow_by_small_steps() -> None:
+    rng = random.Random(6)
+    for _ in range(250):
+        last, dt_s = Twist(rng.uniform(-0.8, 0.8), rng.uniform(-1.5, 1.5)), rng.uniform(0.0, LONGEST_TICK_S)
+        wanted = Twist(rng.choice((0.0, rng.uniform(-0.3, 0.3), rng.uniform(-1, 1))), rng.uniform(-2, 2))
+        sent, expected = LIMITS.step(wanted, last, dt_s), integrated(wanted, last, dt_s)
+        assert sent.velocity_mps == pytest.approx(expected.velocity_mps, abs=1e-3), (wanted, last, dt_s)
+        assert sent.yaw_rate_radps == pytest.approx(expected.yaw_rate_radps, abs=1e-3)
+
+
+def test_a_late_tick_allows_no_larger_step_than_one_of_a_fifth_of_a_second() -> None:
+    assert LIMITS.step(Twist(0.8, 1.5), STOP, 9.0) == Twist(pytest.approx(0.1), pytest.approx(0.6))
+
+
 def test_changes_nothing_in_no_time() -> None:
     for dt_s in (0.0, -1.0, math.nan, math.inf):
         assert LIMITS.step(Twist(0.5, 0.5), Twist(0.2, 0.1), dt_s) == Twist(0.2, 0.1)
