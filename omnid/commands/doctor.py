@@ -53,7 +53,7 @@ def examine(config: Config) -> Iterator[Finding]:
     yield from cameras.cameras(
         {name: camera.settings(name) for name in ("lower", "upper")}, capture_devices(ROOT), ROOT
     )
-    yield from wiring.rig(Path(camera.rig), (camera.width_px, camera.height_px))
+    yield from wiring.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
     yield from wiring.motor(config.motor.port, ROOT)
     yield devices.memberships()
     yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)

@@ -42,8 +42,11 @@ def motor(port: str, root: Path = Path("/")) -> Iterator[Finding]:
         yield from [*access(subject, path), *busy] or [Finding("ok", subject, port)]
 
 
-def rig(path: Path, size_px: tuple[int, int]) -> Iterator[Finding]:
-    """Check that the rig can be read, is of images of this size (width, height), and has masks."""
+def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[Finding]:
+    """Check that the rig can be read, is of images of this size (width, height), states its height, and has masks.
+
+    floor_m: height of the floor in the base frame.
+    """
     try:
         found = read_rig(path)
     except CalibError as error:
@@ -55,12 +58,17 @@ def rig(path: Path, size_px: tuple[int, int]) -> Iterator[Finding]:
         if (width, height) != size_px:
             yield Finding("error", "rig", f"{path}: the {name} camera was calibrated with {width}x{height} px, "
                           f"[cameras] asks for {size_px[0]}x{size_px[1]}", "set cameras.width_px and height_px")
+    height_m = found.height_m(floor_m)
+    if height_m is None:
+        yield Finding("warning", "rig", f"{path} does not state the height of the cameras: nothing is free until the "
+                      "images show the floor", "state it by `omnid calibrate height LOG`, with --ruler-m as a check")
     bare = [name for name, mounted in cameras.items() if mounted.mask is None]
     if bare:
         yield Finding("warning", "rig", f"{path} has no mask for {' and '.join(bare)}, the rim is searched at "
                       "each start", f"add [{bare[0]}.mask] with center, inner_px and outer_px")
     else:
-        yield Finding("ok", "rig", f"{path}, {found.baseline_m:.3f} m between the viewpoints")
+        yield Finding("ok", "rig", f"{path}, {found.baseline_m:.3f} m between the viewpoints"
+                      + ("" if height_m is None else f", {height_m:.3f} m above the floor"))
 
 
 def bus(config: BusConfig) -> Iterator[Finding]:

@@ -57,7 +57,7 @@ def _rig_rows(rig: Rig) -> list[tuple[str, str]]:
     rows = [("baseline", f"{rig.baseline_m * 1e3:.2f} mm"), ("lower camera", _camera(rig.lower)),
             ("upper camera", _camera(rig.upper))]
     if np.allclose(rig.T_base_rig, np.eye(4)):
-        return [*rows, ("on the robot", "the rig's frame is base_link")]
+        return [*rows, ("on the robot", "not stated: the rig's frame is base_link")]
     return [*rows, ("on the robot", f"at {position_m} m, rotated by {rotation_deg} deg")]
 
 

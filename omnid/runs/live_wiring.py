@@ -13,6 +13,7 @@ from calib.rig_file import rig_toml
 from drivers.frame import Camera
 from omnid.controller.link import ControllerLink
 from omnid.core.control.command_sources import PLANNER
+from omnid.diagnostics.floor_status import floor_status
 from omnid.diagnostics.images_status import ImagesStatus
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
@@ -105,6 +106,7 @@ class LiveWiring:
                   *([received.navigation.status] if controller else ()),
                   motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
                   *([partial(places_status, stages.places)] if stages.places else ()),
+                  *([partial(floor_status, stages.floor)] if stages.floor else ()),
                   *(part.status for part in (bus, recorder, saver) if part)]
         sources = StatusSources(graph.telemetry, states, pairing, session.statistics, self._latency.to_pose,
                                 controller.statistics if controller else None, received.commands, TICKERS,

@@ -29,6 +29,7 @@ NAVIGATION: Final = f"{PREFIX}navigation"
 REQUESTS: Final = f"{PREFIX}requests"  # to the navigation
 LOAD: Final = f"{PREFIX}load"
 IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
+FLOOR: Final = f"{PREFIX}floor"  # height of the cameras above it
 EXPOSURE: Final = f"{PREFIX}exposure"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
@@ -74,6 +75,10 @@ class Key(StrEnum):
     MISSING = "missing"  # in words; no key where there is enough
     LOWER_COVERAGE = "lower_coverage"  # views from the hub to the rim, 12 clockwise digits a ring, 9: nine or more
     UPPER_COVERAGE = "upper_coverage"
+    # Floor
+    HEIGHT_M = "height_m"  # of the lower viewpoint
+    SIGMA_M = "sigma_m"
+    TILT_DEG = "tilt_deg"
     # Wheels
     EXPIRIES = "expiries"
     COMMANDS = "commands"

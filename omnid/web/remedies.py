@@ -16,6 +16,7 @@ _OF_PART: Final = {
     status_names.RECORDING: "make room on the disk, or change record.folder",
     status_names.LOAD: "close other programs on the robot, or start it with --profile small",
     status_names.EXPOSURE: "switch lights on, or set cameras.exposure_limit_ms",
+    status_names.FLOOR: "state the height of the cameras in the rig: omnid calibrate height LOG, or --height-m",
     status_names.IMAGES: "clean the mirrors, look for glare and darkness, check the cameras and their driver",
     status_names.RIG: "omnid calibrate check on a recording; name the right rig.toml, or calibrate again",
     status_names.MOTION: "check motor.drive in the configuration, and the grip of the wheels",

@@ -157,7 +157,7 @@ def test_poses_flow_once_it_is_ready(operator: GuestOperator) -> None:
 
 
 def test_poses_match_the_log(operator: GuestOperator) -> None:
-    truth = np.loadtxt(SAMPLE / "truth.txt")  # TUM: time, x y z, quaternion; T_base_rig of this rig is 1
+    truth = np.loadtxt(SAMPLE / "truth.txt")  # TUM: time, x y z, quaternion; T_base_rig of this rig is a height
     first = operator.poses[0]
     until(lambda: operator.index(operator.poses[-1]) >= operator.index(first) + 10)
     last = operator.poses[-1]

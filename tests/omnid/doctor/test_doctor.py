@@ -259,13 +259,19 @@ def test_checks_the_image_size_of_the_rig(scene: Path) -> None:
 
 def test_warns_of_a_rig_without_masks(scene: Path, tmp_path: Path) -> None:
     bare, masked = tmp_path / "bare.toml", tmp_path / "masked.toml"
-    whole = read_rig(scene / "rig.toml")
+    whole = read_rig(scene / "rig.toml").at_height(1.2)
     write_rig(masked, whole)
     write_rig(bare, replace(whole, lower=replace(whole.lower, mask=None), upper=replace(whole.upper, mask=None)))
     (found,) = rig(bare, (256, 256))
     assert found.level == "warning" and "no mask for lower and upper" in found.found
     (found,) = rig(masked, (256, 256))
-    assert found.level == "ok" and "between the viewpoints" in found.found
+    assert found.level == "ok" and "between the viewpoints, 1.200 m above the floor" in found.found
+
+
+def test_warns_of_a_rig_that_does_not_state_its_height(scene: Path) -> None:
+    found = list(rig(scene / "rig.toml", (256, 256)))
+    assert any(one.level == "warning" and "does not state the height" in one.found for one in found)
+    assert not any("does not state" in one.found for one in rig(scene / "rig.toml", (256, 256), -1.2))
 
 
 @pytest.mark.parametrize("text", [None, "", "nonsense = [", "schema = 99"])
