@@ -50,6 +50,21 @@ def test_no_free_cell_touches_an_occupied_one() -> None:
     assert occupied.sum() > 100 and not (grid.cells[near_occupied[1:-1, 1:-1]] == FREE).any()
 
 
+def test_space_is_free_when_two_views_have_seen_through_it() -> None:
+    T = np.tile(pose(0, 0, 0), (2, 1, 1))
+    scan = scan_of(ROOM, T[0])
+    assert at(scan_grid([scan], T[:1], 0.05), 1.0, 0.0) == UNKNOWN
+    assert at(scan_grid([scan] * 2, T, 0.05), 1.0, 0.0) == FREE
+
+
+def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:
+    scan, T = scan_of(ROOM, pose(0, 0, 0)), np.tile(np.eye(4), (4, 1, 1))
+    scan[180 + 45] = 10.0  # a false match far behind the wall, at 45.5 degrees
+    grid = scan_grid([scan] * 4, T, 0.05)
+    behind = [at(grid, r * np.cos(np.deg2rad(45.5)), r * np.sin(np.deg2rad(45.5))) for r in np.arange(3.7, 9.5, 0.1)]
+    assert FREE not in behind
+
+
 def test_the_map_moves_with_its_keyframes() -> None:
     scans = [scan_of(ROOM, T) for T in PATH]
     moved = pose(1.0, 2.0, np.pi / 2)
