@@ -62,7 +62,7 @@ def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> No
     shutil.copy(scene / "rig.toml", tmp_path / "rig.toml")
     save(tmp_path / "log.mcap", exchanged)
     with closing(Base(tmp_path)) as base:
-        command = command_line(tmp_path, free_port(), base.port)
+        command = [*command_line(tmp_path, free_port(), base.port), "--set", "obstacles.ring.floor_m=-1.2"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert not base.line.moved_since(0.0)
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done.stderr
@@ -124,7 +124,8 @@ def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> 
     """Also while it starts."""
     port = free_port()
     command = [sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
-               str(scene / "rig.toml"), "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
+               str(scene / "rig.toml"), "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]',
+               "--set", "obstacles.ring.floor_m=-1.2"]
     with started(command, port) as daemon:
         wait_until(lambda: answers(port), "the bus")  # opened after cameras and motor, before anything runs
         code, err = daemon.end(number)
