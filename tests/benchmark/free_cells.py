@@ -129,8 +129,9 @@ def main() -> None:
     arguments = parser.parse_args()
     table = ResultTable("free_cells", "obstacles", "Points of the cloud in free cells of the map", COLUMNS, (
         "Points whose true height is between 0.1 m and the robot's top; at most 1 % of them may lie in free cells. Of "
-        "`two_walls` (768 px) and `sample` (the same drive at 512 px) the renderer is POV-Ray. The floor's noise and the "
-        "grid were fitted on the sample, rooms 601 and 602, and two_walls 601 and 602; on 603 and 604 nothing was.",))
+        "`two_walls` (768 px) and `sample` (the same drive at 512 px) the renderer is POV-Ray. The floor's noise and "
+        "the grid were fitted on the sample, rooms 601 and 602, and two_walls 601 and 602; for this table only "
+        "those of 603 and 604 are validation.",))
     for folder in arguments.logs:
         for row in measure(folder):
             table.add(*row, folder=folder)
