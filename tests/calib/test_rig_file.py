@@ -146,8 +146,8 @@ def test_refuses_a_mask_image_of_another_size(omni_rig: Rig, tmp_path: Path) -> 
 
 
 def test_unreadable_files_are_one_line_errors(omni_rig: Rig, tmp_path: Path) -> None:
-    for path in (tmp_path / "none.toml", tmp_path):
-        with pytest.raises(CalibError, match="cannot be read"):
+    for path, message in ((tmp_path / "none.toml", "there is no such rig"), (tmp_path, "cannot be read")):
+        with pytest.raises(CalibError, match=message):
             read_rig(path)
     with pytest.raises(CalibError, match="cannot be written"):
         write_rig(tmp_path / "no" / "rig.toml", omni_rig)
