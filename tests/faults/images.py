@@ -131,7 +131,7 @@ CASES: Final[dict[str, Case]] = {
     "sector frozen": Case("box", lambda: Frozen(sector(SIZE_PX, 0.0, SECTOR_DEG))),
     "sector blurred": Case("box", lambda: lambda time_s, frame: blurred(
         time_s, frame, sector(SIZE_PX, 0.0, SECTOR_DEG))),
-    "dark, a person steps in": Case("person at 1.5 m", lambda: None, (Fault("dark", STARTS_S, SECONDS),)),
+    "dark, a person steps in": Case("person at 0.8 m", lambda: None, (Fault("dark", STARTS_S, SECONDS),)),
     "late by 0.5 s": Case("box", lambda: Late(0.5), since_s=0.0),
     "late by 1 s": Case("box", lambda: Late(1.0), since_s=0.0),
     "half speed": Case("box", lambda: Late(speed=0.5)),
