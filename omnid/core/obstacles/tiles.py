@@ -40,6 +40,10 @@ NOISE_CHANGE: Final = 1.128
 # in the sample log live tiles change by a fifth of it at least.
 NOISE_SHARE: Final = 0.1
 MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, and says nothing about a tile
+# Cameras that remove noise repeat plain tiles while the base stands: a tile without texture is dead only if it has
+# changed in nearly all pairs before, by the mean of the newest 1 / LIVELY_GAIN.
+TEXTURE_GREY: Final = 4.0  # standard deviation, more than what such a camera leaves of the noise
+LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
 SATURATED_GREY, SATURATED_SHARE = 250, 0.8
 # Of the energy beside the other camera's. In live images it was 0.57 at least in the sample log and 0.31 in rendered
@@ -99,6 +103,7 @@ class TileMonitor:
         self._half_share = cv2.resize(self._half, (TILE_COLUMNS, 1), interpolation=cv2.INTER_AREA)[0]
         self._before: dict[Side, Image] = {}
         self._since_ns = dict.fromkeys(SIDES, 0)
+        self._lively = {side: np.zeros(self._judged.shape, np.float32) for side in SIDES}  # share of pairs that changed
         self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
         self._faint = {side: np.zeros(TILE_COLUMNS, np.intp) for side in SIDES}  # pairs in a row with little energy
 
@@ -127,11 +132,16 @@ class TileMonitor:
             return np.zeros_like(self._judged)
         change = self._mean(cv2.absdiff(image, before).astype(np.float32))
         least = NOISE_SHARE * NOISE_CHANGE * noise_grey if noise_grey >= MEASURED_NOISE_GREY else 0.0
-        # Black and saturated pixels have no noise, and a plain one may have lost it by compression: they are not dead.
+        # Black and saturated pixels have no noise.
         shows = self._judged & ~self._dark_or_glaring(image)
         is_still = shows & (change <= least)
+        grey, lively = image.astype(np.float32), self._lively[side]
+        texture2 = self._mean(grey * grey) - self._mean(grey) ** 2
+        may_be_dead = is_still & ((texture2 > TEXTURE_GREY**2) | (lively > LIVELY_SHARE))
         enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
-        self._still[side] = np.where(is_still & enough, self._still[side] + 1, 0)
+        self._still[side] = np.where(may_be_dead & enough, self._still[side] + 1, 0)
+        # While it is dead, a tile counts as what it was before.
+        self._lively[side] = np.where(self._still[side] > 0, lively, lively + LIVELY_GAIN * (~is_still - lively))
         return np.asarray(self._still[side] >= IN_A_ROW)
 
     def _dark_or_glaring(self, image: Image) -> Flags:

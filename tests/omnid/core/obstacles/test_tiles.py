@@ -98,6 +98,22 @@ def test_without_noise_a_scene_in_which_a_little_moves_is_live() -> None:
         assert cameras.update(images) is ALL_LIVE
 
 
+def test_a_plain_part_is_dead_only_if_it_has_always_changed() -> None:
+    """A camera that removes noise repeats what is plain; one that does not shows its noise everywhere."""
+    for noise_grey, is_dead in ((2.0, True), (0.0, False)):
+        cameras, states = Cameras(noise_grey), ALL_LIVE
+        cameras.scene[:, PART] = 120
+        kept = cameras.images()["upper"][:, PART].copy()
+        for number in range(26 + IN_A_ROW):
+            images = cameras.images()
+            images["lower"][:, :PART.start] += np.uint8(number % 2)  # somebody moves there
+            images["upper"][:, :PART.start] += np.uint8(number % 2)
+            if number >= 25:
+                images["upper"][:, PART] = kept
+            states = cameras.update(images)
+        assert (states is not ALL_LIVE) == is_dead
+
+
 def test_dark_and_saturated_parts_are_blind_at_once() -> None:
     """Each of them, in one image."""
     cameras = Cameras()
