@@ -16,7 +16,7 @@ The last three are blind. A direction is unknown where one tile of either camera
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import cv2
 import numpy as np
@@ -93,7 +93,7 @@ class TileMonitor:
 
     def __init__(self, visible: Flags) -> None:
         """visible (H, W): pixels that show the world."""
-        self._visible = visible.astype(np.float32)
+        self._visible = _sample(visible).astype(np.float32)
         self._share = _means(self._visible)
         self._judged = self._share >= JUDGED_SHARE
         half = (visible.shape[1] // 2, visible.shape[0] // 2)
@@ -110,8 +110,9 @@ class TileMonitor:
     def update(self, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
         """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey."""
         # 1. What each camera shows by itself.
-        dead = {side: self._dead(side, images[side], noise_grey[side]) for side in SIDES}
-        blind = {side: self._dark_or_glaring(images[side]) for side in SIDES}
+        samples = {side: np.ascontiguousarray(_sample(images[side])) for side in SIDES}
+        blind = {side: self._dark_or_glaring(samples[side]) for side in SIDES}
+        dead = {side: self._dead(side, samples[side], blind[side], noise_grey[side]) for side in SIDES}
         # 2. What one camera does not show that the other one does.
         energy = {side: self._energy(images[side]) for side in SIDES}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -125,15 +126,14 @@ class TileMonitor:
             return ALL_LIVE
         return TileStates(dead, blind, columns, dict(self._since_ns))
 
-    def _dead(self, side: Side, image: Image, noise_grey: float) -> Flags:
-        """Return the tiles of a camera that do not change."""
+    def _dead(self, side: Side, image: Image, blind: Flags, noise_grey: float) -> Flags:
+        """Return the tiles of a camera that do not change. blind: dark and saturated ones, which have no noise."""
         before, self._before[side] = self._before.get(side), image
         if before is None or before.shape != image.shape:
             return np.zeros_like(self._judged)
         change = self._mean(cv2.absdiff(image, before).astype(np.float32))
         least = NOISE_SHARE * NOISE_CHANGE * noise_grey if noise_grey >= MEASURED_NOISE_GREY else 0.0
-        # Black and saturated pixels have no noise.
-        shows = self._judged & ~self._dark_or_glaring(image)
+        shows = self._judged & ~blind
         is_still = shows & (change <= least)
         grey, lively = image.astype(np.float32), self._lively[side]
         texture2 = self._mean(grey * grey) - self._mean(grey) ** 2
@@ -182,6 +182,13 @@ class TileMonitor:
 def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
     """Return flags of the pixels (H, W) of tiles (TILE_ROWS, TILE_COLUMNS)."""
     return np.asarray(cv2.resize(tiles.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
+
+
+def _sample(image: NDArray[Any]) -> NDArray[Any]:
+    """Return every second pixel of each second row: some 240 pixels of a tile at scale 1 are enough, in a quarter of
+    the time.
+    """
+    return image[::2, ::2]
 
 
 def _means(values: Floats) -> Floats:
