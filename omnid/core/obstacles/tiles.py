@@ -5,7 +5,7 @@ a region that a driver no longer writes, dirt or a drop on a mirror, darkness, g
 
     dead      each pixel is as in the image before, or less changed than the noise of a live image changes it,
               twice in a row, while other tiles change. Noise changes a live tile even where nothing moves.
-    dark      its mean is not above black
+    dark      its mean is not above black, and hardly anything is in it but noise
     glaring   most of its pixels are saturated
     blurred   a column of tiles has lost its gradient energy beside the same column of the other camera, which sees the
               same things from 0.1 to 0.4 m above or below; the median over all columns is the two cameras' own ratio
@@ -45,6 +45,7 @@ MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, an
 TEXTURE_GREY: Final = 4.0  # standard deviation, more than what such a camera leaves of the noise
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
+DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
 SATURATED_GREY, SATURATED_SHARE = 250, 0.8
 # Of the energy beside the other camera's. In live images it was 0.57 at least in the sample log and 0.31 in rendered
 # rooms and bare corridors of development seeds; a drop leaves a tenth.
@@ -111,7 +112,7 @@ class TileMonitor:
         """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey."""
         # 1. What each camera shows by itself.
         samples = {side: np.ascontiguousarray(_sample(images[side])) for side in SIDES}
-        blind = {side: self._dark_or_glaring(samples[side]) for side in SIDES}
+        blind = {side: self._dark_or_glaring(samples[side], noise_grey[side]) for side in SIDES}
         dead = {side: self._dead(side, samples[side], blind[side], noise_grey[side]) for side in SIDES}
         # 2. What one camera does not show that the other one does.
         energy = {side: self._energy(images[side]) for side in SIDES}
@@ -135,19 +136,25 @@ class TileMonitor:
         least = NOISE_SHARE * NOISE_CHANGE * noise_grey if noise_grey >= MEASURED_NOISE_GREY else 0.0
         shows = self._judged & ~blind
         is_still = shows & (change <= least)
-        grey, lively = image.astype(np.float32), self._lively[side]
-        texture2 = self._mean(grey * grey) - self._mean(grey) ** 2
-        may_be_dead = is_still & ((texture2 > TEXTURE_GREY**2) | (lively > LIVELY_SHARE))
+        lively = self._lively[side]
+        may_be_dead = is_still & ((self._deviation(image) > TEXTURE_GREY) | (lively > LIVELY_SHARE))
         enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
         self._still[side] = np.where(may_be_dead & enough, self._still[side] + 1, 0)
         # While it is dead, a tile counts as what it was before.
         self._lively[side] = np.where(self._still[side] > 0, lively, lively + LIVELY_GAIN * (~is_still - lively))
         return np.asarray(self._still[side] >= IN_A_ROW)
 
-    def _dark_or_glaring(self, image: Image) -> Flags:
+    def _dark_or_glaring(self, image: Image, noise_grey: float) -> Flags:
+        is_dark = self._mean(image.astype(np.float32)) < BLACK_GREY
+        if is_dark.any():
+            is_dark &= self._deviation(image) < DARK_CONTRAST * max(noise_grey, MEASURED_NOISE_GREY)
         saturated = self._mean((image >= SATURATED_GREY).astype(np.float32))
-        return np.asarray(self._judged & ((self._mean(image.astype(np.float32)) < BLACK_GREY)
-                                          | (saturated > SATURATED_SHARE)))
+        return np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
+
+    def _deviation(self, image: Image) -> Floats:
+        """Return the standard deviations (TILE_ROWS, TILE_COLUMNS) within tiles."""
+        grey = image.astype(np.float32)
+        return np.asarray(np.sqrt(np.maximum(self._mean(grey * grey) - self._mean(grey) ** 2, 0.0)), np.float32)
 
     def _energy(self, image: Image) -> Floats:
         """Return the gradient energy (TILE_COLUMNS,) of columns of tiles at half resolution, grey levels squared.

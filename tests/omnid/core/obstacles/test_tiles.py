@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from omnid.core.obstacles.tiles import (
     ALL_LIVE,
+    BLACK_GREY,
     IN_A_ROW,
     SIDES,
     TILE_COLUMNS,
@@ -124,6 +125,14 @@ def test_dark_and_saturated_parts_are_blind_at_once() -> None:
         states = cameras.update(images)
         assert states.blind["lower"][:, INSIDE].all() and states.unknown[INSIDE].all(), grey
         assert not states.unknown[OUTSIDE].any()
+
+
+def test_a_dim_scene_is_not_dark_while_it_shows_more_than_noise() -> None:
+    """Cameras with a long exposure at night."""
+    cameras = Cameras()
+    cameras.scene = (cameras.scene // 9).astype(np.uint8)
+    assert cameras.scene.mean() < BLACK_GREY
+    assert all(cameras.update(cameras.images()) is ALL_LIVE for _ in range(4))
 
 
 def test_a_lamp_makes_no_direction_unknown() -> None:
