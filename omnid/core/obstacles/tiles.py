@@ -47,9 +47,10 @@ LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
 SATURATED_GREY, SATURATED_SHARE = 250, 0.8
-# Of the energy beside the other camera's. In live images it was 0.57 at least in the sample log and 0.31 in rendered
-# rooms and bare corridors of development seeds; a drop leaves a tenth.
-BLURRED_SHARE: Final = 0.2
+# Of the energy beside the other camera's, in so many columns side by side, because a poster that only one of them sees
+# is all the texture of a column: 0.15 was left in rendered corridors. A drop leaves less.
+BLURRED_SHARE: Final = 0.1
+BLURRED_COLUMNS: Final = 3
 LEAST_ENERGY: Final = 2.0  # of a column, in variances of the noise: with less texture no blur is seen
 COMPARED_COLUMNS: Final = 15  # that have so much, at least: else a single poster decides what is usual
 BLIND_SHARE: Final = 0.5  # of the judged tiles of a column, of which more blind ones make its direction unknown
@@ -137,7 +138,7 @@ class TileMonitor:
         shows = self._judged & ~blind
         is_still = shows & (change <= least)
         lively = self._lively[side]
-        may_be_dead = is_still & ((self._deviation(image) > TEXTURE_GREY) | (lively > LIVELY_SHARE))
+        may_be_dead = is_still & ((self._contrast(image) > TEXTURE_GREY) | (lively > LIVELY_SHARE))
         enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
         self._still[side] = np.where(may_be_dead & enough, self._still[side] + 1, 0)
         # While it is dead, a tile counts as what it was before.
@@ -147,11 +148,11 @@ class TileMonitor:
     def _dark_or_glaring(self, image: Image, noise_grey: float) -> Flags:
         is_dark = self._mean(image.astype(np.float32)) < BLACK_GREY
         if is_dark.any():
-            is_dark &= self._deviation(image) < DARK_CONTRAST * max(noise_grey, MEASURED_NOISE_GREY)
+            is_dark &= self._contrast(image) < DARK_CONTRAST * max(noise_grey, MEASURED_NOISE_GREY)
         saturated = self._mean((image >= SATURATED_GREY).astype(np.float32))
         return np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
 
-    def _deviation(self, image: Image) -> Floats:
+    def _contrast(self, image: Image) -> Floats:
         """Return the standard deviations (TILE_ROWS, TILE_COLUMNS) within tiles."""
         grey = image.astype(np.float32)
         return np.asarray(np.sqrt(np.maximum(self._mean(grey * grey) - self._mean(grey) ** 2, 0.0)), np.float32)
@@ -178,6 +179,9 @@ class TileMonitor:
         ratio = energy / np.maximum(other, 1e-6)
         usual = float(np.median(ratio[textured]))
         is_faint = textured & (ratio < BLURRED_SHARE * usual)
+        wide = np.logical_and.reduce([np.roll(is_faint, -shift) for shift in range(BLURRED_COLUMNS)])
+        # All of such a run, and the columns beside it, which dirt covers in part.
+        is_faint = np.logical_or.reduce([np.roll(wide, shift) for shift in range(-1, BLURRED_COLUMNS + 1)])
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
         return np.asarray(self._faint[side] >= IN_A_ROW)
 

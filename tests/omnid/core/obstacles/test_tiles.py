@@ -154,7 +154,18 @@ def test_a_part_that_only_one_camera_shows_blurred_is_blind(side: Side) -> None:
         noise = np.random.default_rng(number).normal(0, 2, SHAPE)
         images[side][:, PART] = np.clip(np.rint(smooth + noise), 0, 255).astype(np.uint8)[:, PART]
         states = cameras.update(images)
-    assert states.blind[side][:, INSIDE].all() and not states.unknown[OUTSIDE].any()
+    assert states.blind[side][:, INSIDE].all() and not states.unknown[OUTSIDE[1:-1]].any()
+
+
+def test_texture_that_only_one_camera_sees_is_no_dirt_on_the_other() -> None:
+    """A poster at the edge of the view, two columns of tiles wide."""
+    cameras, states = Cameras(), ALL_LIVE
+    cameras.scene[:, 300:330] = 120
+    for _ in range(IN_A_ROW + 1):
+        images = cameras.images()
+        images["upper"][100:200:4, 300:330] = 20
+        states = cameras.update(images)
+    assert states is ALL_LIVE
 
 
 def test_a_plain_part_of_the_scene_is_not_blind() -> None:
