@@ -21,6 +21,7 @@ from omnid.errors import OmnidError
 
 MOVE_S: Final = 1.0  # in each direction
 REST_S: Final = 0.3  # until the wheels stand
+LEAST_COMMANDS: Final = 2  # of a motion: the driver may send a stop in place of the first one
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 LARGEST_TURNS: Final = 1000.0
 # The setting that makes the number of turns right; controllers of other protocols take m/s, and know the rest.
@@ -119,7 +120,10 @@ class WiringTest:
         period_s = 1 / self._config.rate_hz
         motor.send(stop_command(0))  # after a pause the driver sends one in place of the first command
         begin_s = next_s = time.monotonic()
-        while time.monotonic() < begin_s + duration_s:
+        sent = 0
+        # A busy computer may have paused this program already: the wheels move nevertheless, if only for a moment.
+        while sent < LEAST_COMMANDS or time.monotonic() < begin_s + duration_s:
+            sent += 1
             with suppress(LateReplyError):  # the wheels go on turning: the controller's watchdog is far from its end
                 motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
             next_s += period_s
