@@ -136,7 +136,7 @@ def test_reports_a_mask_beyond_the_rim(scene: Path, tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.parametrize(("words", "message"), [
-    ([], "no rig.toml is attached to the log"), (["--rig", "none.toml"], "none.toml: cannot be read"),
+    ([], "no rig.toml is attached to the log"), (["--rig", "none.toml"], "none.toml: there is no such rig"),
     (["--refine"], "--refine and -o go together"), (["-o", "rig.toml"], "--refine and -o go together"),
     (["--lower", "/x"], "no topic '/x'"),
 ])

@@ -6,23 +6,22 @@ import numpy as np
 
 from omnid.config import Config
 from omnid.core.obstacles.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
-from omnid.core.types.panorama import PaddedPanorama
 from omnid.diagnostics.images_status import LIVE, ImagesStatus
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.messages import OdometryUpdate, Panoramas, StereoDepth
+from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.simulation.robot import make_robot
 from omnid.stages.geometry import geometry
 from omnid.tracking_state import TrackingState
 from omnid.transport.codec import ERROR, OK, STALE
 from omnid.transport.status_names import lost_parts_key
+from tests.omnid.small_pair import small_depth
 
 S = 1_000_000_000
 
 
 def update(tiles: TileStates, stamp_ns: int) -> OdometryUpdate:
     """Return a pose whose pair has these tiles."""
-    panorama = PaddedPanorama(np.zeros((4, 8), np.uint8), 1)
-    pair = Panoramas(0, stamp_ns, panorama, panorama, np.ones((4, 6), bool))
+    pair = small_depth(stamp_ns).panoramas
     return OdometryUpdate(0, stamp_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 9, 9,
                           StereoDepth(replace(pair, tiles=tiles)))
 

@@ -21,12 +21,11 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.types.panorama import PaddedPanorama
 from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.diagnostics.status import TIMEOUT_S, StatusCollector, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.messages import OdometryUpdate, Panoramas, StereoDepth
+from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
@@ -34,6 +33,7 @@ from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diag
 from omnid.transport.commands import CommandReceiver
 from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import ODOMETRY, Key, landmark_counts, short_name
+from tests.omnid.small_pair import small_depth
 from tests.simulation import build
 
 SIZE = 256
@@ -103,10 +103,8 @@ class Daemon:
             self.pair.process(Frame(0, time.monotonic_ns() - round(age_s * 1e9), camera, "jpeg", data))
 
     def pose(self, state: str = "tracking", age_s: float = 0.0) -> None:
-        panorama = PaddedPanorama(np.zeros((4, 8), np.uint8), 1)
-        depth = StereoDepth(Panoramas(0, 0, panorama, panorama, np.ones((4, 6), bool)))
         odometry = OdometryUpdate(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
-                            np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, depth)
+                            np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, small_depth())
         self.statistics.process(odometry)
         self.latency.process(odometry)
         self.controller.set_pose(controller_pose(odometry, np.eye(4)))

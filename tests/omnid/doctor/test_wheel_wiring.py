@@ -74,7 +74,9 @@ def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, 
     watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
     with contextlib.closing(SimulatedMotor(watched)) as motor:
         watchdog_ms = 2000 if protocol == "ros_arduino_bridge" else 1000
-        yield MotorSettings(motor.port, protocol, watchdog_ms=watchdog_ms, drive=drive), Person(watched), motor
+        # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.
+        settings = MotorSettings(motor.port, protocol, rate_hz=5.0, watchdog_ms=watchdog_ms, drive=drive)
+        yield settings, Person(watched), motor
 
 
 @pytest.mark.parametrize(("protocol", "true"), [
@@ -132,7 +134,8 @@ def test_the_command_asks_prints_and_writes(tmp_path: Path) -> None:
                     f"wheel_radius_m = {RADIUS_M}\n[record]\nfile_mb = 7\n")
     with simulated("roboteq", swapped=True, reverse_left=True, gear=1.0) as (config, person, motor):
         command = [sys.executable, "-m", "omnid", "motor", "test", "--motor", config.port, "--config", str(path),
-                   "--write", str(path), "--turns", "1", "--speed", "0.4", "--set", "motor.watchdog_ms=1000"]
+                   "--write", str(path), "--turns", "1", "--speed", "0.4", "--set", "motor.watchdog_ms=1000", "--set",
+                   "motor.rate_hz=5"]
         with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdin is not None and process.stdout is not None
             shown = ""

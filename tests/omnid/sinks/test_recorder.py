@@ -28,6 +28,7 @@ from omnid.sinks.recorder import Recorder
 from omnid.transport.codec import ERROR, OK, DiagnosticStatus
 from omnid.transport.image_codec import image_cdr, image_topic
 from tests.drivers.logs.mcap_logs import STORE, jpeg
+from tests.omnid.small_pair import small_depth
 
 ROOT = Path(__file__).parents[3]
 START_NS = 1_700_000_000 * 10**9
@@ -98,7 +99,7 @@ def test_rows_without_padding_get_their_step() -> None:
 
 def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
     return OdometryUpdate(seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60,
-                    None)  # type: ignore[arg-type]  # the depth is not used
+                    small_depth())
 
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:

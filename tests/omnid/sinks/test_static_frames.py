@@ -15,6 +15,7 @@ from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.sinks.static_frames import StaticFrames
+from tests.omnid.small_pair import small_depth
 from tests.simulation import build
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -49,7 +50,7 @@ def test_a_recording_keeps_them_for_late_subscribers_of_its_player(tmp_path: Pat
     recorder = Recorder(SingleLog(tmp_path / "a.mcap", {}), "omnid", Encoder(RIG.T_base_rig, MapEncoding(1), 0, RIG))
     for seq in range(3):
         recorder.process(OdometryUpdate(seq, 10**18 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), "tracking", 0,
-                                        9, 9, None))  # type: ignore[arg-type]  # the depth is not used
+                                        9, 9, small_depth()))
     recorder.finish()
     with AnyReader([tmp_path / "a.mcap"]) as bag:
         (connection,) = [found for found in bag.connections if found.topic == "/tf_static"]
