@@ -185,8 +185,7 @@ class ObstaclesConfig:
     """Ring of the nearest obstacles around the base, published as scan."""
 
     enabled: bool = knob(True, "find obstacles; off: nothing keeps the base from driving against them")
-    rate_hz: float = knob(5.0, "rings a second, each with dense stereo, which the map shares; 0: one for each pair",
-                          low=0, high=100)
+    rate_hz: float = knob(10.0, "rings a second at most; 0: one for each pair", low=0, high=100)
     ring: RingSettings = field(default_factory=RingSettings)
 
 

@@ -34,9 +34,14 @@ class CameraFloor:
         """The floor as it is known now; None: nothing may be called free."""
         return self.stated or self._estimator.floor
 
+    @property
+    def wants_points(self) -> bool:
+        """True as long as `add` may change the floor."""
+        return self.stated is None and not self._estimator.is_final
+
     def add(self, depth: DensePoints) -> None:
         """Look for the floor in the points of a pair, where the rig does not state its height."""
-        if self.stated is None and not self._estimator.is_final:
+        if self.wants_points:
             points = se3.apply(self._T_base_rig, depth.points) - self.view
             self._estimator.add(points, depth.variance_m2)
 

@@ -1,10 +1,9 @@
-"""Obstacle stage: ring of the nearest obstacles around the base, from the depth of pairs."""
+"""Obstacle stage: ring of the nearest obstacles around the base, from the columns of pairs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +15,9 @@ from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.floor import Floor
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.floor_plane import FloorPlane
-from omnid.core.obstacles.floor_view import FloorCamera
+from omnid.core.obstacles.column import FOCAL_PX, NEAREST_M, Columns, floor_plane
+from omnid.core.obstacles.grid import ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
-from omnid.core.obstacles.observation import observe, with_plane
-from omnid.core.obstacles.ring_filter import RingFilter
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas
@@ -40,27 +37,19 @@ SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
     LoadLevel.FULL: 0, LoadLevel.SPARSE_MAP: 0, LoadLevel.NO_MAP: 250_000_000, LoadLevel.REDUCED: 300_000_000}
 
 
-class _FloorTables(NamedTuple):
-    """Parts that depend on the floor only, computed once for each estimate of it."""
-
-    floor: Floor
-    T_floor_rig: Array  # (4, 4)
-    view: Array  # (3,) viewpoint in the level frame
-    camera: FloorCamera
-    plane: FloorPlane
-
-
 class Obstacles:
-    """Makes a ring of each pair that is due; dense stereo of a pair is shared with the map."""
+    """Makes a ring of each pair that is due, from the evidence of its columns."""
 
     def __init__(self, geometry: Geometry, config: ObstaclesConfig, dense: DenseDepths, load: Load = full_load) -> None:
-        """dense: computes the depth of a pair that is due."""
+        """dense: computes the depth of a pair, from which a floor is found that the rig does not state."""
         self._load, self._dense, self._geometry = load, dense, geometry
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
         self._settings = config.ring
-        self._filter, self._tracker = RingFilter(self._settings), MovingTracker()
         self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
-        self._tables: _FloorTables | None = None
+        self._of_floor: Floor | None = None  # for which the columns were made
+        self._columns: Columns | None = None
+        self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, config.ring)
+        self._tracker = MovingTracker()
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._last_ns: int | None = None
         self._resets = 0
@@ -72,46 +61,45 @@ class Obstacles:
         self._last_ns = odometry.stamp_ns
         if odometry.state is TrackingState.LOST or odometry.reset_counter != self._resets:
             # Their memory is in odom, which has lost its relation to the robot.
-            self._filter.clear()
+            self._grid.clear()
             self._tracker.clear()
             self._resets = odometry.reset_counter
-        depth, panoramas = self._dense.of(odometry.depth), odometry.depth.panoramas
+        panoramas = odometry.depth.panoramas
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
-        self.floor.add(depth)
-        if self.floor.floor is None:
+        if self.floor.wants_points:
+            self.floor.add(self._dense.of(odometry.depth))
+        columns = self._columns_of(self.floor.floor, panoramas)
+        if columns is None:
             return ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
-        at = self._tables_of(self.floor.floor, panoramas)
-        points = se3.apply(at.T_floor_rig, depth.points)
-        seen = observe(points, np.sqrt(depth.variance_m2), at.view, self._settings, at.floor.sigma_m)
-        seen = with_plane(seen, at.plane.free_m(panoramas.lower, panoramas.upper))
         # What dead and blind parts of the images show is no evidence, and what was known there is no longer watched.
-        seen = without(seen, unwatched)
-        pose, view = transform(planar(T_odom_base)), partial(at.camera.view, panoramas.lower, panoramas.usable)
-        ring = without(self._filter.update(odometry.stamp_ns, pose, seen, view), unwatched)
-        moving = self._tracker.update(odometry.stamp_ns, pose, seen.ranges_m, seen.sigma_m)
+        lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
+        evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
+        pose = transform(planar(T_odom_base))
+        ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched)
+        moving = self._tracker.update(odometry.stamp_ns, pose, *self._grid.pair_ring(evidence))
         return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
                             moving, unwatched)
 
-    def _tables_of(self, floor: Floor, panoramas: Panoramas) -> _FloorTables:
-        """Return the tables of a floor; all panoramas of a run show the same part of the world."""
-        if self._tables is None or self._tables.floor is not floor:
-            geometry = self._geometry
-            T_floor_rig = self.floor.T_floor_rig(floor)
-            T_rect_floor = geometry.rig.T_rect_rig @ se3.inverse(T_floor_rig)
-            self._tables = _FloorTables(
-                floor, T_floor_rig, se3.apply(T_floor_rig, geometry.rig.lower.viewpoint[None])[0],
-                FloorCamera(geometry.cylinder, T_rect_floor),
-                FloorPlane(geometry.cylinder, T_rect_floor, geometry.rig.baseline_m, panoramas.visible))
-        return self._tables
+    def _columns_of(self, floor: Floor | None, panoramas: Panoramas) -> Columns | None:
+        """Return the columns for a floor, None without one; all panoramas of a run show the same part of the world."""
+        if floor is not None and floor is not self._of_floor:
+            geometry, settings = self._geometry, self._settings
+            T_rect_floor = geometry.rig.T_rect_rig @ se3.inverse(self.floor.T_floor_rig(floor))
+            plane = floor_plane(T_rect_floor)
+            self._of_floor = floor
+            self._columns = Columns(geometry.cylinder, geometry.rig.baseline_m, plane, settings.heights_m,
+                                    (NEAREST_M, settings.max_range_m), panoramas.visible)
+            self._grid.set_floor(T_rect_floor, plane.height_m)
+        return self._columns
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
-        """True if a pair is to give a ring: at the rate, and for a keyframe, whose depth is there, after half of it."""
+        """True if a pair is to give a ring."""
         if self._last_ns is None:
             return True
         wait_ns = max(self._period_ns, SHED_PERIOD_NS[self._load()])
         since_ns = odometry.stamp_ns - self._last_ns
-        return since_ns < 0 or since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
+        return since_ns < 0 or since_ns >= wait_ns - STAMP_JITTER_NS
 
 
 def controller_ring(ring: ObstacleRing) -> ControllerRing:

@@ -1,4 +1,4 @@
-"""Observation of the ring from one pair: the nearest obstacle in each direction, and how far the floor was seen.
+"""Range scan of one pair's points: the nearest obstacle in each direction, for the map and its keyframes.
 
 The floor and what is passed below are removed by height, with a margin that grows with the range: by the noise of
 stereo along the slanting ray, and by the tilt of the base. Support is counted in bins of inverse range, in which the
@@ -22,9 +22,6 @@ Counts = NDArray[np.intp]
 HEIGHT_SIGMAS: Final = 2.0  # of the height, between the floor and an obstacle
 INVERSE_STEP: Final = 0.02  # 1/m: width of a bin; two of them are about four sigma of a usual rig
 NEAREST_M: Final = 0.2  # of the bins
-FLOOR_STEP_M: Final = 0.1  # of the bins of the floor's range
-FLOOR_POINTS: Final = 3  # of such a bin, within three sectors, that show the floor
-FLOOR_GAP: Final = 4  # bins without floor that are passed over, as a floor without edges gives no points
 
 
 class Observation(NamedTuple):
@@ -32,16 +29,6 @@ class Observation(NamedTuple):
 
     ranges_m: RangeScan  # (SECTORS,) nearest obstacle; inf: something beyond the longest range was seen; NaN: unknown
     sigma_m: RangeScan  # (SECTORS,) of the ranges; NaN without one
-    free_m: RangeScan  # (SECTORS,) up to which the way was seen to be free; 0 where nothing was seen
-    floor_from_m: float = math.inf  # nearest floor that the cameras see in most directions; inf: they see none
-    plane_m: RangeScan = np.zeros(SECTORS, np.float32)  # (SECTORS,) up to which the floor's plane is seen without a gap
-
-
-class HeightBand(NamedTuple):
-    """Points by their heights."""
-
-    is_obstacle: NDArray[np.bool_]  # (N,)
-    is_floor: NDArray[np.bool_]  # (N,)
 
 
 def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float = 0.0
@@ -54,27 +41,18 @@ def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings, 
     turned = (np.arctan2(points[:, 1], points[:, 0]) + math.pi) * (SECTORS / (2 * math.pi))
     sector = np.floor(turned).astype(np.intp) % SECTORS
     usable = (ranges > NEAREST_M) & np.isfinite(sigma_m)
-    band = by_height(points, sigma_m, view, settings, floor_sigma_m)
-    chosen = band.is_obstacle & usable
+    chosen = usable & _is_obstacle(points, sigma_m, view, settings, floor_sigma_m)
     found, sigma, seen_beyond = _nearest(sector[chosen], ranges[chosen], sigma_m[chosen], settings)
     found = fill_gaps(found)
     sigma = np.where(np.isfinite(found) & ~np.isfinite(sigma), _carried(sigma), sigma)
-    chosen = band.is_floor & usable
-    free, floor_from_m = _floor_reach(sector[chosen], ranges[chosen], settings.max_range_m)
     is_open = ~np.isfinite(found) & seen_beyond
     result = np.where(is_open, np.inf, found).astype(np.float32)
-    free = np.where(is_open, settings.max_range_m, np.where(np.isfinite(found), found, free))
-    return Observation(result, sigma.astype(np.float32), free.astype(np.float32), floor_from_m)
+    return Observation(result, sigma.astype(np.float32))
 
 
-def with_plane(seen: Observation, plane_m: Array) -> Observation:
-    """Return the observation with the floor (SECTORS,) that was seen as a plane, where no obstacle ends it."""
-    free_m = np.where(np.isfinite(seen.ranges_m), seen.free_m, np.maximum(seen.free_m, plane_m))
-    return seen._replace(free_m=free_m.astype(np.float32), plane_m=plane_m.astype(np.float32))
-
-
-def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float) -> HeightBand:
-    """Tell obstacles from floor among points (N, 3); the arguments are those of `observe`."""
+def _is_obstacle(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float
+                 ) -> NDArray[np.bool_]:
+    """Return which of points (N, 3) are within the band of heights; the arguments are those of `observe`."""
     low, high = settings.heights_m
     away = points - view
     across2 = away[:, 0] ** 2 + away[:, 1] ** 2
@@ -82,7 +60,7 @@ def by_height(points: Array, sigma_m: Array, view: Array, settings: RingSettings
     of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
     margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + math.radians(settings.tilt_deg) ** 2 * across2 + floor_sigma_m**2)
     z = points[:, 2]
-    return HeightBand((z - margin > low) & (z + margin < high), z - margin <= low)
+    return np.asarray((z - margin > low) & (z + margin < high))
 
 
 def _nearest(sector: Counts, ranges: Array, sigma_m: Array, settings: RingSettings
@@ -118,26 +96,6 @@ def _with_next(sums: Array) -> Array:
 def _of_neighbours(sums: Array) -> Array:
     """Return the sums over each sector and those beside it."""
     return np.asarray(sums + np.roll(sums, 1, axis=0) + np.roll(sums, -1, axis=0))
-
-
-def _floor_reach(sector: Counts, ranges: Array, max_range_m: float) -> tuple[Array, float]:
-    """Return the ranges (SECTORS,) up to which the floor was seen without a longer gap, 0 where it was not; and from
-    which on most directions see it.
-    """
-    bins = math.ceil(max_range_m / FLOOR_STEP_M)
-    inside = ranges < bins * FLOOR_STEP_M
-    index = sector[inside] * bins + np.floor(ranges[inside] / FLOOR_STEP_M).astype(np.intp)
-    counts = np.bincount(index, minlength=SECTORS * bins).reshape(SECTORS, bins)
-    seen = _of_neighbours(counts.astype(float)) >= FLOOR_POINTS
-    first = np.argmax(seen, axis=1)  # nearer than this the floor is hidden by the robot itself
-    position = np.arange(bins)
-    last = np.maximum.accumulate(np.where(seen, position, -1), axis=1)
-    gap = (position - last > FLOOR_GAP) & (position >= first[:, None])
-    # The first bin of the gap that is too long is FLOOR_GAP + 1 bins behind the last one that shows the floor.
-    end = np.where(gap.any(axis=1), last[np.arange(SECTORS), np.argmax(gap, axis=1)], last[:, -1])
-    sees = seen.any(axis=1)
-    floor_from_m = float(np.median(first[sees]) + 0.5) * FLOOR_STEP_M if sees.any() else math.inf
-    return np.where(sees, (end + 0.5) * FLOOR_STEP_M, 0.0), floor_from_m
 
 
 def _carried(sigma: RangeScan) -> RangeScan:

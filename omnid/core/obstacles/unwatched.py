@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.observation import Observation
+from omnid.core.obstacles.grid import GridRing
 from omnid.core.obstacles.tiles import TILE_COLUMNS
 
 Array = NDArray[np.float64]
@@ -56,10 +56,10 @@ class Unwatched:
         return [((int(begin) - 180) % 360, (int(end) + 1 - 180) % 360) for begin, end in zip(begins, ends, strict=True)]
 
 
-def without(seen: Observation, unwatched: Flags) -> Observation:
+def without(ring: GridRing, unwatched: Flags) -> GridRing:
     """Return the ring without what is said about unwatched sectors (SECTORS,): no range, and no free floor."""
     if not unwatched.any():
-        return seen
+        return ring
     nan = np.float32(np.nan)
-    return seen._replace(ranges_m=np.where(unwatched, nan, seen.ranges_m), free_m=np.where(unwatched, 0, seen.free_m),
-                         sigma_m=np.where(unwatched, nan, seen.sigma_m), plane_m=np.where(unwatched, 0, seen.plane_m))
+    return GridRing(np.where(unwatched, nan, ring.ranges_m), np.where(unwatched, nan, ring.sigma_m),
+                    np.where(unwatched, np.float32(0), ring.free_m))

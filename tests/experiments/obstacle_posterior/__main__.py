@@ -22,20 +22,18 @@ from calib import se3
 from omnid.config import Config
 from omnid.core.compiled import declared
 from omnid.core.mapping.range_scan import azimuths
+from omnid.core.obstacles.column import FOCAL_PX, NEAREST_M, Columns, floor_plane
+from omnid.core.obstacles.grid import CELL_M, CELLS, GridRing, ObstacleGrid
+from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import FramePair, Panoramas
 from omnid.simulation.lockstep import with_masks
 from omnid.simulation.rendering.sensor import MountedSensor
 from omnid.simulation.robot import SimulatedRobot, make_robot
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
-from tests.experiments.obstacle_posterior.column import Columns, HeightBand, floor_plane
-from tests.experiments.obstacle_posterior.grid import CELL_M, CELLS, GridRing, ObstacleGrid
 from tests.experiments.obstacle_posterior.scenes import CASES, ObstacleScene, base_pose, obstacle_scene, render_pair
 
 Array = NDArray[np.float64]
-HEIGHTS_M: Final = (0.06, 1.7)  # above the floor: lower surfaces are floor, higher ones are passed below
-EDGE_M: Final = 0.05  # a floor that is lower by this is an edge
-NEAREST_M, MAX_RANGE_M = 0.5, 6.0  # ranges that are compared
 STEP_M: Final = 0.05
 START_M: Final = -1.2
 PERIOD_NS: Final = 100_000_000
@@ -91,25 +89,28 @@ def drive(case: str, seed: int, robot: SimulatedRobot, steps: int, scores: Score
     """Drive into the room of a case and add to its scores."""
     config = Config()
     shape: Geometry = geometry(robot.rig, config.panorama)
-    columns, grid = posterior(shape)
+    grid = ObstacleGrid(FOCAL_PX * shape.rig.baseline_m, RingSettings())
+    columns: Columns | None = None
     scene = obstacle_scene(case, seed)
     for x_m, panoramas in pairs(scene, robot, Dewarp(shape, config.panorama), steps, seed):
+        if columns is None:
+            columns = columns_of(shape, panoramas, grid)
         begin = time.thread_time()
-        evidence = columns.evidence(panoramas.lower, panoramas.upper, panoramas.visible)
+        evidence = columns.evidence(panoramas.lower, panoramas.upper)
         ring = grid.update(panoramas.stamp_ns, base_pose(x_m, 0.0, 0.0), evidence)
         scores.milliseconds.append(1e3 * (time.thread_time() - begin))
         compare(ring, scene, x_m, scores)
     add_cells(grid, scene, x_m, scores)
 
 
-def posterior(shape: Geometry) -> tuple[Columns, ObstacleGrid]:
-    """Return the evidence of pairs and the grid for a rig whose T_base_rig has the height above the floor."""
+def columns_of(shape: Geometry, panoramas: Panoramas, grid: ObstacleGrid) -> Columns:
+    """Return the columns for a rig whose T_base_rig has the height above the floor, which the grid takes too."""
+    settings = RingSettings()
     T_rect_base = shape.rig.T_rect_rig @ se3.inverse(shape.rig.T_base_rig)
-    plane = floor_plane(T_rect_base, 0.0)
-    cylinder, baseline_m = shape.cylinder, shape.rig.baseline_m
-    columns = Columns(cylinder, baseline_m, plane, HeightBand(*HEIGHTS_M, EDGE_M), (NEAREST_M, MAX_RANGE_M))
-    return columns, ObstacleGrid(T_rect_base, cylinder.focal_px * baseline_m, cylinder.focal_px, plane.height_m,
-                                 MAX_RANGE_M)
+    plane = floor_plane(T_rect_base)
+    grid.set_floor(T_rect_base, plane.height_m)
+    return Columns(shape.cylinder, shape.rig.baseline_m, plane, settings.heights_m,
+                   (NEAREST_M, settings.max_range_m), panoramas.visible)
 
 
 def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) -> None:

@@ -45,21 +45,8 @@ def within(low_deg: float, high_deg: float) -> np.ndarray:
 def test_a_wall_is_found_at_its_range_and_elsewhere_nothing_is_known() -> None:
     ring = seen(arc(2.0, (-30, 30), (-0.8, 0.6)))
     np.testing.assert_allclose(ring.ranges_m[within(-29, 29)], 2.0, atol=1e-3)
-    assert np.isnan(ring.ranges_m[~within(-32, 32)]).all() and (ring.free_m[~within(-32, 32)] == 0).all()
+    assert np.isnan(ring.ranges_m[~within(-32, 32)]).all()
     assert np.all(ring.sigma_m[within(-29, 29)] > 0.02) and np.all(ring.sigma_m[within(-29, 29)] < 0.06)
-
-
-def test_the_floor_is_no_obstacle_and_shows_how_far_the_way_is_free() -> None:
-    ring = seen(floor(3.0))
-    assert np.isnan(ring.ranges_m).all()
-    np.testing.assert_allclose(ring.free_m, 3.0, atol=0.3)
-
-
-def test_a_floor_that_is_seen_again_behind_a_gap_does_not_count() -> None:
-    ground = floor(4.0)
-    r = np.hypot(ground[:, 0], ground[:, 1])
-    ring = seen(ground[(r < 1.5) | (r > 2.6)])
-    np.testing.assert_allclose(ring.free_m, 1.5, atol=0.3)
 
 
 def test_a_floor_with_noise_and_tilt_is_no_obstacle_at_any_range() -> None:
@@ -85,13 +72,13 @@ def test_few_points_are_no_obstacle() -> None:
 
 def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
     ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
-    assert np.isposinf(ring.ranges_m[within(-28, 28)]).all() and (ring.free_m[within(-28, 28)] == 6.0).all()
+    assert np.isposinf(ring.ranges_m[within(-28, 28)]).all()
     assert np.isnan(ring.ranges_m[within(92, 118)]).all()
 
 
 def test_nothing_is_unknown() -> None:
     ring = observe(np.zeros((0, 3)), np.zeros(0), VIEW, SETTINGS)
-    assert np.isnan(ring.ranges_m).all() and (ring.free_m == 0).all()
+    assert np.isnan(ring.ranges_m).all()
 
 
 def test_heights_must_be_in_order() -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.observation import Observation
+from omnid.core.obstacles.grid import GridRing
 from omnid.core.obstacles.tiles import TILE_COLUMNS
 from omnid.core.obstacles.unwatched import Unwatched, without
 
@@ -49,9 +49,9 @@ def test_spans_are_named_counter_clockwise_from_ahead() -> None:
 def test_unwatched_sectors_have_neither_range_nor_free_floor() -> None:
     """No range, no free floor, and the rest as it was."""
     ranges = np.full(SECTORS, 2.0, np.float32)
-    seen = Observation(ranges, 0.1 * ranges, ranges, plane_m=ranges)
+    seen = GridRing(ranges, 0.1 * ranges, ranges)
     where = np.arange(SECTORS) < 90
     found = without(seen, where)
-    assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any() and not found.plane_m[:90].any()
+    assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any()
     assert (found.ranges_m[90:] == 2.0).all() and (found.free_m[90:] == 2.0).all()
     assert without(seen, np.zeros(SECTORS, bool)) is seen

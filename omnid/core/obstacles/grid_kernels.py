@@ -13,62 +13,59 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
-# Columns of an image on either side whose mean is one direction: the weakest direction of a cell counts.
-HALF_DIRECTION = 1
 
-
-@compiled("(f4[:, ::1], f4[:, ::1], f4[:, ::1], f8[::1], f8[::1], f8, f4[:, :, ::1])", writes=("cells",))
-def gather(floor: Floats, surface: Floats, edge: Floats, origin: Doubles, geometry: Doubles, cell_m: float,
+@compiled("(f4[:, ::1], f4[:, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
+def gather(floor: Floats, surface: Floats, origin: Doubles, at_1m: float, cell_m: float, reach_m: float, thin_m: float,
            cells: Floats) -> None:
-    """Write the evidence (3, N, N) of cells: floor of the weakest direction, surface of the strongest, edge; NaN: not
-    in view.
+    """Write the evidence (2, N, N) of cells: floor where it is weakest, and the strongest surface; NaN: no floor can be
+    seen there.
 
-    floor, surface, edge (K, W): log-likelihood ratios of bins of disparity and columns, NaN where nothing is compared.
+    floor, surface (K, W): log-likelihood ratios by disparity and direction, NaN where nothing is compared.
     origin (4,): place of the middle of cell (0, 0) in the frame of the columns, and cosine and sine of its axes there;
-    geometry (3,): focal length px, disparity at 1 m, share of a bin at which its middle lies.
+    at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest
+    obstacle, whose directions count together.
     """
     bins, width = floor.shape
-    focal, at_1m, middle = geometry[0], geometry[1], geometry[2]
+    by_angle = width / math.tau
     c, s = origin[2], origin[3]
     for i in range(cells.shape[1]):
         for j in range(cells.shape[2]):
             x = origin[0] + cell_m * (c * j - s * i)
             y = origin[1] + cell_m * (s * j + c * i)
             r = math.sqrt(x * x + y * y)
-            cells[0, i, j], cells[1, i, j], cells[2, i, j] = np.nan, np.nan, np.nan
-            if r < cell_m:
+            cells[0, i, j], cells[1, i, j] = np.nan, 0.0
+            if r < cell_m or r > reach_m:
                 continue
-            at = (math.pi - math.atan2(y, x)) * focal - 0.5
-            half = 0.5 * cell_m / r * focal
+            at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
+            half = 0.5 * cell_m / r * by_angle
             first, last = math.ceil(at - half), math.floor(at + half)
             if last < first:
                 first = last = round(at)
-            near = math.floor(at_1m / (r - 0.5 * cell_m) - middle + 0.5)
-            far = math.floor(at_1m / (r + 0.5 * cell_m) - middle + 0.5)
-            if far >= bins:
+            near = min(math.floor(at_1m / (r - 0.5 * cell_m)), bins - 1)
+            far = min(math.floor(at_1m / (r + 0.5 * cell_m)), near)
+            if far < 0:
                 continue
-            near = min(near, bins - 1)
-            least, most, mean_edge = np.float32(np.inf), np.float32(0.0), np.float32(0.0)
+            last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
+            first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
+            least, most = np.inf, np.float32(0.0)
+            run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             for u in range(first, last + 1):
                 at_u = (u + width) % width
-                total, edges = np.float32(0.0), np.float32(0.0)
-                for k in range(max(far, 0), near + 1):
-                    for n in range(u - HALF_DIRECTION, u + HALF_DIRECTION + 1):
-                        total += floor[k, (n + width) % width]
-                    edges += edge[k, at_u]
+                for k in range(first_surface, last_surface + 1):
                     if surface[k, at_u] > most:
                         most = surface[k, at_u]
-                if not total >= least:
-                    least = total
-                mean_edge += edges
-            least /= np.float32(2 * HALF_DIRECTION + 1)
+                if u + run <= last + 1:
+                    # The mean of the disparities, the sum of the directions that something thin would hide.
+                    total = 0.0
+                    for n in range(u, u + run):
+                        for k in range(far, near + 1):
+                            total += floor[k, (n + width) % width]
+                    if not total >= least:
+                        least = total
+            cells[0, i, j] = least / (near - far + 1)
             # The best of many is less evidence than one.
-            count = np.float32((last - first + 1) * (near - max(far, 0) + 1))
-            most = max(most - np.log(count), np.float32(0.0))
-            cells[0, i, j] = least
-            cells[1, i, j] = most
-            # No edge is thin.
-            cells[2, i, j] = mean_edge / np.float32(last - first + 1)
+            count = (last - first + 1) * (last_surface - first_surface + 1)
+            cells[1, i, j] = max(most - np.float32(math.log(count)), np.float32(0.0))
 
 
 @compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("hit", "free"))

@@ -1,0 +1,195 @@
+"""Evidence of one pair, for each direction and range: log-likelihood ratios of the floor and of surfaces.
+
+An epipolar line is a column, so each direction is a problem of its own, whose floor has a disparity that is linear in
+the row. Each patch of a column is explained by one disparity. Where there is no texture all of them are as likely, and
+the logarithm of the ratio is 0. README.md has the equations.
+
+Panoramas are brought to one working size, so that no parameter depends on the size of the images.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.obstacles import column_kernels as kernels
+from omnid.core.types.panorama import PaddedPanorama
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+Tables = NDArray[np.int32]
+
+NEAREST_M: Final = 0.5  # range of a surface that is looked for
+DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
+FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian: that of images of 512 px
+FINE_PX: Final = 0.8  # sigmas of the band-pass along columns
+COARSE_ROWS: Final = 17  # of two means that follow each other: like a sigma of 7 rows
+TEXTURE_SHARE: Final = 0.3  # of the local contrast by which two views of a surface differ, beside noise
+CONTRAST_ROWS: Final = 15  # in which the contrast is measured, with a column on either side
+BAND_NOISE: Final = 0.5  # noise of the band-pass, as a share of a panorama's
+UNITS: Final = 12.0  # of a normalised image that make one sigma
+ZERO: Final = 128.5  # level of a normalised image where there is no texture, and half a level to round
+OUTLIER: Final = np.uint8(48)  # units that a pixel differs at most
+DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 would be that of independent pixels
+BIN_ROWS: Final = 2  # on either side of the rows in which the floor has a disparity
+FLOOR_PX: Final = 1.3  # least difference of disparity by which something is not the floor
+OTHERS_PX: Final = (12, 25)  # lower and higher disparities than the floor's that may explain its rows
+NEAR_M: Final = 1.15  # nearer than this on the floor, a direction is as wide there: mirrors show less detail
+NEAR_SHARE: Final = 0.3  # of the ratio by a difference in four times as many columns
+ADJACENT_PX: Final = 4.0  # what hides the floor is often a little before it or behind: decay of the prior,
+DISTANT_SHARE: Final = 0.1  # and what is left of it
+STRIP_ROWS, STRIP_OVERLAP = 4, 2  # of surfaces, and rows that two strips share
+STRIP_BOUND: Final = 3.0  # of the log-likelihood ratio of a strip
+STRIP_PRIOR: Final = 0.5  # by which a strip of a surface must be more likely than its other explanations
+FLOOR_WEIGHT: Final = 10.0  # probability of the floor in rows that may show it, by that of one disparity
+LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations
+
+
+class FloorPlane(NamedTuple):
+    """Floor in the rectified frame: z = -height_m + r (a cos(azimuth) + b sin(azimuth))."""
+
+    height_m: float
+    a: float
+    b: float
+
+
+class ColumnEvidence(NamedTuple):
+    """Log-likelihood ratios of K disparities and DIRECTIONS directions of the rectified frame; k = 0 is far."""
+
+    floor: Floats  # (K, DIRECTIONS) of the floor from disparity k to k + 1, NaN where both cameras cannot see it
+    surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
+    nearest_floor_m: float  # that both cameras see, 0: none
+
+
+def floor_plane(T_rect_floor: Array) -> FloorPlane:
+    """Return the floor's plane z = 0 of a level frame, from which T_rect_floor (4, 4) leads to the rectified one."""
+    T = se3.inverse(T_rect_floor)
+    return FloorPlane(float(T[2, 3] / T[2, 2]), float(-T[2, 0] / T[2, 2]), float(-T[2, 1] / T[2, 2]))
+
+
+class Columns:
+    """Computes the evidence of pairs; tables are computed once for a plane of the floor."""
+
+    def __init__(self, cylinder: Cylinder, baseline_m: float, plane: FloorPlane, heights_m: tuple[float, float],
+                 ranges_m: tuple[float, float], visible: Flags) -> None:
+        """heights_m: of surfaces over the floor: lower ones are floor, higher ones are passed below. ranges_m: nearest
+        and farthest; visible (H, W): pixels of a panorama that both cameras see."""
+        self._baseline_m, self._plane, self._heights_m = baseline_m, plane, heights_m
+        self._floor_slope = baseline_m / plane.height_m
+        self._height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
+        self._row0 = (cylinder.row0 + 0.5) * self._height / cylinder.height - 0.5
+        self.at_1m = FOCAL_PX * baseline_m  # disparity
+        self.bins = math.ceil(self.at_1m / ranges_m[0])
+        self._first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))
+        self._visible = self._working(visible * np.uint8(255)) > 127
+        self._last_row = int(np.flatnonzero(self._visible.mean(axis=1) > 0.5)[-1])
+        self._warps = self._made_warps()
+        self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
+        self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
+        self._tested = self._floor_bins[:, kernels.FLOOR_END] > 0
+        tested = np.flatnonzero(self._tested)
+        self.nearest_floor_m = self.at_1m / (float(tested[-1]) + 1.0) if len(tested) else 0.0
+
+    def evidence(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> ColumnEvidence:
+        """Return the evidence of a pair; lost (H, W): pixels that are no evidence, None: all in view are."""
+        # 1. Normalised panoramas, the upper one with the bounds of half a row about each pixel.
+        noise = BAND_NOISE * max(lower.noise_grey, upper.noise_grey)
+        one, two = self._normalised(lower, noise), self._normalised(upper, noise)
+        if self._plane.a or self._plane.b:
+            one, two = self._warped(one, 0), self._warped(two, 0)
+        upright, plane = _bounds(two), _bounds(self._warped(two, 1))
+        shown = self._visible if lost is None else self._visible & (self._working(lost * np.uint8(255)) == 0)
+        mask = np.where(shown, np.uint8(255), np.uint8(0))
+        # 2. Likelihoods.
+        scale = np.float32(DIFFERENCE_RATIO / UNITS)
+        others = np.empty((self.bins, DIRECTIONS), np.float32)
+        kernels.floor_evidence(one, upright, plane, mask, self._floor_bins, OUTLIER, scale,
+                                np.float32(NEAR_SHARE) * scale, self._prior, others)
+        surface = np.empty((self.bins, DIRECTIONS), np.float32)
+        kernels.surface_evidence(one, upright, plane, mask, self._strips, OUTLIER, scale, np.float32(FLOOR_WEIGHT),
+                                 np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR), surface)
+        # A surface fits a little at the disparities beside its own.
+        peak = np.ones_like(surface, bool)
+        peak[1:] &= surface[1:] >= surface[:-1]
+        peak[:-1] &= surface[:-1] >= surface[1:]
+        surface[~peak] = 0.0
+        floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
+        floor[~self._tested] = np.nan
+        return ColumnEvidence(floor, surface, self.nearest_floor_m)
+
+    def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.asarray(cv2.resize(image, (DIRECTIONS, self._height), interpolation=cv2.INTER_AREA), np.uint8)
+
+    def _normalised(self, panorama: PaddedPanorama, noise_grey: float) -> Bytes:
+        """Return the panorama less its mean along columns, in units of what two views of it differ by."""
+        image = self._working(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
+        smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
+        coarse = cv2.blur(cv2.blur(smooth, (1, COARSE_ROWS)), (1, COARSE_ROWS))
+        band = cv2.subtract(smooth, coarse)
+        contrast2 = cv2.blur(cv2.multiply(band, band), (3, CONTRAST_ROWS))
+        unit = cv2.sqrt(contrast2 * np.float32(TEXTURE_SHARE**2) + np.float32(noise_grey**2))
+        found = cv2.divide(band, unit, scale=UNITS) + np.float32(ZERO)
+        return np.asarray(np.clip(found, 0, 255), np.uint8)
+
+    def _warped(self, image: Bytes, number: int) -> Bytes:
+        return np.asarray(cv2.remap(image, *self._warps[number], cv2.INTER_LINEAR,
+                                    borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+    def _made_warps(self) -> list[tuple[NDArray[np.int16], NDArray[np.uint16]]]:
+        """Return the maps to a panorama in which the floor's horizon is level, and from that to the floor's plane."""
+        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
+        tilt = self._plane.a * np.cos(azimuth) + self._plane.b * np.sin(azimuth)
+        rows = np.arange(self._height)[:, None]
+        columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self._height, DIRECTIONS))
+        plane = rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)
+        maps = []
+        for found in (rows - FOCAL_PX * tilt, np.broadcast_to(plane, columns.shape)):
+            maps.append(cv2.convertMaps(columns, found.astype(np.float32), cv2.CV_16SC2))
+        return [(np.asarray(a, np.int16), np.asarray(b, np.uint16)) for a, b in maps]
+
+    def _made_floor_bins(self) -> Tables:
+        """Return the table of kernels.floor_evidence."""
+        table = np.zeros((self.bins, 7), np.int32)
+        for k in range(self._first_bin, self.bins):
+            first, end = (math.ceil(self._row0 + n / self._floor_slope) for n in (k, k + 1))
+            middle = self._floor_slope * ((first + end - 1) / 2 - self._row0)
+            first, end = first - BIN_ROWS, end + BIN_ROWS
+            if first < 0 or end + self._floor_slope * (end - self._row0) > self._last_row:
+                continue
+            begin, last = max(0, k - OTHERS_PX[0]), min(self.bins, self._last_row - end, k + OTHERS_PX[1])
+            table[k] = (first, end, begin, math.floor(middle - FLOOR_PX), math.ceil(middle + FLOOR_PX), last,
+                        self.at_1m / (k + 0.5) < NEAR_M)
+        return table
+
+    def _made_strips(self) -> Tables:
+        """Return the table of kernels.surface_evidence."""
+        found = []
+        h, (low_m, high_m) = self._plane.height_m, self._heights_m
+        first_row = int(np.flatnonzero(self._visible.mean(axis=1) > 0.5)[0])
+        for v in range(first_row + STRIP_OVERLAP, self._last_row - STRIP_ROWS - STRIP_OVERLAP, STRIP_ROWS):
+            first, end = v - STRIP_OVERLAP, v + STRIP_ROWS + STRIP_OVERLAP
+            last = min(self.bins, self._last_row - end)
+            fall = v + (STRIP_ROWS - 1) / 2 - self._row0
+            if fall <= 0:
+                mine = math.ceil(self._baseline_m * -fall / max(high_m - h, 1e-3))
+            else:
+                floor = self._floor_slope * fall
+                mine = math.ceil(max(floor * h / (h - low_m), floor + FLOOR_PX))
+            found.append((first, end, max(self._first_bin, mine), max(last, 0), fall > 0))
+        return np.array(found, np.int32)
+
+
+def _bounds(image: Bytes) -> Bytes:
+    """Return the least and the most (2, H, W) of an image within half a row of each pixel."""
+    above = np.concatenate([image[:1], image[:-1]])
+    below = np.concatenate([image[1:], image[-1:]])
+    up, down = cv2.addWeighted(image, 0.5, above, 0.5, 0.0), cv2.addWeighted(image, 0.5, below, 0.5, 0.0)
+    return np.stack([cv2.min(cv2.min(up, down), image), cv2.max(cv2.max(up, down), image)])

@@ -1,0 +1,269 @@
+"""Log-odds of floor and of surfaces in cells of a square in odom, which follows the robot.
+
+Evidence of pairs is added up cell by cell. A cell is free only by floor that was seen in each direction that crosses
+it, and taken where a surface is more likely than not. README.md has the equations.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.obstacles import grid_kernels as kernels
+from omnid.core.obstacles.column import ColumnEvidence
+from omnid.core.obstacles.settings import RingSettings
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+
+CELL_M: Final = 0.05
+CELLS: Final = 256  # on each side of the square
+MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved
+VIEW_CELLS: Final = 90  # on either side of the robot, that a pair changes
+NEVER: Final = np.iinfo(np.int64).min
+
+PRIOR: Final = (-1.0, -6.0)  # log-odds of floor and surface where nothing was seen
+LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pairs
+MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow each other are alike
+FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
+TAKEN_ODDS: Final = 0.0  # of a surface
+SURFACE_SHARE: Final = 0.5  # of the ratio of a run: its strips overlap by half
+PAIR_RUN: Final = 4.0  # of a surface in one pair, that may move
+CONTRADICTION: Final = -1.2  # to a surface where the floor is seen and no surface
+APART_M: Final = 0.05  # between places whose errors differ
+APART_S: Final = 0.2  # of pairs from one place that are one more
+FRESH_NS: Final = 500_000_000  # time constant of the mean evidence by which a cell is watched
+MOST_FRESH: Final = 1.2  # evidence of floor or surface in a pair that counts in it: what ends is told in half a second
+LEAST_FRESH: Final = 0.4  # mean in a cell that is watched; that of noise is 0.2
+FLOOD_MPS: Final = 1.6  # speed at which something may come in unseen
+NARROW_CELLS: Final = 5  # what comes in is wider
+ONCE_FREE_S: Final = 30.0  # for which a cell that was free and is hidden now is a way by which something may have come
+# Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
+SPECK_CELLS: Final = 6
+THIN_M: Final = 0.03  # width of the thinnest obstacle
+END_BINS: Final = 2
+END_M: Final = 0.1  # before the end of the free floor: patches at the foot of something show both
+PAST_SECTORS: Final = 3  # on either side, that see past a place too near to be seen
+OPEN_SHARE: Final = 0.9  # of the longest range, up to which an open direction is free
+
+
+class GridRing(NamedTuple):
+    """Nearest obstacles and free floor around the base, by the grid."""
+
+    ranges_m: Floats  # (SECTORS,) nearest surface; inf: floor up to the longest range; NaN: unknown
+    sigma_m: Floats  # (SECTORS,) of the ranges, NaN without one
+    free_m: Floats  # (SECTORS,) up to which the way is free
+
+
+class ObstacleGrid:
+    """Layers of log-odds (2, CELLS, CELLS): floor, surface; and how well they are watched."""
+
+    def __init__(self, at_1m: float, settings: RingSettings) -> None:
+        """at_1m: disparity at 1 m; `set_floor` comes before the first pair."""
+        self._at_1m, self._low_m = at_1m, settings.heights_m[0]
+        self._max_range_m = min(settings.max_range_m, (MARGIN_CELLS - 2) * CELL_M)
+        self._T_rect_base, self._gap_share = np.eye(4), 0.0
+        self._azimuths = azimuths()
+        self.clear()
+
+    def set_floor(self, T_rect_base: Array, height_m: float) -> None:
+        """Take T_rect_base (4, 4), from the base levelled on the floor to the columns' frame, and the viewpoint's
+        height.
+        """
+        self._T_rect_base = T_rect_base
+        # What is lower than an obstacle may hide this share of the range.
+        self._gap_share = self._low_m / max(height_m - self._low_m, self._low_m)
+
+    def clear(self) -> None:
+        """Forget everything: the pose has lost its relation to the past."""
+        self._odds = np.empty((2, CELLS, CELLS), np.float32)
+        self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
+        self._fresh = np.zeros((CELLS, CELLS), np.float32)  # mean evidence of the last FRESH_NS
+        self._free_ns = np.full((CELLS, CELLS), NEVER, np.int64)  # when a cell was free last
+        self._flooded = np.zeros((CELLS, CELLS), np.uint8)  # 1 where something may have come unseen
+        self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
+        self._start_ns: int | None = None
+        self._nearest_m = 0.0  # range of the floor in view at the start
+        self._place_m: Array | None = None  # of the last pair
+        self._last_ns, self._carry = NEVER, 0.0
+
+    def update(self, stamp_ns: int, T_odom_base: Array, evidence: ColumnEvidence) -> GridRing:
+        """Add the evidence of a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
+        place = T_odom_base[:2, 3] / CELL_M
+        corner = self._follow(place)
+        at = np.floor(place).astype(np.int64) - corner
+        rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
+        if self._start_ns is None:
+            # The robot stands where nothing else can be: the floor too near to be seen counts until it is reached.
+            self._start_ns = stamp_ns
+            self._nearest_m = evidence.nearest_floor_m
+            self._assume_free(at, evidence.nearest_floor_m)
+        # 1. Evidence of each cell.
+        floor, surface = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
+        in_view = np.isfinite(floor)
+        floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
+        surface = np.minimum(np.float32(SURFACE_SHARE) * surface, np.float32(MOST_RATIO))
+        # 2. Log-odds.
+        odds, weight = self._odds[:, rows, columns], self._weight(stamp_ns, T_odom_base[:2, 3])
+        is_surface = surface > 0
+        odds[0] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
+        passes = (floor > 0) & ~is_surface
+        odds[1] += weight * np.where(passes, np.float32(CONTRADICTION), surface)
+        np.clip(odds[0], -LIMIT / 2, LIMIT, out=odds[0])
+        np.clip(odds[1], PRIOR[1], LIMIT, out=odds[1])
+        self._keep_fresh(stamp_ns, (rows, columns), np.maximum(floor, surface).clip(0, MOST_FRESH))
+        # 3. What is not watched, and may have changed.
+        self._flood(stamp_ns, in_view, rows, columns)
+        self._clear_seen_past(place - corner, evidence.nearest_floor_m)
+        i, j = int(at[1]), int(at[0])
+        self._odds[0, i - 3 : i + 4, j - 3 : j + 4] = LIMIT
+        return self._ring(T_odom_base, place - corner)
+
+    @property
+    def corner_m(self) -> Array:
+        """Place (2,) of the corner of cell (0, 0) in odom."""
+        return CELL_M * (np.zeros(2) if self._corner is None else self._corner.astype(float))
+
+    @property
+    def floor_odds(self) -> Floats:
+        """Log-odds (CELLS, CELLS) that a cell is floor, a copy."""
+        return np.array(self._odds[0])
+
+    def state(self) -> Bytes:
+        """Return the cells: 0 unknown, 1 free, 2 taken."""
+        taken = self._odds[1] > TAKEN_ODDS
+        free = (self._odds[0] > FREE_ODDS) | taken
+        _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
+        free |= about[patch, cv2.CC_STAT_AREA] <= SPECK_CELLS
+        return np.where(taken, np.uint8(2), free.astype(np.uint8))
+
+    def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
+        """Return the evidence (2, N, N) of the cells of the view, the first of which has its middle at first_m."""
+        T_rect_odom = self._T_rect_base @ se3.inverse(T_odom_base)
+        x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
+        c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
+        norm = math.hypot(c, s)
+        cells = np.empty((2, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
+        floor = evidence.floor
+        if END_BINS:
+            floor = np.concatenate([np.full_like(floor[:END_BINS], np.nan), floor[:-END_BINS]])
+        kernels.gather(floor, evidence.surface, np.array([x, y, c / norm, s / norm]), self._at_1m, CELL_M,
+                       VIEW_CELLS * CELL_M, THIN_M, cells)
+        return cells
+
+    def _weight(self, stamp_ns: int, place_m: Array) -> np.float32:
+        """Return the weight of a pair: pairs from one place have the same errors, and are little more than one."""
+        if self._place_m is None:
+            self._place_m = place_m.copy()
+            return np.float32(1.0)
+        way_m = math.dist(place_m, self._place_m)
+        self._place_m = place_m.copy()
+        return np.float32(min(max(way_m / APART_M, (stamp_ns - self._last_ns) * 1e-9 / APART_S), 1.0))
+
+    def _keep_fresh(self, stamp_ns: int, window: tuple[slice, slice], amount: Floats) -> None:
+        """Take the amount of evidence of a pair into the mean of the last FRESH_NS."""
+        passed_ns = FRESH_NS if self._last_ns == NEVER else max(stamp_ns - self._last_ns, 0)
+        kept = math.exp(-passed_ns / FRESH_NS)
+        self._fresh *= np.float32(kept)
+        self._fresh[window] += np.float32(1 - kept) * amount
+
+    def _assume_free(self, at: NDArray[np.int64], within_m: float) -> None:
+        y, x = np.ogrid[:CELLS, :CELLS]
+        near = (x - at[0]) ** 2 + (y - at[1]) ** 2 < ((within_m + 2 * CELL_M) / CELL_M) ** 2
+        self._odds[0][near] = FREE_ODDS + 1.0
+
+    def _flood(self, stamp_ns: int, in_view: Flags, rows: slice, columns: slice) -> None:
+        """Forget the floor that something may have come to that was not seen, from cells that are not watched."""
+        passed_s = 0.0 if self._last_ns == NEVER else min((stamp_ns - self._last_ns) * 1e-9, 1.0)
+        self._last_ns = stamp_ns
+        if self._start_ns is None or stamp_ns - self._start_ns < FRESH_NS:
+            return
+        self._carry += max(passed_s, 0.0) * FLOOD_MPS / CELL_M
+        steps, self._carry = int(self._carry), self._carry % 1.0
+        watched = (self._fresh > LEAST_FRESH).astype(np.uint8)
+        box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
+        free = (self._odds[0] > FREE_ODDS).astype(np.uint8)
+        visible = np.zeros((CELLS, CELLS), np.uint8)
+        visible[rows, columns] = in_view
+        self._free_ns[free > 0] = stamp_ns
+        lost = (1 - watched) & (visible | (1 - free)) & (self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9))
+        passable = (free & (1 - watched)) | lost
+        reached = cv2.morphologyEx(lost, cv2.MORPH_OPEN, box) | (self._flooded & lost)
+        for step in range(steps):
+            kernel = np.ones((3, 3), np.uint8) if step % 2 else CROSS
+            reached = np.asarray(cv2.dilate(reached, kernel), np.uint8) & passable
+        self._flooded = reached
+        self._odds[0][(reached & free) > 0] = PRIOR[0]
+
+    def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
+        """End the flood too near to be seen where the nearest floor in view is watched: a person would hide it."""
+        if not nearest_m or not self._flooded.any():
+            return
+        steps = int(nearest_m / CELL_M) + 2
+        direction = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
+        ways = np.arange(1, steps + 1)[None, :, None] * direction[:, None]
+        columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
+        ends = rows[:, -2:], columns[:, -2:]
+        past = ((self._fresh[ends] > LEAST_FRESH) & (self._odds[0][ends] > FREE_ODDS)).all(axis=1)
+        past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
+        cells = rows[past], columns[past]
+        flooded = self._flooded[cells] > 0
+        self._odds[0][cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[0][cells])
+        self._flooded[cells] = 0
+
+    def _ring(self, T_odom_base: Array, place: Array) -> GridRing:
+        """Return the ring about a place (2,) [cells] of the square."""
+        hit, free = np.empty(SECTORS), np.empty(SECTORS)
+        kernels.march(self.state(), np.array([*place, CELL_M / 2, self._max_range_m, CELL_M, self._gap_share,
+                                              CELL_M + self._gap_share * self._nearest_m]),
+                      self._azimuths + float(se3.yaw(T_odom_base)), hit, free)
+        is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)
+        ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
+        sigma = np.where(np.isfinite(ranges), CELL_M / 2, np.nan)
+        free = np.where(free < hit, np.maximum(free - END_M, 0.0), hit)
+        return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32))
+
+    def pair_ring(self, evidence: ColumnEvidence) -> tuple[Floats, Floats]:
+        """Return the nearest surface (SECTORS,) of one pair, NaN without one, and its sigma."""
+        surface = evidence.surface > PAIR_RUN
+        bins, width = surface.shape
+        nearest = np.where(surface.any(axis=0), bins - 1 - np.argmax(surface[::-1], axis=0), -1)
+        T = se3.inverse(self._T_rect_base)
+        azimuth = math.pi - (np.arange(width) + 0.5) * (math.tau / width) + math.atan2(T[1, 0], T[0, 0])
+        found = np.full(SECTORS, -1)
+        np.maximum.at(found, np.floor((azimuth + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS, nearest)
+        ranges = np.where(found >= 0, self._at_1m / np.maximum(found, 1), np.nan)
+        return ranges.astype(np.float32), (0.5 * ranges**2 / self._at_1m).astype(np.float32)
+
+    def _follow(self, place: Array) -> NDArray[np.int64]:
+        """Move the square where the robot comes near its border; return its corner, in cells of odom."""
+        cell = np.floor(place).astype(np.int64)
+        if self._corner is None:
+            self._corner = cell - CELLS // 2
+            return self._corner
+        at = cell - self._corner
+        if ((at >= MARGIN_CELLS) & (at < CELLS - MARGIN_CELLS)).all():
+            return self._corner
+        shift = at - CELLS // 2
+        gone = np.ones((CELLS, CELLS), bool)
+        x, y = np.clip(shift, -CELLS, CELLS).tolist()
+        gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
+        self._odds[:] = np.roll(self._odds, (-y, -x), axis=(1, 2))
+        for layer in (self._fresh, self._free_ns, self._flooded):
+            layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
+        self._odds[:, gone] = np.array(PRIOR, np.float32)[:, None]
+        self._fresh[gone], self._flooded[gone] = 0.0, 0
+        self._free_ns[gone] = NEVER
+        self._corner = self._corner + shift
+        return self._corner
+
+
+CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)

@@ -1,0 +1,86 @@
+"""Evidence of columns: where the wall and the floor are, and that what shows nothing is no evidence."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
+from tests.omnid.core.obstacles.drawn_floor import (
+    BASELINE_M,
+    CYLINDER,
+    HEIGHT_M,
+    T_RECT_BASE,
+    Pattern,
+    panoramas,
+    plain,
+    stains,
+    striped,
+    worn,
+)
+
+WALL_M = 2.0
+VISIBLE = np.zeros((CYLINDER.height, CYLINDER.width), bool)
+VISIBLE[8:-8] = True
+
+
+@pytest.fixture(scope="module")
+def columns() -> Columns:
+    return Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), VISIBLE)
+
+
+def evidence(columns: Columns, floor: Pattern, wall: Pattern, drop_m: float = 0.0) -> ColumnEvidence:
+    return columns.evidence(*panoramas(floor, WALL_M, wall, drop_m))
+
+
+def floor_at(columns: Columns, found: ColumnEvidence, near_m: float, far_m: float) -> np.ndarray:
+    """Return the evidence of the floor between two ranges."""
+    return found.floor[int(columns.at_1m / far_m) : int(columns.at_1m / near_m)]
+
+
+def test_floor_plane_of_an_upright_rig_is_level() -> None:
+    assert floor_plane(T_RECT_BASE) == pytest.approx((HEIGHT_M, 0.0, 0.0))
+
+
+def test_wall_and_the_floor_before_it_are_found_in_all_directions(columns: Columns) -> None:
+    found = evidence(columns, stains, striped)
+    assert (np.abs(np.argmax(found.surface, axis=0) - columns.at_1m / WALL_M) <= 1.5).mean() > 0.95
+    assert (floor_at(columns, found, 1.1, 1.6) > 1).mean() > 0.9
+    assert (floor_at(columns, found, 2.5, 4.0) < -1).mean() > 0.95
+    assert (found.surface[int(columns.at_1m / 1.5) :] > 2).mean() < 0.01
+
+
+def test_floor_of_weak_texture_is_weak_evidence_for_the_floor(columns: Columns) -> None:
+    """Stains of 3 grey levels with noise of 1 say less than strong ones, and the right thing."""
+    weak, strong = (floor_at(columns, evidence(columns, floor, striped), 1.1, 1.6) for floor in (worn, stains))
+    assert 1.0 < weak.mean() < 0.8 * strong.mean() and (weak < -1).mean() < 0.01
+
+
+def test_plain_wall_and_plain_floor_are_no_evidence(columns: Columns) -> None:
+    found = evidence(columns, plain, plain)
+    inner = floor_at(columns, found, 1.0, 1.6)
+    assert abs(inner.mean()) < 0.3 and np.percentile(np.abs(inner), 95) < 2.0
+    assert np.percentile(found.surface, 99.5) < 2
+
+
+def test_floor_that_is_lower_is_no_floor(columns: Columns) -> None:
+    level, lower = (floor_at(columns, evidence(columns, stains, striped, drop), 1.1, 1.6) for drop in (0.0, 0.15))
+    assert np.median(lower) < -1 and np.median(level) > 1
+
+
+def test_lost_pixels_are_no_evidence(columns: Columns) -> None:
+    lost = np.zeros((CYLINDER.height, CYLINDER.width), bool)
+    lost[:, 400:] = True
+    found = columns.evidence(*panoramas(stains, WALL_M, striped), lost)
+    first = int(400 / CYLINDER.width * DIRECTIONS) + 2
+    gone = slice(first, DIRECTIONS - 2)
+    assert not found.surface[:, gone].any() and np.nanmax(np.abs(found.floor[:, gone])) < 1e-3
+    assert found.surface[:, : first - 4].any()
+
+
+def test_cameras_that_see_no_floor_have_no_evidence_of_it() -> None:
+    visible = np.zeros_like(VISIBLE)
+    visible[8:90] = True
+    columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), visible)
+    found = columns.evidence(*panoramas(stains, WALL_M, striped))
+    assert np.isnan(found.floor).all() and found.nearest_floor_m == 0.0

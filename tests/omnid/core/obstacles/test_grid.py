@@ -1,0 +1,132 @@
+"""The obstacle grid: rings of drawn rooms, what is remembered too near to be seen, and how it ends in the dark."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
+from omnid.core.obstacles.grid import FLOOD_MPS, FRESH_NS, GridRing, ObstacleGrid
+from omnid.core.obstacles.settings import RingSettings
+from tests.omnid.core.obstacles.drawn_floor import (
+    BASELINE_M,
+    CYLINDER,
+    HEIGHT_M,
+    T_RECT_BASE,
+    Pattern,
+    Pole,
+    panoramas,
+    plain,
+    stains,
+    striped,
+)
+
+WALL_M = 2.0
+PERIOD_NS = 100_000_000
+VISIBLE = np.zeros((CYLINDER.height, CYLINDER.width), bool)
+VISIBLE[8:-8] = True
+SETTINGS = RingSettings(max_range_m=4.0)
+COLUMNS = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), SETTINGS.heights_m, (NEAREST_M, 6.0), VISIBLE)
+AHEAD = slice(SECTORS // 2 - 2, SECTORS // 2 + 2)
+
+
+SEEDS = range(5)  # of the noise: pairs from one place differ by it
+Pairs = list[ColumnEvidence]
+
+
+def evidence(floor: Pattern, wall: Pattern, drop_m: float = 0.0, wall_m: float = WALL_M, pole: Pole | None = None
+             ) -> Pairs:
+    return [COLUMNS.evidence(*panoramas(floor, wall_m, wall, drop_m, pole, seed)) for seed in SEEDS]
+
+
+@pytest.fixture(scope="module")
+def seen() -> Pairs:
+    return evidence(stains, striped)
+
+
+@pytest.fixture
+def grid() -> ObstacleGrid:
+    made = ObstacleGrid(COLUMNS.at_1m, SETTINGS)
+    made.set_floor(T_RECT_BASE, HEIGHT_M)
+    return made
+
+
+def after(grid: ObstacleGrid, found: Pairs, pairs: int, first: int = 0) -> GridRing:
+    """Return the ring after so many pairs of a base that stands."""
+    for n in range(first, first + pairs):
+        ring = grid.update(n * PERIOD_NS, np.eye(4), found[n % len(found)])
+    return ring
+
+
+def test_ring_has_the_wall_and_the_floor_before_it(grid: ObstacleGrid, seen: Pairs) -> None:
+    ring = after(grid, seen, 40)
+    assert np.isfinite(ring.ranges_m).mean() > 0.9
+    assert np.nanmedian(ring.ranges_m) == pytest.approx(WALL_M, abs=0.12)
+    assert np.median(ring.free_m) > WALL_M - 0.5 and (ring.free_m <= WALL_M + 0.1).all()
+
+
+def test_plain_wall_is_unknown_and_nothing_behind_it_is_free(grid: ObstacleGrid) -> None:
+    near_m = 1.3
+    ring = after(grid, evidence(stains, plain, wall_m=near_m), 40)
+    assert np.isnan(ring.ranges_m).mean() > 0.9
+    assert ring.free_m.max() <= near_m + 0.2 and np.median(ring.free_m) > near_m - 0.35
+
+
+@pytest.mark.parametrize("grey", [120.0, 190.0])
+def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: float) -> None:
+    """A column of a plain pole shows nothing; the floor that it hides is missing, one degree wide or two."""
+    ring = after(grid, evidence(stains, striped, wall_m=3.0, pole=Pole(1.3, 0.05, grey)), 30)
+    assert ring.free_m[AHEAD].min() < 1.5
+    beside = np.r_[SECTORS // 2 - 12 : SECTORS // 2 - 6, SECTORS // 2 + 6 : SECTORS // 2 + 12]
+    assert ring.free_m[beside].min() > 2.0
+
+
+def test_lower_floor_is_unknown(grid: ObstacleGrid) -> None:
+    ring = after(grid, evidence(stains, striped, 0.3), 40)
+    assert ring.free_m.max() < 1.3 and not np.isposinf(ring.ranges_m).any()
+
+
+def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: Pairs) -> None:
+    assert after(grid, seen, 20).free_m.min() > 0.6
+    dark = seen[0]._replace(surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor)
+    seconds = 3 * FRESH_NS * 1e-9 + seen[0].nearest_floor_m / FLOOD_MPS
+    ring = after(grid, [dark], int(seconds * 1e9 / PERIOD_NS) + 1, first=20)
+    assert ring.free_m.max() < 0.45
+
+
+@pytest.mark.parametrize(("range_m", "free_m"), [(1.3, 1.35), (0.8, 0.4)])
+def test_what_comes_into_view_ends_the_free_floor_until_it_goes(grid: ObstacleGrid, seen: Pairs, range_m: float,
+                                                                free_m: float) -> None:
+    """A plain column 0.4 m wide, where floor was. What hides the nearest floor in view may stand nearer as well."""
+    assert after(grid, seen, 20).free_m[AHEAD].min() > 1.4
+    person = evidence(stains, striped, pole=Pole(range_m, 0.4))
+    ring = after(grid, person, 25, first=20)
+    assert ring.free_m[AHEAD].max() < free_m and np.median(ring.free_m) > 1.4
+    # It has gone: the floor is seen past all places at which it may stand.
+    assert after(grid, seen, 25, first=45).free_m[AHEAD].min() > 1.4
+
+
+def test_floor_is_kept_too_near_to_be_seen_as_long_as_the_way_to_it_is_watched(grid: ObstacleGrid, seen: Pairs
+                                                                             ) -> None:
+    assert after(grid, seen, 60).free_m.min() > seen[0].nearest_floor_m - 0.2
+
+
+def test_nothing_is_known_after_clear(grid: ObstacleGrid, seen: Pairs) -> None:
+    after(grid, seen, 20)
+    grid.clear()
+    assert not grid.state().any()
+
+
+def test_square_follows_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
+    after(grid, seen, 20)
+    far = np.eye(4)
+    far[0, 3] = 50.0
+    ring = grid.update(20 * PERIOD_NS, far, seen[0])
+    assert np.abs(grid.corner_m - [50.0 - 6.4, -6.4]).max() < 0.1 and not np.isfinite(ring.ranges_m).any()
+
+
+def test_ring_of_one_pair_has_the_wall(grid: ObstacleGrid, seen: Pairs) -> None:
+    ranges, sigma = grid.pair_ring(seen[0])
+    assert np.isfinite(ranges).mean() > 0.8 and np.nanmedian(ranges) == pytest.approx(WALL_M, abs=0.15)
+    assert np.nanmedian(sigma) == pytest.approx(0.5 * WALL_M**2 / COLUMNS.at_1m, rel=0.2)
