@@ -86,6 +86,11 @@ class _Finder(ast.NodeVisitor):
         for statement in node.body:
             self.visit(statement)
 
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        """Visit default values and the body, not the type of the result."""
+        for part in (node.args, *node.body):
+            self.visit(part)
+
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
         """Visit the value only."""
         if node.value is not None:

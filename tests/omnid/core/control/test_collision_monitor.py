@@ -146,6 +146,8 @@ def test_in_the_dark_the_base_does_not_even_turn() -> None:
     assert after(ranges, turn) == (turn, "")
     assert after(ranges, turn, unwatched=(True,) * 360) == (Twist(), monitor_module.UNSEEN)
     assert monitor_module.remedy(monitor_module.UNSEEN) == monitor_module.IMAGES_REMEDY
+    assert monitor_module.remedy(monitor_module.RING_STALE) == monitor_module.RING_REMEDY
+    assert monitor_module.remedy(monitor_module.BLOCKED) == monitor_module.REMEDY
 
 
 @pytest.mark.parametrize(("stale", "expected_mps"), [("stop", 0.0), ("slow", SETTINGS.slow_mps), ("ignore", 0.5)])

@@ -134,7 +134,7 @@ def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
         allowed = monitor.step(now_ns, Twist(*motion))
         found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
         shares.append(check(settings, braking_mps2, motion, points, found))
-        assert bool(monitor.reason) == (found < 1.0)
+        assert bool(monitor.reason) == (found < 1.0) and monitor.share == pytest.approx(found)
     reduced = [share for share in shares if 0.0 < share < 1.0]
     assert len(reduced) > 15 and shares.count(0.0) > 15 and shares.count(1.0) > 15
 

@@ -6,6 +6,8 @@ import cmath
 import math
 import random
 
+import pytest
+
 from omnid.core.control.arming import AUTOMATIC
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
@@ -79,6 +81,19 @@ def test_a_heading_jumps_where_the_base_cannot_have_turned_so_far() -> None:
         assert (law.reason == POSE_JUMPED) == jumps, (before, pose, terms)
         counts[jumps] += 1
     assert min(counts.values()) > 300
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_goal_of_a_motor_controller_does_not_pass_a_heading_across_pi(side: int) -> None:
+    """It holds headings by itself; here it is blocked, so that the goal goes as far as it may."""
+    law = law_with(ControllerPose(START_NS, side * 3.13, 0.0, "tracking"))
+    goals_rad = []
+    for tick in range(1, 120):
+        now_ns = START_NS + tick * TICK_NS
+        law.set_pose(ControllerPose(now_ns, side * 3.13, 0.0, "tracking"))
+        law.set_command(TimedSetpoint(now_ns, Setpoint(0.0, -side * 3.13)))
+        goals_rad.append(side * law.step(now_ns, TICK_S).heading_rad)
+    assert max(goals_rad) == pytest.approx(math.tau - 6.26) and min(goals_rad) >= 0.0
 
 
 def test_a_setpoint_of_the_very_instant_of_a_reason_to_stop_is_void() -> None:

@@ -62,6 +62,14 @@ def test_turns_on_although_noise_at_half_a_turn_changes_the_nearer_side() -> Non
     assert abs(motion.yaw_rate_radps) == LIMITS.yaw_rate_radps
 
 
+@pytest.mark.parametrize(("error_rad", "side"), [(2.8, 1), (3.05, -1), (-2.8, -1), (-3.05, -1)])
+def test_goes_on_to_the_side_it_turns_to_within_a_fifth_of_a_radian_of_half_a_turn(error_rad: float, side: int) -> None:
+    motion = Twist(0.0, -0.9)
+    for _ in range(20):
+        motion = CONTROLLER.step(Setpoint(0.0, error_rad), 0.0, DT_S, motion)
+    assert motion.yaw_rate_radps == side * LIMITS.yaw_rate_radps
+
+
 def any_number(rng: random.Random) -> float:
     return rng.choice(
         [rng.uniform(-1, 1), rng.uniform(-10, 10), rng.gauss(0, 1e6), 0.0, 1e308, -1e308, 5e-324, *NOT_FINITE]
