@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from omnid.errors import OmnidError
+from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.session import open_session, zenoh_config
 
@@ -64,6 +65,24 @@ def test_default_is_local_without_multicast_and_denies_writing() -> None:
     assert setting(BusConfig(), "listen/endpoints") == ["tcp/127.0.0.1:7447"]
     assert setting(BusConfig(), "scouting/multicast/enabled") is False
     assert setting(BusConfig(), "access_control")["default_permission"] == "deny"
+
+
+@pytest.mark.parametrize(("ros2", "stops", "commands"), [
+    ("off", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
+    ("ros2dds", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
+    ("rmw_zenoh", ["robot7/cmd/stop", "5/robot7/cmd/stop/**"], ["robot7/cmd/**", "5/robot7/cmd/**"]),
+])
+@pytest.mark.parametrize("names", [(), ("boss",)])
+def test_everybody_may_stop_and_only_named_programs_command(ros2: str, stops: list[str], commands: list[str],
+                                                           names: tuple[str, ...]) -> None:
+    """The rules as they stand, for each way to ROS 2; another key cannot be written."""
+    rules = access_control(BusConfig(robot="robot7", ros2=ros2, ros2_domain=5, command_names=names))
+    written = {rule["id"]: rule["key_exprs"] for rule in rules["rules"]
+               if rule["permission"] == "allow" and "ingress" in rule["flows"] and "put" in rule["messages"]}
+    assert written == {"stop": stops, "command": commands} and rules["default_permission"] == "deny"
+    subjects = {policy["id"]: (policy["rules"], policy["subjects"]) for policy in rules["policies"]}
+    assert "stop" in subjects["all"][0] and subjects["all"][1] == ["everybody"]
+    assert subjects["some"] == (["command"], ["name-0"] if names else ["everybody"])
 
 
 def test_introduces_no_peers_and_uses_the_configured_protocols_only(tmp_path: Path) -> None:

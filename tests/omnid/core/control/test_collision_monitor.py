@@ -73,9 +73,24 @@ def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -
 
 def test_weak_brakes_slow_down_earlier() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 0.1)
-    monitor.set_ring(ControllerRing(10 * S, with_points((1.4, 0.0))))
+    monitor.set_ring(ControllerRing(10 * S, with_points((1.8, 0.0))))
     allowed = monitor.step(10 * S, AHEAD)
-    assert allowed.velocity_mps**2 / (2 * 0.1) <= 1.0
+    left_m = 1.8 - SETTINGS.front_m - SETTINGS.stop_m
+    assert allowed.velocity_mps**2 / (2 * 0.8 * 0.1) == pytest.approx(left_m, rel=0.01), "0.2 of the brakes are for lag"
+
+
+def test_a_base_that_creeps_is_not_stopped_before_it_is_near() -> None:
+    creeping = Twist(0.015)  # slower than the speed below which the monitor rather stops
+    way_m = creeping.velocity_mps * SETTINGS.time_s
+    keeps_m = SETTINGS.front_m + SETTINGS.stop_m
+    assert after(with_points((keeps_m + 1.2 * way_m, 0.0)), creeping) == (creeping, "")
+    assert after(with_points((keeps_m + 0.5 * way_m, 0.0)), creeping) == (Twist(), monitor_module.BLOCKED)
+
+
+def test_a_base_that_stands_needs_no_ring() -> None:
+    monitor = CollisionMonitor(SETTINGS, 1.5)
+    assert (monitor.step(S, Twist()), monitor.reason) == (Twist(), "")
+    assert (monitor.step(S, Twist(1.0)), monitor.reason) == (Twist(), monitor_module.RING_STALE)
 
 
 def test_drives_slowly_past_what_is_beside_its_way() -> None:
