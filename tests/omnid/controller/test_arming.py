@@ -337,3 +337,18 @@ def test_a_doubt_slows_the_base_down_and_says_what_differs_and_by_how_much(drivi
     unchecked.send_setpoint()
     unchecked.tick()
     assert unchecked.controller.state.armed and unchecked.last.velocity_mps == 0.3
+
+
+def test_a_contact_that_was_released_no_longer_counts() -> None:
+    """A fault that comes after it and passes needs no request in automatic mode."""
+    arming = Arming(AUTOMATIC)
+    arming.step(BUMPER, 10, 1.0)
+    arming.step("", 20, 1.0)
+    assert not arming.armed and arming.needs_request
+    arming.request(ArmRequest(30))
+    arming.step("", 30, 1.0)
+    assert arming.armed
+    arming.step(safety_rules.POSE_LOST, 40, 1.0)
+    assert not arming.armed and not arming.needs_request
+    arming.step("", 50, 1.0)
+    assert arming.armed

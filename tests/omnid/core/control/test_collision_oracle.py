@@ -223,6 +223,24 @@ def test_where_the_images_show_nothing_the_way_ends_at_the_distance_to_keep(poli
     assert min(counts.values()) > 20
 
 
+def test_beside_parts_where_the_images_show_nothing_there_is_room_of_a_hand() -> None:
+    """Dead parts at both sides: arcs end where the sides, or the swinging corners, come 0.05 m nearer than they keep."""
+    rng, shares = random.Random(7), []
+    ranges = [math.nan if abs(abs(azimuth_rad(k)) - math.pi / 2) < 0.22 else math.inf for k in range(SECTORS)]
+    dead = tuple(map(math.isnan, ranges))
+    for _ in range(60):
+        settings, braking_mps2 = any_settings(rng, stale="stop"), rng.uniform(0.2, 2.0)
+        motion = (rng.choice((-1, 1)) * rng.uniform(0.1, 0.6), rng.choice((-1, 1)) * rng.uniform(0.5, 2.0))
+        side_m = settings.half_width_m + settings.side_m + 0.05
+        rays = [cmath.rect(1.0, azimuth_rad(k)) for k in range(SECTORS) if dead[k]]
+        walls = [ray * side_m / abs(ray.imag) for ray in rays]
+        monitor = CollisionMonitor(settings, braking_mps2)
+        monitor.set_ring(ControllerRing(S, tuple(ranges), (), (), dead))
+        found = monitor.step(S, Twist(*motion)).velocity_mps / motion[0]
+        shares.append(check(settings, braking_mps2, motion, walls, found))
+    assert sum(share < 1.0 for share in shares) > 10 and sum(share == 1.0 for share in shares) > 10
+
+
 def test_a_base_is_slow_while_something_is_in_the_slow_polygon() -> None:
     rng, slow = random.Random(3), 0
     for _ in range(400):
