@@ -224,7 +224,7 @@ def test_where_the_images_show_nothing_the_way_ends_at_the_distance_to_keep(poli
 
 
 def test_beside_parts_where_the_images_show_nothing_there_is_room_of_a_hand() -> None:
-    """Dead parts at both sides: arcs end where the sides, or the swinging corners, come 0.05 m nearer than they keep."""
+    """Dead parts at both sides: arcs end where the sides, or swinging corners, reach 0.05 m beyond what they keep."""
     rng, shares = random.Random(7), []
     ranges = [math.nan if abs(abs(azimuth_rad(k)) - math.pi / 2) < 0.22 else math.inf for k in range(SECTORS)]
     dead = tuple(map(math.isnan, ranges))
