@@ -96,6 +96,18 @@ def test_the_goal_of_a_motor_controller_does_not_pass_a_heading_across_pi(side: 
     assert max(goals_rad) == pytest.approx(math.tau - 6.26) and min(goals_rad) >= 0.0
 
 
+def test_the_goal_of_a_motor_controller_moves_by_the_turn_of_each_tick() -> None:
+    law, goal_rad = law_with(ControllerPose(START_NS, 0.0, 0.0, "tracking")), 0.0
+    for tick, dt_s in enumerate((TICK_S, 0.05, 0.01, TICK_S, 0.03, 0.1), 1):
+        now_ns = START_NS + tick * TICK_NS
+        law.set_command(TimedSetpoint(now_ns, Setpoint(0.0, None, 0.6)))
+        output = law.step(now_ns, dt_s)
+        goal_rad += output.motion.yaw_rate_radps * dt_s
+        assert output.heading_rad == pytest.approx(goal_rad) and output.motion.yaw_rate_radps > 0.0
+    output = law.step(START_NS + 8 * TICK_NS, 9.0)
+    assert output.heading_rad == pytest.approx(goal_rad + output.motion.yaw_rate_radps * 0.2), "a late tick"
+
+
 def test_a_setpoint_of_the_very_instant_of_a_reason_to_stop_is_void() -> None:
     law = ControlLaw(ControllerSettings(arming=AUTOMATIC).of_log, START_NS)
     law.set_pose(ControllerPose(START_NS, 0.0, 0.0, "tracking"))
