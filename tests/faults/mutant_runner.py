@@ -41,6 +41,12 @@ class Reached:
     tests: dict[str, float]  # names of the tests that passed, with their durations [s]
     calls: dict[str, list[tuple[int, int, list[str]]]]  # of a file: first and last line of a function, its tests
 
+    def calls_all(self, path: str, functions: Iterable[CodeType]) -> bool:
+        """True if tests call all these functions: those that only the import calls have done their work before a fork.
+        """
+        called = {first for first, *_ in self.calls.get(path, [])}
+        return all(function.co_firstlineno in called for function in functions)
+
     def of(self, mutant: Mutant, *, in_function: bool = True) -> list[str]:
         """Return the tests for a mutant: those of its file's own test module first, then the fast ones.
 
@@ -74,6 +80,8 @@ class MutantRunner:
             path.write_text(mutant.apply(self._sources[mutant.path]), "utf-8")
             try:
                 changed = changed_functions(self._sources[mutant.path], path)
+                if not reached.calls_all(mutant.path, changed):
+                    changed = {}
                 names = [name for name in reached.of(mutant, in_function=bool(changed)) if name in items]
                 # A test that has begun within the limit is given the time to end.
                 times_s = [reached.tests[name] for name in names]

@@ -53,6 +53,13 @@ def test_the_tests_of_the_innermost_function_run_the_fast_ones_first() -> None:
     assert reached.of(Mutant("a.py", 6, 0, 1, ""), in_function=False) == ["fast", "other", "slow"], "beside a lambda"
 
 
+def test_a_function_that_only_the_import_calls_needs_a_new_python() -> None:
+    reached = Reached({"one": 0.1}, {"a.py": [(5, 8, ["one"])]})
+    code = compile("\n\n\n\ndef called():\n    pass\n\n\ndef imported():\n    pass\n", "a.py", "exec")
+    called, imported = (const for const in code.co_consts if hasattr(const, "co_firstlineno"))
+    assert reached.calls_all("a.py", [called]) and not reached.calls_all("a.py", [called, imported])
+
+
 def test_the_tests_of_the_own_module_run_first() -> None:
     names = {"tests/test_b.py::fast": 0.1, "tests/test_a.py::slow": 2.0, "tests/test_a.py::quick": 1.0}
     reached = Reached(names, {"a.py": [(1, 9, list(names))]})
