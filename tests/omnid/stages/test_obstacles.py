@@ -59,8 +59,12 @@ def test_the_walls_of_the_corridor_stand_left_and_right(inline: Rings) -> None:
 
 
 def test_rings_come_at_the_rate(inline: Rings) -> None:
-    # 10 pairs a second, 5 rings a second; keyframes may be taken earlier.
-    assert inline.poses // 2 <= len(inline.rings) <= inline.poses
+    # 10 pairs a second.
+    assert len(inline.rings) == inline.poses
+
+
+def test_rings_come_at_a_lower_rate(scene: Path, inline: Rings) -> None:
+    assert abs(len(rings_of(scene, "obstacles.rate_hz=5").rings) - len(inline.rings) / 2) <= 1
 
 
 def test_threads_give_the_same_bytes(scene: Path, inline: Rings) -> None:
