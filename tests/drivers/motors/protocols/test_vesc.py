@@ -59,6 +59,13 @@ def test_ignores_other_payloads(answer: bytes) -> None:
     assert protocol.bad_frames == 1
 
 
+@pytest.mark.parametrize("other", [b"\x32" + config(9, 100)[1:], config(9, 100)[:9], b"\x11"])
+def test_takes_no_other_and_no_cut_payload_for_a_timeout(other: bytes) -> None:
+    """The watchdog in force decides when the wheels stop by themselves."""
+    protocol = Vesc(DRIVE)
+    assert result(protocol.connect(500), config(3, 450), other, config(9, 400)) == 400 and protocol.bad_frames == 1
+
+
 def test_waits_for_a_reply_of_each_controller() -> None:
     with pytest.raises(UnfinishedError):
         result(Vesc(DRIVE).drive(TURN, 0.0), values(3, 0), values(3, 0), values(3, 0))
