@@ -24,9 +24,10 @@ FOREIGN = ("omnid", "drivers", "numpy", "cv2", "zenoh", "json", "pickle", "html"
 NOWHERE = ("--connect", "nonsense")
 NO_ROUTE = "bus.connect has 'nonsense'"
 NO_FILE = "No such file or directory"
+NO_RIG = "there is no such rig"
 # Words of each command -> its arguments, and what it then says: it has run far enough to load its packages.
 COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
-    "run": (("--lower", "/dev/null", "--upper", "/dev/null", "--rig", "none.toml"), NO_FILE),
+    "run": (("--lower", "/dev/null", "--upper", "/dev/null", "--rig", "none.toml"), NO_RIG),
     "simulate": (("nowhere",), "world 'nowhere' is not known"),
     "replay": (("none.mcap",), "none.mcap"),
     "demo": (("--output", "/dev/null/demo"), "/dev/null/demo"),
@@ -35,10 +36,11 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "calibrate live": (("--log", "none.mcap", "--corners", "6x7", "--square-mm", "30"), "none.mcap"),
     "calibrate camera": (("none.png", "--corners", "6x7", "--square-mm", "30", "-o", "c.toml"), "none.png"),
     "calibrate rig": (("none.mcap", "--corners", "6x7", "--square-mm", "30", "-o", "r.toml"), "none.mcap"),
-    "calibrate check": (("none.mcap", "--rig", "none.toml"), NO_FILE),
-    "calibrate drive": (("none.mcap", "--rig", "none.toml", "-o", "r.toml"), NO_FILE),
+    "calibrate check": (("none.mcap", "--rig", "none.toml"), NO_RIG),
+    "calibrate drive": (("none.mcap", "--rig", "none.toml", "-o", "r.toml"), NO_RIG),
+    "calibrate height": (("none.mcap", "--rig", "none.toml"), "none"),
     "calibrate import": (("none.yaml", "-o", "r.toml"), "none.yaml"),
-    "calibrate export": (("none.toml", "--format", "kalibr", "-o", "c.yaml"), NO_FILE),
+    "calibrate export": (("none.toml", "--format", "kalibr", "-o", "c.yaml"), NO_RIG),
     "cameras": (("--snapshot", "views", "--log", "none.mcap"), "none.mcap"),
     "arm": (NOWHERE, NO_ROUTE),
     "stop": (NOWHERE, NO_ROUTE),

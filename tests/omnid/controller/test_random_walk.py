@@ -21,13 +21,15 @@ from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
 from omnid.core.control.collision_monitor import BLOCKED, MOVING, NEAR, RING_STALE, UNKNOWN, ControllerRing, MovingPoint
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
+from omnid.core.control.contacts import BUMPER, CLIFF, NO_CONTACT
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Setpoint, Twist, wrap_angle
 from omnid.core.control.heading_goal import longest_lead_rad
+from omnid.core.control.motion_monitor import AGREE, WITNESSES, Witness
 from omnid.core.control.velocity_limits import STOP
 from tests.omnid.controller.bench import LIMITS, PERIOD_NS, PERIOD_S, SETTINGS
 
-TICKS = 20_000
+TICKS = 30_000
 MANY_TICKS = 1_000_000
 DEADLINES = SETTINGS.deadlines
 HOLD_NS = round(SETTINGS.sources.hold_s * 1e9)
@@ -82,6 +84,7 @@ class Oracle:
     fault_ns: int = 0  # of the last tick with a fault
     failed: bool = False  # the motor controller, at the last tick
     stopped: bool = False
+    contact: bool = False  # a bumper or a cliff sensor reports one
     pose: ControllerPose | None = None
     ring: ControllerRing | None = None
     requests: list[ArmRequest] = field(default_factory=list)  # since the last tick
@@ -121,7 +124,8 @@ class Oracle:
     def fault(self, now_ns: int, late_s: float) -> bool:
         """True if a fault holds at a tick."""
         pose = self.pose
-        return (self.failed or self.stopped or late_s > DEADLINES.tick_s or pose is None or pose.state == "lost"
+        return (self.contact or self.failed or self.stopped or late_s > DEADLINES.tick_s or pose is None
+                or pose.state == "lost" or pose.witness.is_fault
                 or abs(now_ns - pose.stamp_ns) * 1e-9 > DEADLINES.pose_s)
 
     def step(self, now_ns: int, late_s: float) -> TimedSetpoint | None:
@@ -129,6 +133,7 @@ class Oracle:
         fault = self.fault(now_ns, late_s)
         if fault:
             self.fault_ns = now_ns
+        self.stop_latched |= self.contact
         self.armed = (self.automatic or self.armed) and not fault and not self.stop_latched
         for request in self.requests:
             age_s = (now_ns - request.arrival_ns) * 1e-9
@@ -154,17 +159,21 @@ class Walk:
         self.motion, self.last_ns = STOP, self.now_ns  # that the base follows, and since when
         self.calm, self.quiet = True, False  # phases with few faults and with many, without commands
         self.seen_mps, self.sigma_mps, self.resets, self.steady = math.nan, 0.0, 0, False
+        self.contacts, self.witness = NO_CONTACT, AGREE
         self.main = SENDERS[0]  # source and sender of most commands of a phase
         self.heading_rad = self.reported_rad = 0.0  # in odom; in the count of the motor controller
         self.seen: Counter[str] = Counter()
 
     def run(self, ticks: int) -> Counter[str]:
         """Return the number of ticks by reason."""
+        rng = self.rng
         for tick in range(ticks):
             if tick % 100 == 0:
                 self.calm = self.rng.random() < 0.7
-                usual, self.steady = self.chance(0.7, 0.4), self.rng.random() < 0.5
-                oddity = USUAL if usual else self.rng.choice(ODDITIES)
+                usual, self.steady = self.chance(0.7, 0.4), rng.random() < 0.5
+                oddity, self.witness = USUAL if usual else rng.choice(ODDITIES), AGREE
+                if usual and rng.random() < 0.2:
+                    self.witness = Witness(rng.choice(WITNESSES), "", rng.random() < 0.7)
                 self.motor.number, self.motor.battery_v, self.motor.wheels_mps, self.seen_mps, self.sigma_mps = oddity
             if tick % 25 == 0:
                 self.rings = self.rng.choice(RINGS)
@@ -191,6 +200,9 @@ class Walk:
             asked_ns = self.delayed_ns()
             oracle.take_stop(asked_ns)
             controller.stop(asked_ns)
+        holding = self.contacts.bumper or self.contacts.cliff
+        if self.chance(0.3, 0.3) if holding else self.chance(0.001, 0.005):
+            self.touch(rng.choice((BUMPER, CLIFF)), holds=not holding)
         while self.chance(0.06, 0.1):
             request = ArmRequest(self.delayed_ns(), self.now_ns)
             oracle.requests[:] = [request]  # the newest that was handed over counts
@@ -198,6 +210,13 @@ class Walk:
         self.motor.fault = rng.choice(("silent", "late", "late", "expired")) if self.chance(0.004, 0.06) else ""
         self.motor.counted_rad = rng.uniform(-math.pi, math.pi) if self.chance(0.01, 0.1) else self.motor.counted_rad
         self.motor.rate_radps = rng.choice((0.0, 0.0, 0.5, -0.5, 3.0, -3.0, math.nan))
+
+    def touch(self, contact: str, *, holds: bool) -> None:
+        """Report the beginning of a contact, or the end of all."""
+        for name in (contact,) if holds else (BUMPER, CLIFF):
+            self.contacts = self.contacts.after(name, holds=holds)
+        self.oracle.contact = holds
+        self.controller.touch(self.contacts)
 
     def delayed_ns(self) -> int:
         """Return the arrival of a message that is handed over now, mostly a moment ago."""
@@ -212,7 +231,7 @@ class Walk:
         age_s = rng.uniform(0.0, 0.15) if self.chance(0.999, 0.95) else rng.uniform(-1, 1)
         self.resets += not self.chance(0.9995, 0.99)
         pose = ControllerPose(self.now_ns - round(age_s * 1e9), wrap_angle(self.heading_rad), rng.uniform(-0.5, 0.5),
-                              state, self.seen_mps, self.sigma_mps, resets=self.resets)
+                              state, self.seen_mps, self.sigma_mps, resets=self.resets, witness=self.witness)
         self.oracle.pose = pose
         self.controller.set_pose(pose)
 
