@@ -112,7 +112,7 @@ class Odometry:
         overrides: Sequence[str] = (),
         mask_images: Iterable[tuple[InputImage, InputImage]] = (),
     ) -> None:
-        """Prepare the stages; that takes about a second, and some 15 s where functions are to be compiled.
+        """Prepare the stages; that takes about a second, and some 20 s where functions are to be compiled.
 
         rig, config, overrides: as in `replay`. mask_images: pairs (lower, upper), such as the first 60 of a drive, in
         which the rims of the mirrors are searched if the rig has no masks. A camera without a mask counts as far as

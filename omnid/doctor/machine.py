@@ -111,10 +111,10 @@ def compiled_functions(service: Path = CACHE) -> Iterator[Finding]:
         return
     if kept.unusable:
         yield Finding("warning", "compiled code", f"cannot be kept in {kept.folder}: {kept.unusable}: every start "
-                      "takes some 15 s longer", "make that folder writable, or set OMNID_CACHE_DIR to another one")
+                      "takes some 20 s longer", "make that folder writable, or set OMNID_CACHE_DIR to another one")
     elif kept.missing:
         yield Finding("ok", "compiled code", f"{kept.missing} functions will be compiled at the next start, which "
-                      f"takes some 15 s, and be kept in {kept.folder}")
+                      f"takes some 20 s, and be kept in {kept.folder}")
     else:
         yield Finding("ok", "compiled code", f"{kept.kept} functions in {kept.folder}")
 
