@@ -17,10 +17,10 @@ from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
-from omnid.core.obstacles.tiles import ALL_LIVE, TileStates
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.stereo.photometry import Light
+from omnid.core.stereo.tiles import ALL_LIVE, TileStates
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import AT_ONCE, PixelTimes
 from omnid.navigation_state import NavigationState

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.tiles import SIDES, Side, TileStates
 from omnid.core.obstacles.unwatched import Unwatched
+from omnid.core.stereo.tiles import SIDES, Side, TileStates
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import nothing
 from omnid.stages.geometry import Geometry

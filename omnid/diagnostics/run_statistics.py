@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.tiles import Side
+from omnid.core.stereo.tiles import Side
 from omnid.messages import OdometryUpdate
 from omnid.tracking_state import TrackingState
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig, TimingConfig
-from omnid.core.obstacles.tiles import Side, TileMonitor
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
+from omnid.core.stereo.tiles import Side, TileMonitor
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.errors import OmnidError

@@ -1,15 +1,15 @@
-"""Range scan of a keyframe: the nearest obstacles above the floor, as the obstacle ring finds them in one pair."""
+"""Range scan of a keyframe: the nearest obstacles above the floor, by the height of its points."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.mapping.point_scan import ScanLimits, point_scan
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, RangeScan
-from omnid.core.obstacles.observation import observe
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import DensePoints
 from omnid.stages.floor import CameraFloor
@@ -30,6 +30,6 @@ def keyframe_scan(depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Arr
     T_floor_level = se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0]))
     points = se3.apply(se3.inverse(T_floor_level) @ T_floor_rig, depth.points)
     view = np.array([0.0, 0.0, T_floor_rect[2, 3]])
-    settings = replace(settings, max_range_m=MAX_RANGE_M)
-    ranges = observe(points, np.sqrt(depth.variance_m2), view, settings, floor.sigma_m).ranges_m
+    limits = ScanLimits(settings.heights_m, math.radians(settings.tilt_deg), MAX_RANGE_M, settings.min_points)
+    ranges = point_scan(points, np.sqrt(depth.variance_m2), view, limits, floor.sigma_m)
     return np.where(np.isfinite(ranges), ranges, np.float32(np.nan))

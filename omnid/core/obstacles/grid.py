@@ -49,8 +49,8 @@ ONCE_FREE_S: Final = 30.0  # for which a cell that was free and is hidden now is
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
 THIN_M: Final = 0.03  # width of the thinnest obstacle
-END_BINS: Final = 2
-END_M: Final = 0.1  # before the end of the free floor: patches at the foot of something show both
+END_BINS: Final = 2  # a cell takes the evidence of a patch so much farther: one at the foot of something shows both
+END_M: Final = 0.1  # before the end of the free floor, for the same reason
 PAST_SECTORS: Final = 3  # on either side, that see past a place too near to be seen
 OPEN_SHARE: Final = 0.9  # of the longest range, up to which an open direction is free
 
@@ -152,9 +152,8 @@ class ObstacleGrid:
         c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
         norm = math.hypot(c, s)
         cells = np.empty((2, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
-        floor = evidence.floor
-        if END_BINS:
-            floor = np.concatenate([np.full_like(floor[:END_BINS], np.nan), floor[:-END_BINS]])
+        nearest = np.full_like(evidence.floor[:END_BINS], np.nan)
+        floor = np.concatenate([nearest, evidence.floor[:-END_BINS]])
         kernels.gather(floor, evidence.surface, np.array([x, y, c / norm, s / norm]), self._at_1m, CELL_M,
                        VIEW_CELLS * CELL_M, THIN_M, cells)
         return cells
@@ -184,7 +183,8 @@ class ObstacleGrid:
         """Forget the floor that something may have come to that was not seen, from cells that are not watched."""
         passed_s = 0.0 if self._last_ns == NEVER else min((stamp_ns - self._last_ns) * 1e-9, 1.0)
         self._last_ns = stamp_ns
-        if self._start_ns is None or stamp_ns - self._start_ns < FRESH_NS:
+        assert self._start_ns is not None, "the first pair sets it"
+        if stamp_ns - self._start_ns < FRESH_NS:
             return
         self._carry += max(passed_s, 0.0) * FLOOD_MPS / CELL_M
         steps, self._carry = int(self._carry), self._carry % 1.0

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.grid import GridRing
-from omnid.core.obstacles.tiles import TILE_COLUMNS
+from omnid.core.stereo.tiles import TILE_COLUMNS
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -40,7 +40,6 @@ class Unwatched:
         found = np.zeros(SECTORS, bool)
         found[self._sectors[:, columns]] = True
         return found
-
 
     def spans_deg(self, columns: Flags) -> list[tuple[int, int]]:
         """Return from where to where columns of tiles lie about the base, counter-clockwise from ahead [deg]."""

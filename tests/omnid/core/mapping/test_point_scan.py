@@ -1,25 +1,22 @@
-"""Ring of one pair, from points of worlds that are known."""
+"""Range scan of the points of one pair, in worlds that are known."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
+from omnid.core.mapping.point_scan import ScanLimits, point_scan
 from omnid.core.mapping.range_scan import azimuths
-from omnid.core.obstacles.observation import Observation, observe
-from omnid.core.obstacles.settings import RingSettings
-from omnid.errors import OmnidError
 
 FLOOR_M = -1.2
 VIEW = np.zeros(3)
-SETTINGS = RingSettings()
+LIMITS = ScanLimits((0.06, 1.7), np.radians(0.5), 6.0, 6)
 
 
-def seen(*parts: np.ndarray, sigma_of_m2: float = 0.01, settings: RingSettings = SETTINGS) -> Observation:
-    """Return the observation of points, whose sigma is so many metres per square metre of range."""
+def seen(*parts: np.ndarray, sigma_of_m2: float = 0.01) -> np.ndarray:
+    """Return the scan of points, whose sigma is so many metres per square metre of range."""
     points = np.vstack(parts)
     above_floor = points - [0.0, 0.0, FLOOR_M]
-    return observe(above_floor, sigma_of_m2 * (points**2).sum(axis=1), VIEW - [0.0, 0.0, FLOOR_M], settings)
+    return point_scan(above_floor, sigma_of_m2 * (points**2).sum(axis=1), VIEW - [0.0, 0.0, FLOOR_M], LIMITS)
 
 
 def arc(range_m: float, degrees: tuple[float, float], heights_m: tuple[float, float], count: int = 2000) -> np.ndarray:
@@ -44,9 +41,8 @@ def within(low_deg: float, high_deg: float) -> np.ndarray:
 
 def test_a_wall_is_found_at_its_range_and_elsewhere_nothing_is_known() -> None:
     ring = seen(arc(2.0, (-30, 30), (-0.8, 0.6)))
-    np.testing.assert_allclose(ring.ranges_m[within(-29, 29)], 2.0, atol=1e-3)
-    assert np.isnan(ring.ranges_m[~within(-32, 32)]).all()
-    assert np.all(ring.sigma_m[within(-29, 29)] > 0.02) and np.all(ring.sigma_m[within(-29, 29)] < 0.06)
+    np.testing.assert_allclose(ring[within(-29, 29)], 2.0, atol=1e-3)
+    assert np.isnan(ring[~within(-32, 32)]).all()
 
 
 def test_a_floor_with_noise_and_tilt_is_no_obstacle_at_any_range() -> None:
@@ -56,31 +52,26 @@ def test_a_floor_with_noise_and_tilt_is_no_obstacle_at_any_range() -> None:
     noisy = ground * (1 + 0.01 * r * rng.standard_normal(len(r)))[:, None]
     tilted = noisy + np.outer(np.tan(np.deg2rad(0.7)) * ground[:, 0], [0, 0, 1])
     ring = seen(tilted)
-    assert np.isfinite(ring.ranges_m).sum() <= 2
+    assert np.isfinite(ring).sum() <= 2
 
 
 def test_a_box_before_a_wall_is_found_although_most_points_are_of_the_wall() -> None:
     ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.4, (-5, 5), (-0.9, -0.6), 150))
-    np.testing.assert_allclose(ring.ranges_m[within(-4, 4)], 1.4, atol=0.02)
-    np.testing.assert_allclose(ring.ranges_m[within(8, 50)], 3.0, atol=0.02)
+    np.testing.assert_allclose(ring[within(-4, 4)], 1.4, atol=0.02)
+    np.testing.assert_allclose(ring[within(8, 50)], 3.0, atol=0.02)
 
 
 def test_few_points_are_no_obstacle() -> None:
-    ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.0, (0, 1), (-0.5, 0.5), SETTINGS.min_points - 1))
-    np.testing.assert_allclose(ring.ranges_m[within(-50, 50)], 3.0, atol=0.02)
+    ring = seen(arc(3.0, (-60, 60), (-0.9, 0.7), 20_000), arc(1.0, (0, 1), (-0.5, 0.5), LIMITS.min_points - 1))
+    np.testing.assert_allclose(ring[within(-50, 50)], 3.0, atol=0.02)
 
 
 def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
     ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
-    assert np.isposinf(ring.ranges_m[within(-28, 28)]).all()
-    assert np.isnan(ring.ranges_m[within(92, 118)]).all()
+    assert np.isposinf(ring[within(-28, 28)]).all()
+    assert np.isnan(ring[within(92, 118)]).all()
 
 
 def test_nothing_is_unknown() -> None:
-    ring = observe(np.zeros((0, 3)), np.zeros(0), VIEW, SETTINGS)
-    assert np.isnan(ring.ranges_m).all()
-
-
-def test_heights_must_be_in_order() -> None:
-    with pytest.raises(OmnidError, match="lower height first"):
-        RingSettings(heights_m=(1.0, 0.5))
+    ring = point_scan(np.zeros((0, 3)), np.zeros(0), VIEW, LIMITS)
+    assert np.isnan(ring).all()

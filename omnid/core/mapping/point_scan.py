@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, fill_gaps
-from omnid.core.obstacles.settings import RingSettings
 
 Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
@@ -24,16 +23,20 @@ INVERSE_STEP: Final = 0.02  # 1/m: width of a bin; two of them are about four si
 NEAREST_M: Final = 0.2  # of the bins
 
 
-class Observation(NamedTuple):
-    """Ring of one pair, in the base frame."""
+class ScanLimits(NamedTuple):
+    """Limits of what is an obstacle, as the settings obstacles.ring give them."""
 
-    ranges_m: RangeScan  # (SECTORS,) nearest obstacle; inf: something beyond the longest range was seen; NaN: unknown
-    sigma_m: RangeScan  # (SECTORS,) of the ranges; NaN without one
+    heights_m: tuple[float, float]  # above the floor
+    tilt_rad: float  # sigma of the base's tilt against the floor
+    max_range_m: float
+    min_points: int  # that make an obstacle
 
 
-def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float = 0.0
-            ) -> Observation:
-    """Return the ring of points (N, 3) [m] in the level frame of the base, whose z is the height above the floor.
+def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float = 0.0
+               ) -> RangeScan:
+    """Return the scan (SECTORS,) of points (N, 3) [m] in the level frame of the base; z is the height above the floor.
+
+    A range is that of the nearest obstacle, m; inf: something beyond the longest range was seen; NaN: unknown.
 
     sigma_m (N,): of the points, along the rays; view (3,): the viewpoint in that frame; floor_sigma_m: of the floor.
     """
@@ -41,49 +44,42 @@ def observe(points: Array, sigma_m: Array, view: Array, settings: RingSettings, 
     turned = (np.arctan2(points[:, 1], points[:, 0]) + math.pi) * (SECTORS / (2 * math.pi))
     sector = np.floor(turned).astype(np.intp) % SECTORS
     usable = (ranges > NEAREST_M) & np.isfinite(sigma_m)
-    chosen = usable & _is_obstacle(points, sigma_m, view, settings, floor_sigma_m)
-    found, sigma, seen_beyond = _nearest(sector[chosen], ranges[chosen], sigma_m[chosen], settings)
+    chosen = usable & _is_obstacle(points, sigma_m, view, limits, floor_sigma_m)
+    found, seen_beyond = _nearest(sector[chosen], ranges[chosen], limits)
     found = fill_gaps(found)
-    sigma = np.where(np.isfinite(found) & ~np.isfinite(sigma), _carried(sigma), sigma)
-    is_open = ~np.isfinite(found) & seen_beyond
-    result = np.where(is_open, np.inf, found).astype(np.float32)
-    return Observation(result, sigma.astype(np.float32))
+    return np.where(~np.isfinite(found) & seen_beyond, np.inf, found).astype(np.float32)
 
 
-def _is_obstacle(points: Array, sigma_m: Array, view: Array, settings: RingSettings, floor_sigma_m: float
+def _is_obstacle(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float
                  ) -> NDArray[np.bool_]:
-    """Return which of points (N, 3) are within the band of heights; the arguments are those of `observe`."""
-    low, high = settings.heights_m
+    """Return which of points (N, 3) are within the band of heights; the arguments are those of `point_scan`."""
+    low, high = limits.heights_m
     away = points - view
     across2 = away[:, 0] ** 2 + away[:, 1] ** 2
     rise2 = away[:, 2] ** 2
     of_stereo2 = sigma_m**2 * rise2 / np.maximum(across2 + rise2, 1e-12)
-    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + math.radians(settings.tilt_deg) ** 2 * across2 + floor_sigma_m**2)
+    margin = HEIGHT_SIGMAS * np.sqrt(of_stereo2 + limits.tilt_rad**2 * across2 + floor_sigma_m**2)
     z = points[:, 2]
     return np.asarray((z - margin > low) & (z + margin < high))
 
 
-def _nearest(sector: Counts, ranges: Array, sigma_m: Array, settings: RingSettings
-             ) -> tuple[RangeScan, RangeScan, NDArray[np.bool_]]:
-    """Return range and sigma (SECTORS,) of the nearest supported obstacles, and where something beyond was seen."""
+def _nearest(sector: Counts, ranges: Array, limits: ScanLimits) -> tuple[RangeScan, NDArray[np.bool_]]:
+    """Return the ranges (SECTORS,) of the nearest supported obstacles, and where something beyond was seen."""
     bins = math.ceil(1 / (NEAREST_M * INVERSE_STEP))
     # Bin 0 is the nearest.
     index = sector * bins + np.clip(bins - 1 - np.floor(1 / (ranges * INVERSE_STEP)).astype(np.intp), 0, bins - 1)
     counts = np.bincount(index, minlength=SECTORS * bins).reshape(SECTORS, bins).astype(float)
     inverse = np.bincount(index, 1 / ranges, SECTORS * bins).reshape(SECTORS, bins).astype(float)
-    noise = np.bincount(index, sigma_m / ranges**2, SECTORS * bins).reshape(SECTORS, bins).astype(float)
     pair = _with_next(counts)
-    supported = (_of_neighbours(pair) >= settings.min_points) & (pair > 0)
-    limit = bins - 1 - math.floor(1 / (settings.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
+    supported = (_of_neighbours(pair) >= limits.min_points) & (pair > 0)
+    limit = bins - 1 - math.floor(1 / (limits.max_range_m * INVERSE_STEP))  # bins from here on lie beyond
     near = supported[:, : limit + 1]
     first = np.argmax(near, axis=1)
     rows = np.arange(SECTORS)
     known = near[rows, first]
     with np.errstate(divide="ignore", invalid="ignore"):
-        count = pair[rows, first]
-        found = np.where(known, count / _with_next(inverse)[rows, first], np.nan)
-        sigma = np.where(known, found**2 * _with_next(noise)[rows, first] / count, np.nan)
-    return found.astype(np.float32), sigma.astype(np.float32), ~known & supported[:, limit + 1 :].any(axis=1)
+        found = np.where(known, pair[rows, first] / _with_next(inverse)[rows, first], np.nan)
+    return found.astype(np.float32), ~known & supported[:, limit + 1 :].any(axis=1)
 
 
 def _with_next(sums: Array) -> Array:
@@ -96,12 +92,3 @@ def _with_next(sums: Array) -> Array:
 def _of_neighbours(sums: Array) -> Array:
     """Return the sums over each sector and those beside it."""
     return np.asarray(sums + np.roll(sums, 1, axis=0) + np.roll(sums, -1, axis=0))
-
-
-def _carried(sigma: RangeScan) -> RangeScan:
-    """Return for each sector the sigma of the nearest known sector before it, NaN where there is none."""
-    known = np.flatnonzero(np.isfinite(sigma))
-    if not len(known):
-        return sigma
-    before = np.searchsorted(known, np.arange(SECTORS), side="right") - 1
-    return sigma[known[before]]

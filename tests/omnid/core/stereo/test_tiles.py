@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.tiles import (
+from omnid.core.stereo.tiles import (
     ALL_LIVE,
     BLACK_GREY,
     IN_A_ROW,
