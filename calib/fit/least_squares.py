@@ -44,7 +44,7 @@ class ArrowSystem:
     """Normal equations [[A, B], [B^T, C]] [common; blocks] = [a; c] with K blocks of D unknowns, C block diagonal."""
 
     A: Array  # (P, P)
-    B: sparse.csr_matrix  # (P, K D)
+    B: sparse.csr_matrix | Array  # (P, K D); an array where each block meets most common unknowns
     C: Array  # (K, D, D)
     a: Array  # (P,)
     c: Array  # (K D,)
@@ -68,7 +68,9 @@ class ArrowSystem:
     def _reduced_by(self, inverse: sparse.csr_matrix, damping: float) -> tuple[Array, Array]:
         between = self.B @ inverse
         damped = self.A + damping * np.diag(np.diag(self.A))
-        return damped - (between @ self.B.T).toarray(), np.asarray(self.a - between @ self.c)
+        share = between @ self.B.T
+        by_blocks = share.toarray() if sparse.issparse(share) else share
+        return damped - by_blocks, np.asarray(self.a - between @ self.c)
 
 
 class Problem(Protocol[State]):

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy import sparse
 
 from calib import se3
 from calib.errors import CalibError
@@ -171,7 +170,7 @@ class _BoardProblem:
             prior, to_prior = (np.pad(part, (0, fields.shape[3])) for part in (prior, to_prior))
         between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
         return ArrowSystem(
-            A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior), B=sparse.csr_matrix(between),
+            A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior), B=between,
             C=J_pose.swapaxes(1, 2) @ J_pose, a=np.einsum("kri,kr->i", J_in, r) - to_prior,
             c=np.einsum("kri,kr->ki", J_pose, r).ravel())
 
@@ -199,11 +198,11 @@ def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
 
 
 def _by_point(camera: Projection, points: Array) -> Array:
-    """Return the derivative (N, 2, 3) of the pixels by the points."""
+    """Return the derivative (N, 2, 3) of the pixels by the points; one projection of all moved points."""
     reach = DIFFERENCE_STEP * np.linalg.norm(points, axis=1, keepdims=True)
-    columns = [(camera.project(points + reach * axis) - camera.project(points - reach * axis)) / (2 * reach)
-               for axis in np.eye(3)]
-    return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
+    moved = points + reach * np.vstack([np.eye(3), -np.eye(3)])[:, None]  # (6, N, 3)
+    pixels = camera.project(moved.reshape(-1, 3)).reshape(2, 3, len(points), 2)
+    return np.asarray(np.nan_to_num(np.moveaxis((pixels[0] - pixels[1]) / (2 * reach), 0, -1)))
 
 
 def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:
