@@ -22,10 +22,14 @@ _RETRY_S: Final = 0.5
 Writer: TypeAlias = TumWriter | BusLogWriter
 
 
-def listen(bus: BusConfig, tum: Path | None, mcap: Path | None, seconds: float | None) -> int:
-    """Show the robot until Ctrl-C or for so many seconds. Return the exit code, 1 where no pose arrived."""
+def listen(bus: BusConfig, tum: Path | None, mcap: Path | None, seconds: float | None, *, shows_load: bool = False
+           ) -> int:
+    """Show the robot until Ctrl-C or for so many seconds. Return the exit code, 1 where no pose arrived.
+
+    shows_load: the share of each of its threads, in place of its state.
+    """
     check_outputs([(name, path) for name, path in (("--tum", tum), ("--mcap", mcap)) if path is not None], [])
-    state, screen = RobotState(), Screen(bus.robot)
+    state, screen = RobotState(), Screen(bus.robot, shows_load=shows_load)
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with suppress(KeyboardInterrupt), ExitStack() as stack:
         robot = _connected(bus, end_s, screen)

@@ -14,17 +14,20 @@ from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Pose
-from omnid.transport.status_names import STAGE_PREFIX, short_name
+from omnid.transport.status_names import STAGE_PREFIX, THREADS, Key, number, short_name
 
 _LEVELS: Final = ("", "warning", "ERROR", "stale")
+LARGEST: Final = 5  # shares of threads in one line
 CLEAR: Final = "\x1b[H\x1b[J"
 
 
 class Screen:
     """Output of the state: a table in place on a terminal, else one line per call."""
 
-    def __init__(self, robot: str, out: IO[str] | None = None) -> None:
+    def __init__(self, robot: str, out: IO[str] | None = None, *, shows_load: bool = False) -> None:
+        """shows_load: the share of each thread, in place of the state."""
         self._robot, self._out = robot, out or sys.stdout
+        self._line, self._table = (load_line, load_table) if shows_load else (summary_line, status_table)
         self._last_reason = ""
 
     def waiting(self, reason: str) -> None:
@@ -37,10 +40,10 @@ class Screen:
         """Write the state; dropped: messages that the inbox could not hold."""
         if self._out.isatty():
             size = shutil.get_terminal_size()
-            lines = fitted(status_table(self._robot, state, dropped), size.columns, size.lines)
+            lines = fitted(self._table(self._robot, state, dropped), size.columns, size.lines)
             self._out.write(CLEAR + "\n".join(lines) + "\n")
         else:
-            self._out.write(summary_line(self._robot, state) + "\n")
+            self._out.write(self._line(self._robot, state) + "\n")
         self._out.flush()
 
 
@@ -68,6 +71,35 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
     for status in sorted(state.statuses.values(), key=_importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield plain(f"  {_LEVELS[status.level % 4]:7s} {short_name(status.name):16s} {status.message}  {values}")
+
+
+def load_table(robot: str, state: RobotState, dropped: int = 0) -> Iterator[str]:
+    """Yield the share of a core that all threads take, and that of each, the largest first."""
+    shares = dict(thread_shares(state))
+    if not shares:
+        yield f"{robot}: no load of its threads yet"
+        return
+    yield f"{robot}: {_percent(shares.pop(Key.ALL, math.nan))} of a core"
+    for name, share in sorted(shares.items(), key=lambda entry: -entry[1]):
+        yield plain(f"  {_percent(share):>7s}  {name}")
+
+
+def load_line(robot: str, state: RobotState) -> str:
+    """Return the share of a core that all threads take, and those of the largest, in one line."""
+    head, *rows = load_table(robot, state)
+    return ", ".join([head, *(" ".join(row.split()) for row in rows[:LARGEST])])
+
+
+def thread_shares(state: RobotState) -> Iterator[tuple[str, float]]:
+    """Yield names and shares of a core that the robot has reported; all together under Key.ALL."""
+    if (status := state.statuses.get(THREADS)) is not None:
+        for name, text in status.values.items():
+            if (share := number(text)) is not None:
+                yield name, share
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} %"
 
 
 def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:

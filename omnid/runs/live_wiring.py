@@ -20,6 +20,7 @@ from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.status import StatusCollector, StatusSources
+from omnid.diagnostics.threads_status import ThreadsStatus
 from omnid.engine.graph import NEWEST, Sink
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure_control import ExposureControl
@@ -102,7 +103,7 @@ class LiveWiring:
         received.subscribe(recorder, sensors, saver)
         # 5. Status.
         images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))
-        status = [ladder.status, images, exposure.status, live_rig.status,
+        status = [ladder.status, ThreadsStatus(), images, exposure.status, live_rig.status,
                   *([received.navigation.status] if controller else ()),
                   motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
                   *([partial(places_status, stages.places)] if stages.places else ()),

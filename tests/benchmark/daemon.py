@@ -1,70 +1,30 @@
 """Processor time of the whole daemon by its threads, over a minute: `python -m tests.benchmark.daemon`.
 
 `omnid run` on a log that begins again at its end, with all stages, the bus, an operator who sends commands, and a
-simulated motor controller. The share of a core of each thread is the difference of its times in
-/proc/PID/task/TID/stat; those of one name are added up. Memory: the resident size at the end and the largest one.
+simulated motor controller. The share of a core is that of all threads of a name (omnid/engine/thread_times.py).
+Memory: the resident size at the end and the largest one.
 The log is that of `tests/benchmark/live_daemon.py`; --rates are those at which its pairs are offered.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
 import tempfile
 import time
-from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from omnid.engine.thread_times import ThreadShare, process_time_s, shares, thread_times
 from tests.benchmark.live_daemon import HZ, daemon
 from tests.benchmark.results import Column, ResultTable
 from tests.replay.live import Operator
 
-TICKS_PER_S: Final = os.sysconf("SC_CLK_TCK")
 LEAST_SHARE: Final = 0.002  # of a core; threads below it make one row
 OTHERS: Final = "others"
 ENDED: Final = "threads that ended"
 COLUMNS: Final = (Column("rate, thread"), Column("threads"), Column("share of a core", "", 3),
                   *(Column(name, "MB", 0) for name in ("resident", "most")),
                   *(Column(name, "ms", 1) for name in ("pose p50", "pose p99")), Column("poses/s", "", 1))
-
-
-@dataclass(frozen=True, slots=True)
-class ThreadTime:
-    """Name of a thread, and the processor time that it has used [s]."""
-
-    name: str
-    used_s: float
-
-
-def thread_times(pid: int) -> dict[int, ThreadTime]:
-    """Return the times of the threads of a process, by their id; Linux proc(5), fields 14 and 15 of stat."""
-    times = {}
-    for task in Path(f"/proc/{pid}/task").iterdir():
-        try:
-            name, _, rest = (task / "stat").read_text().partition("(")[2].rpartition(")")
-        except FileNotFoundError:  # it has ended
-            continue
-        fields = rest.split()
-        times[int(task.name)] = ThreadTime(name, (int(fields[11]) + int(fields[12])) / TICKS_PER_S)
-    return times
-
-
-def process_time_s(pid: int) -> float:
-    """Return the time of the whole process, with the threads that have ended."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / TICKS_PER_S
-
-
-def shares(before: dict[int, ThreadTime], after: dict[int, ThreadTime], seconds: float) -> dict[str, tuple[int, float]]:
-    """Return the number of threads and their share of a core by name, the largest first."""
-    counts: Counter[str] = Counter()
-    used_s: dict[str, float] = {}
-    for tid, now in after.items():
-        counts[now.name] += 1
-        used_s[now.name] = used_s.get(now.name, 0.0) + now.used_s - (before[tid].used_s if tid in before else 0.0)
-    return {name: (counts[name], used_s[name] / seconds) for name in sorted(used_s, key=lambda name: -used_s[name])}
 
 
 def memory_mb(pid: int) -> tuple[float, float]:
@@ -87,14 +47,14 @@ def measure(table: ResultTable, rate_hz: float, seconds: float, warm_s: float, s
         p50_ms, p99_ms, poses_hz = latencies(operator)
     by_name = shares(before, after, measured_s)
     whole = (after_s - before_s) / measured_s
-    table.add(f"{rate_hz:g} Hz: all", sum(count for count, _ in by_name.values()), whole, resident_mb, most_mb, p50_ms,
-              p99_ms, poses_hz)
-    small = [entry for entry in by_name.values() if entry[1] < LEAST_SHARE]
-    rows = {name: entry for name, entry in by_name.items() if entry[1] >= LEAST_SHARE}
-    rows[OTHERS] = (sum(count for count, _ in small), sum(share for _, share in small))
-    rows[ENDED] = (0, whole - sum(share for _, share in by_name.values()))
-    for name, (count, share) in rows.items():
-        table.add(f"{rate_hz:g} Hz: {name}", count, share, None, None, None, None, None)
+    threads = sum(entry.threads for entry in by_name.values())
+    table.add(f"{rate_hz:g} Hz: all", threads, whole, resident_mb, most_mb, p50_ms, p99_ms, poses_hz)
+    small = [entry for entry in by_name.values() if entry.share < LEAST_SHARE]
+    rows = {name: entry for name, entry in by_name.items() if entry.share >= LEAST_SHARE}
+    rows[OTHERS] = ThreadShare(sum(entry.threads for entry in small), sum(entry.share for entry in small))
+    rows[ENDED] = ThreadShare(0, whole - sum(entry.share for entry in by_name.values()))
+    for name, entry in rows.items():
+        table.add(f"{rate_hz:g} Hz: {name}", entry.threads, entry.share, None, None, None, None, None)
 
 
 def latencies(operator: Operator) -> tuple[float | None, float | None, float | None]:

@@ -20,12 +20,12 @@ from calib import se3
 from omnid.client import Robot
 from omnid.formats.tum import read_tum
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
-from omnid.monitor.screen import Screen, status_table, summary_line
+from omnid.monitor.screen import Screen, load_line, load_table, status_table, summary_line
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.status_names import BUS, WHEELS
+from omnid.transport.status_names import BUS, THREADS, WHEELS
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, wait_until
 from tests.replay.command import Command, rows
 
@@ -191,3 +191,16 @@ def test_the_inbox_drops_the_oldest_when_full() -> None:
         inbox.put(str(number), b"", b"")
     first = inbox.get(0.0)
     assert inbox.dropped == 10 and first is not None and first.topic == "10"
+
+
+def test_the_load_is_shown_by_threads() -> None:
+    state = RobotState()
+    assert load_line("rover", state) == "rover: no load of its threads yet"
+    values = {"all": "0.500", "bus": "0.104", "odometry": "0.396", "words": "none", "\x1b[2J": "0.001"}
+    state.statuses[THREADS] = DiagnosticStatus(THREADS, 0, "", values)
+    assert list(load_table("rover", state)) == [
+        "rover: 50.0 % of a core", "   39.6 %  odometry", "   10.4 %  bus", "    0.1 %  \\x1b[2J"]
+    assert load_line("rover", state) == "rover: 50.0 % of a core, 39.6 % odometry, 10.4 % bus, 0.1 % \\x1b[2J"
+    out = io.StringIO()
+    Screen("rover", out, shows_load=True).show(state)
+    assert out.getvalue() == load_line("rover", state) + "\n"

@@ -1,0 +1,69 @@
+"""The times of threads are those that they have used, by names that say whose they are."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+
+from omnid.engine.realtime import name_thread
+from omnid.engine.thread_times import (
+    LIBRARIES,
+    MAIN,
+    ThreadShare,
+    ThreadShares,
+    ThreadTime,
+    process_time_s,
+    shares,
+    thread_times,
+)
+
+BURNT_S = 0.15
+TICK_S = 0.02  # the kernel counts ticks of 0.01 s, in the program and in the kernel
+
+
+def burning(name: str, end: threading.Event) -> threading.Thread:
+    """Return a running thread that has used BURNT_S and waits for the end; an empty name: it has none of its own."""
+    burnt = threading.Event()
+
+    def burn() -> None:
+        if name:
+            name_thread(name)
+        while time.thread_time() < BURNT_S:
+            pass
+        burnt.set()
+        end.wait()
+
+    thread = threading.Thread(target=burn)
+    thread.start()
+    burnt.wait()
+    return thread
+
+
+def test_reads_names_and_times_of_running_threads() -> None:
+    before_s, reader, end = process_time_s(), ThreadShares(), threading.Event()
+    named, unnamed = burning("burn (1) x", end), burning("", end)  # a name with what ends the field of names
+    times, found = thread_times(), reader()
+    end.set()
+    for thread in (named, unnamed):
+        thread.join()
+        assert thread.native_id is not None and times[thread.native_id].used_s >= BURNT_S - TICK_S
+        assert thread.native_id not in thread_times()
+    assert times[named.native_id or 0].name == "burn (1) x" and times[unnamed.native_id or 0].name == LIBRARIES
+    assert times[os.getpid()].name == MAIN
+    assert found["burn (1) x"].threads == 1 and 0 < found["burn (1) x"].share < os.cpu_count()
+    assert process_time_s() - before_s >= 2 * (BURNT_S - TICK_S), "also of threads that have ended"
+
+
+def test_adds_up_the_threads_of_a_name() -> None:
+    before = {1: ThreadTime("pool", 1.0), 2: ThreadTime("odometry", 2.0)}
+    after = {1: ThreadTime("pool", 1.5), 2: ThreadTime("odometry", 6.0), 3: ThreadTime("pool", 0.5)}
+    assert shares(before, after, 10.0) == {"odometry": ThreadShare(1, 0.4), "pool": ThreadShare(2, 0.1)}
+
+
+def test_an_id_that_is_used_again_begins_at_zero() -> None:
+    assert shares({7: ThreadTime("old", 5.0)}, {7: ThreadTime("new", 1.0)}, 2.0) == {"new": ThreadShare(1, 0.5)}
+
+
+def test_there_are_none_of_a_process_that_has_ended() -> None:
+    assert thread_times(2**22 + 1) == {}, "above the largest id of a process"
