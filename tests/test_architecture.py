@@ -60,7 +60,7 @@ RULES = (
     Rule("drivers.motors", ("numpy", "cv2")),
     Rule("omnid", ("threading", "_thread"),
          excepted=("omnid/engine/graph.py", "omnid/engine/inbox.py", "omnid/engine/bounded_call.py",
-                   "omnid/engine/one_at_a_time.py", "omnid/engine/poller.py")),
+                   "omnid/engine/one_at_a_time.py", "omnid/engine/poller.py", "omnid/engine/ticker.py")),
     Rule("omnid", ("zenoh",),
          excepted=("omnid/transport/bus.py", "omnid/transport/command_intake.py", "omnid/transport/namesakes.py",
                    "omnid/transport/publishers.py", "omnid/transport/session.py",

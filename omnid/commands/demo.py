@@ -91,5 +91,5 @@ def _drive(args: argparse.Namespace) -> int:
         off_cm = 100 * cross_track_m(first, second)
         print(f"the repeated path is {np.percentile(off_cm, 95):.1f} cm off the taught one (95 % of it), at most "
               f"{off_cm.max():.1f} cm, by the truth")
-    print(f"picture of the taught path (black) and the repeated one (red): {image}; map: {place_map}")
+    print(f"picture: {image}; map: {place_map}")
     return 0 if script.end == NavigationState.REACHED else 1

@@ -23,7 +23,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     verbs = parser.add_mutually_exclusive_group()
     verbs.add_argument("--cancel", action="store_const", dest="verb", const="cancel", help="end what is under way")
     verbs.add_argument("--pause", action="store_const", dest="verb", const="pause", help="halt")
-    verbs.add_argument("--resume", action="store_const", dest="verb", const="resume", help="go on after a halt")
+    verbs.add_argument("--resume", action="store_const", dest="verb", const="resume", help="go on after a halt or "
+                       "a fault; it arms the robot, too")
     parser.add_argument("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
     add_robot(parser)
     add_settings(parser)
@@ -33,6 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Drive, or cancel, pause, resume."""
     from omnid.errors import OmnidError
+    from omnid.monitor.arming import arm
     from omnid.monitor.navigation import NavigationClient, drive_to_end
 
     if args.verb and args.pose:
@@ -41,7 +43,10 @@ def run(args: argparse.Namespace) -> int:
         raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
     if not all(math.isfinite(value) and abs(value) <= FARTHEST_M for value in args.pose):
         raise OmnidError(f"goto: expected finite numbers of at most {FARTHEST_M:g}")
-    with NavigationClient(config_of(args).bus) as client:
+    bus = config_of(args).bus
+    with NavigationClient(bus) as client:
+        if args.verb == "resume" and (refusal := arm(bus)):
+            raise OmnidError(f"{bus.robot} refuses to be armed: {refusal}")
         if args.verb:
             report = client.navigate(args.verb)
             print(f"{report.state}: {report.reason}" if report.reason else report.state)

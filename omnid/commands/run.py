@@ -53,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config_use import unused_settings
     from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import LiveRun
+    from omnid.runs.live_robot import ConnectedRobot
 
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
     if args.log is None:
@@ -64,10 +65,11 @@ def run(args: argparse.Namespace) -> int:
     show = HANDLER.show if sys.stderr.isatty() else None
     if args.log is None:
         _require_no_log_options(args)
-        return LiveRun(config, _devices(config), log, show=show).run()
+        return LiveRun(config, ConnectedRobot(_devices(config)), log, show=show).run()
     config = replace(config, controller=config.controller.of_log)
     opener, motion = _recorded(args, config)
-    return LiveRun(config, opener, log, None if args.rig else _rig_of(args), show, motion).run()
+    robot = ConnectedRobot(opener, motion)
+    return LiveRun(config, robot, log, None if args.rig else _rig_of(args), show).run()
 
 
 def _require_no_log_options(args: argparse.Namespace) -> None:

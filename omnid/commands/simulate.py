@@ -8,17 +8,20 @@ import sys
 from collections import Counter, defaultdict
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_map, map_settings
 
+AUTO, REAL_TIME = "auto", "1.0"
 IMU_BAUD = 115_200  # at which the stamps of the simulated gyro are right
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-    from omnid.config import Config
-    from omnid.runs.live_cameras import OpenCamera
+    from drivers.motors.simulated.simulated_base import Pose
+    from omnid.runs.live_robot import LiveRobot
+    from omnid.simulation.paced_robot import PacedRobot
     from omnid.simulation.realtime import RealtimeRobot
     from omnid.simulation.robot import SimulatedRobot
 
@@ -27,10 +30,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `simulate` to the command line."""
     parser = subparsers.add_parser(
         "simulate", help="the daemon with a simulated robot in a simulated world",
-        description="Run the daemon with a simulated robot: both cameras are rendered, and the motor controller is "
-        "simulated behind a pseudo-terminal, and so is a gyro (motion.imu=off: none). Everything else is as in `omnid "
-        "run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`.")
+        description="Run the daemon with a simulated robot: cameras, motor controller and gyro (motion.imu=off: none) "
+        "are simulated. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid "
+        "web`. Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.")
     parser.add_argument("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)")
+    parser.add_argument("--speed", choices=(AUTO, REAL_TIME), default=AUTO, help="auto: simulated time waits for the "
+                        "daemon, and is never faster than real time; 1.0: real time, as on a robot: what the computer "
+                        "cannot do in time is dropped; default %(default)s")
     parser.add_argument("--seed", type=int, default=1, help="of textures and noise; default %(default)s")
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig")
     parser.add_argument("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default "
@@ -53,8 +59,10 @@ def run(args: argparse.Namespace) -> int:
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from omnid.config import load_config
     from omnid.config_use import unused_settings
+    from omnid.controller.motor import SIMULATED
     from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import LiveRun
+    from omnid.simulation.paced_robot import PacedRobot
     from omnid.simulation.realtime import RealtimeRobot
     from omnid.simulation.world_file import WorldOptions, load_world
     from omnid.sinks.files import check_outputs
@@ -70,15 +78,27 @@ def run(args: argparse.Namespace) -> int:
     options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
     world = load_world(args.world, args.seed, options)
     show = HANDLER.show if sys.stderr.isatty() else None
-    robot = RealtimeRobot(world, _robot(args), config.motor.protocol, config.motor.drive.geometry(), args.seed,
-                          lambda line: log(logging.WARNING, line))
-    with closing(robot):
+    warn = partial(log, logging.WARNING)
+    if args.speed == AUTO:
+        config = replace(config, motor=replace(config.motor, port=SIMULATED))
+        paced = PacedRobot(world, _robot(args), config, args.seed, warn)
+        code = LiveRun(config, paced, log, paced.rig, show).run()
+        return _end(args, paced, code)
+    geometry = config.motor.drive.geometry()
+    with closing(RealtimeRobot(world, _robot(args), config.motor.protocol, geometry, args.seed, warn)) as robot:
         config = replace(config, motor=replace(config.motor, port=robot.port))
         if config.motion.imu == "auto" and not config.motion.imu_port:
             config = replace(config, motion=replace(config.motion, imu_port=robot.imu_port, imu_baud=IMU_BAUD))
-        code = LiveRun(config, _opener(robot), log, robot.rig, show).run()
+        code = LiveRun(config, _connected(robot), log, robot.rig, show).run()
+    return _end(args, robot, code)
+
+
+def _end(args: argparse.Namespace, robot: PacedRobot | RealtimeRobot, code: int) -> int:
+    """Write the truth where it is asked for; return the exit code."""
+    from omnid.engine.logging_setup import log
+
     if args.truth:
-        _write_truth(args.truth, robot, config)
+        _write_truth(args.truth, robot.truth, robot.offset_ns)
     log(logging.INFO, f"contacts with obstacles: {robot.contacts}")
     return code
 
@@ -93,10 +113,11 @@ def _robot(args: argparse.Namespace) -> SimulatedRobot:
     return make_robot(args.size, read_rig(args.rig) if args.rig else None)
 
 
-def _opener(robot: RealtimeRobot) -> OpenCamera:
-    """Return a function that opens cameras; those that are opened together have one clock."""
+def _connected(robot: RealtimeRobot) -> LiveRobot:
+    """Return the robot as the run sees it; cameras that are opened together have one clock."""
     from drivers.cameras.log_camera import LogClock
     from drivers.frame import Camera
+    from omnid.runs.live_robot import ConnectedRobot
     from omnid.simulation.realtime import SimulatedCamera
 
     clocks: defaultdict[int, LogClock] = defaultdict(LogClock)
@@ -106,21 +127,18 @@ def _opener(robot: RealtimeRobot) -> OpenCamera:
         opened[camera] += 1
         return robot.open_camera(camera, clocks[opened[camera]])
 
-    return open_camera
+    return ConnectedRobot(open_camera)
 
 
-def _write_truth(path: Path, robot: RealtimeRobot, config: Config) -> None:
+def _write_truth(path: Path, truth: dict[int, Pose], offset_ns: int) -> None:
     """Write the true poses of the base since the first one, with the stamps of the poses on the bus."""
-    import time
-
     import numpy as np
 
     from calib import se3
     from omnid.sinks.files import write_trajectory
 
-    offset_ns = time.time_ns() - time.monotonic_ns()
-    poses = np.array(list(robot.truth.values())).reshape(-1, 3)
+    poses = np.array(list(truth.values())).reshape(-1, 3)
     zero = np.zeros(len(poses))
     R = se3.rotation_exp(np.column_stack([zero, zero, poses[:, 2]]))
     T = se3.transform(R, np.column_stack([poses[:, :2], zero]))
-    write_trajectory(path, np.array(list(robot.truth), np.int64) + offset_ns, se3.inverse(T[:1]) @ T)
+    write_trajectory(path, np.array(list(truth), np.int64) + offset_ns, se3.inverse(T[:1]) @ T)

@@ -6,7 +6,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Final
+from typing import Final, Protocol
 
 from drivers.errors import DriverError
 from drivers.motion import WheelSample
@@ -28,6 +28,40 @@ START_S: Final = 30.0  # some boards restart when their port is opened
 END_S: Final = LONGEST_RAMP_S + 2.0
 RECEIVE_S: Final = 0.5
 PROCESS: Final = "omnid.controller.process"
+
+
+class DriveLink(Protocol):
+    """The daemon's end of a controller. All methods may be called from any thread; the newest of a kind counts.
+
+    Arrivals are by CLOCK_MONOTONIC; a controller with another clock dates them by its own.
+    """
+
+    statistics: ControllerStatistics
+    take_wheels: Callable[[WheelSample], object]  # called with what the motor controller reports
+
+    def send_pose(self, pose: ControllerPose) -> None:
+        """Send a pose."""
+
+    def send_ring(self, ring: ControllerRing) -> None:
+        """Send an obstacle ring."""
+
+    def send_setpoint(self, command: TimedSetpoint) -> None:
+        """Send a setpoint."""
+
+    def stop(self) -> None:
+        """Stop the wheels until `arm` is called later."""
+
+    def touch(self, contact: str, *, holds: bool) -> None:
+        """Report a bumper or a cliff sensor (BUMPER, CLIFF)."""
+
+    def arm(self, request: ArmRequest) -> None:
+        """Ask to arm."""
+
+    def end(self) -> None:
+        """Have the wheels slow down to a stop, and `commands` end."""
+
+    def commands(self) -> Iterator[VelocityCommand]:
+        """Yield the commands that are sent from now on, until the end."""
 
 
 class ControllerLink:

@@ -62,6 +62,7 @@ class StatusSources(NamedTuple):
     commands: CommandReceiver | None
     tickers: frozenset[str]  # stages whose `dropped` are missed deadlines
     others: tuple[Callable[[], DiagnosticStatus], ...] = ()  # parts that make their own entries
+    clock_ns: Callable[[], int] = time.monotonic_ns  # the clock of the stamps of images and poses
 
 
 class StatusCollector:
@@ -85,7 +86,7 @@ class StatusCollector:
         statistics, newest = self._sources.statistics, self._sources.statistics.newest
         if newest is None:
             return DiagnosticStatus(status_names.ODOMETRY, STALE, "no pose yet", {})
-        age_s = (time.monotonic_ns() - newest.stamp_ns) * 1e-9
+        age_s = (self._sources.clock_ns() - newest.stamp_ns) * 1e-9
         values = {Key.RATE_HZ: f"{self._rates('poses', statistics.poses):.1f}", Key.AGE_S: f"{age_s:.3f}",
                   Key.INLIERS: str(newest.inliers), Key.TRACKED: str(newest.tracks),
                   Key.RESETS: str(newest.reset_counter), Key.LENGTH_M: f"{statistics.length_m:.2f}",
@@ -132,7 +133,7 @@ class StatusCollector:
     def _image_age_s(self, camera: Camera) -> float:
         """Return the age of the camera's newest image; inf before the first."""
         newest_ns = self._sources.pair.newest_ns[camera]
-        return (time.monotonic_ns() - newest_ns) * 1e-9 if newest_ns else math.inf
+        return (self._sources.clock_ns() - newest_ns) * 1e-9 if newest_ns else math.inf
 
     def _cameras(self) -> Iterable[DiagnosticStatus]:
         for name, state in self._sources.cameras.items():

@@ -1,4 +1,4 @@
-"""The graph of stages and its threads. Only this module and that of the inboxes import threading.
+"""The graph of stages and its threads. Only this module and those of inboxes and tickers import threading.
 
 A stream exists before it is read, so a cycle cannot be wired. Messages flow through bounded inboxes that belong to
 their readers; the end of a stream flows the same way. Inline, the same stages run in the caller's thread, each message
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -31,8 +30,9 @@ from omnid.engine.flow import (
     Stream,
     nothing,
 )
-from omnid.engine.inbox import Port, StageInbox
+from omnid.engine.inbox import InFlight, Port, StageInbox
 from omnid.engine.telemetry import StageStats, Telemetry
+from omnid.engine.ticker import Ticker
 from omnid.errors import OmnidError
 
 __all__ = ["LOSSLESS", "NEWEST", "Graph", "Policy", "Sink", "Slot", "Stage", "Stream", "Ticker"]
@@ -43,50 +43,11 @@ Out = TypeVar("Out")
 _POLL_S: Final = 0.1  # a signal handled in another thread does not wake the main one, so it polls
 
 
-class Ticker:
-    """Calls an action at a fixed rate, independent of the stages.
-
-    The graph calls the action's optional `close` once, also after an error. `stats.dropped` counts missed deadlines.
-    """
-
-    def __init__(self, name: str, period_s: float, action: Callable[[], object]) -> None:
-        if not 0.0 < period_s < threading.TIMEOUT_MAX:
-            raise OmnidError(f"ticker '{name}': expected a period above 0 s, found {period_s}")
-        self.name = name
-        self.stats = StageStats(name)
-        self._period_ns = round(period_s * 1e9)
-        self._action = action
-        self._halt = threading.Event()
-
-    def halt(self) -> None:
-        """End `run` before its next tick."""
-        self._halt.set()
-
-    def run(self, stopping: Callable[[], bool]) -> None:
-        """Tick until halted or stopping."""
-        deadline_ns = time.monotonic_ns()
-        while not self._halt.wait(max(0.0, (deadline_ns - time.monotonic_ns()) * 1e-9)) and not stopping():
-            skipped = skipped_deadlines(deadline_ns, time.monotonic_ns(), self._period_ns)
-            self.stats.dropped += skipped
-            self.stats.busy_since_ns = time.monotonic_ns()
-            self.stats.timed(self._action)
-            self.stats.busy_since_ns = 0
-            deadline_ns += (1 + skipped) * self._period_ns
-
-    def close(self) -> None:
-        """Close the action."""
-        getattr(self._action, "close", nothing)()
-
-
-def skipped_deadlines(deadline_ns: int, now_ns: int, period_ns: int) -> int:
-    """Return how many deadlines to skip so that the newest one passed is served now, without drift and burst."""
-    return max(0, now_ns - deadline_ns) // period_ns
-
-
 class Graph:
     """The wiring of one run, and the run itself.
 
     `policy` is that of all inboxes unless a sink has its own; `depth` is the capacity of an inbox.
+    `sinks_wait`: sinks have no policy of their own, so with LOSSLESS no message is ever dropped.
     `on_thread` is called in each thread, with its name, before its work; it must not raise.
     """
 
@@ -96,10 +57,13 @@ class Graph:
         policy: Policy = LOSSLESS,
         threaded: bool = True,
         depth: int = 2,
+        sinks_wait: bool = False,
         on_thread: Callable[[str], object] = nothing,
     ) -> None:
         self.telemetry = Telemetry()
         self._policy, self._threaded, self._depth, self._on_thread = policy, threaded, depth, on_thread
+        self._sinks_wait = sinks_wait
+        self._in_flight = InFlight()
         self._sources: list[Source] = []
         self._inboxes: dict[str, StageInbox] = {}  # by the name of the stage
         self._tickers: list[Ticker] = []
@@ -148,7 +112,8 @@ class Graph:
     ) -> None:
         """Add a sink, with its own policy or depth if given."""
         node = Node(self._add(StageStats(name)), sink)
-        self._node(node, inputs, policy or self._policy, self._depth if depth is None else depth)
+        own = None if self._sinks_wait else policy
+        self._node(node, inputs, own or self._policy, self._depth if depth is None else depth)
 
     def ticker(self, name: str, period_s: float, action: Callable[[], object]) -> Ticker:
         """Add an action that is called at a fixed rate in its own thread, also inline, until the run ends.
@@ -159,6 +124,14 @@ class Graph:
         self._add(ticker.stats)
         self._tickers.append(ticker)
         return ticker
+
+    def settle(self) -> None:
+        """Wait until all messages have been processed, or the run ends: for a source whose time stands still meanwhile.
+
+        What a stage does after it has passed on its result counts. Inline, nothing ever waits.
+        """
+        while not (self._in_flight.is_none(_POLL_S) or self._stopping):
+            pass
 
     def stop(self) -> None:
         """End the sources and process what is in the inboxes; a second call drops the inboxes and finishes nothing.
@@ -206,7 +179,8 @@ class Graph:
             raise OmnidError(f"'{node.name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
         readers: list[Reader] = [Direct(node, len(inputs), self._succeeds, self._finish)] * len(inputs)
         if self._threaded:
-            inbox = self._inboxes[node.name] = StageInbox(node.stats, len(inputs), depth, policy)
+            inbox = self._inboxes[node.name] = StageInbox(node.stats, len(inputs), depth, policy,
+                                                                self._in_flight)
             self._thread(node.name, self._run_node, node, inbox)
             readers = [Port(inbox, writer) for writer in range(len(inputs))]
         for stream, reader in zip(inputs, readers, strict=True):

@@ -15,6 +15,26 @@ LASTING = 0.9  # share of an earlier longest time that still counts after each m
 EARLY = 0.75  # of the time expected for that work: to come late would cost the reader more than an older message does
 
 
+class InFlight:
+    """Counts the messages that wait in the inboxes of a graph, or are being processed."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._changed = threading.Condition()
+
+    def add(self, count: int) -> None:
+        """Add so many messages; fewer than 0: they are done or dropped."""
+        with self._changed:
+            self._count += count
+            if not self._count:
+                self._changed.notify_all()
+
+    def is_none(self, timeout_s: float) -> bool:
+        """True as soon as there is none; False after the timeout."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._count, timeout_s)
+
+
 class StageInbox:
     """Bounded queue of a reader for a number of writers; it ends when all of them have ended.
 
@@ -22,7 +42,9 @@ class StageInbox:
     of two cameras takes the place of the other one's image.
     """
 
-    def __init__(self, stats: StageStats, writers: int, depth: int, policy: Policy) -> None:
+    def __init__(self, stats: StageStats, writers: int, depth: int, policy: Policy, in_flight: InFlight) -> None:
+        """in_flight: the count of the graph, in which a message is until its reader asks for the next one."""
+        self._in_flight, self._has_taken = in_flight, False
         self._stats, self._writers, self._depth, self._policy = stats, writers, depth, policy
         self._capacity = depth * writers
         self._messages: deque[tuple[int, object]] = deque()  # with the number of the writer
@@ -51,6 +73,7 @@ class StageInbox:
             if self._policy is NEWEST:
                 self._make_room(writer)
             self._messages.append((writer, message))
+            self._in_flight.add(1)
             self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
             self._changed.notify_all()
 
@@ -58,6 +81,7 @@ class StageInbox:
         own = [k for k, (other, _) in enumerate(self._messages) if other == writer]
         if len(own) >= self._depth:
             del self._messages[own[0]]
+            self._in_flight.add(-1)
             self._stats.dropped += 1
 
     def get(self) -> object:
@@ -75,6 +99,7 @@ class StageInbox:
             self._changed.notify_all()
             self._taken_ns = time.monotonic_ns()
             _, message = self._messages.popleft()
+            self._has_taken = True
         self._tell_ahead()
         return message
 
@@ -89,6 +114,9 @@ class StageInbox:
 
     def _finished(self) -> None:
         """Note that the reader is idle."""
+        if self._has_taken:
+            self._has_taken = False
+            self._in_flight.add(-1)
         if not self._taken_ns:
             return
         after_s = (time.monotonic_ns() - self._passed_ns) * 1e-9
@@ -133,6 +161,7 @@ class StageInbox:
         with self._changed:
             self._closed = True
             self._stats.dropped += len(self._messages)
+            self._in_flight.add(-len(self._messages))
             self._messages.clear()
             self._stats.busy_since_ns = 0
             self._taken_ns = self._passed_ns = 0

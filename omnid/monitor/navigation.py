@@ -31,7 +31,7 @@ class NavigationClient:
         try:
             self._driver = driver_of(self._robot)
             self._reports: Subscription[NavigationReport] = self._robot.subscribe(NavigationReport)
-            newest = self._reports.wait(CONNECT_S)
+            newest = self._reports.wait(SILENCE_S)  # one a second, or fewer where a simulation is slow
             if newest is None:
                 raise OmnidError(f"{bus.robot} reports no navigation: check that its daemon runs with a motor, and "
                                  "gives poses")

@@ -14,6 +14,7 @@ from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics, Pose, decode_diagnostics, decode_pose
+from omnid.transport.status_names import SIMULATION, Key
 
 NO_POSE_S: Final = 2.0  # without a pose, from which the state and the rate of the last poses are no longer shown
 _INBOX_DEPTH: Final = 2000
@@ -61,7 +62,7 @@ class RobotState:
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.poses = self.missed = self.broken = 0
-        self.age = Histogram()  # s, from the capture of a pose's images to its arrival
+        self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
 
@@ -85,6 +86,8 @@ class RobotState:
         for status in diagnostics.statuses:
             if status.name in self.statuses or len(self.statuses) < _MAX_STATUSES:
                 self.statuses[status.name] = status
+        if self.real_time_factor:
+            self.age = Histogram()
 
     def _add_pose(self, pose: Pose) -> Pose:
         """Count a pose. Skipped sequence numbers are missed poses; a smaller number means that the daemon restarted."""
@@ -97,6 +100,12 @@ class RobotState:
             if 0 <= pose.received_ns - since_ns < _MAX_AGE_NS:
                 histogram.add((pose.received_ns - since_ns) * 1e-9)
         return pose
+
+    @property
+    def real_time_factor(self) -> str:
+        """Simulated time over time on the wall; empty for a robot whose clock is that of its computer."""
+        simulation = self.statuses.get(SIMULATION)
+        return "" if simulation is None else simulation.values.get(Key.REAL_TIME_FACTOR, "")
 
     @property
     def time_since_pose_s(self) -> float:

@@ -121,7 +121,9 @@ def _position(pose: Pose) -> str:
 
 
 def _latencies(state: RobotState) -> str:
-    """Return ages and network latencies in ms, median and 99th percentile."""
+    """Return ages and network latencies in ms, median and 99th percentile; the pace of a simulation."""
+    pace = [f"{plain(state.real_time_factor)} x real time"] if state.real_time_factor else []
     named = (("age", state.age), ("network", state.network))
-    return "  ".join(f"{name} {1e3 * times_s.p(0.5):.1f}/{1e3 * times_s.p(0.99):.1f} ms" for name, times_s in named
-                     if times_s.count)
+    times = [f"{name} {1e3 * times_s.p(0.5):.1f}/{1e3 * times_s.p(0.99):.1f} ms" for name, times_s in named
+             if times_s.count]
+    return "  ".join([*pace, *times])

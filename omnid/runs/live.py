@@ -15,16 +15,15 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.config import Config
 from omnid.engine.bounded_call import started
-from omnid.engine.graph import NEWEST, Graph
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.refinement.refined_file import RefinedRigFile
-from omnid.runs.live_cameras import OpenCamera, first_frames
+from omnid.runs.live_robot import LiveRobot
 from omnid.runs.live_status import add_terminal_ticker
 from omnid.runs.live_wiring import LiveWiring, Report
 from omnid.runs.place_maps import RunPlaces
-from omnid.runs.sensor_sources import MotionSource
 from omnid.runs.session import CAMERAS, Session
 from omnid.runs.systemd import print_stacks_when_killed
 from omnid.stages.geometry import Geometry
@@ -35,16 +34,11 @@ from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
 class LiveRun:
     """One run of the daemon."""
 
-    def __init__(self, config: Config, open_camera: OpenCamera, report: Report, rig: Rig | None = None,
-                 show: Callable[[str], None] | None = None, motion: MotionSource | None = None) -> None:
-        """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal.
-
-        motion: wheels and gyro where the images are those of a log; None: those of the robot.
-        """
-        self._show, self._motion = show, motion
-        self._config, self._open_camera, self._report, self._rig = config, open_camera, report, rig
-        on_thread = ThreadStart(priorities(config.realtime, *CAMERAS), report)
-        self._graph = Graph(policy=NEWEST, depth=1, on_thread=on_thread)
+    def __init__(self, config: Config, robot: LiveRobot, report: Report, rig: Rig | None = None,
+                 show: Callable[[str], None] | None = None) -> None:
+        """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
+        self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
+        self._graph = _graph_that_waits(config) if robot.waits else _graph_in_time(config, report)
         self._refined: RefinedRigFile | None = None
         self._connected = False
 
@@ -53,23 +47,23 @@ class LiveRun:
         print_stacks_when_killed()
         imported = started(_import_slow_modules, "imports")
         compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
-        offset_ns = time.time_ns() - time.monotonic_ns()
+        offset_ns = time.time_ns() - self._robot.clock_ns()
         with ExitStack() as outputs:
             session = Session(self._config, self._graph, outputs, lambda text: self._report(logging.WARNING, text),
-                              offset_ns=offset_ns)
+                              offset_ns=offset_ns, clock_ns=self._robot.clock_ns)
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
             imported()
             prepare_kernels(self._report)
             self._connected = True
-            cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
             run_places = RunPlaces(self._config, geometry, session.warn)
-            LiveWiring(session, geometry, self._refined, self._report).wire(cameras, run_places, self._motion)
+            LiveWiring(session, geometry, self._refined, self._report).wire(self._robot, run_places)
             if self._show is not None:
-                add_terminal_ticker(session, self._show, self._report)
+                add_terminal_ticker(session, self._show, self._report, self._robot.words)
             cv2.setNumThreads(self._config.graph.opencv_threads)
-            for refused in prepare(self._config.realtime):
-                session.warn(refused)
+            if not self._robot.waits:
+                for refused in prepare(self._config.realtime):
+                    session.warn(refused)
             try:
                 self._graph.run()
             except BaseException:
@@ -90,7 +84,7 @@ class LiveRun:
 
     def _geometry(self, session: Session) -> Geometry:
         rig = self._rig or self._rig_of_file()
-        with closing(first_frames(self._open_camera)) as frames:
+        with closing(self._robot.first_frames()) as frames:
             return session.geometry(rig, frames)
 
     def _rig_of_file(self) -> Rig:
@@ -101,6 +95,16 @@ class LiveRun:
             return calibration
         self._refined = RefinedRigFile(Path(settings.refined_file), calibration, path)
         return self._refined.start(self._report, is_wanted=settings.refine == "use")
+
+
+def _graph_in_time(config: Config, report: Report) -> Graph:
+    """Return a graph whose stages take the newest messages, in threads with the priorities of the settings."""
+    return Graph(policy=NEWEST, depth=1, on_thread=ThreadStart(priorities(config.realtime, *CAMERAS), report))
+
+
+def _graph_that_waits(config: Config) -> Graph:
+    """Return a graph that drops nothing, in threads as others are: the robot's time waits for it."""
+    return Graph(policy=LOSSLESS, depth=config.graph.depth, sinks_wait=True)
 
 
 def _import_slow_modules() -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeAlias
 
-from omnid.controller.link import ControllerLink
+from omnid.controller.link import DriveLink
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import Session
@@ -26,7 +26,7 @@ Receive: TypeAlias = Callable[[str, bytes, str, int], None]  # key, payload, sen
 class LiveCommands:
     """The receivers of commands, requests and samples; without a motor only samples and requests to save the map."""
 
-    def __init__(self, session: Session, bus: Bus, controller: ControllerLink | None, requests: RequestQueue,
+    def __init__(self, session: Session, bus: Bus, controller: DriveLink | None, requests: RequestQueue,
                  report: Callable[[int, str], None]) -> None:
         """requests: to the navigation. report: takes lines for the log, with a level of `logging`."""
         self._session, self._bus, self._controller = session, bus, controller
@@ -47,7 +47,7 @@ class LiveCommands:
             table |= {key: lambda key, payload, _, sent_ns: self.navigation.receive(key, payload, sent_ns)
                       for key in NAVIGATION_TOPICS}
             if recorder is not None:
-                record = command_recorder(recorder, self._session.offset_ns, topics)
+                record = command_recorder(recorder, self._session.now_ns, topics)
                 table = {key: _recorded(receive, record) for key, receive in table.items()}
         # Samples are recorded with the poses.
         table |= {key: lambda key, payload, *_: sensors.receiver.receive(key, payload) for key in SENSOR_TOPICS}

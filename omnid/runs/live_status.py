@@ -29,17 +29,19 @@ def add_status_tickers(session: Session, status: StatusCollector, bus: Bus, reco
     config, graph = session.config, session.graph
     publishers = [_status_on_bus(bus)]
     if recorder is not None:
-        publishers.append(_status_in_recording(recorder, session.offset_ns))
+        publishers.append(_status_in_recording(recorder, session.now_ns))
     graph.ticker("status", config.live.status_s, StatusTick(status, *publishers))
     line = StatusLine(session.statistics, graph.telemetry, TICKERS)
     service = Service(graph.telemetry, line, config.service.stall_timeout_s)
     graph.ticker("watchdog", service.period_s, service)
 
 
-def add_terminal_ticker(session: Session, show: Callable[[str], None], report: Callable[[int, str], None]) -> None:
-    """Show the status in one line of a terminal; show: rewrites that line."""
+def add_terminal_ticker(session: Session, show: Callable[[str], None], report: Callable[[int, str], None],
+                        words: Callable[[], str]) -> None:
+    """Show the status in one line of a terminal; show: rewrites that line, which ends with the words."""
     line = StatusLine(session.statistics, session.graph.telemetry, TICKERS)
-    terminal = TerminalStatus(show, line, partial(report, logging.INFO), session.statistics, _ready(session.config))
+    terminal = TerminalStatus(show, lambda: line() + words(), partial(report, logging.INFO), session.statistics,
+                              _ready(session.config))
     session.graph.ticker("terminal", terminal.period_s, terminal)
 
 
@@ -65,11 +67,11 @@ def _status_on_bus(bus: Bus) -> StatusPublisher:
     return publish
 
 
-def _status_in_recording(recorder: Recorder, offset_ns: int) -> StatusPublisher:
+def _status_in_recording(recorder: Recorder, clock_ns: Callable[[], int]) -> StatusPublisher:
     """Return a function that records statuses, in the time of all other messages also when the clock was set."""
 
     def record(statuses: list[DiagnosticStatus]) -> None:
-        now_ns = time.monotonic_ns() + offset_ns
+        now_ns = clock_ns()
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
             recorder.add(status_report(now_ns, statuses), now_ns)
 

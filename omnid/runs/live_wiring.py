@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeAlias
 
 from calib.rig_file import rig_toml
-from drivers.frame import Camera
-from omnid.controller.link import ControllerLink
+from omnid.controller.link import DriveLink
 from omnid.core.control.command_sources import PLANNER
 from omnid.diagnostics.floor_status import floor_status
 from omnid.diagnostics.images_status import ImagesStatus
@@ -27,15 +26,15 @@ from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
 from omnid.messages import OdometryUpdate
 from omnid.refinement.refined_file import RefinedRigFile
-from omnid.runs.live_cameras import LiveCamera
 from omnid.runs.live_commands import LiveCommands
+from omnid.runs.live_robot import LiveRobot
 from omnid.runs.live_status import add_status_tickers
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.rig_checks import LiveRig, live_health
-from omnid.runs.sensor_sources import MotionSource, SensorSources
+from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import TICKERS, Session
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
@@ -57,27 +56,24 @@ class LiveWiring:
     def __init__(self, session: Session, geometry: Geometry, refined: RefinedRigFile | None, report: Report) -> None:
         """refined: the file of the refined rig; None where the rig is not refined."""
         self._session, self._geometry, self._refined, self._report = session, geometry, refined, report
-        self._latency = Latency()
+        self._latency = Latency(session.clock_ns)
 
-    def wire(self, cameras: Mapping[Camera, LiveCamera], run_places: RunPlaces, motion: MotionSource | None) -> None:
-        """Join cameras, stages, sinks and tickers.
-
-        motion: wheels and gyro where the images are those of a log; None: those of the robot.
-        """
+    def wire(self, robot: LiveRobot, run_places: RunPlaces) -> None:
+        """Join the robot, stages, sinks and tickers."""
         session, geometry, rig = self._session, self._geometry, self._geometry.rig
         config, graph = session.config, session.graph
         # 1. Connections: the wheels, the bus, wheels' and gyro's samples, the recording.
-        controller = session.start_controller(config.realtime) if config.motor.port else None
+        controller = robot.connect(session)
         bus = session.open_bus(rig)
         pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
-        sensors = SensorSources(config, pairing.motion, session, controller, self._report, motion)
-        if sensors.read_by_thread is not None:
-            graph.source("imu" if sensors.gyro else "motion", sensors.read, wake=sensors.read_by_thread.close)
+        sensors = SensorSources(config, pairing.motion, session, controller, self._report,
+                                with_images=robot.brings_samples)
+        sensors.add_to(graph)
         recorder = self._recorder() if config.record.enabled else None
         # 2. From the cameras to pairs.
-        frames = [graph.source(name, camera.frames, wake=camera.close) for name, camera in cameras.items()]
+        frames = robot.sources(graph, pairing.motion.add)
         pairs = graph.stage("pair", pairing, *frames)
-        states = {name: camera.state for name, camera in cameras.items()}
+        states = robot.states()
         exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, states)
         graph.sink("exposure", exposure, pairs, policy=NEWEST, depth=1)
         # 3. From pairs to poses, maps and setpoints.
@@ -94,7 +90,7 @@ class LiveWiring:
             parts = replace(parts, drive=LiveDrive(controller, rig.T_base_rig, requests.end),
                             navigation=self._navigation(controller, requests))
         stages = wire(graph, pairs, front_end, config, sinks, parts)
-        if config.live.shed_load:
+        if config.live.shed_load and not robot.waits:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
         saver = self._saver(run_places, stages.places)
@@ -108,10 +104,10 @@ class LiveWiring:
                   motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
                   *([partial(places_status, stages.places)] if stages.places else ()),
                   *([partial(floor_status, stages.floor)] if stages.floor else ()),
-                  *(part.status for part in (bus, recorder, saver) if part)]
+                  *robot.status, *(part.status for part in (bus, recorder, saver) if part)]
         sources = StatusSources(graph.telemetry, states, pairing, session.statistics, self._latency.to_pose,
                                 controller.statistics if controller else None, received.commands, TICKERS,
-                                tuple(status))
+                                tuple(status), session.clock_ns)
         add_status_tickers(session, StatusCollector(sources), bus, recorder)
 
     def _sinks(self, live_rig: LiveRig, bus: Bus) -> Sinks:
@@ -145,7 +141,7 @@ class LiveWiring:
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _navigation(self, controller: ControllerLink, requests: RequestQueue) -> NavigationParts | None:
+    def _navigation(self, controller: DriveLink, requests: RequestQueue) -> NavigationParts | None:
         """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
         config = self._session.config
         if PLANNER not in config.controller.sources.names:

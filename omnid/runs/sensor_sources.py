@@ -12,8 +12,9 @@ from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.topic_choice import MotionTopics
 from drivers.motion import MotionSample
 from omnid.config import Config
-from omnid.controller.link import ControllerLink
+from omnid.controller.link import DriveLink
 from omnid.core.odometry.motion_settings import MotionSensorSettings
+from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.runs.session import Session
 from omnid.stages.motion_inbox import MotionInbox
@@ -53,22 +54,21 @@ class MotionSource(Protocol):
 class SensorSources:
     """One source for the wheels, one for the gyro: the nearest device that the settings name.
 
-    With the images of a log both are those of the log: no other wheels and no other gyro fit them.
+    Where the images are those of a log, or of a simulation, both come with them: no others fit.
     """
 
     def __init__(self, config: Config, inbox: MotionInbox, session: Session,
-                 controller: ControllerLink | None, report: Callable[[int, str], None],
-                 of_log: MotionSource | None = None) -> None:
-        """Open the IMU; DriverError where its port cannot be opened. of_log: with the images of a log."""
+                 controller: DriveLink | None, report: Callable[[int, str], None], *, with_images: bool = False
+                 ) -> None:
+        """Open the IMU; DriverError where its port cannot be opened. with_images: they come with the images."""
         self._inbox = inbox
-        self.read_by_thread: MotionSource | None = of_log
         self.gyro: WitMotionGyro | None = None
         joints = joint_wheels(config)
-        topics: set[str] = set() if of_log else self._open(config.motion, session, controller, report, joints)
+        topics: set[str] = set() if with_images else self._open(config.motion, session, controller, report, joints)
         self.receiver = SensorReceiver(inbox.add, session.offset_ns, frozenset(topics),
                                        partial(report, logging.WARNING), joints)
 
-    def _open(self, settings: MotionSensorSettings, session: Session, controller: ControllerLink | None,
+    def _open(self, settings: MotionSensorSettings, session: Session, controller: DriveLink | None,
               report: Callable[[int, str], None], joints: JointWheels | None) -> set[str]:
         """Open the devices; return the topics of the bus that are taken."""
         topics = set()
@@ -80,15 +80,13 @@ class SensorSources:
         if settings.imu == "auto":
             if settings.imu_port:
                 self.gyro = WitMotionGyro(settings.imu_port, settings.imu_baud, partial(report, logging.WARNING))
-                self.read_by_thread = self.gyro
                 session.outputs.callback(self.gyro.close)
             else:
                 topics.add(IMU)
         return topics
 
-    def read(self) -> Iterator[None]:
-        """Pass the samples of `read_by_thread` on until it is closed; yields once for each."""
-        assert self.read_by_thread is not None
-        for sample in self.read_by_thread.samples():
-            self._inbox.add(sample)
-            yield
+    def add_to(self, graph: Graph) -> None:
+        """Let a thread of the graph read the IMU, if there is one."""
+        gyro = self.gyro
+        if gyro is not None:
+            graph.source("imu", lambda: map(self._inbox.add, gyro.samples()), wake=gyro.close)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
@@ -13,6 +14,7 @@ from drivers.frame import Camera, Frame
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
+from omnid.core.control.control_law import ControllerSettings
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.bounded_call import returns_within
 from omnid.engine.graph import Graph
@@ -34,11 +36,15 @@ class Session:
     """One run: its graph, its statistics and its outputs, which are closed in reverse order when `outputs` closes."""
 
     def __init__(
-        self, config: Config, graph: Graph, outputs: ExitStack, warn: Callable[[str], None], *, offset_ns: int = 0
+        self, config: Config, graph: Graph, outputs: ExitStack, warn: Callable[[str], None], *, offset_ns: int = 0,
+        clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        """warn: takes a line for the user; offset_ns: from the stamps of the frames to Unix time."""
+        """warn: takes a line for the user; offset_ns: from the stamps of the frames to Unix time.
+
+        clock_ns: the clock of these stamps.
+        """
         self.config, self.graph, self.outputs, self.warn = config, graph, outputs, warn
-        self.offset_ns = offset_ns
+        self.offset_ns, self.clock_ns = offset_ns, clock_ns
         self.statistics = RunStatistics()
         self.signal = 0  # number of the signal that ended the run
 
@@ -72,19 +78,27 @@ class Session:
         The wheels stop, and the process ends, at the latest with `outputs`.
         """
         settings = self.config.controller.of_replay if of_replay else self.config.controller
-        if settings.collision.check and not self.config.obstacles.enabled:
-            settings = settings.without_obstacles
-            self.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
-                      "against obstacles")
-        start = ControllerStart(self.config.motor, settings, realtime)
+        start = ControllerStart(self.config.motor, self.with_obstacles_known(settings), realtime)
         link = ControllerLink(start, self.graph.telemetry.add(StageStats("motor")), self.warn)
         self.outputs.callback(link.close)
         return link
+
+    def with_obstacles_known(self, settings: ControllerSettings) -> ControllerSettings:
+        """Return the settings, without the collision monitor where no obstacles are looked for, which is told."""
+        if not settings.collision.check or self.config.obstacles.enabled:
+            return settings
+        self.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
+                  "against obstacles")
+        return settings.without_obstacles
 
     def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
         """Return an encoder that gives at most so many points of the map."""
         encoding = map_encoding(self.config, cloud_points)
         return Encoder(rig.T_base_rig, encoding, self.offset_ns, rig)
+
+    def now_ns(self) -> int:
+        """Return the time, of Unix time, by the clock of the stamps."""
+        return self.clock_ns() + self.offset_ns
 
     def dropped_messages(self) -> int:
         """Return the number of messages that were dropped in front of the stages and sinks."""

@@ -13,6 +13,17 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
+from omnid.formats.plan_sheet import (
+    BLACK,
+    LIGHT_GREY,
+    MARGIN_PX,
+    RED,
+    Sheet,
+    cells_image,
+    draw_frame,
+    draw_start,
+    with_legend,
+)
 from omnid.messages import ObstacleRing
 from omnid.navigation_state import NavigationState
 from omnid.simulation.clearance import footprints
@@ -28,8 +39,10 @@ ANSWER_S: Final = 0.5  # after a request, before its end is looked for
 RECOGNISED_S: Final = 5.0  # after the first drive, in which the robot must have recognised the start
 SHOWN_S: Final = 5.0  # between two lines of progress
 PX_PER_M: Final = 90.0
-MARGIN_PX: Final = 20
-_WHITE, _GREY, _BLACK, _RED, _BLUE = (255, 255, 255), (150, 150, 150), (0, 0, 0), (0, 0, 190), (210, 140, 60)  # BGR
+BORDER_M: Final = 0.25  # around the world
+WALL_PX, SEEN_PX = 3, 9  # widths of lines
+SEEN: Final = (60, 60, 60)  # BGR: a cell in which much was seen
+LINES: Final = (("taught path", BLACK, 5), ("repeated path", RED, 2))
 
 
 def oval() -> Array:
@@ -126,29 +139,25 @@ def seen_obstacles(run: SimulatedRun) -> Array:
 
 
 def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray[np.uint8]:
-    """Return an image (H, W, 3): the world in grey, what the robot has seen of it in blue, both paths on it.
+    """Return an image (H, W, 3) in the style of plan.png: the world, what the robot has seen of it, both paths.
 
-    The first path is black and wide, the second one red. All are positions (N, 2) [m] in the world.
+    All are positions (N, 2) [m] in the world. A cell is the darker, the more often something was seen there.
     """
     segments = footprints(world.standing, 1.2)
-    low, high = segments.reshape(-1, 2).min(axis=0), segments.reshape(-1, 2).max(axis=0)
-    width, height = (int(side) for side in np.ceil((high - low) * PX_PER_M) + 2 * MARGIN_PX)
-    image = np.full((height, width, 3), _WHITE, np.uint8)
-
-    def pixels(points: Array) -> NDArray[np.int32]:
-        across = (points[:, 0] - low[0]) * PX_PER_M + MARGIN_PX
-        down = (high[1] - points[:, 1]) * PX_PER_M + MARGIN_PX
-        return np.asarray(np.rint(np.column_stack([across, down])), np.int32)
-
+    corners = segments.reshape(-1, 2)
+    sheet = Sheet(corners.min(axis=0) - BORDER_M, corners.max(axis=0) + BORDER_M, PX_PER_M)
+    area = cells_image(sheet, obstacles, np.ones(len(obstacles), np.float32))
+    image = np.pad(area, ((MARGIN_PX, MARGIN_PX), (MARGIN_PX, MARGIN_PX), (0, 0)), constant_values=255)
     for segment in segments:
-        cv2.polylines(image, [pixels(segment)], False, _GREY, 5, cv2.LINE_AA)
-    columns, rows = pixels(obstacles).T
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
-    image[rows[inside], columns[inside]] = _BLUE
-    for path, color, thickness in ((first, _BLACK, 4), (second, _RED, 2)):
+        cv2.polylines(image, [sheet.pixels(segment)], False, LIGHT_GREY, WALL_PX, cv2.LINE_AA)
+    draw_frame(image, sheet)
+    for path, (_, colour, width_px) in zip((first, second), LINES, strict=True):
         if len(path):
-            cv2.polylines(image, [pixels(path)], False, color, thickness, cv2.LINE_AA)
-    return image
+            cv2.polylines(image, [sheet.pixels(path)], False, colour, width_px, cv2.LINE_AA)
+    if len(first):
+        x, y = sheet.pixels(first[:1])[0]
+        draw_start(image, (int(x), int(y)))
+    return with_legend(image, (*LINES, ("seen obstacles", SEEN, SEEN_PX), ("walls and boxes", LIGHT_GREY, WALL_PX)))
 
 
 def drift_m(run: SimulatedRun) -> float:

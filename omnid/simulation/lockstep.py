@@ -140,7 +140,10 @@ class _Lockstep:
         self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
         self._rig = with_masks(robot.rig)
         self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
-        self._vehicle = Vehicle(world, robot, config, seed)
+        self._ticks: list[Tick] = []
+        self._lines: list[tuple[float, str]] = []
+        self._vehicle = Vehicle(world, robot, config, seed, lambda tick, _: self._ticks.append(tick),
+                                lambda time_s, line: self._lines.append((time_s, line)))
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
         self._ends = False
@@ -155,7 +158,7 @@ class _Lockstep:
 
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
-        config, vehicle = self._config, self._vehicle
+        config = self._config
         graph = Graph(threaded=False)
         frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
@@ -174,7 +177,7 @@ class _Lockstep:
             np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
             np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
             tuple(state for _, _, state in self._poses), np.array(self._slipping, bool),
-            tuple(vehicle.log.ticks), tuple(vehicle.log.lines), tuple(self._rings),
+            tuple(self._ticks), tuple(self._lines), tuple(self._rings),
             tuple(self._navigation), tuple(self._places), self._rig.T_base_rig)
 
     def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:

@@ -6,7 +6,6 @@ import heapq
 import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from drivers.motors.simulated.lockstep_motor import LockstepMotor
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.controller.controller import Controller
+from omnid.controller.statistics import TickReport
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
@@ -40,42 +40,43 @@ class Tick(NamedTuple):
     clearance_m: float  # of the robot's outline; 0 or less: contact
 
 
-@dataclass(slots=True)
-class DriveLog:
-    """All ticks, and lines that the controller has reported."""
-
-    ticks: list[Tick] = field(default_factory=list)
-    lines: list[tuple[float, str]] = field(default_factory=list)
-
-
 class Vehicle:
     """A body that is advanced by its caller. Messages to the controller arrive at their times, in order."""
 
-    def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int) -> None:
-        self.now_ns = START_NS
+    def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int,
+                 take_tick: Callable[[Tick, TickReport], None], report: Callable[[float, str], None],
+                 start_ns: int = START_NS) -> None:
+        """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s]."""
+        self.now_ns = self._start_ns = start_ns
         self.people = Walkers(world.people)
-        self.log = DriveLog()
+        self._take_tick = take_tick
         drive = config.motor.drive.geometry()
         self.twin = SIMULATED_CONTROLLERS[config.motor.protocol](drive)
         base = self.twin.base
         base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
         self.motor = LockstepMotor(PROTOCOLS[config.motor.protocol](drive), self.twin, config.motor.watchdog_ms,
                                    lambda: self.now_ns)
-        self.controller = Controller(self.motor, config.controller, 1.0 / config.motor.rate_hz, self._report,
+        self.controller = Controller(self.motor, config.controller, 1.0 / config.motor.rate_hz,
+                                     lambda line: report(self.time_s, line),
                                      clock_ns=lambda: self.now_ns, limited=drive.limited)
         self._period_ns = round(1e9 / config.motor.rate_hz)
-        self._tick_ns = START_NS
+        self._tick_ns = start_ns
         self._waiting: list[tuple[int, int, Callable[[], None]]] = []
         self._posted = 0
         self._gyro_noise = random.Random(seed + 1)
-        self._gyro_ns = START_NS
+        self._gyro_ns = start_ns
         self.samples: list[MotionSample] = []  # since they were taken
         self._robot, self._standing = robot, footprints(world.standing, robot.height_m)
 
     @property
     def time_s(self) -> float:
         """Return the time since the start."""
-        return (self.now_ns - START_NS) * 1e-9
+        return (self.now_ns - self._start_ns) * 1e-9
+
+    @property
+    def last_tick_ns(self) -> int:
+        """Return the time of the last tick; before the first one, that of one before the start."""
+        return self._tick_ns - self._period_ns
 
     @property
     def T_world_base(self) -> Array:
@@ -88,9 +89,12 @@ class Vehicle:
         heapq.heappush(self._waiting, (due_ns, self._posted, deliver))
         self._posted += 1
 
-    def advance(self, until_ns: int) -> None:
-        """Advance to a time, with all ticks and samples that are due until then."""
-        while (due_ns := min(self._tick_ns, self._gyro_ns)) <= until_ns:
+    def advance(self, until_ns: int, *, ticks_then: bool = True) -> None:
+        """Advance to a time, with all ticks and samples that are due until then.
+
+        ticks_then: those that are due just then, too; otherwise the next call gives them.
+        """
+        while (due_ns := min(self._tick_ns, self._gyro_ns)) < until_ns + ticks_then:
             self._move(due_ns)
             if due_ns == self._gyro_ns:
                 self._gyro_ns += round(1e9 / self._robot.gyro.rate_hz)
@@ -127,14 +131,11 @@ class Vehicle:
         status = self.motor.status
         if self._robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
             self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
-        self.log.ticks.append(Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason,
-                                   self._clearance_m()))
+        self._take_tick(Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason,
+                             self._clearance_m()), report)
 
     def _clearance_m(self) -> float:
         x_m, y_m, _ = self.twin.base.pose
         walking = footprints(self.people.faces(), self._robot.height_m)
         return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))
-
-    def _report(self, line: str) -> None:
-        self.log.lines.append((self.time_s, line))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from typing import Final
 
@@ -22,17 +21,18 @@ from omnid.transport.topics import EMPTY_SCHEMA
 _EMPTY: Final = b"\0\1\0\0\0"  # std_msgs/msg/Empty in CDR: the encapsulation header and one byte
 
 
-def command_recorder(recorder: Recorder, offset_ns: int, topics: Mapping[str, str]) -> Callable[[str, bytes], None]:
+def command_recorder(recorder: Recorder, now_ns: Callable[[], int], topics: Mapping[str, str]
+                     ) -> Callable[[str, bytes], None]:
     """Return a function that records a command, by key and payload, at the time of its arrival.
 
-    It may be called in any thread and never raises. offset_ns: from CLOCK_MONOTONIC to Unix time. topics: of commands,
-    with their types; others are not recorded.
+    It may be called in any thread and never raises. now_ns: the time of the log. topics: of commands, with their types;
+    others are not recorded.
     """
 
     def record(key: str, payload: bytes) -> None:
         message = logged_command(key, payload, topics)
         if message is not None:
-            recorder.add(message, time.monotonic_ns() + offset_ns)
+            recorder.add(message, now_ns())
 
     return record
 

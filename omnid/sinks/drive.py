@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
-from omnid.controller.link import ControllerLink
+from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
@@ -27,7 +27,7 @@ FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a r
 class LiveDrive:
     """Pass the poses of `omnid run` on; setpoints come from the network."""
 
-    def __init__(self, link: ControllerLink, T_base_rig: NDArray[np.float64], ended: Callable[[], object] = nothing
+    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64], ended: Callable[[], object] = nothing
                  ) -> None:
         """ended: called after the last pose."""
         self._link, self._T_base_rig, self._ended = link, T_base_rig, ended
@@ -53,7 +53,7 @@ class LiveDrive:
 class PlannerDrive:
     """Pass the setpoints of the navigation on; those of a source of higher priority keep them out."""
 
-    def __init__(self, link: ControllerLink) -> None:
+    def __init__(self, link: DriveLink) -> None:
         self._link = link
 
     def process(self, update: NavigationUpdate) -> None:
@@ -65,7 +65,7 @@ class PlannerDrive:
 class RingToController:
     """Passes the obstacle rings of `omnid run` to the controller process."""
 
-    def __init__(self, link: ControllerLink) -> None:
+    def __init__(self, link: DriveLink) -> None:
         self._link = link
 
     def process(self, ring: ObstacleRing) -> None:

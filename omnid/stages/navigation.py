@@ -17,7 +17,7 @@ from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.forecast import Forecast, forecast
 from omnid.core.navigation.local_planner import room_ahead
-from omnid.core.navigation.navigator import Navigation, Navigator
+from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import (
     GoalRequest,
@@ -146,7 +146,7 @@ class NavigationStage:
             case NavigationVerb.CANCEL:
                 navigator.cancel("cancelled by a request")
             case NavigationVerb.PAUSE:
-                navigator.pause("paused by a request")
+                navigator.pause(f"paused by a request: {RESUME}")
             case NavigationVerb.RESUME:
                 _raise_if(navigator.resume(self._situation()))
             case GoalRequest():

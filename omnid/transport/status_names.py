@@ -33,6 +33,7 @@ IMAGES: Final = f"{PREFIX}images"  # parts of them that are frozen or blind
 FLOOR: Final = f"{PREFIX}floor"  # height of the cameras above it
 EXPOSURE: Final = f"{PREFIX}exposure"
 CALIBRATION: Final = f"{PREFIX}calibration"  # of `omnid calibrate live`
+SIMULATION: Final = f"{PREFIX}simulation"  # of a simulated robot whose time waits for the daemon
 SUMMARY: Final = f"{PREFIX}summary"  # at the end of a replay
 STAGE_PREFIX: Final = f"{PREFIX}stage "
 
@@ -93,6 +94,8 @@ class Key(StrEnum):
     OBSTACLE_STOPS = "obstacle_stops"
     ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
     ARM_REFUSAL = "arm_refusal"  # the reason, no key where it was accepted
+    # Simulation
+    REAL_TIME_FACTOR = "real_time_factor"  # simulated time over time on the wall
     # Map file
     SAVES = "saves"
     ANSWERED = "answered"  # requests to save it

@@ -22,6 +22,7 @@ from drivers.motors.simulated.simulated_base import Pose
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.config import load_config
 from omnid.runs.live import LiveRun
+from omnid.runs.live_robot import ConnectedRobot
 from omnid.simulation.realtime import RealtimeRobot, SimulatedCamera
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world_file import load_world
@@ -126,7 +127,8 @@ def main() -> int:
         return robot.open_camera(camera, clocks[opened[camera]])
 
     config = load_config(None, [*args.settings, f"motor.port={args.motor}"])
-    return LiveRun(config, open_camera, lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True),
+    connected = ConnectedRobot(open_camera)
+    return LiveRun(config, connected, lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True),
                    robot.rig).run()
 
 

@@ -25,6 +25,7 @@ from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
 from drivers.frame import Camera, Frame, gray
 from omnid.config import load_config
 from omnid.runs.live import LiveRun
+from omnid.runs.live_robot import ConnectedRobot
 
 TIME, TIME_NS = time.time, time.time_ns
 
@@ -95,7 +96,7 @@ def main() -> int:
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
     images, clock = LogImages.load(args.log), LogClock(time.monotonic_ns())
     config = load_config(None, ["controller.motion.check=false", *args.settings, f"motor.port={args.motor}"])
-    live = LiveRun(config, lambda camera: FaultyCamera(images, camera, clock, faults),
+    live = LiveRun(config, ConnectedRobot(lambda camera: FaultyCamera(images, camera, clock, faults)),
                 lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
     return live.run()
 

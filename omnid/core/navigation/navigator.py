@@ -33,6 +33,7 @@ PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # by trial on development seed
 BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left; by trial on development seeds
 PLANNED_M: Final = 4.0  # of the path that the local planner is given; enough: its grid ends at 3.2 m
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
+RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
 
 
@@ -171,7 +172,7 @@ class Navigator:
         if wheels.disarmed_by == ASKED:
             self._end(NavigationState.CANCELLED, ASKED)
         else:
-            drive.paused = f"disarmed: {wheels.disarmed_by}: see to it, arm (`omnid arm`) and resume"
+            drive.paused = f"disarmed: {wheels.disarmed_by}: see to it, then {RESUME}"
 
     def _advance(self, drive: Drive, now: Situation) -> None:
         """Sum up the way since the pose in the map was known."""
@@ -198,7 +199,7 @@ class Navigator:
             reason = refusal_of_map(now, self._settings.map_sigma_m)
             return NavigationState.NOT_LOCALISED, reason.partition(":")[0] or "not localised"
         if now.wheels.source not in ("", PLANNER):
-            return NavigationState.PAUSED, f"{now.wheels.source} drives"
+            return NavigationState.PAUSED, f"{now.wheels.source} drives: it goes on when that ends"
         return None
 
     def _wait(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:

@@ -15,7 +15,8 @@ from typing import NoReturn
 import numpy as np
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot, Ticker, skipped_deadlines
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot
+from omnid.engine.ticker import Ticker, skipped_deadlines
 from omnid.errors import OmnidError
 
 pytestmark = pytest.mark.usefixtures("default_signals")
@@ -133,6 +134,61 @@ def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
     assert slow.got == list(range(300))
     assert max(ahead) <= 3 + 2  # the inbox, one message at the writer, one at the reader
     assert [row.drops for row in graph.telemetry.summary()] == [0, 0, 0]
+
+
+@both
+def test_a_source_settles_until_all_that_follows_is_done(threaded: bool) -> None:
+    graph, slow = Graph(policy=LOSSLESS, threaded=threaded, sinks_wait=True), Collect()
+    behind: list[int] = []
+
+    class Later:
+        """A stage that goes on after its result was passed on."""
+
+        done = 0
+
+        def process(self, message: int) -> int:
+            return message
+
+        def after(self) -> None:
+            threading.Event().wait(1e-3)
+            self.done += 1
+
+    later = Later()
+
+    def numbers() -> Iterator[int]:
+        for number in range(20):
+            yield number
+            graph.settle()
+            behind.append(2 * number + 2 - later.done - len(slow.got))
+
+    graph.sink("slow", slow, graph.stage("later", later, graph.source("numbers", numbers)), policy=NEWEST, depth=1)
+    graph.run()
+    assert slow.got == list(range(20))
+    assert behind == 20 * [0]
+
+
+def test_a_failure_ends_the_wait_of_a_source_that_settles() -> None:
+    graph = Graph(policy=LOSSLESS)
+
+    def numbers() -> Iterator[int]:
+        yield 0
+        graph.settle()
+        yield 1
+
+    graph.stage("bad", Apply(fail_at(0)), graph.source("numbers", numbers))
+    with pytest.raises(ValueError, match="cannot take 0"):
+        graph.run()
+
+
+def test_sinks_that_wait_drop_nothing() -> None:
+    graph = Graph(policy=LOSSLESS, depth=1, sinks_wait=True)
+
+    def crawl(_: int) -> None:
+        threading.Event().wait(1e-4)
+
+    graph.sink("slow", Apply(crawl), graph.source("numbers", lambda: range(200)), policy=NEWEST, depth=1)
+    graph.run()
+    assert (graph.telemetry.of("slow").processed, graph.telemetry.of("slow").dropped) == (200, 0)
 
 
 def test_newest_drops_the_oldest_and_counts_it() -> None:

@@ -35,7 +35,7 @@ def test_commands_are_recorded_unchanged(tmp_path: Path) -> None:
     config = replace(config, record=replace(config.record, folder=str(tmp_path / "log"), free_mb=0, file_mb=1))
     recorder = open_recorder(config, "", lambda *_: None)
     offset_ns = NOW_NS - time.monotonic_ns()
-    record = command_recorder(recorder, offset_ns, TOPICS)
+    record = command_recorder(recorder, lambda: time.monotonic_ns() + offset_ns, TOPICS)
     record("cmd/heading", codec.heading_cdr(NOW_NS, 0.3, -1.2))
     record("cmd/twist", codec.twist_stamped_cdr(NOW_NS, "base_link", 0.4, 0.5))
     record("cmd/stop", b"whatever")

@@ -1,0 +1,98 @@
+"""The robot of a live run: its clock, its images, its samples and its wheels."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, closing
+from typing import Final, Protocol
+
+from drivers.cameras.camera_state import CameraState
+from drivers.frame import Camera, Frame
+from drivers.motion import MotionSample
+from omnid.controller.link import DriveLink
+from omnid.engine.graph import Graph, Stream
+from omnid.runs.live_cameras import LiveCamera, OpenCamera, first_frames
+from omnid.runs.sensor_sources import MotionSource
+from omnid.runs.session import CAMERAS, Session
+from omnid.transport.codec import DiagnosticStatus
+
+
+class LiveRobot(Protocol):
+    """A robot, or a simulated one, as a live run sees it."""
+
+    @property
+    def waits(self) -> bool:
+        """True if its time stands still until the run has answered: nothing is dropped or given up under load."""
+
+    @property
+    def brings_samples(self) -> bool:
+        """True if wheels and gyro come with the images: no others fit them."""
+
+    def clock_ns(self) -> int:
+        """Return the time, by the clock of the stamps of images, poses and ticks [ns]."""
+
+    def first_frames(self) -> Generator[Frame, None, None]:
+        """Yield the first frames of both cameras in turn, for the rims of the mirrors."""
+
+    def connect(self, session: Session) -> DriveLink | None:
+        """Open the cameras and start the controller; None without wheels. Outputs of the session close them."""
+
+    def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
+        """Add the sources of the images to a graph. take: takes the samples that come with them, from any thread."""
+
+    def states(self) -> Mapping[Camera, CameraState]:
+        """Return the states of the cameras."""
+
+    def words(self) -> str:
+        """Return what the line on a terminal ends with."""
+
+    @property
+    def status(self) -> tuple[Callable[[], DiagnosticStatus], ...]:
+        """Functions that make the entries of the status that only this kind of robot has."""
+
+
+class ConnectedRobot:
+    """Cameras, or the images of a log in their place, and a motor controller on a serial port, in real time."""
+
+    waits: Final = False
+
+    def __init__(self, open_camera: OpenCamera, motion: MotionSource | None = None) -> None:
+        """motion: wheels and gyro where the images are those of a log; None: those of the robot."""
+        self._open_camera, self._motion = open_camera, motion
+        self.brings_samples = motion is not None
+        self._cameras: dict[Camera, LiveCamera] = {}
+
+    def clock_ns(self) -> int:
+        """Return CLOCK_MONOTONIC."""
+        return time.monotonic_ns()
+
+    def first_frames(self) -> Generator[Frame, None, None]:
+        """Open the cameras for their first frames."""
+        return first_frames(self._open_camera)
+
+    def connect(self, session: Session) -> DriveLink | None:
+        """Open the cameras, and start the controller process where there is a motor."""
+        outputs: ExitStack = session.outputs
+        self._cameras = {name: outputs.enter_context(closing(self._open_camera(name))) for name in CAMERAS}
+        return session.start_controller(session.config.realtime) if session.config.motor.port else None
+
+    def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
+        """Add the cameras, and the samples of a log."""
+        motion = self._motion
+        if motion is not None:
+            graph.source("motion", lambda: map(take, motion.samples()), wake=motion.close)
+        return [graph.source(name, camera.frames, wake=camera.close) for name, camera in self._cameras.items()]
+
+    def states(self) -> Mapping[Camera, CameraState]:
+        """Return the states of the cameras."""
+        return {name: camera.state for name, camera in self._cameras.items()}
+
+    def words(self) -> str:
+        """Return nothing."""
+        return ""
+
+    @property
+    def status(self) -> tuple[Callable[[], DiagnosticStatus], ...]:
+        """Nothing: all its parts have entries of their own."""
+        return ()

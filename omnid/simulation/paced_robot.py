@@ -1,0 +1,206 @@
+"""A simulated robot whose time waits for the daemon: a busy computer slows it down, and changes nothing else.
+
+Between two pairs of images the controller ticks, in the thread that renders. Its ticks up to the next pair need no
+answer to the last one, since a pose takes that long to reach the wheels: so the next pair is rendered while the daemon
+works on the last. Then time stands still until the daemon has answered. Deadlines, ramps and watchdogs are judged by
+this one clock.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import replace
+from itertools import count
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.cameras.camera_state import CameraState
+from drivers.frame import Camera, Frame
+from drivers.motion import GyroSample, MotionSample
+from drivers.motors.simulated.simulated_base import Pose
+from omnid.config import Config
+from omnid.controller.link import DriveLink
+from omnid.controller.statistics import TickReport
+from omnid.engine.graph import Graph, Stream
+from omnid.engine.telemetry import StageStats
+from omnid.runs.session import Session
+from omnid.simulation.cameras import CAMERAS, SimulatedCameras
+from omnid.simulation.lockstep import STOPPING_NS, with_masks
+from omnid.simulation.paced_link import Delivery, PacedLink
+from omnid.simulation.realtime import MOST_POSES, SAMPLES
+from omnid.simulation.robot import SimulatedRobot
+from omnid.simulation.vehicle import Tick, Vehicle
+from omnid.simulation.world import World
+from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.status_names import SIMULATION, Key
+
+Array = NDArray[np.float64]
+RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
+POLL_S: Final = 0.05  # longest sleep, so that `close` takes effect soon
+
+
+class RealTimeFactor:
+    """Simulated time over time on the wall, of the last pairs; it is never let above 1."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._at_s: deque[float] = deque(maxlen=RECENT)  # when the last pairs were given
+        self._due_s = 0.0
+
+    @property
+    def left_s(self) -> float:
+        """Time until the next pair is due [s]; 0 or less: now."""
+        return self._due_s - time.monotonic()
+
+    def count(self) -> None:
+        """Note that a pair is given now. One that comes late is not made up for."""
+        now_s = time.monotonic()
+        self._at_s.append(now_s)
+        self._due_s = max(self._due_s, now_s - self._period_s) + self._period_s
+
+    @property
+    def value(self) -> float:
+        """The factor; NaN before the second pair."""
+        at_s = list(self._at_s)
+        return (len(at_s) - 1) * self._period_s / (at_s[-1] - at_s[0]) if len(at_s) > 1 else float("nan")
+
+
+class PacedRobot:
+    """A LiveRobot in simulated time."""
+
+    waits: Final = True
+    brings_samples: Final = True
+
+    def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int,
+                 report: Callable[[str], None]) -> None:
+        """report: takes a line at each contact with an obstacle."""
+        self.rig = with_masks(robot.rig)
+        self._world, self._robot, self._config, self._seed, self._report = world, robot, config, seed, report
+        self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
+        self._period_ns = round(1e9 / robot.rate_hz)
+        self._start_ns = time.monotonic_ns()
+        self._vehicle: Vehicle | None = None
+        self._link: PacedLink | None = None
+        self._arrived_ns = 0  # of the newest message that was delivered to the controller
+        self.offset_ns = 0  # from the simulated time to Unix time
+        self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
+        self._pace = RealTimeFactor(1.0 / robot.rate_hz)
+        self._touches = self._closed = False
+        self.contacts = 0
+        self.truth: dict[int, Pose] = {}  # of the base in the world, by the stamps of the pairs
+
+    def clock_ns(self) -> int:
+        """Return the simulated time; it begins with that of the computer, and never runs ahead of it."""
+        return self._start_ns if self._vehicle is None else self._vehicle.now_ns
+
+    def first_frames(self) -> Generator[Frame, None, None]:
+        """Yield none: the rig has its masks."""
+        yield from ()
+
+    def connect(self, session: Session) -> DriveLink:
+        """Set the robot up, with the controller of the settings."""
+        self.offset_ns = session.offset_ns
+        config = replace(session.config, controller=session.with_obstacles_known(session.config.controller))
+        self._link = PacedLink(session.graph.telemetry.add(StageStats("motor")), self._period_ns)
+        self._vehicle = Vehicle(self._world, self._robot, config, self._seed, self._take_tick,
+                                lambda _, line: session.warn(line), self._start_ns)
+        return self._link
+
+    def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
+        """Add the one source of both cameras, which advances the time."""
+        return [graph.source("cameras", lambda: self._frames(graph.settle, take), wake=self.close)]
+
+    def states(self) -> Mapping[Camera, CameraState]:
+        """Return the states of the cameras."""
+        return self._states
+
+    @property
+    def status(self) -> tuple[Callable[[], DiagnosticStatus], ...]:
+        """The entry of the simulation."""
+        return (self._status,)
+
+    def words(self) -> str:
+        """Return the real-time factor."""
+        return f", {self._pace.value:.2f} x real time"
+
+    def close(self) -> None:
+        """End the images; from any thread."""
+        self._closed = True
+
+    def _status(self) -> DiagnosticStatus:
+        time_s = (self.clock_ns() - self._start_ns) * 1e-9
+        values = {str(Key.REAL_TIME_FACTOR): f"{self._pace.value:.2f}", "time_s": f"{time_s:.1f}",
+                  "contacts": str(self.contacts)}
+        return DiagnosticStatus(SIMULATION, OK, "its time waits for the daemon", values)
+
+    def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:
+        """Advance from pair to pair; settle: returns when the daemon has answered."""
+        vehicle, link = self._vehicle, self._link
+        assert vehicle is not None and link is not None
+        try:
+            for seq in count():
+                # 1. Up to the exposure, by what the controller knows.
+                stamp_ns = self._start_ns + (seq + 1) * self._period_ns
+                self._advance(vehicle, link, stamp_ns, ticks_then=False)
+                # 2. The images, while the daemon works on those before.
+                pair = [self._frame(vehicle, camera, seq, stamp_ns) for camera in CAMERAS]
+                self._keep(stamp_ns, vehicle.twin.base.pose)
+                # 3. The daemon's answers, which take effect with the tick of now.
+                settle()
+                self._advance(vehicle, link, stamp_ns)
+                for sample in vehicle.take_samples():
+                    if self._is_given(sample):
+                        take(sample)
+                # 4. The images, not before their time.
+                while not self._closed and (left_s := self._pace.left_s) > 0:
+                    time.sleep(min(left_s, POLL_S))
+                if self._closed:
+                    return
+                self._pace.count()
+                yield from pair
+        finally:
+            vehicle.controller.end()
+            self._advance(vehicle, link, vehicle.now_ns + STOPPING_NS)
+            link.end()
+
+    def _advance(self, vehicle: Vehicle, link: PacedLink, until_ns: int, *, ticks_then: bool = True) -> None:
+        """Advance to a time; what was sent to the controller arrives at its ticks, in order."""
+        for due_ns, deliver in link.posted():
+            vehicle.post(due_ns, lambda deliver=deliver: self._deliver(vehicle, deliver))  # type: ignore[misc]
+        vehicle.advance(until_ns, ticks_then=ticks_then)
+
+    def _deliver(self, vehicle: Vehicle, deliver: Delivery) -> None:
+        """Hand a message to the controller: it arrives after the one before, and after the tick before."""
+        self._arrived_ns = max(self._arrived_ns, vehicle.last_tick_ns) + 1
+        deliver(vehicle.controller, self._arrived_ns)
+
+    def _is_given(self, sample: MotionSample) -> bool:
+        """True if the settings ask for samples of this kind."""
+        motion = self._config.motion
+        return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) == "auto"
+
+    def _frame(self, vehicle: Vehicle, camera: Camera, seq: int, stamp_ns: int) -> Frame:
+        state = self._states[camera]
+        state.status = "streaming"
+        state.frames += 1
+        return self._rendered.frame(camera, seq, stamp_ns, vehicle.T_world_base @ self.rig.T_base_rig, vehicle.people)
+
+    def _keep(self, stamp_ns: int, pose: Pose) -> None:
+        """Keep the truth."""
+        if len(self.truth) >= MOST_POSES:
+            del self.truth[next(iter(self.truth))]
+        self.truth[stamp_ns] = pose
+
+    def _take_tick(self, tick: Tick, report: TickReport) -> None:
+        """Pass a tick on, and report a contact."""
+        assert self._link is not None
+        self._link.take(report)
+        touches = tick.clearance_m <= 0
+        if touches and not self._touches:
+            self.contacts += 1
+            self._report(f"contact with an obstacle at {tick.pose[0]:.2f}, {tick.pose[1]:.2f} m in the world")
+        self._touches = touches

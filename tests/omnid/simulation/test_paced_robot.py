@@ -1,0 +1,130 @@
+"""`omnid simulate` in its own time: a daemon that is slowed down loses nothing, and drives where it is told to.
+
+The test stands for a busy computer: it stops the whole daemon again and again, for longer than its deadlines.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from drivers.motion import WheelSample
+from drivers.motor import VelocityCommand
+from omnid.cli import main
+from omnid.client import Diagnostics, Robot
+from omnid.controller.statistics import ControllerState, TickReport
+from omnid.core.control.arming import ArmRequest
+from omnid.engine.telemetry import StageStats
+from omnid.formats.tum import read_tum
+from omnid.simulation.paced_link import MOST_COMMANDS, PacedLink
+from omnid.transport.bus_config import BusConfig
+from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, WHEELS, Key
+from tests.replay.live import Daemon, free_port, started, wait_until
+
+STOPPED_S, RUNNING_S = 0.6, 0.3  # longer than the deadlines of poses and commands; share of a computer that is left
+NEAR_M = 0.05
+GOAL = ("0.5", "0.1")
+
+
+@contextmanager
+def slowed(daemon: Daemon) -> Iterator[None]:
+    """Stop the daemon again and again in this block."""
+    ends = threading.Event()
+
+    def stop_and_go() -> None:
+        while not ends.wait(RUNNING_S):
+            daemon.process.send_signal(signal.SIGSTOP)
+            ends.wait(STOPPED_S)
+            daemon.process.send_signal(signal.SIGCONT)
+
+    thread = threading.Thread(target=stop_and_go)
+    thread.start()
+    try:
+        yield
+    finally:
+        ends.set()
+        thread.join()
+
+
+def newest(port: int) -> Diagnostics:
+    """Return a whole status of the daemon."""
+    with Robot(settings=BusConfig(connect=(f"tcp/127.0.0.1:{port}",))) as robot, \
+            robot.subscribe(Diagnostics) as statuses:
+        while True:
+            report = statuses.wait(20.0)
+            assert report is not None
+            if len(report.statuses) > 1:
+                return report
+
+
+def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]
+                                                            ) -> None:
+    port, truth = free_port(), tmp_path / "truth.tum"
+    connect = ["--connect", f"tcp/127.0.0.1:{port}"]
+    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320", "--truth", str(truth),
+               "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]', "--set", "live.status_s=0.2"]
+    with started(command, port) as daemon:
+        wait_until(lambda: main(["arm", *connect]) == 0, "arming")
+        assert [main(["goto", *words, *connect]) for words in (["0.2", "0", "--no-wait"], ["--pause"], ["--resume"])
+                ] == [0, 0, 0]
+        assert "paused by a request: `omnid goto --resume`" in capsys.readouterr().out
+        with slowed(daemon):
+            reached = main(["goto", *GOAL, *connect])
+        status = newest(port)
+        code, log = daemon.end()
+    assert reached == 0, log
+    # 1. Nothing was lost on the way, and no rule stopped the wheels.
+    stages = {entry.name: entry.values for entry in status.statuses if entry.name.startswith(STAGE_PREFIX)}
+    dropped = {name: values[Key.DROPPED] for name, values in stages.items() if Key.DROPPED in values}
+    assert {f"{STAGE_PREFIX}bus", f"{STAGE_PREFIX}odometry"} <= set(dropped)
+    assert set(dropped.values()) == {"0"}
+    assert status.value(WHEELS, Key.ARMED) == "1"
+    # 2. Its time went more slowly than that on the wall.
+    assert 0 < float(status.value(SIMULATION, Key.REAL_TIME_FACTOR)) <= 1.0
+    # 3. The robot stands at the goal.
+    assert code == 0 and "contacts with obstacles: 0" in log
+    assert math.dist(read_tum(truth).T[-1, :2, 3], tuple(map(float, GOAL))) < NEAR_M
+
+
+class Kept:
+    """A controller that keeps what reaches it."""
+
+    def __init__(self) -> None:
+        self.got: list[tuple[str, int]] = []
+
+    def stop(self, asked_ns: int) -> None:
+        self.got.append(("stop", asked_ns))
+
+    def arm(self, request: ArmRequest) -> None:
+        self.got.append(("arm", request.arrival_ns))
+
+
+def test_messages_are_dated_by_the_simulated_clock() -> None:
+    link, kept = PacedLink(StageStats("motor"), 100), Kept()
+    link.stop()
+    link.arm(ArmRequest(123, 456))
+    for number, (due_ns, deliver) in enumerate(link.posted()):
+        assert due_ns == 0
+        deliver(kept, 7 + number)  # type: ignore[arg-type]
+    assert kept.got == [("stop", 7), ("arm", 8)]
+    assert list(link.posted()) == []
+
+
+def test_commands_wait_for_the_stages_and_end_with_the_run() -> None:
+    link = PacedLink(StageStats("motor"), 100)
+    reports = [TickReport(VelocityCommand(k, 0.1, 0.0, 0.0), 0.0, 0.0, math.nan, ControllerState(),
+                          WheelSample(k, 0.1, 0.0)) for k in range(3 * MOST_COMMANDS)]
+    ticking = threading.Thread(target=lambda: [link.take(report) for report in reports])
+    ticking.start()
+    taken = link.commands()
+    assert [next(taken).stamp_ns for _ in reports] == list(range(len(reports)))
+    ticking.join()
+    link.end()
+    assert list(taken) == []
