@@ -42,6 +42,11 @@ DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 woul
 BIN_ROWS: Final = 2  # on either side of the rows in which the floor has a disparity
 FLOOR_PX: Final = 1.3  # least difference of disparity by which something is not the floor
 OTHERS_PX: Final = (12, 25)  # lower and higher disparities than the floor's that may explain its rows
+EDGE_M: Final = 0.05  # least fall of the floor that is an edge; lower ones the base's wheels pass
+LEVEL_STEP_PX: Final = 0.75  # between planes beside the floor, up to where others are compared: matching tells half
+LEVEL_STEPS: Final = 3  # enough at all disparities to where others are compared
+EVEN_SHARE: Final = 0.33  # of the least height and fall, by which a floor is no plane: two more planes are floor
+LEVEL_RATIO: Final = 1.5  # log-likelihood by a sigma: that of single directions by three that are no more alike
 NEAR_M: Final = 1.15  # nearer than this on the floor, a direction is as wide there: mirrors show less detail
 NEAR_SHARE: Final = 0.3  # of the ratio by a difference in four times as many columns
 ADJACENT_PX: Final = 4.0  # what hides the floor is often a little before it or behind: decay of the prior,
@@ -66,6 +71,7 @@ class ColumnEvidence(NamedTuple):
 
     floor: Floats  # (K, DIRECTIONS) of the floor from disparity k to k + 1, NaN where both cameras cannot see it
     surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
+    level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
     nearest_floor_m: float  # that both cameras see, 0: none
 
 
@@ -93,6 +99,9 @@ class Columns:
         self._last_row = int(np.flatnonzero(self._visible.mean(axis=1) > 0.5)[-1])
         self._warps = self._made_warps()
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
+        rows = np.arange(self._height)
+        self._plane_rows = (rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)).astype(np.float32)
+        self._offsets = self._made_offsets()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
         self._tested = self._floor_bins[:, kernels.FLOOR_END] > 0
         tested = np.flatnonzero(self._tested)
@@ -122,8 +131,11 @@ class Columns:
         peak[:-1] &= surface[:-1] >= surface[1:]
         surface[~peak] = 0.0
         floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
+        level = np.empty((2, self.bins, DIRECTIONS), np.float32)
+        kernels.level_evidence(one, two, self._plane_rows, mask, self._floor_bins, self._offsets, OUTLIER,
+                               np.float32(LEVEL_RATIO / 64 / UNITS), level)
         floor[~self._tested] = np.nan
-        return ColumnEvidence(floor, surface, self.nearest_floor_m)
+        return ColumnEvidence(floor, surface, level, self.nearest_floor_m)
 
     def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return np.asarray(cv2.resize(image, (DIRECTIONS, self._height), interpolation=cv2.INTER_AREA), np.uint8)
@@ -168,6 +180,20 @@ class Columns:
             table[k] = (first, end, begin, math.floor(middle - FLOOR_PX), math.ceil(middle + FLOOR_PX), last,
                         self.at_1m / (k + 0.5) < NEAR_M)
         return table
+
+    def _made_offsets(self) -> Floats:
+        """Return the differences of disparity of kernels.level_evidence."""
+        h = self._plane.height_m
+        offsets = np.full((3, self.bins, LEVEL_STEPS), np.nan, np.float32)
+        for k in range(self.bins):
+            up, down = (z * (k + 0.5) / (h - z) for z in (self._heights_m[0], -EDGE_M))
+            offsets[0, k, :3] = 0.0, EVEN_SHARE * up, EVEN_SHARE * down
+            for j in range(LEVEL_STEPS):
+                step = j * LEVEL_STEP_PX
+                for kind, offset in ((1, up + step), (2, down - step)):
+                    if j == 0 or abs(offset) < FLOOR_PX + 1:
+                        offsets[kind, k, j] = offset
+        return offsets
 
     def _made_strips(self) -> Tables:
         """Return the table of kernels.surface_evidence."""

@@ -40,6 +40,19 @@ def add_differences(lower: Bytes, least: Bytes, most: Bytes, live: Bytes, outlie
 
 
 @inner
+def add_between(lower: Bytes, first: Bytes, second: Bytes, share: np.uint16, live: Bytes, outlier: np.uint8,
+                sums: Words) -> None:
+    """Add to sums (W,) by how much a row differs from a place between two others; share: of the second one, of 256."""
+    rest = np.uint16(np.uint16(256) - share)
+    for u in range(len(sums)):
+        between = np.uint8(np.uint16(np.uint16(first[u]) * rest + np.uint16(second[u]) * share) >> np.uint16(8))
+        a = lower[u]
+        difference = np.uint8(a - between) if a > between else np.uint8(between - a)
+        difference = difference if difference < outlier else outlier
+        sums[u] = np.uint16(sums[u] + np.uint16(difference & live[u]))
+
+
+@inner
 def likelihoods(sums: Words, best: Words, scale: np.float32, into: Floats) -> None:
     """Write exp(-scale (sums - best)) (W,)."""
     for u in range(len(into)):
@@ -99,6 +112,43 @@ def add_run(before: Floats, mine: Floats, after: Floats, total: Floats, blank: n
         value = value if value > NOTHING else NOTHING
         run[u] = value
         best[u] = value if value > best[u] else best[u]
+
+
+@compiled("(u1[:, ::1], u1[:, ::1], f4[::1], u1[:, ::1], i4[:, ::1], f4[:, :, ::1], u1, f4, f4[:, :, ::1])",
+          writes=("ratios",))
+def level_evidence(lower: Bytes, upper: Bytes, plane: Floats, live: Bytes, bins: Numbers, offsets: Floats,
+                   outlier: np.uint8, scale: np.float32, ratios: Floats) -> None:
+    """Write the log-likelihood ratios (2, K, W) of the floor to the best level patch above it, and to one below it.
+
+    lower, upper (H, W): normalised panoramas; plane (H,): row of the upper one that shows the floor of a row. live,
+    bins: as for floor_evidence. offsets (3, K, J): differences of disparity of patches of the floor, above and below,
+    NaN: no more; scale: logarithm of the likelihood by a unit of difference, by 64.
+    """
+    width = lower.shape[1]
+    sums, wide = np.zeros(width, np.uint16), np.empty(width, np.uint16)
+    best = np.empty((3, width), np.uint16)
+    ratios[:] = NOTHING
+    for k in range(len(bins)):
+        if bins[k, FLOOR_END] <= bins[k, FLOOR_FIRST]:
+            continue
+        best[:] = LARGEST
+        for kind in range(3):
+            for j in range(offsets.shape[2]):
+                if math.isnan(offsets[kind, k, j]):
+                    continue
+                sums[:] = 0
+                for v in range(bins[k, FLOOR_FIRST], bins[k, FLOOR_END]):
+                    row = plane[v] + offsets[kind, k, j]
+                    above = math.floor(row)
+                    share = np.uint16((row - np.float32(above)) * np.float32(256.0))
+                    add_between(lower[v], upper[above], upper[above + 1], share, live[v], outlier, sums)
+                spread(sums, wide)
+                spread(wide, sums)
+                spread(sums, wide)
+                lower_to(wide, best[kind])
+        for kind in range(2):
+            for u in range(width):
+                ratios[kind, k, u] = scale * (np.float32(best[kind + 1, u]) - np.float32(best[0, u]))
 
 
 @compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4[::1], f4[:, ::1])",

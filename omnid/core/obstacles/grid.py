@@ -30,7 +30,10 @@ MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved
 VIEW_CELLS: Final = 90  # on either side of the robot, that a pair changes
 NEVER: Final = np.iinfo(np.int64).min
 
-PRIOR: Final = (-1.0, -6.0)  # log-odds of floor and surface where nothing was seen
+# Layers: floor against what stands up, against planes just above it, and just below it; surface.
+FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
+FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
+PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pairs
 MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow each other are alike
 FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
@@ -64,7 +67,7 @@ class GridRing(NamedTuple):
 
 
 class ObstacleGrid:
-    """Layers of log-odds (2, CELLS, CELLS): floor, surface; and how well they are watched."""
+    """Layers of log-odds (4, CELLS, CELLS), and how well they are watched."""
 
     def __init__(self, at_1m: float, settings: RingSettings) -> None:
         """at_1m: disparity at 1 m; `set_floor` comes before the first pair."""
@@ -84,7 +87,7 @@ class ObstacleGrid:
 
     def clear(self) -> None:
         """Forget everything: the pose has lost its relation to the past."""
-        self._odds = np.empty((2, CELLS, CELLS), np.float32)
+        self._odds = np.empty((len(PRIOR), CELLS, CELLS), np.float32)
         self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
         self._fresh = np.zeros((CELLS, CELLS), np.float32)  # mean evidence of the last FRESH_NS
         self._free_ns = np.full((CELLS, CELLS), NEVER, np.int64)  # when a cell was free last
@@ -107,24 +110,26 @@ class ObstacleGrid:
             self._nearest_m = evidence.nearest_floor_m
             self._assume_free(at, evidence.nearest_floor_m)
         # 1. Evidence of each cell.
-        floor, surface = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
+        cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
+        floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         in_view = np.isfinite(floor)
         floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
         surface = np.minimum(np.float32(SURFACE_SHARE) * surface, np.float32(MOST_RATIO))
         # 2. Log-odds.
         odds, weight = self._odds[:, rows, columns], self._weight(stamp_ns, T_odom_base[:2, 3])
         is_surface = surface > 0
-        odds[0] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
+        odds[FLOOR] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
         passes = (floor > 0) & ~is_surface
-        odds[1] += weight * np.where(passes, np.float32(CONTRADICTION), surface)
-        np.clip(odds[0], -LIMIT / 2, LIMIT, out=odds[0])
-        np.clip(odds[1], PRIOR[1], LIMIT, out=odds[1])
+        odds[SURFACE] += weight * np.where(passes, np.float32(CONTRADICTION), surface)
+        odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
+        np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
+        np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
         self._keep_fresh(stamp_ns, (rows, columns), np.maximum(floor, surface).clip(0, MOST_FRESH))
         # 3. What is not watched, and may have changed.
         self._flood(stamp_ns, in_view, rows, columns)
         self._clear_seen_past(place - corner, evidence.nearest_floor_m)
         i, j = int(at[1]), int(at[0])
-        self._odds[0, i - 3 : i + 4, j - 3 : j + 4] = LIMIT
+        self._odds[FLOORS, i - 3 : i + 4, j - 3 : j + 4] = LIMIT
         return self._ring(T_odom_base, place - corner)
 
     @property
@@ -134,27 +139,31 @@ class ObstacleGrid:
 
     @property
     def floor_odds(self) -> Floats:
-        """Log-odds (CELLS, CELLS) that a cell is floor, a copy."""
-        return np.array(self._odds[0])
+        """Log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
+        return np.asarray(self._odds[FLOORS].min(axis=0))
 
     def state(self) -> Bytes:
         """Return the cells: 0 unknown, 1 free, 2 taken."""
-        taken = self._odds[1] > TAKEN_ODDS
-        free = (self._odds[0] > FREE_ODDS) | taken
+        taken = self._odds[SURFACE] > TAKEN_ODDS
+        free = self._is_floor() | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
         free |= about[patch, cv2.CC_STAT_AREA] <= SPECK_CELLS
         return np.where(taken, np.uint8(2), free.astype(np.uint8))
 
+    def _is_floor(self) -> Flags:
+        """Return the cells (CELLS, CELLS) that are the floor rather than any other explanation."""
+        return np.asarray(self._odds[FLOORS].min(axis=0) > FREE_ODDS)
+
     def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
-        """Return the evidence (2, N, N) of the cells of the view, the first of which has its middle at first_m."""
+        """Return the evidence (4, N, N) of the cells of the view, the first of which has its middle at first_m."""
         T_rect_odom = self._T_rect_base @ se3.inverse(T_odom_base)
         x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
         c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
         norm = math.hypot(c, s)
-        cells = np.empty((2, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
-        nearest = np.full_like(evidence.floor[:END_BINS], np.nan)
-        floor = np.concatenate([nearest, evidence.floor[:-END_BINS]])
-        kernels.gather(floor, evidence.surface, np.array([x, y, c / norm, s / norm]), self._at_1m, CELL_M,
+        cells = np.empty((len(PRIOR), 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
+        floor, level = np.full_like(evidence.floor, np.nan), np.zeros_like(evidence.level)
+        floor[END_BINS:], level[:, END_BINS:] = evidence.floor[:-END_BINS], evidence.level[:, :-END_BINS]
+        kernels.gather(floor, evidence.surface, level, np.array([x, y, c / norm, s / norm]), self._at_1m, CELL_M,
                        VIEW_CELLS * CELL_M, THIN_M, cells)
         return cells
 
@@ -177,7 +186,7 @@ class ObstacleGrid:
     def _assume_free(self, at: NDArray[np.int64], within_m: float) -> None:
         y, x = np.ogrid[:CELLS, :CELLS]
         near = (x - at[0]) ** 2 + (y - at[1]) ** 2 < ((within_m + 2 * CELL_M) / CELL_M) ** 2
-        self._odds[0][near] = FREE_ODDS + 1.0
+        self._odds[FLOORS, near] = FREE_ODDS + 1.0
 
     def _flood(self, stamp_ns: int, in_view: Flags, rows: slice, columns: slice) -> None:
         """Forget the floor that something may have come to that was not seen, from cells that are not watched."""
@@ -190,18 +199,19 @@ class ObstacleGrid:
         steps, self._carry = int(self._carry), self._carry % 1.0
         watched = (self._fresh > LEAST_FRESH).astype(np.uint8)
         box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
-        free = (self._odds[0] > FREE_ODDS).astype(np.uint8)
+        free = self._is_floor().astype(np.uint8)
         visible = np.zeros((CELLS, CELLS), np.uint8)
         visible[rows, columns] = in_view
         self._free_ns[free > 0] = stamp_ns
-        lost = (1 - watched) & (visible | (1 - free)) & (self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9))
+        was_free = (self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9)).astype(np.uint8)
+        lost = np.asarray((1 - watched) & (visible | (1 - free)) & was_free, np.uint8)
         passable = (free & (1 - watched)) | lost
-        reached = cv2.morphologyEx(lost, cv2.MORPH_OPEN, box) | (self._flooded & lost)
+        reached = np.asarray(cv2.morphologyEx(lost, cv2.MORPH_OPEN, box), np.uint8) | (self._flooded & lost)
         for step in range(steps):
             kernel = np.ones((3, 3), np.uint8) if step % 2 else CROSS
             reached = np.asarray(cv2.dilate(reached, kernel), np.uint8) & passable
         self._flooded = reached
-        self._odds[0][(reached & free) > 0] = PRIOR[0]
+        self._odds[FLOOR][(reached & free) > 0] = PRIOR[FLOOR]
 
     def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
         """End the flood too near to be seen where the nearest floor in view is watched: a person would hide it."""
@@ -212,11 +222,11 @@ class ObstacleGrid:
         ways = np.arange(1, steps + 1)[None, :, None] * direction[:, None]
         columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
         ends = rows[:, -2:], columns[:, -2:]
-        past = ((self._fresh[ends] > LEAST_FRESH) & (self._odds[0][ends] > FREE_ODDS)).all(axis=1)
+        past = ((self._fresh[ends] > LEAST_FRESH) & self._is_floor()[ends]).all(axis=1)
         past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
         cells = rows[past], columns[past]
         flooded = self._flooded[cells] > 0
-        self._odds[0][cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[0][cells])
+        self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._flooded[cells] = 0
 
     def _ring(self, T_odom_base: Array, place: Array) -> GridRing:
@@ -225,6 +235,8 @@ class ObstacleGrid:
         kernels.march(self.state(), np.array([*place, CELL_M / 2, self._max_range_m, CELL_M, self._gap_share,
                                               CELL_M + self._gap_share * self._nearest_m]),
                       self._azimuths + float(se3.yaw(T_odom_base)), hit, free)
+        # A direction between cells may belong to either side.
+        free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
         is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)
         ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
         sigma = np.where(np.isfinite(ranges), CELL_M / 2, np.nan)

@@ -14,13 +14,14 @@ Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
-@compiled("(f4[:, ::1], f4[:, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
-def gather(floor: Floats, surface: Floats, origin: Doubles, at_1m: float, cell_m: float, reach_m: float, thin_m: float,
-           cells: Floats) -> None:
-    """Write the evidence (2, N, N) of cells: floor where it is weakest, and the strongest surface; NaN: no floor can be
-    seen there.
+@compiled("(f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
+def gather(floor: Floats, surface: Floats, level: Floats, origin: Doubles, at_1m: float, cell_m: float, reach_m: float,
+           thin_m: float, cells: Floats) -> None:
+    """Write the evidence (4, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
+    floor against planes above and below it; the strongest surface.
 
-    floor, surface (K, W): log-likelihood ratios by disparity and direction, NaN where nothing is compared.
+    floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
+    compared.
     origin (4,): place of the middle of cell (0, 0) in the frame of the columns, and cosine and sine of its axes there;
     at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest
     obstacle, whose directions count together.
@@ -33,7 +34,7 @@ def gather(floor: Floats, surface: Floats, origin: Doubles, at_1m: float, cell_m
             x = origin[0] + cell_m * (c * j - s * i)
             y = origin[1] + cell_m * (s * j + c * i)
             r = math.sqrt(x * x + y * y)
-            cells[0, i, j], cells[1, i, j] = np.nan, 0.0
+            cells[:, i, j] = np.nan, 0.0, 0.0, 0.0
             if r < cell_m or r > reach_m:
                 continue
             at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
@@ -47,13 +48,16 @@ def gather(floor: Floats, surface: Floats, origin: Doubles, at_1m: float, cell_m
                 continue
             last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
             first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
-            least, most = np.inf, np.float32(0.0)
+            least, most, above, below = np.inf, np.float32(0.0), 0.0, 0.0
             run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             for u in range(first, last + 1):
                 at_u = (u + width) % width
                 for k in range(first_surface, last_surface + 1):
                     if surface[k, at_u] > most:
                         most = surface[k, at_u]
+                for k in range(far, near + 1):
+                    above += level[0, k, at_u]
+                    below += level[1, k, at_u]
                 if u + run <= last + 1:
                     # The mean of the disparities, the sum of the directions that something thin would hide.
                     total = 0.0
@@ -63,9 +67,11 @@ def gather(floor: Floats, surface: Floats, origin: Doubles, at_1m: float, cell_m
                     if not total >= least:
                         least = total
             cells[0, i, j] = least / (near - far + 1)
+            patches = (last - first + 1) * (near - far + 1)
+            cells[1, i, j], cells[2, i, j] = above / patches, below / patches
             # The best of many is less evidence than one.
             count = (last - first + 1) * (last_surface - first_surface + 1)
-            cells[1, i, j] = max(most - np.float32(math.log(count)), np.float32(0.0))
+            cells[3, i, j] = max(most - np.float32(math.log(count)), np.float32(0.0))
 
 
 @compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("hit", "free"))

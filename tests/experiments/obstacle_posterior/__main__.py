@@ -41,6 +41,8 @@ STANDING: Final = 8  # pairs before the base starts
 FARTHEST_M: Final = 4.0
 AHEAD_RAD: Final = 0.25
 NEIGHBOURS: Final = 2  # directions on either side that an edge may be off
+OPEN_M: Final = (1.0, 1.5, 2.0, 3.0)
+OPEN_MARGIN_M: Final = 0.3  # of the nearest obstacle beyond the place that is to be told as free
 ODDS_BINS: Final = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.01)
 
 
@@ -56,6 +58,7 @@ class Scores:
     target_found: int = 0
     target_missed: int = 0
     excess_m: list[float] = field(default_factory=list)  # free ahead, more than true, within 1.5 m of it
+    open: Array = field(default_factory=lambda: np.zeros((len(OPEN_M), 2)))  # directions free so far: told, true
     milliseconds: list[float] = field(default_factory=list)
     cells: Array = field(default_factory=lambda: np.zeros((len(ODDS_BINS) - 1, 2)))  # free and all, by odds
 
@@ -64,8 +67,9 @@ class Scores:
         share = [f"{100 * n / max(self.directions, 1):.2f} %" for n in (self.found, self.missed, self.false)]
         target = [f"{100 * n / self.of_target:.1f} %" if self.of_target else "-"
                   for n in (self.target_found, self.target_missed)]
+        free = " / ".join(f"{100 * n / max(true, 1):.0f}" for n, true in self.open) + " %"
         excess = f"{100 * max(self.excess_m):.0f} cm" if self.excess_m else "-"
-        cells = " | ".join([case, *share, *target, excess, f"{np.median(self.milliseconds):.1f}"])
+        cells = " | ".join([case, *share, *target, free, excess, f"{np.median(self.milliseconds):.1f}"])
         return f"| {cells} |"
 
 
@@ -134,6 +138,9 @@ def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) ->
         scores.of_target += int(target.sum())
         scores.target_found += int((found & target).sum())
         scores.target_missed += int((missed & target).sum())
+    for number, open_m in enumerate(OPEN_M):
+        is_open = truth > open_m + OPEN_MARGIN_M
+        scores.open[number] += ((is_open & (ring.free_m >= open_m)).sum(), is_open.sum())
     ahead = np.abs(azimuths()) < AHEAD_RAD
     if truth[ahead].min() < 1.5:
         scores.excess_m.append(float(ring.free_m[ahead].min() - truth[ahead].min()))
@@ -165,8 +172,9 @@ def main() -> None:
         kernel.compile()
     robot = make_robot(arguments.size)
     robot = replace(robot, rig=with_masks(robot.rig))
-    print("| case | found | missed | false | thing found | thing missed | most free beyond, ahead | ms a pair |")
-    print("|---|---|---|---|---|---|---|---|")
+    print("| case | found | missed | false | thing found | thing missed | told free to "
+          f"{' / '.join(f'{m:g}' for m in OPEN_M)} m | most free beyond, ahead | ms a pair |")
+    print("|---|---|---|---|---|---|---|---|---|")
     total = np.zeros((len(ODDS_BINS) - 1, 2))
     for case in arguments.cases:
         scores = Scores()

@@ -68,13 +68,22 @@ def test_floor_that_is_lower_is_no_floor(columns: Columns) -> None:
     assert np.median(lower) < -1 and np.median(level) > 1
 
 
+@pytest.mark.parametrize(("drop_m", "others"), [(0.08, 1), (-0.08, 0)])
+def test_low_steps_are_not_the_floor(columns: Columns, drop_m: float, others: int) -> None:
+    """8 cm are 0.8 to 1.4 rows of disparity at 1.2 to 1.8 m."""
+    near, far = int(columns.at_1m / 1.2), int(columns.at_1m / 1.8)
+    level, step = (evidence(columns, stains, striped, drop).level[:, far:near] for drop in (0.0, drop_m))
+    assert (level.mean(axis=2) > 1).all() and (step[others].mean(axis=1) < -1).all()
+
+
 def test_lost_pixels_are_no_evidence(columns: Columns) -> None:
     lost = np.zeros((CYLINDER.height, CYLINDER.width), bool)
     lost[:, 400:] = True
     found = columns.evidence(*panoramas(stains, WALL_M, striped), lost)
     first = int(400 / CYLINDER.width * DIRECTIONS) + 2
     gone = slice(first, DIRECTIONS - 2)
-    assert not found.surface[:, gone].any() and np.nanmax(np.abs(found.floor[:, gone])) < 1e-3
+    assert not found.surface[:, gone].any() and not found.level[:, :, first + 3 : DIRECTIONS - 5].any()
+    assert np.nanmax(np.abs(found.floor[:, gone])) < 1e-3
     assert found.surface[:, : first - 4].any()
 
 

@@ -66,6 +66,12 @@ def test_ring_has_the_wall_and_the_floor_before_it(grid: ObstacleGrid, seen: Pai
     assert np.median(ring.free_m) > WALL_M - 0.5 and (ring.free_m <= WALL_M + 0.1).all()
 
 
+def test_free_floor_ends_where_a_low_step_would_look_like_it(grid: ObstacleGrid) -> None:
+    """A fall of 5 cm differs from the floor by less than half a row from some 3 m on."""
+    ring = after(grid, evidence(stains, striped, wall_m=6.0), 40)
+    assert 1.5 < np.median(ring.free_m) < 3.5 and np.isposinf(ring.ranges_m).mean() < 0.1
+
+
 def test_plain_wall_is_unknown_and_nothing_behind_it_is_free(grid: ObstacleGrid) -> None:
     near_m = 1.3
     ring = after(grid, evidence(stains, plain, wall_m=near_m), 40)
@@ -82,14 +88,16 @@ def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: fl
     assert ring.free_m[beside].min() > 2.0
 
 
-def test_lower_floor_is_unknown(grid: ObstacleGrid) -> None:
-    ring = after(grid, evidence(stains, striped, 0.3), 40)
+@pytest.mark.parametrize("drop_m", [0.3, 0.08, -0.08])
+def test_floor_at_another_height_is_unknown(grid: ObstacleGrid, drop_m: float) -> None:
+    ring = after(grid, evidence(stains, striped, drop_m), 40)
     assert ring.free_m.max() < 1.3 and not np.isposinf(ring.ranges_m).any()
 
 
 def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: Pairs) -> None:
     assert after(grid, seen, 20).free_m.min() > 0.6
-    dark = seen[0]._replace(surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor)
+    dark = seen[0]._replace(surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor,
+                            level=np.zeros_like(seen[0].level))
     seconds = 3 * FRESH_NS * 1e-9 + seen[0].nearest_floor_m / FLOOD_MPS
     ring = after(grid, [dark], int(seconds * 1e9 / PERIOD_NS) + 1, first=20)
     assert ring.free_m.max() < 0.45
