@@ -1,6 +1,8 @@
 """Panoramas on a cylinder about the line through both viewpoints, in which every epipolar line is a column.
 
-column: azimuth falls from left to right, as seen from inside; azimuth 0 (the rig's x) is in the middle.
+column: azimuth falls from left to right, as seen from inside; in that of a full turn azimuth 0 (the rig's x) is in the
+middle. Cameras that share less than a full turn have a panorama of their sector: some columns of the full turn, with
+first as column 0.
 row = row0 - focal * z / r, r the distance from the axis, so row_upper - row_lower = focal * baseline / r.
 """
 
@@ -18,10 +20,17 @@ from calib.models.camera import Array, inside_image
 from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
-# Grid on which the common field of view is measured, and the least share of azimuths at which a slope is visible.
+# Grid on which the common field of view is measured, and the least share of the azimuths, of a full turn or of the
+# sector, at which a slope is visible.
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
-# Least length of the horizon of a camera that sees it.
-MIN_HORIZON_PX = 64
+# A sector begins and ends at one of so many steps of a full turn, each of a whole number of columns. Steps of 3.75
+# degrees are five directions of the obstacles, and a sector is at most two of them wider than what is seen.
+SECTOR_STEPS = 96
+SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
+# Least azimuth that no camera pair shares beside which a panorama is a sector: a strut or a mast hides less.
+MIN_UNSEEN_RAD = math.radians(45)
+# Least length of the horizon of a camera that sees it: of a full turn, and of a radian of a sector.
+MIN_HORIZON_PX, MIN_HORIZON_PX_PER_RAD = 64, 32
 # Columns: more than cv2.remap's 32767 with padding cannot be used. Pixels: tables and images must fit the memory.
 MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
 # Rows of a table that are computed at once: the projection takes some 200 bytes a pixel.
@@ -32,52 +41,127 @@ MIN_RADIUS = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """Size and scale of a panorama [px]; pixels are (column, row), columns are periodic in width."""
+    """Size and scale of a panorama [px]; pixels are (column, row). Columns of a full turn are periodic."""
 
     width: int
     height: int
     row0: float
+    turn_px: int = 0  # columns of a full turn, of which the panorama has `width`; 0: all of them
+    first: int = 0  # column of the full turn that is column 0
+
+    def __post_init__(self) -> None:
+        if not self.turn_px:
+            object.__setattr__(self, "turn_px", self.width)
 
     @property
     def focal_px(self) -> float:
         """Return the pixels per radian of azimuth, and per unit of z/r: square pixels on the horizon."""
-        return self.width / (2 * math.pi)
+        return self.turn_px / (2 * math.pi)
+
+    @property
+    def left_rad(self) -> float:
+        """Return the azimuth of the left edge of column 0."""
+        return math.pi - self.first / self.focal_px
+
+    @property
+    def edges_rad(self) -> tuple[float, float]:
+        """Return the azimuths of the left and of the right edge."""
+        return self.left_rad, self.left_rad - 2 * math.pi * (self.width / self.turn_px)
+
+    def resized(self, width: int) -> Cylinder:
+        """Return the panorama of about the same view in other columns."""
+        scale = width / self.width
+        turn_px, first = round(self.turn_px * scale), round(self.first * scale)
+        return Cylinder(width, max(1, round(self.height * scale)), self.row0 * scale, turn_px, first)
+
+    @property
+    def full_turn(self) -> Cylinder:
+        """Return the panorama of the full turn of which this is a sector."""
+        return Cylinder(self.turn_px, self.height, self.row0)
+
+    def azimuth(self, columns: Array) -> Array:
+        """Return the azimuths (N,) of columns (N,)."""
+        return np.asarray(self.left_rad - (columns + 0.5) / self.focal_px)
 
     def rays(self, pixels: Array) -> Array:
         """Return rays (N, 3) with r = 1 in the rectified frame of pixels (N, 2)."""
-        azimuth = math.pi - (pixels[:, 0] + 0.5) / self.focal_px
+        azimuth = self.azimuth(pixels[:, 0])
         return np.column_stack([np.cos(azimuth), np.sin(azimuth), (self.row0 - pixels[:, 1]) / self.focal_px])
 
     def pixels(self, points: Array) -> Array:
-        """Return pixels (N, 2) of points (N, 3) relative to the viewpoint, in the rectified frame."""
+        """Return pixels (N, 2) of points (N, 3) relative to the viewpoint, in the rectified frame.
+
+        What a sector does not show has columns beside it: each point is at most half a turn from the middle.
+        """
         r = np.hypot(points[:, 0], points[:, 1])
-        column = (math.pi - np.arctan2(points[:, 1], points[:, 0])) * self.focal_px - 0.5
+        column = (self.left_rad - np.arctan2(points[:, 1], points[:, 0])) * self.focal_px - 0.5
+        if self.width < self.turn_px:
+            column = self.width / 2 + self.wrap(column - self.width / 2)
         return np.column_stack([column, self.row0 - self.focal_px * points[:, 2] / np.maximum(r, MIN_RADIUS)])
 
     def wrap(self, columns: Array) -> Array:
-        """Return column differences, mapped to [-width/2, width/2)."""
-        return np.asarray((columns + self.width / 2) % self.width - self.width / 2)
+        """Return column differences, mapped to [-turn/2, turn/2)."""
+        return np.asarray((columns + self.turn_px / 2) % self.turn_px - self.turn_px / 2)
+
+    def shows(self, columns: Array) -> NDArray[np.bool_]:
+        """True (N,) for columns, as `pixels` returns them, that the panorama has."""
+        return np.asarray((self.width == self.turn_px) | ((columns >= 0) & (columns <= self.width - 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sector:
+    """Azimuths that both cameras share: from right_rad on, turning left; the whole circle has a span of 2 pi."""
+
+    right_rad: float
+    span_rad: float
+
+    @property
+    def is_full(self) -> bool:
+        return self.span_rad == 2 * math.pi
 
 
 def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0), scale: float = 1.0
                  ) -> Cylinder:
-    """Return the panorama of the elevations that both cameras see; width 0: the resolution of the images, scaled."""
-    width = width_px or 8 * round(scale * _horizon_px(rig) / 8)
-    if width > MAX_WIDTH_PX:
-        raise _too_large(f"{width} columns")
-    focal = width / (2 * math.pi)
+    """Return the panorama of what both cameras see: a full turn or a sector of it, within elevations.
+
+    width_px: columns of a full turn; 0: the resolution of the images, scaled.
+    """
     low, high = (np.tan(np.deg2rad(elevation_deg)))
-    seen = [_seen_slopes(rig, mounted, np.linspace(low, high, SLOPES)) for mounted in (rig.lower, rig.upper)]
-    both = seen[0] & seen[1]
-    if not both.any():
+    slopes: Array = np.linspace(low, high, SLOPES)
+    sector = _shared_sector(rig, slopes)
+    if sector is None:
         raise CalibError(f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
                          "of elevation; check the transforms and the masks")
-    slopes = np.linspace(low, high, SLOPES)[both]
+    # 1. Slopes that both cameras see over most of the sector.
+    seen = [_seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE
+            for mounted in (rig.lower, rig.upper)]
+    both = seen[0] & seen[1]
+    if not both.any():
+        raise CalibError(f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no "
+                         f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
+                         "the transforms and the masks")
+    slopes = slopes[both]
+    # 2. Columns.
+    turn = width_px
+    if not turn:
+        per_turn = scale * _turn_px(rig, sector, float(np.clip(0.0, slopes.min(), slopes.max())))
+        turn = 8 * round(per_turn / 8)
+    width, first = turn, 0
+    if not sector.is_full:
+        step = max(1, round(turn / SECTOR_STEPS))
+        turn, step_rad = step * SECTOR_STEPS, 2 * math.pi / SECTOR_STEPS
+        left = math.floor((math.pi - sector.right_rad - sector.span_rad) / step_rad)
+        right = math.ceil((math.pi - sector.right_rad) / step_rad)
+        width, first = step * min(right - left, SECTOR_STEPS), step * (left % SECTOR_STEPS)
+    if width > MAX_WIDTH_PX:
+        raise _too_large(f"{width} columns")
+    # 3. Rows.
+    focal = turn / (2 * math.pi)
     row0 = float(focal * slopes.max())
     height = math.ceil(row0 - focal * slopes.min()) + 1
     if width * height > MAX_PIXELS:
         raise _too_large(f"{width} x {height} pixels")
-    return Cylinder(width, height, row0)
+    return Cylinder(width, height, row0, turn, first)
 
 
 def _too_large(found: str) -> CalibError:
@@ -86,25 +170,63 @@ def _too_large(found: str) -> CalibError:
                       "set panorama.width_px")
 
 
-def _seen_slopes(rig: Rig, mounted: MountedCamera, slopes: Array) -> NDArray[np.bool_]:
-    """Return the mask of slopes z/r that a camera sees at half of all azimuths at least."""
-    azimuth = np.deg2rad(np.arange(0, 360, AZIMUTH_STEP_DEG))
+def _shared_sector(rig: Rig, slopes: Array) -> _Sector | None:
+    """Return the azimuths at which both cameras see a slope; None where there is none.
+
+    It is the complement of the widest gap, or the whole circle if no gap is as wide as MIN_UNSEEN_RAD.
+    """
+    step_rad = 2 * math.pi / SECTOR_GRID
+    azimuths = np.asarray((np.arange(SECTOR_GRID) + 0.5) * step_rad - math.pi, float)
+    few = slopes[:: SLOPES // 40]
+    shared = _seen(rig, rig.lower, few, azimuths) & _seen(rig, rig.upper, few, azimuths)
+    seen = np.flatnonzero(shared.any(axis=0))
+    if not len(seen):
+        return None
+    gaps = np.diff(np.append(seen, seen[0] + SECTOR_GRID)) - 1
+    widest = int(gaps.argmax())
+    if gaps[widest] * step_rad < MIN_UNSEEN_RAD:
+        return _Sector(-math.pi, 2 * math.pi)
+    right = int(seen[(widest + 1) % len(seen)])
+    return _Sector(right * step_rad - math.pi, (SECTOR_GRID - int(gaps[widest])) * step_rad)
+
+
+def _azimuths(sector: _Sector) -> Array:
+    """Return the azimuths (N,) at which the slopes of a sector are counted."""
+    if sector.is_full:
+        return np.asarray(np.deg2rad(np.arange(0, 360, AZIMUTH_STEP_DEG)), float)
+    count = max(24, math.ceil(sector.span_rad / math.radians(AZIMUTH_STEP_DEG)))
+    return np.asarray(sector.right_rad + (np.arange(count) + 0.5) * sector.span_rad / count)
+
+
+def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> NDArray[np.bool_]:
+    """Return flags (S, A) of slopes z/r (S,) that a camera sees at azimuths (A,)."""
     grid = np.column_stack([np.tile(np.cos(azimuth), len(slopes)), np.tile(np.sin(azimuth), len(slopes)),
                             np.repeat(slopes, len(azimuth))])
     pixels = _project(rig, mounted, grid)
     seen = inside_image(mounted.camera, pixels) & mounted.visible.contains(pixels)
-    return np.asarray(seen.reshape(len(slopes), -1).mean(axis=1) >= MIN_VISIBLE)
+    return np.asarray(seen.reshape(len(slopes), -1))
 
 
-def _horizon_px(rig: Rig) -> float:
-    """Return the length of the horizon [px] in the camera with the lower resolution."""
+def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
+    """Return the length [px] of a full turn in the images, from that of the sector at a slope, in the coarser camera.
+
+    That of a full circle is the length of the horizon.
+    """
     azimuth = np.linspace(0, 2 * math.pi, 361)
-    ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)])
+    if not sector.is_full:
+        azimuth = sector.right_rad + np.linspace(0, sector.span_rad, 361)
+    ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, 0.0 if sector.is_full else slope)])
     with np.errstate(over="ignore", invalid="ignore"):
-        around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1).sum() for m in (rig.lower, rig.upper)]
-    if not np.isfinite(around).all() or min(around) < MIN_HORIZON_PX:
+        around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1) for m in (rig.lower, rig.upper)]
+    if sector.is_full:
+        lengths, least = [steps.sum() for steps in around], MIN_HORIZON_PX
+    else:
+        # At the ends of a sector one of the cameras may have no image: the median step stands for all.
+        lengths = [np.nanmedian(steps) * 360 * 2 * math.pi / sector.span_rad for steps in around]
+        least = MIN_HORIZON_PX_PER_RAD
+    if not np.isfinite(lengths).all() or min(lengths) < least:
         raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
-    return float(min(around))
+    return float(min(lengths))
 
 
 def _project(rig: Rig, mounted: MountedCamera, rays: Array) -> Array:
@@ -116,7 +238,8 @@ def _project(rig: Rig, mounted: MountedCamera, rays: Array) -> Array:
 def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: int = 0) -> Maps:
     """Return image coordinates (H, W + 2 pad) float32 of every panorama pixel, for cv2.remap; -1 outside the image.
 
-    pad_px columns are repeated on either side, so that windows and pyramids are continuous across the seam.
+    pad_px columns more lie on either side, those of a full turn repeated, so that windows and pyramids are continuous
+    across the seam.
     """
     shape = cylinder.height, cylinder.width + 2 * pad_px
     u, v = np.empty(shape, np.float32), np.empty(shape, np.float32)

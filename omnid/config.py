@@ -122,10 +122,10 @@ class TimingConfig:
 class PanoramaConfig:
     """Size and borders of the panoramas."""
 
-    width_px: int = knob(0, "columns of a full turn, px; 0: the images' own resolution", low=0, high=4096)
+    width_px: int = knob(0, "columns of a full turn, px; 0: the images' own resolution", low=0, high=65536)
     scale: float = knob(1.0, "where width_px is 0: columns as a share of the images' own resolution", low=0.25, high=1)
     elevation_deg: tuple[float, float] = knob((-50.0, 40.0), "lowest and highest elevation, deg", low=-80, high=80)
-    pad_px: int = knob(48, "columns repeated on either side, so that windows run across the seam", low=16, high=256)
+    pad_px: int = knob(48, "columns more on either side, so that windows run across the seam", low=16, high=256)
     rim_margin_px: float = knob(4.0, "margin along rim and hub in the images, px", low=0, high=100)
     margin_px: int = knob(7, "margin along the border of the common view of both cameras, px", low=0, high=100)
 

@@ -63,6 +63,12 @@ def inscribed_mask(camera: OmniCamera) -> Mask:
     return Mask((u, v), 0.0, max(0.0, min(u, v, width - 1 - u, height - 1 - v)))
 
 
+def whole_image(camera: OmniCamera) -> Mask:
+    """Return the disc about the camera's axis that holds its image: the mask of a lens if none is known."""
+    (u, v), (width, height) = camera.center, camera.size
+    return Mask((u, v), 0.0, float(np.hypot(max(u, width - 1 - u), max(v, height - 1 - v))) + 1.0)
+
+
 def field_of_view(camera: OmniCamera, mask: Mask) -> tuple[float, float]:
     """Return the smallest and largest angle [rad] from the ray of the camera's centre within the mask; NaN if empty."""
     width, height = camera.size

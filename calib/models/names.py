@@ -5,6 +5,7 @@ from __future__ import annotations
 from calib.models.camera import OmniCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.ocam import OcamCamera
+from calib.models.unified import UnifiedCamera
 
 
 def model_name(camera: OmniCamera) -> str:
@@ -16,3 +17,10 @@ def model_name(camera: OmniCamera) -> str:
     if isinstance(camera, ExtendedUnifiedCamera):
         return "eucm"
     return "equidistant" if isinstance(camera, EquidistantCamera) else "omni"
+
+
+def is_lens(camera: OmniCamera) -> bool:
+    """True for a camera that sees the world directly: its image has no hub and need not have a rim."""
+    if isinstance(camera, UnifiedCamera):
+        return camera.xi == 0
+    return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera))

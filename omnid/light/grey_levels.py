@@ -30,9 +30,7 @@ class UsefulArea:
     """The pixels of both images that the panoramas are made of, evenly spread over the panorama."""
 
     def __init__(self, rig: Rig, cylinder: Cylinder) -> None:
-        width = max(LEAST_COLUMNS, cylinder.width // SAMPLE_STEP)
-        scale = width / cylinder.width
-        coarse = Cylinder(width, max(1, round(cylinder.height * scale)), cylinder.row0 * scale)
+        coarse = cylinder.resized(max(LEAST_COLUMNS, cylinder.width // SAMPLE_STEP))
         sides = [(mounted, remap_tables(rig, mounted, coarse)) for mounted in (rig.lower, rig.upper)]
         both = np.logical_and(*(visible(mounted, maps, MARGIN_PX) for mounted, maps in sides))
         self._pixels = [_flat(mounted, maps[0][both], maps[1][both]) for mounted, maps in sides]

@@ -153,7 +153,7 @@ def place_rig(geometry: Geometry) -> PlaceRig:
     """Return the part of a rig on which a map depends."""
     rig = geometry.rig
     text = rig_toml(replace(rig, lower=_unmasked(rig.lower), upper=_unmasked(rig.upper), covariance=None))
-    return PlaceRig(geometry.cylinder, rig.baseline_m, geometry.T_rig_rect, rig.T_base_rig,
+    return PlaceRig(geometry.cylinder.full_turn, rig.baseline_m, geometry.T_rig_rect, rig.T_base_rig,
                     hashlib.sha256(text.encode()).hexdigest())
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.panorama import Maps, remap_tables, visible
 from omnid.config import PanoramaConfig, TimingConfig
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
-from omnid.core.stereo.tiles import Side, TileMonitor
+from omnid.core.stereo.tiles import Side, TileMonitor, tile_columns
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.errors import OmnidError
@@ -32,13 +32,14 @@ class Dewarp:
         self._pad_px = config.pad_px
         timing = timing or TimingConfig()
         rig, cylinder = geometry.rig, geometry.cylinder
+        self._sector = cylinder.turn_px, cylinder.first
         self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
         self._blur_px = _blur_px((self._lower, self._upper))
         both = visible(rig.lower, self._lower, config.rim_margin_px)
         both &= visible(rig.upper, self._upper, config.rim_margin_px)
         self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
         self._visible.setflags(write=False)
-        self._tiles = TileMonitor(self._visible)
+        self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
         self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
         line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
@@ -75,7 +76,8 @@ class Dewarp:
         noise_grey = self._noise_grey[camera]
         found = light(inner, self._visible, noise_grey)
         gain = gain_of(found.level_grey)
-        return PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain), found, inner
+        padded = PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain, *self._sector)
+        return padded, found, inner
 
 
 def _blur_px(tables: tuple[Maps, ...]) -> float:

@@ -1,21 +1,28 @@
-"""Two fisheye lenses one above the other, which look up and see the horizon: imported from Kalibr and replayed."""
+"""Two lenses one above the other: fisheyes that look up and see the horizon, and pairs that see a sector of it."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import omnid
+from calib import se3
 from calib.models.camera import Mask
 from calib.models.lens import EquidistantCamera
 from calib.rig import MountedCamera
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from tests.simulation import build, write_log
+from tests.omnid.stages.test_obstacles import rings_of
+from tests.replay.command import Command
+from tests.simulation import build, corridor, paths, write_log
+from tests.simulation.rigs import lens, lens_rig
 
 SIZE, PAIRS, SEEN_DEG = 256, 16, 115.0
+FOOTPRINT_M = 0.25  # of the robot, on which nothing else can be
 
 
 def test_a_rig_of_lenses_gives_poses(tmp_path: Path) -> None:
@@ -32,3 +39,43 @@ def test_a_rig_of_lenses_gives_poses(tmp_path: Path) -> None:
     result = omnid.replay(tmp_path / "log.mcap", rig=tmp_path / "rig.toml")
     found = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(tmp_path / "truth.txt"))
     assert found.pairs == PAIRS and found.ate_rmse_m < 0.003 and abs(found.length_error_ratio) < 0.01
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(capsys)
+
+
+@pytest.fixture(scope="module")
+def sector(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a log of two pinhole cameras that see 90 degrees behind the robot, 0.6 m above the floor."""
+    folder = tmp_path_factory.mktemp("sector")
+    rig = replace(lens_rig(lens("pinhole", 90, (480, 360)), heading_deg=-173.0),
+                  T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, 0.6]))
+    poses = paths.spline_path(5, 40, 0.05, sway_m=0.02)  # what was seen before stays in view
+    poses[:, 2, 3] = 0.6
+    write_log(folder, rig, poses, corridor(5), seed=5)
+    return folder
+
+
+def test_a_sector_gives_poses(sector: Path, command: Command) -> None:
+    """A pair that looks back across azimuth 180: the command line replays and evaluates it."""
+    done = command("replay", sector / "log.mcap", "--rig", sector / "rig.toml", "--quiet", "--tum",
+                         sector / "out.txt")
+    assert done.code == 0 and "tracking 100.0%" in done.out and "rim" not in done.err + done.out, done
+    shown = command("eval", sector / "out.txt", sector / "truth.txt", "--json")
+    found = json.loads(shown.out)
+    assert abs(found["length_error_ratio"]) < 0.002 and found["ate_rmse_m"] < 0.004, found
+
+
+def test_beside_a_sector_nothing_is_free(sector: Path) -> None:
+    """Obstacles and scans know nothing of directions that the cameras do not see, from the first pair to the last."""
+    found = rings_of(sector).rings
+    assert len(found) > 10
+    azimuths = np.rad2deg(np.pi * (2 * np.arange(360) + 1) / 360 - np.pi)
+    aside = np.abs((azimuths + 173 + 180) % 360 - 180)
+    beside, ahead = aside > 45 + 15, aside < 45 - 15
+    for ring in found:
+        assert np.isnan(ring.ranges_m[beside]).all()
+        assert (ring.free_m[beside] <= FOOTPRINT_M).all(), np.nanmax(ring.free_m[beside])
+    assert (found[2].free_m[ahead] > 0.8).mean() > 0.5  # later it has left floor behind that it never saw

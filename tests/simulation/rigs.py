@@ -1,4 +1,4 @@
-"""Rigs of ray-traced mirrors, nominal rigs, and rigs that are wrong."""
+"""Rigs of lenses, of ray-traced mirrors, nominal rigs, and rigs that are wrong."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from calib import se3
+from calib.models.camera import OmniCamera
+from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from omnid.simulation.rendering.rigs import camera_pose
+from omnid.simulation.rendering.rigs import TOPICS, camera_pose
 from tests.simulation.mirrors import MirrorCamera
 
 # Deviation of real mirrors: tilt of a camera below its mirror, shape, centre of the image.
@@ -64,3 +66,35 @@ def with_upper_rotated(rig: Rig, turn_deg: tuple[float, float, float]) -> Rig:
     back = R.T @ se3.rotation_exp(-np.deg2rad(turn_deg)) @ R
     T = se3.transform(back @ T_rig_upper[:3, :3], T_rig_upper[:3, 3])
     return replace(rig, upper=replace(rig.upper, T_cam_rig=se3.inverse(T)))
+
+
+# A camera that looks ahead: its z is the rig's x, its x the rig's -y, its y the rig's -z.
+R_RIG_AHEAD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+LENSES = ("pinhole", "equidistant", "ds", "eucm")
+
+
+def lens(model: str, field_deg: float, size: tuple[int, int] = (640, 480)) -> OmniCamera:
+    """Return a lens whose image is field_deg wide; "pinhole" has radial distortion and less than 130 degrees."""
+    centre, half_px = ((size[0] - 1) / 2 + 2.3, (size[1] - 1) / 2 - 1.7), (size[0] - 1) / 2
+    edge = np.array([[np.sin(np.deg2rad(field_deg) / 2), 0, np.cos(np.deg2rad(field_deg) / 2)]])
+
+    def made(focal: float) -> OmniCamera:
+        if model == "pinhole":
+            return UnifiedCamera(0.0, (focal, focal), centre, size, (-0.03, 0.004, 2e-4, -1e-4))
+        if model == "ds":
+            return DoubleSphereCamera(-0.2, 0.6, (focal, focal), centre, size)
+        if model == "eucm":
+            return ExtendedUnifiedCamera(0.6, 1.1, (focal, focal), centre, size)
+        return EquidistantCamera((0.01, -0.002, 0.0, 0.0), (focal, focal), centre, size)
+
+    return made(half_px / float(made(1.0).project(edge)[0, 0] - centre[0]))
+
+
+def lens_rig(camera: OmniCamera, *, baseline_m: float = 0.2, heading_deg: float = 0.0,
+             misaligned_deg: tuple[float, float, float] = (0.4, -0.3, 0.5)) -> Rig:
+    """Return two equal lenses one above the other that look at heading_deg; the upper one is misaligned."""
+    R = se3.rotation_exp(np.deg2rad([0.0, 0.0, heading_deg])) @ R_RIG_AHEAD
+    R_upper = se3.rotation_exp(np.deg2rad(misaligned_deg)) @ R
+    lower, upper = (MountedCamera(camera, se3.inverse(se3.transform(turned, np.array([0.0, 0.0, height_m]))))
+                    for turned, height_m in ((R, 0.0), (R_upper, baseline_m)))
+    return Rig(lower, upper, topics=TOPICS)

@@ -90,13 +90,17 @@ class Columns:
         and farthest; visible (H, W): pixels of a panorama that both cameras see."""
         self._baseline_m, self._plane, self._heights_m = baseline_m, plane, heights_m
         self._floor_slope = baseline_m / plane.height_m
+        # A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others nothing is seen.
+        self._shown = (np.arange(DIRECTIONS * cylinder.width // cylinder.turn_px)
+                       + DIRECTIONS * cylinder.first // cylinder.turn_px) % DIRECTIONS
         self._height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
         self._row0 = (cylinder.row0 + 0.5) * self._height / cylinder.height - 0.5
         self.at_1m = FOCAL_PX * baseline_m  # disparity
         self.bins = math.ceil(self.at_1m / ranges_m[0])
         self._first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))
         self._visible = self._working(visible * np.uint8(255)) > 127
-        self._last_row = int(np.flatnonzero(self._visible.mean(axis=1) > 0.5)[-1])
+        in_view = self._visible[:, self._shown].mean(axis=1)
+        self._first_row, self._last_row = (int(row) for row in np.flatnonzero(in_view > 0.5)[[0, -1]])
         self._warps = self._made_warps()
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         rows = np.arange(self._height)
@@ -135,10 +139,18 @@ class Columns:
         kernels.level_evidence(one, two, self._plane_rows, mask, self._floor_bins, self._offsets, OUTLIER,
                                np.float32(LEVEL_RATIO / 64 / UNITS), level)
         floor[~self._tested] = np.nan
+        if len(self._shown) < DIRECTIONS:
+            floor[:, np.setdiff1d(np.arange(DIRECTIONS), self._shown)] = np.nan
         return ColumnEvidence(floor, surface, level, self.nearest_floor_m)
 
     def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return np.asarray(cv2.resize(image, (DIRECTIONS, self._height), interpolation=cv2.INTER_AREA), np.uint8)
+        """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
+        shown = cv2.resize(image, (len(self._shown), self._height), interpolation=cv2.INTER_AREA)
+        if len(self._shown) == DIRECTIONS:
+            return np.asarray(shown, np.uint8)
+        whole = np.zeros((self._height, DIRECTIONS), np.uint8)
+        whole[:, self._shown] = shown
+        return whole
 
     def _normalised(self, panorama: PaddedPanorama, noise_grey: float) -> Bytes:
         """Return the panorama less its mean along columns, in units of what two views of it differ by."""
@@ -199,8 +211,7 @@ class Columns:
         """Return the table of kernels.surface_evidence."""
         found = []
         h, (low_m, high_m) = self._plane.height_m, self._heights_m
-        first_row = int(np.flatnonzero(self._visible.mean(axis=1) > 0.5)[0])
-        for v in range(first_row + STRIP_OVERLAP, self._last_row - STRIP_ROWS - STRIP_OVERLAP, STRIP_ROWS):
+        for v in range(self._first_row + STRIP_OVERLAP, self._last_row - STRIP_ROWS - STRIP_OVERLAP, STRIP_ROWS):
             first, end = v - STRIP_OVERLAP, v + STRIP_ROWS + STRIP_OVERLAP
             last = min(self.bins, self._last_row - end)
             fall = v + (STRIP_ROWS - 1) / 2 - self._row0

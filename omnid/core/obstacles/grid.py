@@ -108,7 +108,7 @@ class ObstacleGrid:
             # The robot stands where nothing else can be: the floor too near to be seen counts until it is reached.
             self._start_ns = stamp_ns
             self._nearest_m = evidence.nearest_floor_m
-            self._assume_free(at, evidence.nearest_floor_m)
+            self._assume_free(at, T_odom_base, evidence)
         # 1. Evidence of each cell.
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
@@ -183,9 +183,16 @@ class ObstacleGrid:
         self._fresh *= np.float32(kept)
         self._fresh[window] += np.float32(1 - kept) * amount
 
-    def _assume_free(self, at: NDArray[np.int64], within_m: float) -> None:
+    def _assume_free(self, at: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
+        """Take the floor nearer than what is seen for free, in the directions that the panorama shows."""
         y, x = np.ogrid[:CELLS, :CELLS]
-        near = (x - at[0]) ** 2 + (y - at[1]) ** 2 < ((within_m + 2 * CELL_M) / CELL_M) ** 2
+        radius = (evidence.nearest_floor_m + 2 * CELL_M) / CELL_M
+        near = (x - at[0]) ** 2 + (y - at[1]) ** 2 < radius**2
+        shown = np.asarray(np.isfinite(evidence.floor).any(axis=0))
+        if shown.any() and not shown.all():
+            yaw = float(se3.yaw(self._T_rect_base)) - float(se3.yaw(T_odom_base))
+            turned = (math.pi - np.arctan2(y - at[1], x - at[0]) - yaw) / math.tau
+            near &= shown[np.floor(turned % 1.0 * len(shown)).astype(np.intp)]
         self._odds[FLOORS, near] = FREE_ODDS + 1.0
 
     def _flood(self, stamp_ns: int, in_view: Flags, rows: slice, columns: slice) -> None:

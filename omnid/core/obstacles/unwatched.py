@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.grid import GridRing
-from omnid.core.stereo.tiles import TILE_COLUMNS
+from omnid.core.stereo.tiles import tile_columns
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -26,25 +26,25 @@ class Unwatched:
 
     def __init__(self, cylinder: Cylinder, T_base_rect: Array) -> None:
         """T_base_rect (4, 4): from the rectified frame to the base."""
-        within = np.linspace(0.0, 1.0, SAMPLES)
-        columns = (np.arange(TILE_COLUMNS)[:, None] + within) * (cylinder.width / TILE_COLUMNS) - 0.5
+        within, count = np.linspace(0.0, 1.0, SAMPLES), tile_columns(cylinder)
+        columns = (np.arange(count)[:, None] + within) * (cylinder.width / count) - 0.5
         pixels = np.column_stack([columns.ravel(), np.full(columns.size, cylinder.row0)])
         direction = cylinder.rays(pixels) @ T_base_rect[:3, :3].T
         places = np.array(RANGES_M)[:, None, None] * direction[:, :2] + T_base_rect[:2, 3]
         turned = (np.arctan2(places[..., 1], places[..., 0]) + math.pi) * (SECTORS / (2 * math.pi))
         sectors = np.floor(turned).astype(np.intp) % SECTORS
-        self._sectors = sectors.reshape(len(RANGES_M), TILE_COLUMNS, SAMPLES)
+        self._sectors = sectors.reshape(len(RANGES_M), count, SAMPLES)
 
     def sectors(self, columns: Flags) -> Flags:
-        """Return the sectors (SECTORS,) of columns of tiles (TILE_COLUMNS,)."""
+        """Return the sectors (SECTORS,) of columns of tiles (C,)."""
         found = np.zeros(SECTORS, bool)
-        found[self._sectors[:, columns]] = True
+        found[self._sectors[:, np.flatnonzero(columns)]] = True
         return found
 
     def spans_deg(self, columns: Flags) -> list[tuple[int, int]]:
         """Return from where to where columns of tiles lie about the base, counter-clockwise from ahead [deg]."""
         marked = np.zeros(SECTORS, bool)
-        marked[self._sectors[-1, columns]] = True
+        marked[self._sectors[-1, np.flatnonzero(columns)]] = True
         if marked.all():
             return [(0, 360)]
         begins = np.flatnonzero(marked & ~np.roll(marked, 1))

@@ -8,7 +8,7 @@ grid, by the exact correction at two disparities.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -41,6 +41,7 @@ class DenseCorrection:
     view: tuple[Floats, Floats, Floats]  # from the pixel and its upper row as seen to the view at the stamp
     column: Floats  # from the lower column to that of the upper panorama
     sigma: Floats  # standard deviation of the corrected disparity by the uncertainty of the velocity
+    wraps: bool = True  # the panoramas show a full turn
 
     @staticmethod
     def of(exposure: Exposure, shape: tuple[int, int]) -> DenseCorrection:
@@ -53,11 +54,13 @@ class DenseCorrection:
         coarse = np.nan_to_num(both).astype(np.float32).reshape(len(rows), len(columns), 5, 2)
         whole = (len(columns) * GRID_PX, len(rows) * GRID_PX)
         fields = [_resized(coarse[:, :, k], whole)[: shape[0], : shape[1]] for k in range(5)]
-        return DenseCorrection((fields[0], fields[1], fields[2]), fields[3], fields[4])
+        return DenseCorrection((fields[0], fields[1], fields[2]), fields[3], fields[4],
+                               exposure.model.cylinder.width == exposure.model.cylinder.turn_px)
 
     def column_shift(self, pad_px: int) -> ColumnShift:
-        """Return the shift of the upper column for panoramas that are padded by columns of the other side."""
-        padded = np.pad(self.column, ((0, 0), (pad_px, pad_px), (0, 0)), mode="wrap")
+        """Return the shift of the upper column for padded panoramas."""
+        mode: Literal["wrap", "edge"] = "wrap" if self.wraps else "edge"
+        padded = np.pad(self.column, ((0, 0), (pad_px, pad_px), (0, 0)), mode=mode)
         return ColumnShift(np.ascontiguousarray(padded[:, :, 0]), np.ascontiguousarray(padded[:, :, 1]))
 
     def corrected(self, columns: Indices, rows: Indices, disparity: Floats) -> CorrectedPixels:

@@ -17,7 +17,7 @@ CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
 OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used
 
 
-@compiled("(i8[:], f8[:], f8[:], i8[:], f8[:, :, ::1], f8[:, :, ::1], UniTuple(f8, 4), f8, "
+@compiled("(i8[:], f8[:], f8[:], i8[:], f8[:, :, ::1], f8[:, :, ::1], UniTuple(f8, 5), f8, "
           "f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])",
           writes=("points", "covariance", "in_odom", "covariance_in_odom"))
 def update_depths(rows: Indices, disparity: Array, variance: Array, keyframe: Indices, T_curr_keyframe: Array,
@@ -28,7 +28,7 @@ def update_depths(rows: Indices, disparity: Array, variance: Array, keyframe: In
     keyframe (M,): index of the anchor of each of the rows into the transforms (K, 4, 4). points (N, 3) and covariance
     (N, 3, 3) are in the anchors.
     """
-    focal, _, _, baseline = camera
+    focal, _, _, baseline, _ = camera
     H, PH = np.empty(3), np.empty(3)
     for m in range(len(rows)):
         if math.isnan(disparity[m]):

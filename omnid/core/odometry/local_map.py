@@ -96,6 +96,7 @@ class LocalMap:
         predicted = view(points, self._model.cylinder, self._model.baseline_m)
         bottom = self._model.cylinder.height - 1 - EDGE_ROWS
         is_inside = (predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < bottom)
+        is_inside &= self._model.cylinder.shows(predicted[:, 0])
         if self.lost is not None:
             height, width = self.lost.shape
             columns = np.rint(np.nan_to_num(predicted[:, 0])).astype(np.intp) % width

@@ -57,7 +57,7 @@ class VisualOdometry:
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser, features)
         self._frame_to_map = FrameToMap(self._map, model, klt)
         self._motion = MotionModel(limits)
-        self._static_mask = StaticMask()
+        self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._relocaliser = relocaliser
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
@@ -155,7 +155,8 @@ class VisualOdometry:
         yield T_predicted, True
         yield T_predicted, False
         assert self._previous is not None
-        peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable)
+        peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable,
+                                  turn_px=frame.lower.period_px)
         T_unturned = self._T_odom_rect.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
         yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False

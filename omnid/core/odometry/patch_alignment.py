@@ -84,7 +84,7 @@ def view_noise(covariance: Array, row_variance: Array) -> Array:
 def _cut(panorama: PaddedPanorama, centres: Array, side_px: int) -> Image:
     """Return cells (N, side, side) around whole pixels (N, 2), also across the seam; the border is repeated."""
     image, side = panorama.image, np.arange(side_px) - side_px // 2
-    columns = (centres[:, :1] % panorama.width).astype(np.intp) + panorama.pad_px + side
+    columns = panorama.padded(centres[:, 0])[:, None].astype(np.intp) + side
     rows = centres[:, 1:].astype(np.intp) + side
     columns = columns.clip(0, image.shape[1] - 1)
     rows = rows.clip(0, image.shape[0] - 1) * image.shape[1]

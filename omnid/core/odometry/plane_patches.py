@@ -104,5 +104,5 @@ def fitted_slopes(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array, ne
 
 
 def _padded(panorama: PaddedPanorama, pixels: Array) -> Array:
-    """Return pixels (N, 2) of the padded image, their columns first brought into [0, width)."""
-    return np.column_stack([pixels[:, 0] % panorama.width + panorama.pad_px, pixels[:, 1]])
+    """Return pixels (N, 2) of the padded image."""
+    return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])

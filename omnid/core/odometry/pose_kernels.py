@@ -1,6 +1,6 @@
 """Compiled Gauss-Newton of the pose: see pose_estimation.py for the method and the meaning of the arguments.
 
-camera: (focal_px, row0, width [px], baseline_m) of the panoramas.
+camera: (focal_px, row0, columns of a turn, baseline_m, azimuth of the left edge) of the panoramas.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ def robust_weight(squared: float) -> float:
     return 1 / (1 + squared / KERNEL_WIDTH**2)
 
 
-@compiled("(f8[:, :], f8[:, :, :], f8[:, :], f8[:, :], UniTuple(f8, 4), f8, f8[:, :, :], f8[:, :, ::1])", writes=("W",))
+@compiled("(f8[:, :], f8[:, :, :], f8[:, :], f8[:, :], UniTuple(f8, 5), f8, f8[:, :, :], f8[:, :, ::1])", writes=("W",))
 def whiten(landmarks: Array, covariance: Array, views: Array, T: Array, camera: CameraNumbers, sigma_px: float,
            noise: Array, W: Array) -> None:
     """Write `pose_estimation.whitening` into W (N, 3, 3); noise (N, 3, 3), or (0, 3, 3) for none."""
-    focal, _, _, baseline = camera
+    focal, _, _, baseline, _ = camera
     J, S, JR = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for n in range(len(landmarks)):
         x, y, z = moved(T, landmarks[n, 0], landmarks[n, 1], landmarks[n, 2])
@@ -64,7 +64,7 @@ def whiten(landmarks: Array, covariance: Array, views: Array, T: Array, camera: 
             W[n, 2, 0], W[n, 2, 1], W[n, 2, 2] = 0.0, 0.0, 0.0
 
 
-@compiled("(f8[:, :], f8[:, :], f8[:, :, ::1], f8[:, :, ::1], f8[:, :], UniTuple(f8, 4), i8, f8, "
+@compiled("(f8[:, :], f8[:, :], f8[:, :, ::1], f8[:, :, ::1], f8[:, :], UniTuple(f8, 5), i8, f8, "
           "f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])", writes=("T", "error", "inverse", "squared"))
 def gauss_newton(landmarks: Array, views: Array, W: Array, derivatives: Array, prior: Array, camera: CameraNumbers,
                  steps: int, converged: float, T: Array, error: Array, inverse: Array, squared: Array) -> None:

@@ -1,6 +1,6 @@
 """Compiled RANSAC on three points: see pose_estimation.py for the method and the meaning of the arguments.
 
-camera: (focal_px, row0, width [px], baseline_m) of the panoramas.
+camera: (focal_px, row0, columns of a turn, baseline_m, azimuth of the left edge) of the panoramas.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _SHIFTS = np.uint64(12), np.uint64(25), np.uint64(27)
 _HIGH_BITS, _UNIT = np.uint64(11), 2.0**-53
 
 
-@compiled("(f8[:, :], f8[:, :], f8[:, :], UniTuple(f8, 4), f8, u8, f8[:, ::1], b1[::1])", writes=("best", "consensus"))
+@compiled("(f8[:, :], f8[:, :], f8[:, :], UniTuple(f8, 5), f8, u8, f8[:, ::1], b1[::1])", writes=("best", "consensus"))
 def ransac(landmarks: Array, views: Array, seen: Array, camera: CameraNumbers, threshold_px: float, seed: np.uint64,
            best: Array, consensus: Flags) -> None:
     """Write the best motion (4, 4) and its consensus set (N,): see `pose_estimation.ransac`.
@@ -36,7 +36,7 @@ def ransac(landmarks: Array, views: Array, seen: Array, camera: CameraNumbers, t
     found, most, state = 0, 0, seed | np.uint64(1)
     for n in range(count):
         consensus[n] = False
-        azimuth = math.pi - (views[n, 0] + 0.5) / camera[0]
+        azimuth = camera[4] - (views[n, 0] + 0.5) / camera[0]
         bearing[n, 0], bearing[n, 1] = math.cos(azimuth), math.sin(azimuth)
         if math.isfinite(seen[n, 0]) and math.isfinite(seen[n, 1]) and math.isfinite(seen[n, 2]):
             usable[found] = n
@@ -149,7 +149,7 @@ def consensus_of(landmarks: Array, views: Array, bearing: Array, camera: CameraN
 
     The column is compared as the sine of the angle between the bearings, which needs no arctangent.
     """
-    focal, row0, _, baseline = camera
+    focal, row0, _, baseline, _ = camera
     largest_sine = math.sin(min(threshold_px / focal, math.pi / 2))
     count, left = 0, len(landmarks)
     for n in range(len(landmarks)):

@@ -33,7 +33,9 @@ MAX_EVIDENCE = 4 * EVIDENCE  # so that what was wrongly taken for fixed is relea
 class StaticMask:
     """Learn, at half resolution, where structure stays the same while the robot moves."""
 
-    def __init__(self) -> None:
+    def __init__(self, azimuths_rad: tuple[float, float] = (math.pi, -math.pi)) -> None:
+        """azimuths_rad: of the left and of the right edge of the panoramas."""
+        self._edges_rad = azimuths_rad
         self._reference: tuple[Image, Flags, Array] | None = None  # panorama at half resolution, structure, pose
         self._streak: NDArray[np.uint8] | None = None
         self._blocked: Flags | None = None
@@ -45,8 +47,8 @@ class StaticMask:
             self._reference = (half, _structured(half), T_odom_rect)
             return
         columns = self._reference[0].shape[1]
-        flow = expected_flow(se3.inverse(self._reference[2]) @ T_odom_rect, columns)
-        moving = flow > max(MIN_FLOW_RAD, MIN_FLOW_PX * 2 * math.pi / columns)
+        flow = expected_flow(se3.inverse(self._reference[2]) @ T_odom_rect, columns, self._edges_rad)
+        moving = flow > max(MIN_FLOW_RAD, MIN_FLOW_PX * (self._edges_rad[0] - self._edges_rad[1]) / columns)
         if np.mean(moving) > MOVED_RATIO:
             half = _half(panorama)
             structured = _structured(half)
@@ -71,10 +73,13 @@ class StaticMask:
         self._blocked = np.asarray(cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8).view(bool)
 
 
-def expected_flow(T_before_after: Array, columns: int) -> Array:
-    """Return about how far [rad] each of `columns` of a panorama should have moved, by rotation and by translation."""
+def expected_flow(T_before_after: Array, columns: int, edges_rad: tuple[float, float]) -> Array:
+    """Return about how far [rad] each of `columns` of a panorama should have moved, by rotation and by translation.
+
+    edges_rad: azimuths of its left and right edge.
+    """
     twist = se3.log(T_before_after)
-    azimuth = math.pi - (np.arange(columns) + 0.5) * 2 * math.pi / columns
+    azimuth = edges_rad[0] - (np.arange(columns) + 0.5) * (edges_rad[0] - edges_rad[1]) / columns
     across = np.abs(twist[1] * np.cos(azimuth) - twist[0] * np.sin(azimuth))
     return np.asarray(abs(twist[5]) + across / USUAL_RANGE_M)
 

@@ -1,4 +1,4 @@
-"""Kanade-Lucas-Tomasi tracking on panoramas that wrap around, with the forward-backward check."""
+"""Kanade-Lucas-Tomasi tracking on panoramas, of which a full turn wraps around, with the forward-backward check."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def track(
     there, found = flow(a, b, points, guess, klt)
     back, returned = flow(b, a, there, points, klt)
     error = back - points
-    error[:, 0] = (error[:, 0] + a.width / 2) % a.width - a.width / 2
+    error[:, 0] = a.apart(error[:, 0])
     close = (error**2).sum(axis=1) < klt.max_error_px**2
     return there, found & returned & close
 
@@ -63,11 +63,11 @@ def flow(
         criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE)
     moved = there.reshape(-1, 2).astype(float)
     inside = (moved[:, 1] >= 0) & (moved[:, 1] <= b.image.shape[0] - 1)
-    moved[:, 0] = (moved[:, 0] - b.pad_px) % b.width
-    return moved, (status.ravel() > 0) & inside & np.isfinite(moved).all(axis=1)
+    moved[:, 0], shown = b.unpadded(moved[:, 0])
+    return moved, (status.ravel() > 0) & inside & shown & np.isfinite(moved).all(axis=1)
 
 
-def _padded(points: Array, wrapped: PaddedPanorama) -> NDArray[np.float32]:
-    """Return points (N, 1, 2) float32 in the padded image, their columns first brought into [0, width)."""
-    columns = points[:, 0] % wrapped.width + wrapped.pad_px
+def _padded(points: Array, panorama: PaddedPanorama) -> NDArray[np.float32]:
+    """Return points (N, 1, 2) float32 in the padded image."""
+    columns = panorama.padded(points[:, 0])
     return np.ascontiguousarray(np.stack([columns, points[:, 1]], axis=1)[:, None, :], np.float32)

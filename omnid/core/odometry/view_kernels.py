@@ -1,6 +1,6 @@
 """Compiled view of a landmark in both panoramas, and its derivatives.
 
-camera: (focal_px, row0, width [px], baseline_m) of the panoramas.
+camera: (focal_px, row0, columns of a turn, baseline_m, azimuth of the left edge) of the panoramas.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from omnid.core.compiled import inner
 
 Array = NDArray[np.float64]
-CameraNumbers = tuple[float, float, float, float]
+CameraNumbers = tuple[float, float, float, float, float]
 
 MIN_RADIUS_M = 1e-9  # from the axis: a point on it has no disparity
 
@@ -21,16 +21,16 @@ MIN_RADIUS_M = 1e-9  # from the axis: a point on it has no disparity
 @inner
 def linearise(landmark: Array, seen: Array, camera: CameraNumbers, T: Array, J: Array, e: Array) -> None:
     """Write the derivatives (3, 6) by [t; r] and the error (3,) of the view of a landmark; 0 for an unknown row."""
-    focal, row0, width, baseline = camera
+    focal, row0, width, baseline, left = camera
     x, y, z = moved(T, landmark[0], landmark[1], landmark[2])
     per_r = 1 / max(math.sqrt(x * x + y * y), MIN_RADIUS_M)
     along_x, along_y, scale = x * per_r, y * per_r, focal * per_r
     lower = row0 - scale * z
-    column = (math.pi - math.atan2(y, x)) * focal - 0.5
+    column = (left - math.atan2(y, x)) * focal - 0.5
     e[0] = wrapped(seen[0] - column, width)
     e[1] = seen[1] - lower
     e[2] = 0.0 if math.isnan(seen[2]) else seen[2] - lower - scale * baseline
-    # Column: f (pi - atan2(y, x)); its derivative by a turn about z is -f.
+    # Column: f (left - atan2(y, x)); its derivative by a turn about z is -f.
     J[0, 0], J[0, 1], J[0, 2] = scale * along_y, -scale * along_x, 0.0
     J[0, 3], J[0, 4], J[0, 5] = -z * J[0, 1], z * J[0, 0], -focal
     # Rows: row0 - f height / r; a turn about z does not change them.

@@ -28,14 +28,15 @@ def steps() -> list[float]:
     return [0.0, *both, 10 * STEP_RAD]
 
 
-def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PEAKS) -> list[float]:
+def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PEAKS, turn_px: int = 0) -> list[float]:
     """Return the likeliest turns to the left [rad] from one panorama (H, W) to the next, best first, in [-pi, pi).
 
     Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded.
     Structure that is fixed to the rig must be left out by usable (H, W), because it holds the peak at zero.
+    turn_px: columns of a full turn, in which a sector shows nothing beside itself; 0: all are shown.
     """
-    spectrum = np.conj(_spectrum(before, usable)) * _spectrum(after, usable)
-    width = before.shape[1]
+    width = turn_px or before.shape[1]
+    spectrum = np.conj(_spectrum(before, usable, width)) * _spectrum(after, usable, width)
     score = np.fft.irfft(spectrum.sum(axis=0), width)
     apart = width // PEAKS_APART
     peaks = []
@@ -46,9 +47,9 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PE
     return peaks
 
 
-def _spectrum(image: Image, usable: Flags) -> NDArray[np.complex64]:
-    """Return the spectrum (H / ROW_STEP, W / 2 + 1) over azimuth of the horizontal gradient."""
+def _spectrum(image: Image, usable: Flags, turn_px: int) -> NDArray[np.complex64]:
+    """Return the spectrum (H / ROW_STEP, turn / 2 + 1) over azimuth of the horizontal gradient."""
     wrapped = np.hstack([image[:, -1:], image, image[:, :1]])
     gradient = cv2.Sobel(wrapped, cv2.CV_32F, 1, 0)[:, 1:-1]
     limited = np.clip(gradient, -MAX_GRADIENT, MAX_GRADIENT) * usable
-    return np.fft.rfft(limited[::ROW_STEP], axis=1).astype(np.complex64)
+    return np.fft.rfft(limited[::ROW_STEP], turn_px, axis=1).astype(np.complex64)

@@ -22,10 +22,11 @@ SIDES_PX: Final = (16.0, 240.0)  # smallest and largest side; one sample a pixel
 
 
 def describe(frame: StereoFrame) -> PlaceFeatures:
-    """Return the features of a frame, at most FEATURES, evenly spread."""
+    """Return the features of a frame, at most FEATURES, evenly spread, with views in columns of the full turn."""
     pixels = corners(frame.lower, frame.usable, CORNERS)
     disparity = nearby_disparity(frame.disparity, pixels)
     located = np.flatnonzero(np.isfinite(disparity))[:FEATURES]
     pixels, disparity = pixels[located], disparity[located]
     descriptors = describe_patches(frame.lower, pixels, np.clip(PATCH_BASELINES * disparity, *SIDES_PX))
-    return PlaceFeatures(descriptors, np.column_stack([pixels, pixels[:, 1] + disparity]).astype(np.float32))
+    views = np.column_stack([frame.lower.in_turn(pixels[:, 0]), pixels[:, 1], pixels[:, 1] + disparity])
+    return PlaceFeatures(descriptors, views.astype(np.float32))

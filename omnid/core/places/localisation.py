@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -86,7 +86,8 @@ class MapLocaliser:
         self._localize_only = localize_only
         self.places.bound(len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes,
                           round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed))
-        self.search = PlaceSearch(model)
+        # A map has the columns of full turns, whatever sector of them the cameras show.
+        self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self._tags = TagRecogniser(model, self.places) if self.places.tags else None
         self.correction = MapCorrection(self.places)
         self.ageing = Ageing(self.places)
@@ -115,7 +116,7 @@ class MapLocaliser:
         is_keyframe = self._schedule.keyframe_is_due(self._newest, frame.stamp_ns, frame.T_odom_rect,
                                                      has_depth=frame.is_keyframe)
         if is_keyframe or self._search_is_due(frame):
-            small = thumbnail(frame.stereo.lower.panorama)
+            small = thumbnail(frame.stereo.lower)
             features = describe(frame.stereo)
             # 1. Recognise: a shortlist by signatures, matches, RANSAC, Gauss-Newton; not what is ambiguous.
             tags = self._tags.find(frame.stereo) if self._tags else []

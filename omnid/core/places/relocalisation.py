@@ -63,7 +63,7 @@ class Relocaliser:
         if self._kept and _distance_m(self._kept[-1][1], keyframe) < self._apart_m:
             self._kept.pop()
         self._kept.append((frame, keyframe))
-        self._signatures[frame.seq] = signature(frame.lower.panorama)
+        self._signatures[frame.seq] = signature(frame.lower)
         self._searched = 0
         kept = {frame.seq for frame, _ in self._kept}
         self._descriptors = {seq: features for seq, features in self._descriptors.items() if seq in kept}
@@ -81,7 +81,7 @@ class Relocaliser:
         The most similar keyframes come first, and a search of the next frame goes on where this one ends: all at once
         would take a second, in which the robot has no pose at all.
         """
-        here, seen = _describe(frame, self._model), signature(frame.lower.panorama)
+        here, seen = _describe(frame, self._model), signature(frame.lower)
         ranked = deque(sorted(self._kept, key=lambda kept: -similarity(seen, self._signatures[kept[0].seq])))
         ranked.rotate(-self._searched)
         best: PoseEstimate | None = None

@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.types.panorama import PaddedPanorama
+
 ROWS, COLUMNS = 16, 128  # 2 kB a keyframe, 2.8 degrees a column; by trial on development seeds
 SMOOTH: Final = (31, 5)  # columns, rows: brightness that is taken out, as it changes with the light
 LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare
@@ -18,18 +20,18 @@ Signature = NDArray[np.complex64]
 Thumbnail = NDArray[np.int8]
 
 
-def thumbnail(panorama: NDArray[np.uint8]) -> Thumbnail:
-    """Return the panorama (H, W) of a full turn at (ROWS, COLUMNS) without its slow changes of brightness.
+def thumbnail(panorama: PaddedPanorama) -> Thumbnail:
+    """Return the panorama (H, W) at (ROWS, COLUMNS) of a full turn without its slow changes of brightness.
 
-    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast.
+    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast, and beside a sector.
     """
     contrast = _contrast(panorama)
     scaled = np.rint(THUMBNAIL_SCALE * math.sqrt(contrast.size) * contrast)
     return np.asarray(np.clip(scaled, -127, 127), np.int8)
 
 
-def signature(panorama: NDArray[np.uint8]) -> Signature:
-    """Return the signature (ROWS, COLUMNS / 2 + 1) of a panorama (H, W) of a full turn.
+def signature(panorama: PaddedPanorama) -> Signature:
+    """Return the signature (ROWS, COLUMNS / 2 + 1) of a panorama (H, W).
 
     It is the spectrum over azimuth of the panorama at 16x128 pixels without its slow changes of brightness, scaled to
     length 1; zeros for a panorama without contrast.
@@ -58,13 +60,18 @@ def _correlation(a: Signature, b: Signature) -> NDArray[np.float64]:
     return np.fft.irfft((a * b.conj()).sum(axis=0), COLUMNS)
 
 
-def _contrast(panorama: NDArray[np.uint8]) -> NDArray[np.float32]:
+def _contrast(panorama: PaddedPanorama) -> NDArray[np.float32]:
     """Return the panorama at (ROWS, COLUMNS) without slow changes of brightness, of length 1, or zeros."""
-    small = cv2.resize(panorama, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
+    columns = max(1, round(COLUMNS * panorama.width / panorama.period_px))
+    small = cv2.resize(panorama.panorama, (columns, ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
     pad = SMOOTH[0] // 2
-    turned = cv2.copyMakeBorder(small, 0, 0, pad, pad, cv2.BORDER_WRAP)
-    contrast = small - cv2.blur(turned, SMOOTH)[:, pad:-pad]
+    border = cv2.BORDER_WRAP if columns == COLUMNS else cv2.BORDER_REPLICATE
+    beside = cv2.copyMakeBorder(small, 0, 0, pad, pad, border)
+    contrast = small - cv2.blur(beside, SMOOTH)[:, pad:-pad]
     size = float(np.linalg.norm(contrast))
+    whole = np.zeros((ROWS, COLUMNS), np.float32)
     if size < LEAST_CONTRAST * np.sqrt(small.size):
-        return np.zeros((ROWS, COLUMNS), np.float32)
-    return np.asarray(contrast / size, np.float32)
+        return whole
+    first = round(COLUMNS * panorama.first / panorama.period_px)
+    whole[:, (first + np.arange(columns)) % COLUMNS] = contrast / size
+    return whole

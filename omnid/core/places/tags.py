@@ -79,7 +79,7 @@ class TagFinder:
         for id, four in zip([] if ids is None else ids.ravel().tolist(), corners, strict=True):
             pixels = four.reshape(4, 2).astype(float) - [panorama.pad_px, 0]
             columns = pixels[:, 0].mean()
-            pixels[:, 0] -= panorama.width * np.floor(columns / panorama.width)
+            pixels[:, 0] -= panorama.period_px * np.floor(columns / panorama.period_px)
             # The padding shows a tag at the seam twice; another tag of the same number is no landmark.
             if id in found and np.abs(self._apart(found[id], pixels)).max() > 2.0:
                 twice.add(id)

@@ -109,7 +109,7 @@ def _misfit_deg(drift: RigDrift) -> float:
 
 def _by_azimuth(lower: Array, aside: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
     """Return azimuth of the middle [deg], median offset [px], NaN without matches, and matches of each sector."""
-    azimuth = np.pi - (lower[:, 0] + 0.5) / cylinder.focal_px
+    azimuth = cylinder.azimuth(lower[:, 0])
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     middle = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS
     chosen = [aside[sector == k] for k in range(SECTORS)]

@@ -108,7 +108,7 @@ def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure
     there, good = track(lower, upper, points, guess, KLT)
     # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
     step = there - guess
-    step[:, 0] = (step[:, 0] + lower.width / 2) % lower.width - lower.width / 2
+    step[:, 0] = lower.apart(step[:, 0])
     good &= likely & (np.abs(step).max(axis=1) < MAX_STEP_PX) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
     found = Matches(points[good], there[good], len(points), clear)
     # 4. Views at the stamp of the pair, where its images were exposed at several times.

@@ -108,6 +108,7 @@ class DriveLandmarks:
         index, before = self._tracked, self._pixels
         predicted = self._predicted(current, index)
         inside = (predicted[:, 1] > EDGE_ROWS) & (predicted[:, 1] < self._model.cylinder.height - 1 - EDGE_ROWS)
+        inside &= self._model.cylinder.shows(predicted[:, 0])
         index, before, predicted = index[inside], before[inside], predicted[inside]
         there, found = track(self._keyframes[self._number - 1].lower, current.lower, before, predicted[:, :2], TRACK)
         index, there, predicted = index[found], there[found], predicted[found]
@@ -177,7 +178,7 @@ class DriveLandmarks:
         templates = plane_templates(images, anchors, views[:, :2], surfaces, T_curr_ref, self._model, near, upper=upper)
         aligned = align(templates, current.upper if upper else current.lower, near, anchors, REACH_PX)
         pixels = np.where(aligned.found[:, None], aligned.pixels, near)
-        return np.column_stack([pixels[:, 0] % self._model.cylinder.width, pixels[:, 1]]), aligned.found
+        return np.column_stack([current.lower.own(pixels[:, 0]), pixels[:, 1]]), aligned.found
 
 
 def _is_set(flags: Flags, pixels: Array) -> Flags:

@@ -22,13 +22,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import Cylinder
+
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Side = Literal["lower", "upper"]
 SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 
-# 6 degrees: 15 columns of a panorama at scale 1 (512 px images), less than the narrowest part that matters.
+# Of a full turn; a sector has fewer. 6 degrees: 15 columns of a panorama at scale 1 (512 px images), less than the
+# narrowest part that matters.
 TILE_COLUMNS: Final = 60
 TILE_ROWS: Final = 4  # 63 rows at scale 1
 JUDGED_SHARE: Final = 0.5  # of a tile that shows the world; one of which less does is not judged
@@ -60,18 +63,15 @@ BLIND_SHARE: Final = 0.5  # of the judged tiles of a column, of which more blind
 class TileStates:
     """State of the tiles of a pair."""
 
-    dead: dict[Side, Flags] = field(default_factory=dict)  # (TILE_ROWS, TILE_COLUMNS)
+    dead: dict[Side, Flags] = field(default_factory=dict)  # (TILE_ROWS, C), C the panorama's columns of tiles
     blind: dict[Side, Flags] = field(default_factory=dict)  # the same
-    columns: dict[Side, Flags] = field(default_factory=dict)  # (TILE_COLUMNS,) in which it shows nothing to rely on
+    columns: dict[Side, Flags] = field(default_factory=dict)  # (C,) in which it shows nothing to rely on
     since_ns: dict[Side, int] = field(default_factory=dict)  # first pair of those in a row with such columns
 
     @property
     def unknown(self) -> Flags:
-        """Return the columns of tiles (TILE_COLUMNS,) in which the pair shows nothing to rely on."""
-        found = np.zeros(TILE_COLUMNS, bool)
-        for columns in self.columns.values():
-            found |= columns
-        return found
+        """Return the columns of tiles (C,) in which the pair shows nothing to rely on."""
+        return np.asarray(np.logical_or.reduce(list(self.columns.values()) or [np.zeros(TILE_COLUMNS, bool)]))
 
     def lost_pixels(self, shape: tuple[int, ...]) -> Flags | None:
         """Return the pixels (H, W) of directions that are unknown, and of single tiles that are dead or blind.
@@ -93,21 +93,22 @@ ALL_LIVE: Final = TileStates()
 class TileMonitor:
     """Follows the tiles of both panoramas from pair to pair."""
 
-    def __init__(self, visible: Flags) -> None:
-        """visible (H, W): pixels that show the world."""
+    def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
+        """visible (H, W): pixels that show the world; columns of tiles in W."""
+        self._columns = columns
         self._visible = _sample(visible).astype(np.float32)
-        self._share = _means(self._visible)
+        self._share = _means(self._visible, columns)
         self._judged = self._share >= JUDGED_SHARE
         half = (visible.shape[1] // 2, visible.shape[0] // 2)
         # Pixels at half resolution, all of which show the world, and so do those beside them.
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))
         self._half = (cv2.resize(shown.astype(np.float32), half, interpolation=cv2.INTER_AREA) >= 1).astype(np.float32)
-        self._half_share = cv2.resize(self._half, (TILE_COLUMNS, 1), interpolation=cv2.INTER_AREA)[0]
+        self._half_share = cv2.resize(self._half, (columns, 1), interpolation=cv2.INTER_AREA)[0]
         self._before: dict[Side, Image] = {}
         self._since_ns = dict.fromkeys(SIDES, 0)
         self._lively = {side: np.zeros(self._judged.shape, np.float32) for side in SIDES}  # share of pairs that changed
         self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
-        self._faint = {side: np.zeros(TILE_COLUMNS, np.intp) for side in SIDES}  # pairs in a row with little energy
+        self._faint = {side: np.zeros(columns, np.intp) for side in SIDES}  # pairs in a row with little energy
 
     def update(self, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
         """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey."""
@@ -153,12 +154,12 @@ class TileMonitor:
         return np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
 
     def _contrast(self, image: Image) -> Floats:
-        """Return the standard deviations (TILE_ROWS, TILE_COLUMNS) within tiles."""
+        """Return the standard deviations (TILE_ROWS, C) within tiles."""
         grey = image.astype(np.float32)
         return np.asarray(np.sqrt(np.maximum(self._mean(grey * grey) - self._mean(grey) ** 2, 0.0)), np.float32)
 
     def _energy(self, image: Image) -> Floats:
-        """Return the gradient energy (TILE_COLUMNS,) of columns of tiles at half resolution, grey levels squared.
+        """Return the gradient energy (C,) of columns of tiles at half resolution, grey levels squared.
 
         There the noise is halved, and the texture that dirt takes away is not.
         """
@@ -167,15 +168,15 @@ class TileMonitor:
         squared = np.zeros_like(grey)
         squared[:, 1:] += (grey[:, 1:] - grey[:, :-1]) ** 2
         squared[1:] += (grey[1:] - grey[:-1]) ** 2
-        column = cv2.resize(squared * self._half, (TILE_COLUMNS, 1), interpolation=cv2.INTER_AREA)[0]
+        column = cv2.resize(squared * self._half, (self._columns, 1), interpolation=cv2.INTER_AREA)[0]
         return np.asarray(column / np.maximum(self._half_share, 1e-6), np.float32)
 
     def _blurred(self, side: Side, energy: Floats, other: Floats, noise_grey: float) -> Flags:
-        """Return the columns (TILE_COLUMNS,) in which a camera shows far less than the other one does."""
+        """Return the columns (C,) in which a camera shows far less than the other one does."""
         textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
         if textured.sum() < COMPARED_COLUMNS:
             self._faint[side][:] = 0
-            return np.zeros(TILE_COLUMNS, bool)
+            return np.zeros(self._columns, bool)
         ratio = energy / np.maximum(other, 1e-6)
         usual = float(np.median(ratio[textured]))
         is_faint = textured & (ratio < BLURRED_SHARE * usual)
@@ -186,12 +187,12 @@ class TileMonitor:
         return np.asarray(self._faint[side] >= IN_A_ROW)
 
     def _mean(self, values: Floats) -> Floats:
-        """Return the means (TILE_ROWS, TILE_COLUMNS) of values (H, W) over the pixels that show the world."""
-        return np.asarray(_means(values * self._visible) / np.maximum(self._share, 1e-6), np.float32)
+        """Return the means (TILE_ROWS, C) of values (H, W) over the pixels that show the world."""
+        return np.asarray(_means(values * self._visible, self._columns) / np.maximum(self._share, 1e-6), np.float32)
 
 
 def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
-    """Return flags of the pixels (H, W) of tiles (TILE_ROWS, TILE_COLUMNS)."""
+    """Return flags of the pixels (H, W) of tiles (TILE_ROWS, C)."""
     return np.asarray(cv2.resize(tiles.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
 
 
@@ -202,5 +203,10 @@ def _sample(image: NDArray[Any]) -> NDArray[Any]:
     return image[::2, ::2]
 
 
-def _means(values: Floats) -> Floats:
-    return np.asarray(cv2.resize(values, (TILE_COLUMNS, TILE_ROWS), interpolation=cv2.INTER_AREA), np.float32)
+def _means(values: Floats, columns: int) -> Floats:
+    return np.asarray(cv2.resize(values, (columns, TILE_ROWS), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def tile_columns(cylinder: Cylinder) -> int:
+    """Return the number of columns of tiles of a panorama."""
+    return max(1, round(TILE_COLUMNS * cylinder.width / cylinder.turn_px))

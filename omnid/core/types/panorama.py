@@ -1,4 +1,4 @@
-"""Image of a panorama that wraps around."""
+"""Image of a panorama: a full turn that wraps around, or a sector with two ends."""
 
 from __future__ import annotations
 
@@ -7,24 +7,61 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
 class PaddedPanorama:
-    """Panorama whose first and last pad_px columns are repeated, so that windows run across the seam."""
+    """Panorama with pad_px columns more on either side, so that windows run across the seam of a full turn.
+
+    Those of a full turn repeat its first and last columns; beside a sector they show what the images show there.
+    """
 
     image: Image  # (H, W + 2 pad) uint8
     pad_px: int
     noise_grey: float = 1.0  # standard deviation of the noise, grey levels
     gain: float = 1.0  # by which the image was multiplied because it was dim
+    turn_px: int = 0  # columns of a full turn, of which this shows a sector; 0: all of them
+    first: int = 0  # column of the full turn that is column 0
 
     @property
     def width(self) -> int:
-        """Columns of one full turn [px]."""
+        """Columns without the padding [px]."""
         return int(self.image.shape[1]) - 2 * self.pad_px
+
+    @property
+    def period_px(self) -> int:
+        """Columns of a full turn [px]."""
+        return self.turn_px or self.width
 
     @property
     def panorama(self) -> Image:
         """The panorama itself (H, W), a view."""
         return self.image[:, self.pad_px : self.pad_px + self.width]
+
+    def own(self, columns: Array) -> Array:
+        """Return columns (N,) as those of the panorama: in [0, W) of a full turn, as they are of a sector."""
+        return columns if self.period_px > self.width else np.asarray(columns % self.width)
+
+    def in_turn(self, columns: Array) -> Array:
+        """Return columns (N,) of the full turn, in [0, turn)."""
+        return np.asarray((columns + self.first) % self.period_px)
+
+    def padded(self, columns: Array) -> Array:
+        """Return columns (N,) of the padded image: of a full turn within it, beside a sector at most at its border."""
+        if self.period_px > self.width:
+            return np.asarray(np.clip(columns, -self.pad_px, self.width - 1 + self.pad_px) + self.pad_px)
+        return self.own(columns) + self.pad_px
+
+    def unpadded(self, columns: Array) -> tuple[Array, Flags]:
+        """Return columns (N,) of the panorama from those of the padded image, and flags (N,) of those that it has."""
+        own = columns - self.pad_px
+        if self.period_px > self.width:
+            return own, np.asarray((own >= 0) & (own <= self.width - 1))
+        return self.own(own), np.ones(len(own), bool)
+
+    def apart(self, columns: Array) -> Array:
+        """Return differences (N,) of columns, the short way around a full turn."""
+        return np.asarray((columns + self.period_px / 2) % self.period_px - self.period_px / 2)

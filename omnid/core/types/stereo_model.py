@@ -16,6 +16,10 @@ class StereoModel:
     sigma_px: float = 0.1  # standard deviation
 
     @property
-    def camera(self) -> tuple[float, float, float, float]:
-        """Focal length [px], row0, width [px] and baseline [m]: the arguments of compiled functions."""
-        return self.cylinder.focal_px, self.cylinder.row0, float(self.cylinder.width), self.baseline_m
+    def camera(self) -> tuple[float, float, float, float, float]:
+        """Focal length [px], row0, columns of a turn [px], baseline [m] and azimuth of the left edge [rad].
+
+        They are the arguments of compiled functions.
+        """
+        cylinder = self.cylinder
+        return cylinder.focal_px, cylinder.row0, float(cylinder.turn_px), self.baseline_m, cylinder.left_rad

@@ -220,7 +220,7 @@ def turned_track(
     for _, both_directions in groupby(steps() if turns is None else turns, key=abs):
         before = most
         for turn in both_directions:
-            shift = turn * previous.lower.width / (2 * np.pi)
+            shift = turn * previous.lower.period_px / (2 * np.pi)
             there, found = track(previous.lower, frame.lower, features, features + np.array([shift, 0.0]), klt)
             if found.sum() > most:
                 best, most = (there, found), int(found.sum())

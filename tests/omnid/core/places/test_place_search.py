@@ -39,7 +39,7 @@ def places(twins: RenderedCameras) -> PlaceMap:
     x = np.concatenate([X, X + PERIOD_M])
     for number, T in enumerate(planar_poses(np.column_stack([x, 0 * x]), 0 * x)):
         frame = twins.frame(number, T)
-        places.add(PlaceKeyframe(number, 0, number, T, np.eye(6), thumbnail(frame.lower.panorama),
+        places.add(PlaceKeyframe(number, 0, number, T, np.eye(6), thumbnail(frame.lower),
                                  np.full(360, np.nan, np.float16), describe(frame)), T)
     return places
 
@@ -47,7 +47,7 @@ def places(twins: RenderedCameras) -> PlaceMap:
 def test_of_two_equal_places_none_is_recognised_and_it_is_counted(
     twins: RenderedCameras, places: PlaceMap, query: StereoFrame
 ) -> None:
-    search, small = PlaceSearch(twins.model), thumbnail(query.lower.panorama)
+    search, small = PlaceSearch(twins.model), thumbnail(query.lower)
     assert search.far(small, describe(query), places, list(places.keyframes)) is None and search.ambiguous == 1
     # Both are proposed, to what may settle it: here a pose that is known by other evidence.
     there = se3.exp([PERIOD_M, 0, 0, 0, 0, 0]) @ QUERY
@@ -66,7 +66,7 @@ def test_odometry_tells_which_of_two_equal_places_it_is(
     twins: RenderedCameras, places: PlaceMap, query: StereoFrame, half: int
 ) -> None:
     """None is taken if odometry excludes all places that look like this one."""
-    search, small = PlaceSearch(twins.model), thumbnail(query.lower.panorama)
+    search, small = PlaceSearch(twins.model), thumbnail(query.lower)
     there = se3.exp([half * PERIOD_M, 0, 0, 0, 0, 0]) @ QUERY
     expected = Expected(there, dict.fromkeys(places.keyframes, 0.3), dict.fromkeys(places.keyframes, 0.1), False)
     found = search.near(small, describe(query), places, expected)

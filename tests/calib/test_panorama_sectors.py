@@ -1,0 +1,89 @@
+"""Panoramas of cameras that share a part of the circle: pinholes and fisheyes one above the other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib import se3
+from calib.errors import CalibError
+from calib.models.camera import Mask
+from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
+from tests.simulation import make_rig
+from tests.simulation.rigs import lens, lens_rig
+
+# Widest step at which a sector begins or ends, and what misaligned cameras and the corners of an image add or take.
+STEP_DEG, CORNERS_DEG = 3.75, 3.0
+
+
+@pytest.mark.parametrize(("model", "field_deg", "size"), [
+    ("pinhole", 30, (640, 480)), ("pinhole", 90, (640, 360)), ("equidistant", 60, (640, 480)),
+    ("equidistant", 150, (640, 120)), ("ds", 120, (640, 240)), ("eucm", 120, (640, 240)),
+    ("equidistant", 240, (960, 60)), ("equidistant", 280, (1200, 60))])
+@pytest.mark.parametrize("heading_deg", [20.0, -173.0])
+def test_a_sector_has_the_columns_of_what_both_cameras_see(model: str, field_deg: float, size: tuple[int, int],
+                                                           heading_deg: float) -> None:
+    """Its middle is where the cameras look, also across the seam behind, and its resolution is that of the images."""
+    camera = lens(model, field_deg, size)
+    rig = lens_rig(camera, heading_deg=heading_deg)
+    cylinder = fit_cylinder(rig)
+    span_deg = 360 * cylinder.width / cylinder.turn_px
+    assert field_deg - CORNERS_DEG < span_deg < field_deg + 2 * STEP_DEG + 8 * CORNERS_DEG
+    middle = np.rad2deg(sum(cylinder.edges_rad) / 2) - heading_deg
+    assert abs(math.remainder(middle, 360)) < STEP_DEG + CORNERS_DEG
+    per_rad = np.linalg.norm(np.diff(camera.project(np.array([[-0.01, 0, 1], [0.01, 0, 1.0]])), axis=0)) / 0.02
+    assert 0.7 * per_rad < cylinder.focal_px < 1.9 * per_rad
+    # No column of what both see is missing.
+    wide = Cylinder(cylinder.turn_px, cylinder.height, cylinder.row0)
+    both = np.logical_and(*(visible(m, remap_tables(rig, m, wide)) for m in (rig.lower, rig.upper)))
+    missing = both.any(axis=0)
+    missing[(cylinder.first + np.arange(cylinder.width)) % cylinder.turn_px] = False
+    assert missing.mean() < 0.002
+
+
+def test_pixels_and_rays_of_a_sector_agree_with_those_of_the_full_turn() -> None:
+    """Each point has one column; what the sector does not show lies beside it, never in it."""
+    rng = np.random.default_rng(1)
+    for first in (0, 300, 1100):
+        cylinder = Cylinder(300, 200, 90.0, 1200, first)
+        points = rng.normal(0, 2, (500, 3))
+        pixels, of_turn = cylinder.pixels(points), cylinder.full_turn.pixels(points)
+        np.testing.assert_allclose(cylinder.full_turn.wrap(pixels[:, 0] + first - of_turn[:, 0]), 0, atol=1e-9)
+        assert (np.abs(pixels[:, 0] - 150) <= 600 + 1e-9).all()
+        np.testing.assert_array_equal(cylinder.shows(pixels[:, 0]), (of_turn[:, 0] - first) % 1200 <= 299)
+        rays = cylinder.rays(pixels)
+        np.testing.assert_allclose(np.cross(rays, points), 0, atol=1e-9 * 100)
+        assert ((rays * points).sum(axis=1) > 0).all()
+
+
+def test_mirrors_struts_and_masts_have_a_full_turn() -> None:
+    """A hub, three struts and a mast that hides 40 degrees leave no sector."""
+    rig = make_rig(size=384)
+    whole = fit_cylinder(rig)
+    assert whole.width == whole.turn_px and whole.first == 0
+    rows, columns = np.mgrid[:384, :384] - 191.5
+    for hidden_deg, is_full in ((40, True), (60, False)):
+        shown = np.where(np.abs(np.arctan2(rows, columns)) > np.deg2rad(hidden_deg / 2), 255, 0).astype(np.uint8)
+        mask = Mask((191.5, 191.5), 20.0, 186.0, shown)
+        hidden = replace(rig, lower=replace(rig.lower, mask=mask), upper=replace(rig.upper, mask=mask))
+        found = fit_cylinder(hidden)
+        assert (found.width == found.turn_px) == is_full
+        if is_full:
+            assert found.turn_px == whole.turn_px
+
+
+def test_cameras_that_share_no_view_are_refused() -> None:
+    """Two lenses back to back share nothing; one line says so."""
+    rig = lens_rig(lens("pinhole", 90))
+    turned = rig.upper.T_cam_rig @ se3.transform(se3.rotation_exp([0, 0, math.pi]), np.zeros(3))
+    with pytest.raises(CalibError, match="share no view"):
+        fit_cylinder(replace(rig, upper=replace(rig.upper, T_cam_rig=turned)))
+
+
+def test_a_sector_may_have_finer_columns_than_a_full_turn() -> None:
+    """A telephoto pair of 4,000 px: 48,000 columns of a full turn, of which 4,000 are kept."""
+    cylinder = fit_cylinder(lens_rig(lens("pinhole", 30, (4000, 1000))))
+    assert cylinder.turn_px > 40000 and cylinder.width < 5000
