@@ -23,7 +23,6 @@ from typing import Any, Final, Generic, Self, TypeVar, cast
 import zenoh
 
 from omnid.errors import OmnidError
-from omnid.transport import codec, ros2
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.client_session import HERE, open_client
 from omnid.transport.decode import (
@@ -38,12 +37,14 @@ from omnid.transport.decode import (
     decode_navigation,
     decode_pose,
 )
+from omnid.transport.driver import CONNECT_S, Driver
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.requests import Answer
 from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.transport.session import Unreachable
-from omnid.transport.topics import ARM, HEADING, STOP, TWIST
+from omnid.transport.topics import STOP
 
-__all__ = ["HERE", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "NavigationReport", "Pose",
+__all__ = ["CONNECT_S", "HERE", "Answer", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "NavigationReport", "Pose",
            "PoseAttachment", "Robot", "Scan", "Subscription", "Unreachable", "subscribe"]
 
 T = TypeVar("T")
@@ -57,8 +58,6 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
 }
 _QUERY_TIMEOUT_S: Final = 1.0
 _POLL_S: Final = 0.002
-_MATCH_S: Final = 2.0
-_SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 
 
 class Subscription(Generic[T]):
@@ -259,92 +258,6 @@ class Fleet:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-class Driver:
-    """Sender of commands. Each is valid for controller.deadlines.command_s only: keep sending, or the wheels stop.
-
-    The wheels turn only while the robot is armed: it is disarmed at its start, by each stop and by each fault. Two
-    senders of one source do not drive at once: the first keeps it until it has been silent for a while.
-
-    Drive from one waypoint to the next:
-
-        import math
-        from omnid.client import Pose, Robot
-
-        with Robot("omnid") as robot:
-            driver, poses = robot.driver(), robot.subscribe(Pose)
-            driver.arm()
-            for x_m, y_m in [(1.0, 0.0), (1.0, 1.0)]:
-                for pose in poses:
-                    dx_m, dy_m = x_m - pose.x_m, y_m - pose.y_m
-                    if math.hypot(dx_m, dy_m) < 0.1 or pose.state == "lost":
-                        break
-                    driver.heading(0.3, math.atan2(dy_m, dx_m))
-            driver.twist(0.0, 0.0)
-    """
-
-    def __init__(self, session: zenoh.Session, robot: str, source: str = "") -> None:
-        prefix = f"cmd/{source}" if source else "cmd"
-        self._session, self._robot = session, robot
-        self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
-        self._publishers = {topic: _command_publisher(session, f"{robot}/{topic}")
-                            for topic in (self._twist, self._heading, STOP, ARM)}
-        self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
-
-    @property
-    def connected(self) -> bool:
-        """True if a robot subscribes to the commands."""
-        status: Any = self._publishers[self._twist].matching_status  # zenoh's stub takes it for a bool
-        return bool(status.matching)
-
-    def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
-        """Drive with this forward speed and yaw rate (counter-clockwise)."""
-        payload = codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps)
-        self.send(self._twist, payload)
-
-    def heading(self, velocity_mps: float, heading_rad: float) -> None:
-        """Drive with this speed and hold a heading in odom (counter-clockwise)."""
-        self.send(self._heading, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
-
-    def stop(self) -> None:
-        """Stop the wheels, whatever else was commanded, until `arm` is called."""
-        self.send(STOP, b"")
-
-    def arm(self) -> int:
-        """Ask the robot to arm; it refuses while a fault holds. Return the stamp, which its status repeats, ns.
-
-        Only commands that arrive after it move the wheels. It waits for a new connection to be complete, for at most
-        2 s: the request is sent once. See omnid.monitor.arming for one with an answer.
-        """
-        deadline_s = time.monotonic() + _MATCH_S
-        while not self.connected and time.monotonic() < deadline_s:
-            time.sleep(_POLL_S)
-        stamp_ns = time.time_ns()
-        self.send(ARM, codec.header_cdr(stamp_ns))
-        return stamp_ns
-
-    def send(self, topic: str, payload: bytes) -> None:
-        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which tells senders apart.
-
-        The time of sending is attached: it is the stamp of a message that has none of its own.
-        """
-        if topic not in self._publishers:
-            self._publishers[topic] = _command_publisher(self._session, f"{self._robot}/{topic}")
-        publisher, self._sent = self._publishers[topic], (self._sent + 1) % _SEQUENCE
-        attachment = ros2.attachment(self._sent, time.time_ns(), self._gid)
-        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent), attachment=attachment)
-
-
-def _command_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """Declare a publisher that overtakes all others and blocks rather than drops: a stop must not be lost."""
-    return session.declare_publisher(
-        key,
-        encoding=zenoh.Encoding.APPLICATION_CDR,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        priority=zenoh.Priority.REAL_TIME,
-        express=True,
-    )
 
 
 def subscribe(robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None,

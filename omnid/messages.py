@@ -169,10 +169,9 @@ class MapUpdate:
 
 
 class RequestAnswer(NamedTuple):
-    """Answer to the newest request to the navigation."""
+    """Answer to a request to the navigation."""
 
-    number: int  # rises with each request
-    stamp_ns: int  # of the request, by the sender's clock; 0: it has none
+    id: int  # of the request; 0: none was sent, the recording of a route has ended by itself
     request: str  # in a word
     refusal: str  # the reason, with the remedy; empty: it is accepted
 
@@ -202,5 +201,10 @@ class NavigationUpdate:
     loops_left: int = 0  # of a route, this one included
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0  # its length so far
-    answer: RequestAnswer | None = None  # to the newest request; None: there was none
+    answers: tuple[RequestAnswer, ...] = ()  # to the newest requests, the newest one last
     plan: NavigationPlan | None = None  # where it differs from that of the message before
+
+    @property
+    def answer(self) -> RequestAnswer | None:
+        """Answer to the newest request; None: there was none."""
+        return self.answers[-1] if self.answers else None

@@ -18,9 +18,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Arm the robot; return 1 if it refuses."""
-    from omnid.monitor.arming import arm
+    from omnid.monitor.navigation import connected
 
-    bus = config_of(args).bus
-    refusal = arm(bus)
-    print(f"{bus.robot} refuses: {refusal}" if refusal else f"{bus.robot} is armed: it obeys commands from now on")
-    return int(bool(refusal))
+    with connected(config_of(args).bus) as robot:
+        answer = robot.driver().arm()
+    print(f"{robot.name} is {answer.text}" if answer.done else f"{robot.name} refuses: {answer.text}")
+    return int(not answer.done)

@@ -34,8 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Drive, or cancel, pause, resume."""
     from omnid.errors import OmnidError
-    from omnid.monitor.arming import arm
-    from omnid.monitor.navigation import NavigationClient, drive_to_end
+    from omnid.monitor.navigation import connected, drive_to_end, granted
 
     if args.verb and args.pose:
         raise OmnidError(f"goto: --{args.verb} takes no pose: leave one of them out")
@@ -43,14 +42,13 @@ def run(args: argparse.Namespace) -> int:
         raise OmnidError(f"goto: expected X Y [YAW], numbers found: {len(args.pose)}")
     if not all(math.isfinite(value) and abs(value) <= FARTHEST_M for value in args.pose):
         raise OmnidError(f"goto: expected finite numbers of at most {FARTHEST_M:g}")
-    bus = config_of(args).bus
-    with NavigationClient(bus) as client:
-        if args.verb == "resume" and (refusal := arm(bus)):
-            raise OmnidError(f"{bus.robot} refuses to be armed: {refusal}")
+    with connected(config_of(args).bus) as robot:
+        driver = robot.driver()
+        if args.verb == "resume":
+            granted(robot, driver.arm())
         if args.verb:
-            report = client.navigate(args.verb)
-            print(f"{report.state}: {report.reason}" if report.reason else report.state)
+            print(granted(robot, driver.navigate(args.verb)))
             return 0
         heading_rad = math.radians(args.pose[2]) if len(args.pose) == 3 else None
-        client.goal(args.pose[0], args.pose[1], heading_rad, args.frame)
-        return 0 if args.no_wait else drive_to_end(client)
+        granted(robot, driver.goal(args.pose[0], args.pose[1], heading_rad, args.frame))
+        return 0 if args.no_wait else drive_to_end(robot, driver)

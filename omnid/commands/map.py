@@ -150,9 +150,10 @@ def run_show(args: argparse.Namespace) -> int:
 
 def run_save(args: argparse.Namespace) -> int:
     """Ask the robot to save its map, and print what became of it."""
-    from omnid.monitor.map_saving import save_map
+    from omnid.monitor.navigation import connected, granted
 
-    print(save_map(config_of(args).bus))
+    with connected(config_of(args).bus) as robot:
+        print(granted(robot, robot.driver().save_map()))
     return 0
 
 

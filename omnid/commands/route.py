@@ -61,40 +61,41 @@ def _add(actions: argparse._SubParsersAction[argparse.ArgumentParser], name: str
 def run_teach(args: argparse.Namespace) -> int:
     """Record until Enter is pressed; Ctrl-C drops the recording."""
     from omnid.core.navigation.requests import route_name
-    from omnid.monitor.navigation import NavigationClient
+    from omnid.monitor.navigation import connected, granted
     from omnid.monitor.teaching import record_until_enter
 
     name = route_name(args.name)
-    with NavigationClient(config_of(args).bus) as client:
-        client.route(f"teach {name} replace" if args.replace else f"teach {name}")
+    with connected(config_of(args).bus) as robot:
+        granted(robot, robot.driver().route(f"teach {name} replace" if args.replace else f"teach {name}"))
         if args.no_wait:
             print(f"records {name}: drive it, then `omnid route finish`")
             return 0
-        return record_until_enter(client, name)
+        return record_until_enter(robot, name)
 
 
 def run_repeat(args: argparse.Namespace) -> int:
     """Repeat a route; return 0 if its end is reached, else 1."""
     from omnid.core.navigation.requests import MAX_LOOPS, route_name
     from omnid.errors import OmnidError
-    from omnid.monitor.navigation import NavigationClient, drive_to_end
+    from omnid.monitor.navigation import connected, drive_to_end, granted
 
     if not 1 <= args.loops <= MAX_LOOPS:
         raise OmnidError(f"--loops {args.loops}: expected 1 to {MAX_LOOPS}")
     words = ["repeat", route_name(args.name), *(["reverse"] if args.reverse else [])]
     text = " ".join([*words, f"loops={args.loops}", f"from={args.begin}"])
-    with NavigationClient(config_of(args).bus) as client:
-        client.route(text)
-        return 0 if args.no_wait else drive_to_end(client)
+    with connected(config_of(args).bus) as robot:
+        driver = robot.driver()
+        granted(robot, driver.route(text))
+        return 0 if args.no_wait else drive_to_end(robot, driver)
 
 
 def run_text(args: argparse.Namespace) -> int:
     """Finish a recording, or stop."""
-    from omnid.monitor.navigation import NavigationClient
+    from omnid.monitor.navigation import connected, granted
 
-    with NavigationClient(config_of(args).bus) as client:
-        report = client.route(args.action)
-        print("the route is written" if args.action == "finish" else f"{report.state}: {report.reason}".rstrip(": "))
+    with connected(config_of(args).bus) as robot:
+        text = granted(robot, robot.driver().route(args.action))
+        print("the route is written" if args.action == "finish" else text)
     return 0
 
 

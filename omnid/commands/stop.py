@@ -18,7 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Stop the robot; return 1 if it has not confirmed that."""
-    from omnid.monitor.arming import stop
+    from omnid.monitor.stopping import stop
 
     bus = config_of(args).bus
     if stop(bus):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -12,6 +13,7 @@ from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.safety_rules import IDLE
+from omnid.engine.flow import nothing
 from omnid.engine.telemetry import Histogram, StageStats
 
 
@@ -60,13 +62,16 @@ class ControllerStatistics:
     def __init__(self, stats: StageStats) -> None:
         """stats: the counters of the tick, among those of the stages; busy from one report to the next."""
         self.state = ControllerState()
+        self.take_arm_answer: Callable[[ArmAnswer], object] = nothing  # called with each new answer
         self.to_wheel = Histogram()
         self.lateness = Histogram()
         self._stats = stats
 
     def add(self, tick: TickReport) -> None:
         """Add the report of one tick."""
-        self.state = tick.state
+        before, self.state = self.state.arm_answer, tick.state
+        if self.state.arm_answer != before:
+            self.take_arm_answer(self.state.arm_answer)
         self.lateness.add(tick.late_s)
         if math.isfinite(tick.to_wheel_s):
             self.to_wheel.add(tick.to_wheel_s)

@@ -209,8 +209,8 @@ def summary_status(counters: RunCounters) -> DiagnosticStatus:
 def _arming(state: ControllerState) -> dict[str, str]:
     """Return the values about arming and about the source of the commands, without those that are empty."""
     values = {Key.ARMED: str(int(state.armed)), Key.DISARMED_BY: state.disarmed_by,
-              Key.REMEDY: REMEDY if state.needs_request else "", Key.ARM_STAMP_NS: str(state.arm_answer.stamp_ns),
-              Key.ARM_REFUSAL: state.arm_answer.refusal, Key.SOURCE: state.source}
+              Key.REMEDY: REMEDY if state.needs_request else "", Key.ARM_REFUSAL: state.arm_answer.refusal,
+              Key.SOURCE: state.source}
     return {key: text for key, text in values.items() if text}
 
 

@@ -1,4 +1,4 @@
-"""Goals and routes from another program: requests, their answers, and progress until the end."""
+"""Requests of commands, and the progress of goals and routes until their end."""
 
 from __future__ import annotations
 
@@ -8,102 +8,43 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from omnid.client import NavigationReport, Robot, Subscription
+from omnid.client import CONNECT_S, Answer, Driver, NavigationReport, Robot
 from omnid.errors import OmnidError
-from omnid.monitor.arming import CONNECT_S, driver_of
 from omnid.navigation_state import NavigationState
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.navigation_codec import PlanarGoal, goal_cdr, string_cdr
-from omnid.transport.topics import GOAL, NAVIGATION, ROUTE
 
-ANSWER_S: Final = 5.0
 SILENCE_S: Final = 10.0  # without a report, after which the robot counts as gone
 SHOWN_S: Final = 0.5  # between two lines of progress
-_ENDS: Final = tuple(state for state in NavigationState if state.is_end)
 
 
-class NavigationClient:
-    """A connection that sends requests and follows what becomes of them."""
+def connected(bus: BusConfig) -> Robot:
+    """Return a connection. Raise OmnidError where the robot cannot be reached."""
+    return Robot(settings=bus, timeout_s=CONNECT_S)
 
-    def __init__(self, bus: BusConfig) -> None:
-        """Connect; raise OmnidError where the robot cannot be reached or receives no commands."""
-        self._robot = Robot(settings=bus, timeout_s=CONNECT_S)
-        try:
-            self._driver = driver_of(self._robot)
-            self._reports: Subscription[NavigationReport] = self._robot.subscribe(NavigationReport)
-            newest = self._reports.wait(SILENCE_S)  # one a second, or fewer where a simulation is slow
-            if newest is None:
-                raise OmnidError(f"{bus.robot} reports no navigation: check that its daemon runs with a motor, and "
-                                 "gives poses")
-            self._newest: NavigationReport = newest
-        except BaseException:
-            self._robot.close()
-            raise
 
-    def goal(self, x_m: float, y_m: float, heading_rad: float | None, frame: str) -> NavigationReport:
-        """Ask for a drive to a pose; return the report with the answer. Raise OmnidError with the refusal."""
-        stamp_ns = time.time_ns()
-        self._driver.send(GOAL, goal_cdr(PlanarGoal(stamp_ns, frame, x_m, y_m, heading_rad)))
-        return self._answer(lambda report: report.request_stamp_ns == stamp_ns)
+def granted(robot: Robot, answer: Answer) -> str:
+    """Return what the answer says. Raise OmnidError with the refusal."""
+    if not answer.done:
+        raise OmnidError(f"{robot.name} refuses: {answer.text}")
+    return answer.text
 
-    def navigate(self, verb: str) -> NavigationReport:
-        """Cancel, pause or resume; as `goal`."""
-        return self._text(NAVIGATION, verb)
 
-    def route(self, text: str) -> NavigationReport:
-        """Ask for what a text of cmd/route says; as `goal`."""
-        return self._text(ROUTE, text)
+def follow(robot: Robot, command_ns: int, show: Callable[[NavigationReport], None]) -> NavigationReport:
+    """Show the progress of the drive that a request with this stamp began, until its end; return the last report.
 
-    def next(self, timeout_s: float) -> NavigationReport | None:
-        """Return the next report, None after the timeout."""
-        return self._reports.wait(timeout_s)
-
-    def follow(self, show: Callable[[NavigationReport], None]) -> NavigationReport:
-        """Show the progress until the end of the drive; return the last report.
-
-        Raise OmnidError where the robot is silent for SILENCE_S.
-        """
-        while self._newest.state not in _ENDS:
-            show(self._newest)
-            self._newest = self._expected()
-        return self._newest
-
-    def close(self) -> None:
-        """End the connection."""
-        self._robot.close()
-
-    def __enter__(self) -> NavigationClient:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def _expected(self) -> NavigationReport:
-        """Return the next report. Raise OmnidError where none comes."""
-        report = self._reports.wait(SILENCE_S)
-        if report is not None:
-            return report
-        raise OmnidError(f"{self._robot.name} has been silent for {SILENCE_S:g} s: it stops by itself; see "
-                         "`omnid listen`")
-
-    def _text(self, topic: str, text: str) -> NavigationReport:
-        before = self._newest.request_number
-        self._driver.send(topic, string_cdr(text))
-        return self._answer(lambda report: report.request_number != before)
-
-    def _answer(self, is_answer: Callable[[NavigationReport], bool]) -> NavigationReport:
-        deadline_s = time.monotonic() + ANSWER_S
-        while time.monotonic() < deadline_s:
-            report = self._reports.wait(deadline_s - time.monotonic())
-            if report is not None:
-                self._newest = report
-                if is_answer(report):
-                    if report.refusal:
-                        raise OmnidError(f"{self._robot.name} refuses: {report.refusal}")
-                    return report
-        raise OmnidError(f"{self._robot.name} has not answered within {ANSWER_S:g} s: either this program must not "
-                         "command it (bus.command_users, bus.command_names), the clocks differ, or it gives no poses; "
-                         "see its log")
+    Raise OmnidError where the robot is silent for SILENCE_S, or another request has taken its place.
+    """
+    begun, deadline_s = False, time.monotonic() + SILENCE_S
+    with robot.subscribe(NavigationReport) as reports:
+        while (report := reports.wait(deadline_s - time.monotonic())) is not None:
+            if report.command_ns == command_ns and NavigationState(report.state).is_end:
+                return report
+            if report.command_ns == command_ns:
+                begun, deadline_s = True, time.monotonic() + SILENCE_S
+                show(report)
+            elif begun:
+                raise OmnidError(f"{robot.name} follows another request now: {report.task}")
+    raise OmnidError(f"{robot.name} has been silent for {SILENCE_S:g} s: it stops by itself; see `omnid listen`")
 
 
 class ProgressLine:
@@ -133,15 +74,15 @@ class ProgressLine:
             print()
 
 
-def drive_to_end(client: NavigationClient) -> int:
-    """Show a drive until its end; Ctrl-C cancels it. Return 0 if it has reached its goal, else 1."""
+def drive_to_end(robot: Robot, driver: Driver) -> int:
+    """Show the drive that the driver's newest request began; Ctrl-C cancels it. Return 0 if it has reached its goal."""
     line = ProgressLine()
     try:
-        report = client.follow(line)
+        report = follow(robot, driver.asked_ns, line)
     except KeyboardInterrupt:
         line.end()
-        report = client.navigate("cancel")
-    else:
-        line.end()
+        print(granted(robot, driver.navigate("cancel")))
+        return 1
+    line.end()
     print(f"{report.state}: {report.reason}" if report.reason else report.state)
     return int(report.state != NavigationState.REACHED)

@@ -18,10 +18,12 @@ from calib.bounded_toml import parse_toml
 from omnid.client import Diagnostics, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.errors import OmnidError
-from omnid.monitor.arming import driver_of
+from omnid.monitor.stopping import driver_of
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.codec import header_cdr
 from omnid.transport.status_names import WHEELS, Key
+from omnid.transport.topics import ARM
 
 PERIOD_S: Final = 0.05  # of the commands
 REST_S: Final = 0.5  # after a motion zero is sent for so long; then nothing, so that others may drive
@@ -147,7 +149,7 @@ def _act(driver: Driver, stick: Stick, status: str) -> None:
     if stick.stop_asked:
         driver.stop()
     elif stick.arm_asked:
-        driver.arm()
+        driver.send(ARM, header_cdr(time.time_ns()))  # the status tells the answer: the next key may be a stop
     stick.stop_asked = stick.arm_asked = False
     now_s = time.monotonic()
     velocity_mps, yaw_rate_radps = stick.twist(now_s)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from functools import partial
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from omnid.controller.link import DriveLink
+from omnid.core.control.arming import ArmAnswer
+from omnid.core.control.command_sources import PLANNER
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import Session
@@ -16,11 +18,16 @@ from omnid.sinks.recorder import Recorder
 from omnid.transport.bus import Bus
 from omnid.transport.commands import CommandReceiver
 from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
+from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import DISARMED_BY_STOP
-from omnid.transport.topics import MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, command_topics
+from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, command_topics
 
-Receive: TypeAlias = Callable[[str, bytes, str, int], None]  # key, payload, sender, time of sending [ns, 0: unknown]
+Receive: TypeAlias = Callable[[Request], Answer | None]  # returns None where there is no answer, or not yet
+NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
+NO_PLANNER: Final = f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off"
+NO_MAP_FILE: Final = ("the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
+                      "without --localize-only")
 
 
 class LiveCommands:
@@ -34,8 +41,11 @@ class LiveCommands:
         stamps = StampRule(settings.deadlines.command_s,
                            synchronised=session.config.bus.command_clock == "synchronised")
         self.navigation = NavigationReceiver(requests.put, stamps, report=warn)
-        self.commands = None if controller is None else CommandReceiver(
-            controller, stamps, sources=settings.sources.names, is_unique=lambda: bus.is_unique, report=warn)
+        self.commands: CommandReceiver | None = None
+        if controller is not None:
+            self.commands = CommandReceiver(controller, stamps, sources=settings.sources.names,
+                                            is_unique=lambda: bus.is_unique, report=warn)
+            controller.statistics.take_arm_answer = self._answer_arm
 
     def subscribe(self, recorder: Recorder | None, sensors: SensorSources, saver: MapSaver | None) -> None:
         """Begin to receive; a command is recorded after it was passed on, because a stop must not wait."""
@@ -43,19 +53,21 @@ class LiveCommands:
         topics = command_topics(sources) if self.commands else {**SENSOR_TOPICS, **MAP_TOPICS}
         table: dict[str, Receive] = {}
         if self.commands:
-            table = {key: self.commands.receive for key in topics}
-            table |= {key: lambda key, payload, _, sent_ns: self.navigation.receive(key, payload, sent_ns)
-                      for key in NAVIGATION_TOPICS}
+            navigate = self.navigation.receive if PLANNER in sources else _refusing(NO_PLANNER)
+            table = {topic: self.commands.receive for topic in topics} | dict.fromkeys(NAVIGATION_TOPICS, navigate)
             if recorder is not None:
                 record = command_recorder(recorder, self._session.now_ns, topics)
-                table = {key: _recorded(receive, record) for key, receive in table.items()}
+                table = {topic: _recorded(receive, record) for topic, receive in table.items()}
         # Samples are recorded with the poses.
-        table |= {key: lambda key, payload, *_: sensors.receiver.receive(key, payload) for key in SENSOR_TOPICS}
-        table[MAP] = _ignored if saver is None else lambda _key, payload, *_: saver.receive(payload)
+        table |= {topic: lambda request: sensors.receiver.receive(request.topic, request.payload)
+                  for topic in SENSOR_TOPICS}
+        table[MAP] = _refusing(NO_MAP_FILE) if saver is None else saver.receive
+        others = self.commands.receive if self.commands else _refusing(NO_MOTOR)  # counts unknown topics
 
-        def receive(key: str, payload: bytes, sender: str, sent_ns: int) -> None:
-            handle = table.get(key) or (self.commands.receive if self.commands else _ignored)  # counts unknown topics
-            handle(key, payload, sender, sent_ns)
+        def receive(request: Request) -> None:
+            answer = table.get(request.topic, others)(request)
+            if answer is not None:
+                self._bus.answer(request.id, answer)
 
         self._bus.subscribe_commands(receive, topics, self._is_stopped)
 
@@ -63,14 +75,20 @@ class LiveCommands:
         """True if a stop holds."""
         return self._controller is not None and self._controller.statistics.state.disarmed_by == DISARMED_BY_STOP
 
+    def _answer_arm(self, answer: ArmAnswer) -> None:
+        """Pass on the controller's answer; of several requests at once it answers the newest."""
+        text = answer.refusal or "armed: it obeys commands from now on"
+        self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
+
 
 def _recorded(receive: Receive, record: Callable[[str, bytes], None]) -> Receive:
-    def receive_and_record(key: str, payload: bytes, sender: str, sent_ns: int) -> None:
-        receive(key, payload, sender, sent_ns)
-        record(key, payload)
+    def receive_and_record(request: Request) -> Answer | None:
+        answer = receive(request)
+        record(request.topic, request.payload)
+        return answer
 
     return receive_and_record
 
 
-def _ignored(*_: object) -> None:
-    pass
+def _refusing(reason: str) -> Receive:
+    return lambda _: Answer(False, reason)

@@ -26,7 +26,7 @@ from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
 from omnid.messages import OdometryUpdate
 from omnid.refinement.refined_file import RefinedRigFile
-from omnid.runs.live_commands import LiveCommands
+from omnid.runs.live_commands import NO_PLANNER, LiveCommands
 from omnid.runs.live_robot import LiveRobot
 from omnid.runs.live_status import add_status_tickers
 from omnid.runs.map_saver import MapSaver
@@ -88,12 +88,12 @@ class LiveWiring:
         if controller:
             sinks.rings["controller-ring"] = RingToController(controller)
             parts = replace(parts, drive=LiveDrive(controller, rig.T_base_rig, requests.end),
-                            navigation=self._navigation(controller, requests))
+                            navigation=self._navigation(controller, requests, bus))
         stages = wire(graph, pairs, front_end, config, sinks, parts)
         if config.live.shed_load and not robot.waits:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
-        saver = self._saver(run_places, stages.places)
+        saver = self._saver(run_places, stages.places, bus)
         # 4. From the bus: commands, requests, samples.
         received = LiveCommands(session, bus, controller, requests, self._report)
         received.subscribe(recorder, sensors, saver)
@@ -125,11 +125,11 @@ class LiveWiring:
             self._session.warn("the rig states no height of the cameras: the floor is looked for in the images; "
                                f"until it is found, map, grid and obstacles call nothing free; {ADVICE}")
 
-    def _saver(self, run_places: RunPlaces, places: Places | None) -> MapSaver | None:
+    def _saver(self, run_places: RunPlaces, places: Places | None, bus: Bus) -> MapSaver | None:
         """Return what saves the map of places now and then; None where it stays as it is."""
         if places is None or not run_places.is_extended:
             return None
-        saver = MapSaver(run_places, places, self._session.config.places.save_s)
+        saver = MapSaver(run_places, places, self._session.config.places.save_s, bus.answer)
         self._session.graph.ticker("save", saver.PERIOD_S, saver)
         return saver
 
@@ -141,12 +141,12 @@ class LiveWiring:
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _navigation(self, controller: DriveLink, requests: RequestQueue) -> NavigationParts | None:
+    def _navigation(self, controller: DriveLink, requests: RequestQueue, bus: Bus) -> NavigationParts | None:
         """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
         config = self._session.config
         if PLANNER not in config.controller.sources.names:
-            self._session.warn(f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off")
+            self._session.warn(NO_PLANNER)
             return None
         routes = RouteFolder(Path(config.navigation.routes))
-        return NavigationParts(requests, lambda: wheel_state(controller.statistics.state), PlannerDrive(controller),
-                               routes, config.places.map)
+        return NavigationParts(requests, lambda: wheel_state(controller.statistics.state),
+                               PlannerDrive(controller, bus.answer), routes, config.places.map)

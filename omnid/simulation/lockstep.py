@@ -25,8 +25,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.frames import of_base
-from omnid.core.navigation.requests import NavigationCommand
-from omnid.core.navigation.requests import Request as NavigationRequest
+from omnid.core.navigation.requests import NavigationCommand, NavigationRequest
 from omnid.core.navigation.situation import WheelState
 from omnid.engine.flow import nothing
 from omnid.engine.graph import Graph

@@ -19,6 +19,7 @@ from omnid.engine.flow import nothing
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
+from omnid.transport.requests import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
 FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a replay
@@ -51,15 +52,19 @@ class LiveDrive:
 
 
 class PlannerDrive:
-    """Pass the setpoints of the navigation on; those of a source of higher priority keep them out."""
+    """Pass the setpoints of the navigation on, which a source of higher priority keeps out, and its answers."""
 
-    def __init__(self, link: DriveLink) -> None:
-        self._link = link
+    def __init__(self, link: DriveLink, answer: Callable[[int, Answer], object]) -> None:
+        """answer: takes the id of a request; it does not wait, and a second call for a request does nothing."""
+        self._link, self._answer = link, answer
 
     def process(self, update: NavigationUpdate) -> None:
-        """Send a setpoint, if there is one."""
+        """Send a setpoint, if there is one, and the answers."""
         if update.setpoint is not None:
             self._link.send_setpoint(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
+        state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
+        for answer in update.answers:
+            self._answer(answer.id, Answer(not answer.refusal, answer.refusal or state))
 
 
 class RingToController:

@@ -30,9 +30,7 @@ def navigation_status(update: NavigationUpdate) -> DiagnosticStatus:
     if update.teaching:
         values |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: f"{update.taught_m:.2f}"}
     if update.answer is not None:
-        values |= {Key.REQUEST: update.answer.request, Key.REQUEST_NUMBER: str(update.answer.number)}
-        if update.answer.stamp_ns:
-            values[Key.REQUEST_STAMP_NS] = str(update.answer.stamp_ns)
+        values[Key.REQUEST] = update.answer.request
         if update.answer.refusal:
             values[Key.REFUSAL] = update.answer.refusal
     message = f"{update.state}: {update.reason}" if update.reason else str(update.state)

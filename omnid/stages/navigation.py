@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TypeAlias
 
@@ -23,9 +24,9 @@ from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
     NavigationFrame,
+    NavigationRequest,
     NavigationVerb,
     PathRequest,
-    Request,
     RouteAction,
     RouteRequest,
 )
@@ -41,6 +42,7 @@ NavigationInput: TypeAlias = (OdometryUpdate | PlaceUpdate | ObstacleRing | Navi
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
 RING_NS = 2_000_000_000  # older rings tell nothing: the collision monitor sees to it that the base does not drive on
+MOST_ANSWERS = 64  # that an update repeats, as many as requests may wait: a sink may miss updates
 FIRST_LEG_M = 1.0  # from the robot to a path, beyond which it is refused
 
 
@@ -62,7 +64,7 @@ class NavigationStage:
         self._tie: KeyframeTie | None = None
         self._ring: ObstacleRing | None = None
         self._seq = 0
-        self._answer: RequestAnswer | None = None
+        self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
         self._plan: NavigationPlan | None = None  # that was not given yet
         self._given: tuple[object, ...] = ()  # the state that was given last
         self._given_ns = -REPEAT_NS
@@ -96,7 +98,7 @@ class NavigationStage:
             self._wheels(), self._in_map, obstacles, self._moving(odometry.stamp_ns), nearest_m)
         ended = self._routes.record(now, self._tie)
         if ended:
-            self._refuse(ended)
+            self._answers.append(RequestAnswer(0, "teach", ended))
         return self._update(self._navigator.step(now))
 
     def _obstacles(self, stamp_ns: int) -> Array | None:
@@ -127,20 +129,20 @@ class NavigationStage:
 
     def _request(self, command: NavigationCommand) -> NavigationUpdate:
         """Execute a request; return the new state with the answer."""
-        number = 1 if self._answer is None else self._answer.number + 1
+        refusal = ""
         try:
-            word = self._execute(command)
-            self._answer = RequestAnswer(number, command.stamp_ns, word, "")
+            self._execute(command)
         except OmnidError as error:
-            self._answer = RequestAnswer(number, command.stamp_ns, _word(command.request), str(error))
+            refusal = str(error)
+        self._answers.append(RequestAnswer(command.id, _word(command.request), refusal))
         navigator = self._navigator
         setpoint = STAND if navigator.stopping else None
         update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
         assert update is not None
         return update
 
-    def _execute(self, command: NavigationCommand) -> str:
-        """Execute a request; return it in a word. Raise OmnidError with the reason to refuse it."""
+    def _execute(self, command: NavigationCommand) -> None:
+        """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
         match request:
             case NavigationVerb.CANCEL:
@@ -155,7 +157,6 @@ class NavigationStage:
                 self._start("path", request.frame, [self._given_path(request)], command)
             case RouteRequest():
                 self._route(request, command)
-        return _word(request)
 
     def _route(self, request: RouteRequest, command: NavigationCommand) -> None:
         routes = self._routes
@@ -211,15 +212,11 @@ class NavigationStage:
             raise OmnidError(refusal_to_drive(None, NavigationFrame.ODOM, 0.0))
         return self._now._replace(in_map=self._in_map, wheels=self._wheels())
 
-    def _refuse(self, reason: str) -> None:
-        number = 1 if self._answer is None else self._answer.number + 1
-        self._answer = RequestAnswer(number, 0, "teach", reason)
-
     def _update(self, now: Navigation, *, always: bool = False) -> NavigationUpdate | None:
-        navigator, routes = self._navigator, self._routes
+        navigator, routes, answers = self._navigator, self._routes, tuple(self._answers)
         stamp_ns = 0 if self._now is None else self._now.stamp_ns
         plan, self._plan = self._plan, None
-        state = (now.state, now.reason, navigator.task, routes.teaching, self._answer)
+        state = (now.state, now.reason, navigator.task, routes.teaching, answers)
         same = state == self._given and now.setpoint is None and plan is None
         if same and not always and stamp_ns - self._given_ns < REPEAT_NS:
             return None
@@ -227,10 +224,10 @@ class NavigationStage:
         drive = navigator.drive
         return NavigationUpdate(
             self._seq, stamp_ns, now.setpoint, now.state, now.reason, navigator.task, navigator.command_ns, now.left_m,
-            now.offset_m, len(drive.paths) if drive else 0, routes.teaching, routes.taught_m, self._answer, plan)
+            now.offset_m, len(drive.paths) if drive else 0, routes.teaching, routes.taught_m, answers, plan)
 
 
-def _word(request: Request) -> str:
+def _word(request: NavigationRequest) -> str:
     """Return a request in a word."""
     match request:
         case GoalRequest():

@@ -1,9 +1,9 @@
 """Permissions on the bus, as rules of zenoh's access control.
 
-Every connected program may subscribe, query, and stop the wheels. Other commands, and the release of a stop, may be
-written by those only that the configuration names; nothing else can be written. zenoh applies the rules where a link
-enters the session, so that refused messages never reach the daemon. Where users or certificates are configured, only
-the robot itself declares liveliness tokens below its name.
+Every connected program may subscribe, query, and stop the wheels. Other commands, the release of a stop, and requests
+are for those only that the configuration names; nothing else can be written, and only the robot answers requests. zenoh
+applies the rules where a link enters the session, so that refused messages never reach the daemon. Where users or
+certificates are configured, only the robot itself declares liveliness tokens below its name.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.topics import STOP
+from omnid.transport.topics import STOP, request_key
 
 _ALWAYS: Final = ("declare_subscriber", "declare_queryable", "query", "reply", "liveliness_token", "liveliness_query",
                   "declare_liveliness_subscriber")
@@ -30,16 +30,17 @@ def access_control(config: BusConfig) -> dict[str, Any]:
         "enabled": True,
         "default_permission": "deny",
         "rules": [
-            _rule("subscribe", "egress", (*_ALWAYS, "put", "delete"), list(_EVERYTHING)),
+            _rule("subscribe", "egress", (*_ALWAYS, "put", "delete"), [*_EVERYTHING, request_keys(config)]),
             _rule("query", "ingress", _ALWAYS, list(_EVERYTHING)),
             _rule("stop", "ingress", ("put",), stop_keys(config)),
             _rule("command", "ingress", ("put",), command_keys(config)),
+            _rule("request", "ingress", ("query",), [request_keys(config)]),
             _rule("own names", "ingress", ("liveliness_token",), [f"{config.robot}/**"], permission="deny"),
         ],
         "subjects": [everybody, *commanders],
         "policies": [
             {"id": "all", "rules": ["subscribe", "query", "stop", *names], "subjects": [everybody["id"]]},
-            {"id": "some", "rules": ["command"], "subjects": allowed},
+            {"id": "some", "rules": ["command", "request"], "subjects": allowed},
         ],
     }
 
@@ -48,6 +49,11 @@ def command_keys(config: BusConfig) -> list[str]:
     """Return the key expressions of commands."""
     plain = f"{config.robot}/cmd/**"
     return [plain, f"{config.ros2_domain}/{plain}"] if config.ros2 == "rmw_zenoh" else [plain]
+
+
+def request_keys(config: BusConfig) -> str:
+    """Return the key expression of requests."""
+    return f"{config.robot}/{request_key('*')}"
 
 
 def stop_keys(config: BusConfig) -> list[str]:

@@ -18,10 +18,12 @@ from omnid.errors import OmnidError
 from omnid.transport import status_names
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
-from omnid.transport.command_intake import PERIOD_S, CommandCallback, CommandIntake
+from omnid.transport.command_intake import PERIOD_S, CommandIntake, RequestCallback
 from omnid.transport.intake import QUERY, Intake, floods
 from omnid.transport.namesakes import Namesakes
+from omnid.transport.open_requests import OpenRequests
 from omnid.transport.publishers import RosGraph, TopicPublisher
+from omnid.transport.requests import Answer, Request
 from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import PUBLISHED, STOP
@@ -52,7 +54,8 @@ class Bus:
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, TopicPublisher] = {}
         self._newest: dict[str, tuple[bytes, zenoh.Encoding, bytes | None]] = {}
-        self._on_command: CommandCallback | None = None
+        self._on_command: RequestCallback | None = None
+        self._requests = OpenRequests()
         self._command_topics: Mapping[str, str] = {}
         self._is_stopped: Callable[[], bool] = lambda: False
         self._stop_listener: StopListener | None = None
@@ -125,17 +128,23 @@ class Bus:
         if is_new and self._session is not None:
             self._declare_queryable(self._session, name)
 
-    def subscribe_commands(self, callback: CommandCallback, topics: Mapping[str, str],
+    def subscribe_commands(self, callback: RequestCallback, topics: Mapping[str, str],
                            is_stopped: Callable[[], bool] = lambda: False) -> None:
-        """Call callback(key, payload, sender, sent_ns) for messages on `<robot>/cmd/...`, in a thread of the bus.
+        """Call callback for messages on `<robot>/cmd/...` and queries that ask the same, in a thread of the bus.
 
-        key: from `cmd` on. sender: empty where the message does not name it. sent_ns: 0 where it does not
-        say it. topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
+        topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
         is_stopped: True if a stop holds, which confirms stops that come as datagrams; they are passed on as others.
         """
         self._on_command, self._command_topics, self._is_stopped = callback, topics, is_stopped
         if self._session is not None:
             self._declare_subscribers(self._session, callback)
+
+    def answer(self, id: int, answer: Answer, *, also_before: str = "") -> None:
+        """Answer a request, once, from any thread, without waiting; nothing happens where no query waits for it.
+
+        also_before: a topic on which a request takes the place of earlier ones, which get the same answer.
+        """
+        self._requests.answer(id, answer, also_before=also_before)
 
     def close(self) -> None:
         """End the session; a second call does nothing. zenoh gives up on a subscriber that blocks after 10 s."""
@@ -188,7 +197,7 @@ class Bus:
             self._warned = True
             self._warn(self._same_name)
         if self._on_command is not None:
-            self._on_command(STOP, b"", "", 0)
+            self._on_command(Request(STOP))
 
     def _declare_queryable(self, session: zenoh.Session, name: str) -> None:
         key = f"{self._config.robot}/{name.removeprefix('/')}"
@@ -197,7 +206,11 @@ class Bus:
         self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY)
 
     def _answer_queries(self) -> None:
-        """Answer the queries that have come, and search again for a robot of the same name behind a router."""
+        """Answer the queries that have come, and the requests that are decided.
+
+        Search again for a robot of the same name behind a router.
+        """
+        self._requests.send()
         for name, intake in list(self._queries.items()):
             for query in intake.messages():
                 if name in self._newest:
@@ -208,12 +221,12 @@ class Bus:
             self._namesakes.search()
             self._searched_s = time.monotonic()
 
-    def _declare_subscribers(self, session: zenoh.Session, callback: CommandCallback) -> None:
+    def _declare_subscribers(self, session: zenoh.Session, callback: RequestCallback) -> None:
         if not self.is_unique:
-            callback(STOP, b"", "", 0)
-        self._commands = CommandIntake(session, self._config, self._command_topics, callback)
+            callback(Request(STOP))
+        self._commands = CommandIntake(session, self._config, self._command_topics, self._requests, callback)
         self._pollers.append(Poller(self._commands.process, PERIOD_S, "bus commands"))
-        self._stop_listener = StopListener(self._config, lambda: callback(STOP, b"", "", 0), self._is_stopped)
+        self._stop_listener = StopListener(self._config, lambda: callback(Request(STOP)), self._is_stopped)
         self._pollers.append(Poller(self._stop_listener.process, PERIOD_S, "stop datagrams"))
         if self._graph is not None:
             for name, schema in self._command_topics.items():

@@ -1,45 +1,49 @@
-"""Commands from the bus: a ring for each topic, and one pass over them in the order that is safe."""
+"""Commands and requests from the bus: a ring for each topic, and one pass over them in the order that is safe."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import zenoh
 
 from omnid.transport import ros2
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.intake import UNKNOWN, Intake, budget_of
-from omnid.transport.topics import ARM, STOP
+from omnid.transport.open_requests import OpenRequests
+from omnid.transport.requests import Request
+from omnid.transport.topics import ARM, REQUEST_TOPICS, STOP, request_key
 
-# Key from `cmd` on, payload, identity of the sender, time of sending [ns of Unix time].
-CommandCallback = Callable[[str, bytes, str, int], None]
+RequestCallback: TypeAlias = Callable[[Request], None]
 PERIOD_S: Final = 0.004  # between two passes
 _UNKNOWN: Final = "cmd/**"
 _LAST: Final = (ARM, STOP)
 
 
+class _Ring(NamedTuple):
+    """The messages, or the queries, of one key that wait."""
+
+    topic: str
+    prefix: str  # of the key, before the topic
+    intake: Intake[Any]
+
+
 class CommandIntake:
     """Passes commands on within the budgets of their keys, by `process`, which one thread calls again and again."""
 
-    def __init__(self, session: zenoh.Session, config: BusConfig, topics: Mapping[str, str], callback: CommandCallback
-                 ) -> None:
-        """topics: those with a ring of their own; all others below `cmd` share one."""
-        self._callback = callback
+    def __init__(self, session: zenoh.Session, config: BusConfig, topics: Mapping[str, str], requests: OpenRequests,
+                 callback: RequestCallback) -> None:
+        """topics: those with a ring of their own; all others below `cmd` share one. requests: keeps the queries."""
+        self._callback, self._open = callback, requests
         self._topics = frozenset((*topics, *_LAST))
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
-        prefixes = [f"{config.robot}/"]
-        if config.ros2 == "rmw_zenoh":
-            prefixes.append(f"{config.ros2_domain}/{config.robot}/")
-        ordered = [*sorted(self._topics - {*_LAST}), _UNKNOWN, *_LAST]
-        self._rings = [(topic, self._declare(session, prefix, topic, is_ros=prefix != prefixes[0]), len(prefix))
-                       for topic in ordered for prefix in prefixes]
-        self._stops = [ring for topic, ring, _ in self._rings if topic == STOP]
+        self._rings = list(self._declare(session, config))
+        self._stops = [ring for ring in self._rings if ring.topic == STOP]
 
     @property
-    def intakes(self) -> Sequence[Intake[zenoh.Sample]]:
+    def intakes(self) -> Sequence[Intake[Any]]:
         """The rings, with what they have refused."""
-        return [ring for _, ring, _ in self._rings]
+        return [ring.intake for ring in self._rings]
 
     def process(self) -> None:
         """Pass on what has come: stops first, and again after the requests to arm that came with them.
@@ -48,49 +52,66 @@ class CommandIntake:
         wins.
         """
         stopped, asked_to_arm = self._stop(), False
-        for topic, ring, prefix_length in self._rings:
-            if topic == STOP:
+        for ring in self._rings:
+            if ring.topic == STOP:
                 continue
-            for sample in ring.messages():
-                asked_to_arm |= topic == ARM
-                self._pass_on(topic, sample, prefix_length)
+            for message in ring.intake.messages():
+                asked_to_arm |= ring.topic == ARM
+                if topic := self._topic(ring, message):
+                    self._pass_on(topic, message)
         if asked_to_arm and not self._stop() and stopped:
-            self._callback(STOP, b"", "", 0)
+            self._callback(Request(STOP))
 
     def _stop(self) -> bool:
         """Pass on the stops that have come; return whether there was one."""
-        samples = [sample for ring in self._stops for sample in ring.messages()]
+        samples = [sample for ring in self._stops for sample in ring.intake.messages()]
         if samples:
-            self._callback(STOP, samples[-1].payload.to_bytes(), sender_of(samples[-1]), 0)
+            self._pass_on(STOP, samples[-1])
         return bool(samples)
 
-    def _pass_on(self, topic: str, sample: zenoh.Sample, prefix_length: int) -> None:
-        if topic == _UNKNOWN:
-            key = str(sample.key_expr)[prefix_length:]
-            topic = key if prefix_length == self._rings[0][2] else key.rsplit("/", 2)[0]  # its type and their hash
-            if topic in self._topics:
-                return
-        self._callback(topic, sample.payload.to_bytes(), sender_of(sample), _sent_ns(sample))
+    def _pass_on(self, topic: str, message: zenoh.Sample | zenoh.Query) -> None:
+        payload = b"" if message.payload is None else message.payload.to_bytes()
+        attached = b"" if message.attachment is None else message.attachment.to_bytes()
+        id = self._open.add(topic, message if isinstance(message, zenoh.Query) else None)
+        self._callback(Request(topic, payload, sender_of(message), ros2.sent_ns_in(attached), id))
 
-    def _declare(self, session: zenoh.Session, prefix: str, topic: str, *, is_ros: bool) -> Intake[zenoh.Sample]:
+    def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
+        """Return the topic of a message; empty where another ring has it, and for a query of several keys.
+
+        Who sends a request means one robot and one thing.
+        """
+        key = str(message.key_expr).removeprefix(ring.prefix)
+        if isinstance(message, zenoh.Query):
+            return ring.topic if key == request_key(ring.topic) else ""
+        if ring.topic != _UNKNOWN:
+            return ring.topic
+        topic = key if ring.prefix == self._rings[0].prefix else key.rsplit("/", 2)[0]  # its type and their hash
+        return "" if topic in self._topics else topic
+
+    def _declare(self, session: zenoh.Session, config: BusConfig) -> Iterator[_Ring]:
+        """Declare subscribers and queryables; yield their rings."""
+        own, ros = f"{config.robot}/", f"{config.ros2_domain}/{config.robot}/"
+        for topic in (*sorted(self._topics - {*_LAST}), _UNKNOWN, *_LAST):
+            yield self._ring(session.declare_subscriber, own, topic, topic)
+            if config.ros2 == "rmw_zenoh":
+                yield self._ring(session.declare_subscriber, ros, topic, topic if topic == _UNKNOWN else f"{topic}/*/*")
+            if topic in REQUEST_TOPICS:
+                yield self._ring(session.declare_queryable, own, topic, request_key(topic))
+
+    def _ring(self, declare: Callable[..., Any], prefix: str, topic: str, key: str) -> _Ring:
         budget = UNKNOWN if topic == _UNKNOWN else budget_of(topic)
-        key = f"{prefix}{topic}/*/*" if is_ros and topic != _UNKNOWN else f"{prefix}{topic}"
-        subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(budget.burst))
-        self._declared.append(subscriber)
-        return Intake(topic, subscriber.try_recv, budget, sender_of)
+        declared = declare(f"{prefix}{key}", zenoh.handlers.RingChannel(budget.burst))
+        self._declared.append(declared)
+        return _Ring(topic, prefix, Intake(key, declared.try_recv, budget, sender_of))
 
 
-def sender_of(sample: zenoh.Sample) -> str:
-    """Return the identity of the program that sent a sample, empty where it names none.
+def sender_of(message: zenoh.Sample | zenoh.Query) -> str:
+    """Return the identity of the program that sent a message, empty where it names none.
 
-    Programs with omnid.client give the source of their messages, those of rmw_zenoh the gid of their publisher; zenoh
-    itself adds nothing. No proof: permissions are those of the access rules.
+    Programs with omnid.client give the source of their messages and attach an identity to their requests, those of
+    rmw_zenoh attach the gid of their publisher; zenoh itself adds nothing. No proof: permissions are those of the
+    access rules.
     """
-    if sample.source_info is not None:
-        return str(sample.source_info.source_id.zid)
-    return "" if sample.attachment is None else ros2.gid_in(sample.attachment.to_bytes())
-
-
-def _sent_ns(sample: zenoh.Sample) -> int:
-    """Return the time of sending that omnid.client and rmw_zenoh attach to a sample, 0 without."""
-    return 0 if sample.attachment is None else ros2.sent_ns_in(sample.attachment.to_bytes())
+    if isinstance(message, zenoh.Sample) and message.source_info is not None:
+        return str(message.source_info.source_id.zid)
+    return "" if message.attachment is None else ros2.gid_in(message.attachment.to_bytes())

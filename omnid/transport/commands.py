@@ -29,6 +29,7 @@ from omnid.transport.codec import (
     stamp_from_cdr,
     twist_from_cdr,
 )
+from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import ADVICE, RefusedStamp, StampRule
 from omnid.transport.topics import ARM, HEADING, STOP, TWIST
 
@@ -45,7 +46,7 @@ _ADVICE: Final = ADVICE | {
     "unknown topic": "see controller.sources.names",
 }
 _CONTACTS: Final = {topics.BUMPER: BUMPER, topics.CLIFF: CLIFF}
-_MAX_KEY: Final = 60  # characters of a key in the log
+_MAX_TOPIC: Final = 60  # characters of a topic in the log
 
 
 class RefusedCommand(OmnidError):  # noqa: N818 - named after what it reports
@@ -128,49 +129,48 @@ class CommandReceiver:
         self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
 
-    def receive(self, key: str, payload: bytes, sender: str = "", sent_ns: int = 0) -> None:
-        """Handle one message; never raises.
-
-        sender: identity of the program that sent it, empty if unknown. sent_ns: when, for a message without stamp.
-        """
+    def receive(self, request: Request) -> Answer | None:
+        """Handle one message, never raises; return the refusal, None where there is none or the target decides."""
         arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
-        if key == STOP:
+        if request.topic == STOP:
             self._stop_ns = arrival_ns
             self.stops += 1
             self._target.stop()
-            return
+            return None
         try:
-            if key in _CONTACTS:
-                self._touch(key, payload, sent_ns)
-            elif key == ARM:
-                self._arm(payload, arrival_ns)
+            if request.topic in _CONTACTS:
+                self._touch(request)
+            elif request.topic == ARM:
+                self._arm(request, arrival_ns)
             else:
-                self._drive(key, payload, arrival_ns, sender, sent_ns)
+                self._drive(request, arrival_ns)
         except (RefusedCommand, RefusedStamp) as refusal:
-            self._refuse(key, str(refusal))
+            return self._refuse(request.topic, str(refusal))
         except OmnidError:
-            self._refuse(key, MALFORMED)
+            return self._refuse(request.topic, MALFORMED)
+        return None
 
-    def _refuse(self, key: str, reason: str) -> None:
+    def _refuse(self, topic: str, reason: str) -> Answer:
         self.refused[reason] += 1
+        text = f"{reason}; {_ADVICE[reason]}" if reason in _ADVICE else reason
         if self._report is not None:
-            advice = f"; {_ADVICE[reason]}" if reason in _ADVICE else ""
-            self._report(f"a command on {ascii(key)[1:-1][:_MAX_KEY]} is refused: {reason}{advice}")
+            self._report(f"a command on {ascii(topic)[1:-1][:_MAX_TOPIC]} is refused: {text}")
+        return Answer(False, text)
 
-    def _touch(self, key: str, payload: bytes, sent_ns: int) -> None:
+    def _touch(self, request: Request) -> None:
         """Pass a contact on: only a Bool of False with a fresh stamp says that there is none."""
         holds = True
         try:
-            _check_length(payload)
-            if not bool_from_cdr(payload):
-                self._stamps.check(key, sent_ns)
+            _check_length(request.payload)
+            if not bool_from_cdr(request.payload):
+                self._stamps.check(request.topic, request.sent_ns)
                 holds = False
         finally:
-            self._target.touch(_CONTACTS[key], holds=holds)
+            self._target.touch(_CONTACTS[request.topic], holds=holds)
 
-    def _arm(self, payload: bytes, arrival_ns: int) -> None:
-        _check_length(payload)
-        stamp_ns = stamp_from_cdr(payload)
+    def _arm(self, request: Request, arrival_ns: int) -> None:
+        _check_length(request.payload)
+        stamp_ns = stamp_from_cdr(request.payload)
         age_ns = self._stamps.check_arm(stamp_ns)
         if not self._is_unique():
             raise RefusedCommand(SAME_NAME)
@@ -178,19 +178,20 @@ class CommandReceiver:
             raise RefusedCommand(OLDER_THAN_STOP)
         self._stamps.accept_arm(stamp_ns)
         self.arms += 1
-        self._target.arm(ArmRequest(arrival_ns, stamp_ns))
+        self._target.arm(ArmRequest(arrival_ns, request.id))
 
-    def _drive(self, key: str, payload: bytes, arrival_ns: int, sender: str, sent_ns: int) -> None:
-        if key not in self._topics:
+    def _drive(self, request: Request, arrival_ns: int) -> None:
+        topic, payload = request.topic, request.payload
+        if topic not in self._topics:
             raise RefusedCommand("unknown topic")
         _check_length(payload)
-        source, parser = self._topics[key]
+        source, parser = self._topics[topic]
         command = parser(payload)
-        stamp_ns = command.stamp_ns or sent_ns
+        stamp_ns = command.stamp_ns or request.sent_ns
         if stamp_ns or self._stamps.synchronised or not is_plain_twist(payload):
-            self._stamps.check(key, stamp_ns)
+            self._stamps.check(topic, stamp_ns)
         self.accepted += 1
-        self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, sender))
+        self._target.send_setpoint(TimedSetpoint(arrival_ns, command.setpoint, source, request.sender))
 
 
 def _check_length(payload: bytes) -> None:

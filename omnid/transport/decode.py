@@ -116,8 +116,6 @@ class NavigationReport:
     command_ns: int  # stamp of the goal or path that it follows from; 0 without
     left_m: float  # way to the end; NaN unknown
     request: str  # the newest one
-    request_number: int  # rises with each request
-    request_stamp_ns: int  # of its sender; 0: it had none
     refusal: str  # empty where it was accepted
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0
@@ -133,8 +131,8 @@ def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
     left_m, taught_m = (status_names.number(value(key)) for key in (Key.LEFT_M, Key.TAUGHT_M))
     return NavigationReport(
         report.stamp_ns, value(Key.STATE), value(Key.REASON), value(Key.TASK), _whole(value(Key.COMMAND_NS)),
-        math.nan if left_m is None else left_m, value(Key.REQUEST), _whole(value(Key.REQUEST_NUMBER)),
-        _whole(value(Key.REQUEST_STAMP_NS)), value(Key.REFUSAL), value(Key.TEACHING), taught_m or 0.0)
+        math.nan if left_m is None else left_m, value(Key.REQUEST), value(Key.REFUSAL), value(Key.TEACHING),
+        taught_m or 0.0)
 
 
 def _whole(text: str) -> int:

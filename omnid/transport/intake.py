@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, Generic, TypeVar
 
-from omnid.transport.topics import GOAL, MAP, NAVIGATION, PATH, ROUTE
+from omnid.transport.topics import PATH, REQUEST_TOPICS
 
 T = TypeVar("T")
 MOST_SENDERS: Final = 64  # on a key, that are told apart
@@ -32,7 +32,7 @@ REQUEST: Final = Budget(20.0, 64)
 LONG_REQUEST: Final = Budget(2.0, 4)  # of up to 1 MiB
 UNKNOWN: Final = Budget(200.0, 128)  # topics that do not exist; of up to 1 MiB
 QUERY: Final = Budget(50.0, 64)
-_BUDGETS: Final = {PATH: LONG_REQUEST, GOAL: REQUEST, NAVIGATION: REQUEST, ROUTE: REQUEST, MAP: REQUEST}
+_BUDGETS: Final = {**dict.fromkeys(REQUEST_TOPICS, REQUEST), PATH: LONG_REQUEST}
 
 
 def budget_of(topic: str) -> Budget:
@@ -104,4 +104,7 @@ class Intake(Generic[T]):
 
 def floods(intakes: list[Intake[Any]]) -> Counter[str]:
     """Return the messages above the budgets by key: those refused, and times at which the ring held too many."""
-    return Counter({intake.key: count for intake in intakes if (count := intake.refused + intake.crowded)})
+    counts: Counter[str] = Counter()
+    for intake in intakes:
+        counts[intake.key] += intake.refused + intake.crowded
+    return +counts

@@ -20,9 +20,9 @@ from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
     NavigationFrame,
+    NavigationRequest,
     NavigationVerb,
     PathRequest,
-    Request,
     RouteAction,
     RouteRequest,
     navigation_verb,
@@ -31,9 +31,10 @@ from omnid.core.navigation.requests import (
 from omnid.errors import OmnidError
 from omnid.transport.codec import OK, DiagnosticStatus
 from omnid.transport.navigation_codec import goal_from_cdr, path_from_cdr, string_from_cdr
+from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import ADVICE, RefusedStamp, StampRule
 from omnid.transport.status_names import REFUSED_PREFIX, REQUESTS
-from omnid.transport.topics import GOAL, NAVIGATION, NAVIGATION_TOPICS, PATH
+from omnid.transport.topics import GOAL, NAVIGATION, PATH
 
 LONGEST_PAYLOAD: Final = 1 << 20  # bytes
 LONGEST_TEXT_PAYLOAD: Final = 4096
@@ -55,32 +56,30 @@ class NavigationReceiver:
         self.accepted = 0
         self.refused: Counter[str] = Counter()  # by topic
 
-    def handles(self, key: str) -> bool:
-        """True if a topic is one of the navigation's."""
-        return key in NAVIGATION_TOPICS
-
     def status(self) -> DiagnosticStatus:
         """Return how many requests were accepted, and how many were not valid, by topic."""
         refused = {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(self.refused.items())}
         return DiagnosticStatus(REQUESTS, OK, "", {"accepted": str(self.accepted), **refused})
 
-    def receive(self, key: str, payload: bytes, sent_ns: int = 0) -> None:
-        """Handle one message; sent_ns: when, for a message without stamp, 0 if unknown."""
+    def receive(self, message: Request) -> Answer | None:
+        """Handle one message; return the refusal, None where the target answers."""
         arrival_ns = time.time_ns()
         try:
-            request, stamp_ns = self._parsed(key, payload)
+            request, stamp_ns = self._parsed(message.topic, message.payload)
+            stamp_ns = stamp_ns or message.sent_ns
             if not _is_halt(request):
-                self._stamps.check(key, stamp_ns or sent_ns)
+                self._stamps.check(message.topic, stamp_ns)
         except OmnidError as error:
-            self.refused[key] += 1
+            self.refused[message.topic] += 1
+            refusal = f"{error}; {ADVICE[str(error)]}" if isinstance(error, RefusedStamp) else str(error)
             if self._report is not None:
-                advice = f"; {ADVICE[str(error)]}" if isinstance(error, RefusedStamp) else ""
-                self._report(f"a request on {key} is refused: {error}{advice}")
-            return
+                self._report(f"a request on {message.topic} is refused: {refusal}")
+            return Answer(False, refusal)
         self.accepted += 1
-        self._target(NavigationCommand(request, arrival_ns, stamp_ns))
+        self._target(NavigationCommand(request, arrival_ns, stamp_ns, message.id))
+        return None
 
-    def _parsed(self, key: str, payload: bytes) -> tuple[Request, int]:
+    def _parsed(self, key: str, payload: bytes) -> tuple[NavigationRequest, int]:
         longest = LONGEST_PAYLOAD if key == PATH else LONGEST_TEXT_PAYLOAD
         if len(payload) > longest:
             raise OmnidError(f"{len(payload)} bytes: expected at most {longest}")
@@ -102,7 +101,7 @@ def _stamp_of(text: str) -> tuple[str, int]:
     return (found[1], int(found[2])) if found else (text, 0)
 
 
-def _is_halt(request: Request) -> bool:
+def _is_halt(request: NavigationRequest) -> bool:
     if isinstance(request, RouteRequest):
         return request.action in (RouteAction.STOP, RouteAction.FINISH)
     return request in (NavigationVerb.CANCEL, NavigationVerb.PAUSE)

@@ -33,10 +33,6 @@ class SensorReceiver:
         self._target, self._offset_ns, self._topics, self._report = target, offset_ns, topics, report
         self.refused: Counter[str] = Counter()  # by topic
 
-    def handles(self, key: str) -> bool:
-        """True if a topic is one of wheels or IMU."""
-        return key in SENSOR_TOPICS
-
     def receive(self, key: str, payload: bytes) -> None:
         """Handle one message."""
         try:

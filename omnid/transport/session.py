@@ -13,7 +13,7 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, set_knobs, text_of
-from omnid.transport.topics import PATH, command_topics
+from omnid.transport.topics import PATH, REQUEST_TOPICS, command_topics, request_key
 
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
@@ -142,11 +142,12 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
 
 
 def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
-    """Return the rule that bounds commands in size: many of them wait at once."""
+    """Return the rule that bounds commands and requests in size: many of them wait at once."""
     short = [f"{config.robot}/{topic}" for topic in command_topics(()) if topic != PATH]
     plain = [*short, f"{config.robot}/cmd/*/*"]
     ros = [f"{config.ros2_domain}/{key}/*/*" for key in plain] if config.ros2 == "rmw_zenoh" else []
-    return [{"id": "commands", "flows": ["ingress"], "messages": ["put"], "key_exprs": plain + ros,
+    requests = [f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS - {PATH})]
+    return [{"id": "commands", "flows": ["ingress"], "messages": ["put", "query"], "key_exprs": plain + ros + requests,
              "size_limit": _MAX_COMMAND_BYTES}]
 
 

@@ -92,13 +92,11 @@ class Key(StrEnum):
     REMEDY = "remedy"  # the way to arm, or past an obstacle; no key where none is needed
     OBSTACLE = "obstacle"  # why the collision monitor slows down or stops the base; no key while it does not
     OBSTACLE_STOPS = "obstacle_stops"
-    ARM_STAMP_NS = "arm_stamp_ns"  # of the newest cmd/arm that was answered
-    ARM_REFUSAL = "arm_refusal"  # the reason, no key where it was accepted
+    ARM_REFUSAL = "arm_refusal"  # of the newest request to arm; no key where it was accepted
     # Simulation
     REAL_TIME_FACTOR = "real_time_factor"  # simulated time over time on the wall
     # Map file
     SAVES = "saves"
-    ANSWERED = "answered"  # requests to save it
     # Navigation, on its own topic
     TASK = "task"  # such as "goal" or "route NAME"; no key without one
     REASON = "reason"  # of a halt or an end
@@ -109,8 +107,6 @@ class Key(StrEnum):
     TEACHING = "teaching"  # name of the route that is recorded
     TAUGHT_M = "taught_m"
     REQUEST = "request"  # the newest one, in a word
-    REQUEST_NUMBER = "request_number"  # rises with each request
-    REQUEST_STAMP_NS = "request_stamp_ns"  # of its sender; no key without one
     REFUSAL = "refusal"  # why it is refused; no key where it was accepted
 
 

@@ -54,6 +54,7 @@ NAVIGATION_TOPICS: Final = {GOAL: codec.POSE_SCHEMA, PATH: navigation_codec.PATH
 MAP: Final = "cmd/map"
 SAVE_MAP: Final = "save"  # the request on it
 MAP_TOPICS: Final = {MAP: navigation_codec.STRING_SCHEMA}
+REQUEST_TOPICS: Final = frozenset((ARM, *NAVIGATION_TOPICS, MAP))  # that have an answer
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 JOINT_STATES: Final = "cmd/joint_states"
@@ -70,6 +71,14 @@ def command_topics(sources: Sequence[str]) -> dict[str, str]:
     named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
     return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **CONTACT_TOPICS, **NAVIGATION_TOPICS,
             **MAP_TOPICS, **SENSOR_TOPICS, **named}
+
+
+def request_key(topic: str) -> str:
+    """Return the key of queries that ask what a message on a topic asks: "cmd/arm" -> "@request/arm".
+
+    No star matches a part that begins with @: neither a query nor a permission for everything reaches a request.
+    """
+    return f"@request/{topic.removeprefix('cmd/')}"
 
 
 def ros_name(robot: str, topic: str) -> str:

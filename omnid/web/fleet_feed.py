@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, Final
 
-from omnid.client import Fleet, Unreachable
+from omnid.client import Answer, Fleet, Unreachable
 from omnid.monitor.fleet import FLEET_TOPICS, FleetState, severity, word_of, worst_part
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.plain_text import plain
@@ -21,7 +21,7 @@ from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key, short_na
 from omnid.web.browsers import Browsers
 from omnid.web.channels import Newest, compact
 from omnid.web.snapshot import finite
-from omnid.web.wheel_commands import Answer, within
+from omnid.web.wheel_commands import within
 
 SHOW_S: Final = 0.5
 STOP_S: Final = 10.0  # from the request until a robot that has not confirmed a stop is named

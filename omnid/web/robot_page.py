@@ -7,18 +7,19 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
+from omnid.client import Answer
 from omnid.web.feed import RobotFeed
 from omnid.web.guard import Guard
 from omnid.web.metrics import metrics
-from omnid.web.route_requests import RouteRequests
-from omnid.web.wheel_commands import Answer, WheelCommands
+from omnid.web.robot_requests import RobotRequests
+from omnid.web.wheel_commands import WheelCommands
 
 
 class RobotPage:
     """The answers about one robot."""
 
     def __init__(self, feed: RobotFeed) -> None:
-        self.feed, self.wheels, self._routes = feed, WheelCommands(feed), RouteRequests(feed.bus)
+        self.feed, self.wheels, self._requests = feed, WheelCommands(feed), RobotRequests(feed)
 
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
@@ -28,7 +29,7 @@ class RobotPage:
 
     def metrics(self, guard: Guard) -> str:
         """Return the metrics of the robot and of this server."""
-        counts = {"dropped": self.feed.inbox.dropped, "stops": self.wheels.stops, "arms": self.wheels.arms}
+        counts = {"dropped": self.feed.inbox.dropped, "stops": self.wheels.stops, "arms": self._requests.arms}
         return metrics(self.feed.state, self.feed.browsers, guard.refused, counts)
 
     async def _live(self, websocket: WebSocket) -> None:
@@ -38,16 +39,18 @@ class RobotPage:
         return answered(await self.wheels.stop())
 
     async def _arm(self, _: Request) -> Response:
-        return answered(await self.wheels.arm())
+        if self.wheels.is_stopping:
+            return answered(Answer(False, "a stop is not confirmed yet: arm after it"))
+        return answered(await self._requests.arm())
 
     async def _route(self, request: Request) -> Response:
-        return answered(await self._routes.route(request))
+        return answered(await self._requests.route(request))
 
     async def _navigation(self, request: Request) -> Response:
-        return answered(await self._routes.navigation(request))
+        return answered(await self._requests.navigation(request))
 
     async def _map(self, _: Request) -> Response:
-        return answered(await self._routes.save_map())
+        return answered(await self._requests.save_map())
 
 
 def answered(answer: Answer) -> Response:

@@ -1,4 +1,4 @@
-"""Stop and arm from the page: the same commands with the same answers as `omnid stop` and `omnid arm`."""
+"""Stop from the page: the same command with the same answers as `omnid stop`."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, TypeVar
 
-from omnid.client import HERE, Driver
-from omnid.monitor.arming import ANSWER_S, CONNECT_S, answered_ns
+from omnid.client import CONNECT_S, HERE, Answer, Driver
+from omnid.transport.driver import ANSWER_S
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 from omnid.web.feed import RobotFeed
@@ -21,27 +21,19 @@ _POLL_S: Final = 0.02
 _DATAGRAM_S: Final = 0.05
 
 
-class Answer(NamedTuple):
-    """The answer to a command."""
-
-    done: bool
-    text: str
-
-
 class WheelCommands:
-    """Sends commands. A stop goes on until the robot's status confirms it; any number of browsers may ask for one.
+    """Sends stops. One goes on until the robot's status confirms it; any number of browsers may ask for it.
 
-    Sending may block while the robot does not read: stops and requests to arm have a thread each.
+    Sending may block while the robot does not read: stops have a thread of their own.
     """
 
     def __init__(self, feed: RobotFeed) -> None:
         self._feed = feed
-        self._stop_thread, self._arm_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+        self._stop_thread = ThreadPoolExecutor(1)
         self._driver: Driver | None = None
         self._stopping: asyncio.Task[Answer] | None = None
         self._again = False  # a stop was asked for since the newest one was sent
-        self._arming = False
-        self.stops = self.arms = 0  # that were asked for
+        self.stops = 0  # that were asked for
 
     @property
     def is_stopping(self) -> bool:
@@ -59,19 +51,6 @@ class WheelCommands:
             self._stopping = asyncio.create_task(self._stop())
         assert self._stopping is not None
         return await asyncio.shield(self._stopping)  # a browser that goes does not end it
-
-    async def arm(self) -> Answer:
-        """Ask the robot to arm, and wait for its answer."""
-        if self.is_stopping:
-            return Answer(False, "a stop is not confirmed yet: arm after it")
-        if self._arming:
-            return Answer(False, "another request to arm has no answer yet")
-        self.arms += 1
-        self._arming = True
-        try:
-            return await self._arm()
-        finally:
-            self._arming = False
 
     async def _stop(self) -> Answer:
         begin_s = time.monotonic()
@@ -96,17 +75,6 @@ class WheelCommands:
         with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
             return datagrams.ask(_DATAGRAM_S) == STOPPED
 
-    async def _arm(self) -> Answer:
-        driver = self._ready_driver()
-        if driver is None:
-            return Answer(False, self._reason())
-        stamp_ns = await within(self._arm_thread, driver.arm)
-        answered = stamp_ns is not None and await self._wait_for(lambda: self._answered_ns() >= stamp_ns, ANSWER_S)
-        if not answered:
-            return Answer(False, f"the robot has not answered. {self._reason()}")
-        refusal = self._value(Key.ARM_REFUSAL)
-        return Answer(not refusal, f"refused: {refusal}" if refusal else "the robot is armed: it obeys commands")
-
     def _ready_driver(self) -> Driver | None:
         """Return the sender; None without a connection to the robot."""
         if self._driver is None and self._feed.robot is not None:
@@ -130,14 +98,8 @@ class WheelCommands:
         return self._feed.wheel_reports > reports
 
     def _is_stopped(self) -> bool:
-        return self._value(Key.DISARMED_BY) == DISARMED_BY_STOP
-
-    def _answered_ns(self) -> int:
-        return answered_ns(self._value(Key.ARM_STAMP_NS))
-
-    def _value(self, key: Key) -> str:
         status = self._feed.state.statuses.get(WHEELS)
-        return "" if status is None else status.values.get(key, "")
+        return status is not None and status.values.get(Key.DISARMED_BY) == DISARMED_BY_STOP
 
     def _reason(self) -> str:
         """Return why there may be no answer."""

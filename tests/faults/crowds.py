@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-from omnid.monitor.arming import stop
+from omnid.monitor.stopping import stop
 from omnid.transport.bus_config import BusConfig
 from tests.replay.live import ROOT, robot
 

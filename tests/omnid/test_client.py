@@ -17,13 +17,14 @@ import pytest
 
 import omnid.client
 from calib import se3
-from omnid.client import Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
+from omnid.client import Answer, Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.requests import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, wait_until
 
 
@@ -139,13 +140,15 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
     state = {"x": 0.0, "y": 0.0}
     stops: list[str] = []
 
-    def execute(key: str, payload: bytes, *_: object) -> None:
-        if key == "cmd/heading":
-            _, _, velocity_mps, heading_rad = codec.heading_from_cdr(payload)
+    def execute(request: Request) -> None:
+        if request.topic == "cmd/arm":
+            bus.answer(request.id, Answer(True, "armed"))
+        elif request.topic == "cmd/heading":
+            _, _, velocity_mps, heading_rad = codec.heading_from_cdr(request.payload)
             state["x"] += 0.1 * velocity_mps * math.cos(heading_rad)
             state["y"] += 0.1 * velocity_mps * math.sin(heading_rad)
-        elif key == "cmd/twist":
-            stops.append(key)
+        elif request.topic == "cmd/twist":
+            stops.append(request.topic)
 
     with robot() as (bus, endpoint):
         bus.subscribe_commands(execute, {})
@@ -163,18 +166,20 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
 
 
 def test_sends_commands() -> None:
-    received: list[tuple[str, bytes, str, int]] = []
+    received: list[Request] = []
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         driver = connection.driver()
         assert not driver.connected
-        bus.subscribe_commands(lambda *message: received.append(message), {})
+        bus.subscribe_commands(received.append, {})
         wait_until(lambda: driver.connected)
         driver.twist(0.5, -0.25)
         driver.heading(0.75, 1.5)
         wait_until(lambda: len(received) == 2)
         driver.stop()
         wait_until(lambda: len(received) == 3)
-        stamp_ns = driver.arm()
+        before_ns = time.time_ns()
+        with pytest.raises(OmnidError, match="has not answered"):
+            driver.arm(timeout_s=0.2)
         wait_until(lambda: len(received) == 4)
         connection.driver("planner").twist(0.5, -0.25)
         wait_until(lambda: len(received) == 5)
@@ -182,11 +187,12 @@ def test_sends_commands() -> None:
             other.driver().stop()
             wait_until(lambda: len(received) == 6)
     received[:2] = sorted(received[:2], reverse=True)  # the order of different topics is not kept
-    (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, *_), (planned, d, *_), _ = received
+    (twist, a, *_), (heading, b, *_), (stop, *_), (arm, c, _, sent_ns, _), (planned, d, *_), _ = received
     assert (twist, heading, stop, arm) == ("cmd/twist", "cmd/heading", "cmd/stop", "cmd/arm")
     assert planned == "cmd/planner/twist" and codec.twist_from_cdr(d)[1:] == ("base_link", 0.5, -0.25)
-    assert codec.stamp_from_cdr(c) == stamp_ns
-    senders = [sender for *_, sender, _ in received]
-    assert len(set(senders[:5])) == 1 and senders[5] != senders[0] and len(senders[0]) >= 16
+    assert codec.stamp_from_cdr(c) == sent_ns and before_ns <= sent_ns <= time.time_ns()
+    senders = [request.sender for request in received]
+    assert len({senders[0], senders[1], senders[2], senders[4]}) == 1 and senders[5] != senders[0]
+    assert all(len(sender) >= 16 for sender in senders)
     assert codec.twist_from_cdr(a)[1:] == ("base_link", 0.5, -0.25)
     assert codec.heading_from_cdr(b)[1:] == ("odom", 0.75, 1.5)

@@ -10,20 +10,19 @@ import pytest
 
 from calib import se3
 from omnid.cli import main
+from omnid.client import Robot
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
-from omnid.monitor.navigation import NavigationClient
-from omnid.transport.bus_config import BusConfig
 from tests.replay.live import free_port, started, wait_until
 
 GOAL = (0.6, 0.1, 45.0)  # m, m, deg
 NEAR_M, NEAR_DEG = 0.05, 2.0
 
 
-def reports_navigation(port: int) -> bool:
+def takes_requests(port: int) -> bool:
     try:
-        with NavigationClient(BusConfig(connect=(f"tcp/127.0.0.1:{port}",))):
-            return True
+        with Robot(connect=(f"tcp/127.0.0.1:{port}",)) as robot:
+            return "no pose yet" not in robot.driver().navigate("resume").text
     except OmnidError:
         return False
 
@@ -37,7 +36,7 @@ def test_goals_in_odom_and_in_the_saved_map(tmp_path: Path, capsys: pytest.Captu
     goals: dict[str, list[tuple[str, ...]]] = {"odom": [("0.8", "0"), ("0", "0", "0")], "map": [tuple(map(str, GOAL))]}
     for frame, poses in goals.items():
         with started(command, port) as daemon:
-            wait_until(lambda: reports_navigation(port), "a report of the navigation")
+            wait_until(lambda: takes_requests(port), "the navigation")
             if frame == "odom":
                 assert main(["goto", "1", "0", *connect]) == 2
                 assert "not armed" in capsys.readouterr().err

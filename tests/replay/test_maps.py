@@ -11,11 +11,10 @@ import numpy as np
 import pytest
 
 from calib.rig_file import read_rig, write_rig
+from omnid.client import Robot
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
-from omnid.monitor.map_saving import save_map
 from omnid.tracking_state import MapState
-from omnid.transport.bus_config import BusConfig
 from omnid.transport.status_names import Key
 from tests.replay.command import Command
 from tests.replay.live import Daemon, Operator, answers, command_line, free_port, started, wait_until
@@ -184,7 +183,8 @@ def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, oma
     with running(scene, omap, "--set", "places.save_s=1000") as (daemon, operator):
         wait_until(lambda: int(operator.values("places")["loops"]) > 3, "loops")
         assert sessions(omap) == {0, 1}
-        assert save_map(BusConfig(connect=(f"tcp/127.0.0.1:{daemon.port}",))) == "the map is saved"
+        with Robot(connect=(f"tcp/127.0.0.1:{daemon.port}",)) as program:
+            assert program.driver().save_map() == (True, "the map is saved")
         assert sessions(omap) == {0, 1, 2}
         omap.unlink()  # written again at the end
         code, err = daemon.end()

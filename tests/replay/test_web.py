@@ -33,7 +33,7 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         operator.drive(0.3)
         assert not state(server, lambda found: found["wheels"] and found["pose"])["wheels"]["armed"]
         assert not base.line.moved_since(0.0)
-        assert server.post("/arm") == {"done": True, "text": "the robot is armed: it obeys commands"}
+        assert server.post("/arm") == {"done": True, "text": "armed: it obeys commands from now on"}
         wait_until(lambda: base.drives, "motion")
         answer = server.post("/stop")
         assert answer["done"] and "stand until" in answer["text"]
@@ -46,7 +46,7 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         assert server.post("/arm")["done"]
         base.unplug()
         wait_until(lambda: operator.message("wheels") == FAILED, "the fault")
-        assert server.post("/arm") == {"done": False, "text": f"refused: {FAILED}"}
+        assert server.post("/arm") == {"done": False, "text": f"omnid refuses: {FAILED}"}
         base.plug_in()
         assert daemon.end()[0] == 0
         gone = state(server, lambda found: found["alive"] is False and len(found["warnings"]) == 1)

@@ -28,13 +28,13 @@ class ArmRequest(NamedTuple):
     """A request to arm."""
 
     arrival_ns: int  # by the clock that steps the law
-    stamp_ns: int = 0  # of the sender; the answer carries it
+    id: int = 0  # rises with each request; the answer carries it
 
 
 class ArmAnswer(NamedTuple):
     """The answer to the newest request to arm."""
 
-    stamp_ns: int  # of the request; 0: there was none
+    id: int  # of the request; 0: there was none
     refusal: str  # the reason; empty where the request was accepted
 
 
@@ -92,7 +92,7 @@ class Arming:
             self.armed, self.reason = False, ASKED
         request, self._request = self._request, None
         if request is not None:
-            self.answer = ArmAnswer(request.stamp_ns, self._refusal(request, fault, now_ns, longest_s))
+            self.answer = ArmAnswer(request.id, self._refusal(request, fault, now_ns, longest_s))
             if not self.answer.refusal:
                 self._released_ns, self._touched = request.arrival_ns, False
                 self._arm()

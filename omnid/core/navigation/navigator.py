@@ -104,6 +104,7 @@ class Navigator:
         """Halt until `resume`."""
         if self.drive is not None:
             self.drive.paused = self.drive.paused or reason
+            self.state, self.reason = NavigationState.PAUSED, self.drive.paused
 
     def resume(self, now: Situation) -> str:
         """Go on; return the reason where it cannot."""

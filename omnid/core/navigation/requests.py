@@ -75,15 +75,16 @@ class RouteRequest:
     replace: bool = False  # teach in the place of a route of that name
 
 
-Request: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
+NavigationRequest: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
 
 
 class NavigationCommand(NamedTuple):
     """A request and its times."""
 
-    request: Request
+    request: NavigationRequest
     arrival_ns: int  # of Unix time
     stamp_ns: int = 0  # of the sender, of Unix time; 0: it has none
+    id: int = 0  # of the message that asks; the answer has it too
 
 
 def navigation_verb(text: str) -> NavigationVerb:

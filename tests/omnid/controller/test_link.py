@@ -199,7 +199,7 @@ def test_a_stop_rides_along_with_everything_that_follows_and_needs_a_later_reque
         robot.link._channel.send = send  # type: ignore[method-assign]
         robot.link.arm(early)
         wait_until(lambda: not robot.base.drives, "the stop")
-        wait_until(lambda: state.state.arm_answer.stamp_ns == 1, "the answer")
+        wait_until(lambda: state.state.arm_answer.id == 1, "the answer")
         assert not state.state.armed and state.state.disarmed_by == safety_rules.ASKED
         arm(robot)
         wait_until(lambda: state.state.armed, "the release")

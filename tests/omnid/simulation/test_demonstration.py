@@ -26,8 +26,8 @@ REACHED, DRIVING = NavigationState.REACHED, NavigationState.DRIVING
 def moment(time_s: float, state: NavigationState | None, map_state: MapState = MapState.LOCALIZED, refusal: str = ""
            ) -> Moment:
     """Return a moment of an armed robot."""
-    answer = RequestAnswer(1, 0, "teach", refusal)
-    navigation = None if state is None else NavigationUpdate(0, 0, None, state, "why", answer=answer)
+    answer = RequestAnswer(1, "teach", refusal)
+    navigation = None if state is None else NavigationUpdate(0, 0, None, state, "why", answers=(answer,))
     seen = cast("Any", object())  # only whether there is a pose counts
     place = PlaceUpdate(0, 0, np.eye(4), np.eye(4), np.eye(6), map_state, 0, np.eye(4))
     return Moment(time_s, np.eye(4), ControllerState(armed=True), seen, np.eye(4), navigation, place)

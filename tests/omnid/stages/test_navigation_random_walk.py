@@ -28,9 +28,9 @@ from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
     NavigationFrame,
+    NavigationRequest,
     NavigationVerb,
     PathRequest,
-    Request,
     RouteAction,
     RouteRequest,
 )
@@ -120,7 +120,7 @@ class Walk:
         while rng.random() < (0.05 if self.wanted else 0.25):
             self.ask(self.request())
 
-    def request(self) -> Request:
+    def request(self) -> NavigationRequest:
         """Return a random request."""
         rng = self.rng
         frame = rng.choice(list(NavigationFrame))
@@ -135,7 +135,7 @@ class Walk:
             RouteRequest(RouteAction.REPEAT, route, rng.random() < 0.5, rng.randint(1, 3)),
             RouteRequest(RouteAction.STOP)))
 
-    def ask(self, request: Request) -> None:
+    def ask(self, request: NavigationRequest) -> None:
         """Send a request, and take its answer into the oracle."""
         teaching = self.seen_teaching
         update = self.stage.process(NavigationCommand(request, self.now_ns, self.now_ns))

@@ -19,12 +19,12 @@ from omnid.core.navigation.requests import (
     GoalRequest,
     NavigationCommand,
     NavigationFrame,
+    NavigationRequest,
     NavigationVerb,
     PathRequest,
     RouteAction,
     RouteRequest,
 )
-from omnid.core.navigation.requests import Request as NavigationRequest
 from omnid.core.navigation.route import KeyframePose
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
@@ -78,9 +78,9 @@ class Robot:
         self.map_state, self.resets = MapState.LOCALIZED, 0
         self.in_map = True
 
-    def send(self, request: NavigationRequest, stamp_ns: int = 0) -> NavigationUpdate:
+    def send(self, request: NavigationRequest, stamp_ns: int = 0, id: int = 0) -> NavigationUpdate:
         """Return the answer to a request."""
-        update = self.stage.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns))
+        update = self.stage.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id))
         assert update is not None
         self.updates.append(update)
         return update
@@ -125,8 +125,8 @@ class Robot:
 def test_drives_to_a_goal_of_the_base_in_odom_and_in_the_map(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()
-    update = robot.send(GoalRequest(ODOM, 1.5, 0.5, 1.0), 77)
-    assert update.answer is not None and not update.answer.refusal and update.answer.stamp_ns == 77
+    update = robot.send(GoalRequest(ODOM, 1.5, 0.5, 1.0), 77, 5)
+    assert update.answer == (5, "goal", "") and update.command_ns == 77
     assert update.state is NavigationState.DRIVING and update.plan is not None and update.plan.frame == "odom"
     assert robot.run().state is NavigationState.REACHED
     np.testing.assert_allclose(robot.pose, [1.5, 0.5, 1.0], atol=0.03)
@@ -156,7 +156,7 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     robot.wheels = WheelState(False, True, "a stop was asked for")
     assert "omnid arm" in refusal(GoalRequest(ODOM, 1.0, 0.0))
     assert "no route nowhere in" in refusal(RouteRequest(RouteAction.REPEAT, "nowhere"))
-    assert [u.answer.number for u in robot.updates if u.answer is not None][-1] == 9
+    assert len(robot.updates[-1].answers) == 9
 
 
 def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
@@ -174,8 +174,9 @@ def test_several_requests_at_once_are_done_in_their_order(tmp_path: Path) -> Non
     robot = Robot(tmp_path)
     robot.pass_on()
     requests = [GoalRequest(ODOM, 3.0, 0.0), NavigationVerb.CANCEL]
-    update = robot.stage.process([NavigationCommand(request, 0) for request in requests])
+    update = robot.stage.process([NavigationCommand(request, 0, id=id) for id, request in enumerate(requests, 7)])
     assert update is not None and update.state is NavigationState.CANCELLED
+    assert update.answers == ((7, "goal", ""), (8, "cancel", ""))
     assert robot.stage.process([]) is None
 
 
@@ -209,7 +210,7 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()
     robot.send(RouteRequest(RouteAction.TEACH, "hall"))
-    assert "is being taught" in (robot.send(RouteRequest(RouteAction.REPEAT, "hall")).answer or ("",) * 4)[3]
+    assert "is being taught" in (robot.send(RouteRequest(RouteAction.REPEAT, "hall")).answer or ("",) * 3)[2]
     for k in range(150):
         robot.velocity = np.array([0.3, 0.4 * math.sin(k / 20)])
         robot.pass_on()

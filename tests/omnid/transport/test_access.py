@@ -13,8 +13,11 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from omnid.client import Robot, Unreachable
+from omnid.client import Answer, Driver, Robot, Unreachable
+from omnid.errors import OmnidError
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.requests import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
@@ -79,8 +82,21 @@ def test_refuses_connections_without_a_valid_certificate(credentials: Path, name
 def commands_to(config: BusConfig) -> Iterator[list[str]]:
     received: list[str] = []
     with contextlib.closing(Bus(config)) as bus:
-        bus.subscribe_commands(lambda key, *_: received.append(key), {})
+
+        def take(request: Request) -> None:
+            received.append(request.topic)
+            bus.answer(request.id, Answer(True, "armed"))
+
+        bus.subscribe_commands(take, {})
         yield received
+
+
+def asks_to_arm(driver: Driver) -> bool:
+    """Return whether a program that asks to arm gets an answer."""
+    try:
+        return driver.arm(timeout_s=2.0).done
+    except OmnidError:
+        return False
 
 
 @needs_openssl
@@ -90,13 +106,13 @@ def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(credentials:
           Robot(settings=visitor(credentials, config.listen[0], "driver")) as driver):
         refused, accepted = guest.driver(), driver.driver()
         wait_until(lambda: refused.stop() is None and bool(received))
-        wait_until(lambda: accepted.arm() > 0 and "cmd/arm" in received)
+        wait_until(lambda: asks_to_arm(accepted) and "cmd/arm" in received)
         time.sleep(0.3)
         count = received.count("cmd/arm")
         for _ in range(5):
             refused.twist(1.0, 0.0)
             refused.heading(1.0, 0.0)
-            refused.arm()
+            assert not asks_to_arm(refused)
         guest.driver("planner").twist(1.0, 0.0)
         time.sleep(0.3)
         assert set(received) == {"cmd/stop", "cmd/arm"} and received.count("cmd/arm") == count
@@ -120,9 +136,15 @@ def test_users_need_their_password_and_the_permission_to_drive(tmp_path: Path) -
         count = len(received)
         for _ in range(5):
             drivers[0].twist(0.1, 0.0)
-            drivers[0].arm()
+            assert not asks_to_arm(drivers[0])
         time.sleep(0.3)
-        assert len(received) == count
+        assert len(received) == count and asks_to_arm(drivers[1])
+        for everything in ("**", "omnid/**", "**/@request/*", "omnid/@request/arm"):
+            assert not list(bob._session.get(everything, payload=codec.header_cdr(time.time_ns()), timeout=1.0))
+        assert len(received) == count + 1
+        key, forged = "omnid/@request/arm", '{"done": false, "text": "forged"}'
+        with bob._session.declare_queryable(key, lambda query: query.reply(key, forged)):
+            assert all(asks_to_arm(drivers[1]) for _ in range(5)), "a stranger answers no request"
         wait_until(lambda: drivers[0].stop() is None and "cmd/stop" in received)
         with pytest.raises(Unreachable):
             connected("eve")

@@ -181,7 +181,7 @@ def test_a_client_waits_for_its_router() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(mode="client", listen=(), connect=(endpoint,)))) as bus:
         received: list[str] = []
-        bus.subscribe_commands(lambda key, *_: received.append(key), {})
+        bus.subscribe_commands(lambda request: received.append(request.topic), {})
         bus.serve("config", "robot = 1")
         bus.connect()
         bus.publish("odom", odometry(1))

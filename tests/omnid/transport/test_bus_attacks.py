@@ -19,6 +19,7 @@ from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK, WARN
 from omnid.transport.intake import UNKNOWN, budget_of
+from omnid.transport.requests import Request
 from omnid.transport.topics import command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
@@ -49,7 +50,7 @@ def test_does_not_connect_to_a_peer_that_another_one_introduces() -> None:
         intruder.declare_subscriber("omnid/odom", lambda _: received.set())
         bus = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(here,)))))
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
         # A third peer that keeps zenoh's defaults shows that the introduction has taken place.
         other = stack.enter_context(session(listen__endpoints=[control]))
         viewer = stack.enter_context(session(listen__endpoints=[], connect__endpoints=[here, there, control]))
@@ -98,7 +99,7 @@ def test_does_not_collect_large_messages() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
         before_mb, halt, most_mb = resident_mb(), threading.Event(), [0]
 
         def watch() -> None:
@@ -156,7 +157,7 @@ def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
         second = stack.enter_context(contextlib.closing(
             Bus(BusConfig(listen=(), connect=(router,)), warnings.append)))
         assert len(warnings) == 1 and "change bus.robot" in warnings[0] and "\n" not in warnings[0]
-        second.subscribe_commands(lambda key, *_: commands.append(key), {})
+        second.subscribe_commands(lambda request: commands.append(request.topic), {})
         assert second.status().level == ERROR and not second.is_unique and commands == ["cmd/stop"]
         with contextlib.closing(Bus(BusConfig(robot="other", listen=(), connect=(router,)))) as other:
             assert other.status().level == first.status().level == OK
@@ -170,7 +171,7 @@ def test_a_token_of_a_stranger_keeps_no_robot_from_starting(token: str) -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
         with session(mode="client", connect__endpoints=[endpoint]) as stranger:
             held = stranger.liveliness().declare_token(token)
             if token.endswith("x"):
@@ -189,7 +190,7 @@ def test_with_users_only_the_robot_declares_tokens_below_its_name(tmp_path: Path
     users.write_text("eve:secret\n")
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), users_file=str(users)))) as bus:
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
         with session(mode="client", connect__endpoints=[endpoint], transport__auth__usrpwd__user="eve",
                      transport__auth__usrpwd__password="secret") as stranger:
             held = stranger.liveliness().declare_token("omnid/alive/x")
@@ -208,35 +209,39 @@ config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
 config.insert_json5("scouting/multicast/enabled", "false")
 with zenoh.open(config) as session:
-    publisher = session.declare_publisher(sys.argv[2], congestion_control=zenoh.CongestionControl.BLOCK)
+    key, block = sys.argv[2], zenoh.CongestionControl.BLOCK
+    publisher = session.declare_publisher(key, congestion_control=block)
     print("ready", flush=True)
-    while True:
+    while "@" not in key:
         publisher.put(b"")
+    while True:
+        session.get(key, lambda reply: None, payload=b"", congestion_control=block, timeout=1.0)
 """
 
 
-@pytest.mark.parametrize("key", ["cmd/imu", "cmd/route", "cmd/arm", "cmd/nothing"])
+@pytest.mark.parametrize("key", ["cmd/imu", "cmd/route", "cmd/arm", "cmd/nothing", "@request/arm", "@request/path"])
 def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> None:
     """Of the flood no more than the budget is passed on; a stop and a command on another key get through."""
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
         commands: Counter[str] = Counter()
 
-        def count(topic: str, *_: object) -> None:
-            commands[topic] += 1
+        def count(request: Request) -> None:
+            commands[request.topic] += 1
 
         bus.subscribe_commands(count, command_topics(("operator",)))
         with script(FLOOD, endpoint, f"omnid/{key}"), Robot(connect=(endpoint,)) as operator:
             driver = operator.driver()
             wait_until(lambda: bus.status().level == WARN)
             assert any(name.startswith("flooded, ") for name in bus.status().values)
-            begin_s, before = time.monotonic(), commands[key]
+            topic = key.replace("@request", "cmd")
+            begin_s, before = time.monotonic(), commands[topic]
             wait_until(lambda: driver.stop() is None and commands["cmd/stop"] > 0)
             wait_until(lambda: driver.twist(0.1, 0.0) is None and commands["cmd/twist"] > 0)
             time.sleep(1.0)
-            budget = UNKNOWN if key == "cmd/nothing" else budget_of(key)
+            budget = UNKNOWN if key == "cmd/nothing" else budget_of(topic)
             most = 2 * budget.burst + budget.rate_hz * (time.monotonic() - begin_s)
-            assert commands[key] - before <= most
+            assert commands[topic] - before <= most
 
 
 def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:

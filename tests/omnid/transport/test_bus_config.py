@@ -82,7 +82,10 @@ def test_everybody_may_stop_and_only_named_programs_command(ros2: str, stops: li
     assert written == {"stop": stops, "command": commands} and rules["default_permission"] == "deny"
     subjects = {policy["id"]: (policy["rules"], policy["subjects"]) for policy in rules["policies"]}
     assert "stop" in subjects["all"][0] and subjects["all"][1] == ["everybody"]
-    assert subjects["some"] == (["command"], ["name-0"] if names else ["everybody"])
+    asked = [(rule["id"], rule["key_exprs"]) for rule in rules["rules"] if rule["flows"] == ["ingress"]
+             and "query" in rule["messages"] and any("@request" in key for key in rule["key_exprs"])]
+    assert asked == [("request", ["robot7/@request/*"])], "a star does not match what begins with @"
+    assert subjects["some"] == (["command", "request"], ["name-0"] if names else ["everybody"])
 
 
 def test_introduces_no_peers_and_uses_the_configured_protocols_only(tmp_path: Path) -> None:

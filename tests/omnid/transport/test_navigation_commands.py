@@ -29,6 +29,7 @@ from omnid.transport.navigation_codec import (
     string_from_cdr,
 )
 from omnid.transport.navigation_commands import LONGEST_PAYLOAD, MOST_WAITING, NavigationReceiver, RequestQueue
+from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import StampRule
 
 MAP = NavigationFrame.MAP
@@ -40,13 +41,14 @@ class Received:
     def __init__(self, *, synchronised: bool = True) -> None:
         self.commands: list[NavigationCommand] = []
         self.lines: list[str] = []
+        self.answer: Answer | None = None  # of the newest message
         self.stamps = StampRule(0.5, synchronised=synchronised)
         self.receiver = NavigationReceiver(self.commands.append, self.stamps, report=self.lines.append)
 
     def send(self, topic: str, payload: bytes, sent_ns: int = 0) -> NavigationCommand | None:
         """Return the command that a message leads to."""
         before = len(self.commands)
-        self.receiver.receive(f"cmd/{topic}", payload, sent_ns)
+        self.answer = self.receiver.receive(Request(f"cmd/{topic}", payload, "", sent_ns, 5))
         return self.commands[-1] if len(self.commands) > before else None
 
 
@@ -69,7 +71,7 @@ def test_messages_round_trip() -> None:
 def test_requests_are_passed_on() -> None:
     received, now_ns = Received(), time.time_ns()
     command = received.send("goal", goal(now_ns))
-    assert command is not None and command.stamp_ns == now_ns
+    assert command is not None and (command.stamp_ns, command.id) == (now_ns, 5) and received.answer is None
     assert command.request == GoalRequest(MAP, 1.5, -2.0, pytest.approx(0.5))
     command = received.send("path", path_cdr(now_ns, "odom", [[0, 0], [1, 1]]))
     assert command is not None and isinstance(command.request, PathRequest)
@@ -132,6 +134,7 @@ def test_requests_of_another_clock_that_are_recorded_and_sent_again_are_refused(
 def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
     received = Received(synchronised=False)
     assert received.send(topic, payload) is None
+    assert received.answer is not None and not received.answer.done and received.answer.text in received.lines[0]
     assert received.receiver.refused.total() == 1 and len(received.lines) == 1
     assert received.receiver.status().values[f"refused, cmd/{topic}"] == "1"
 

@@ -22,6 +22,7 @@ from omnid.client import Pose, Robot
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.requests import Request
 from omnid.transport.topics import PUBLISHED, command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
@@ -139,23 +140,23 @@ def test_receives_a_twist_from_ros() -> None:
     endpoint, received = free_endpoint(), []
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.subscribe_commands(lambda *message: received.append(message), COMMANDS)
+        bus.subscribe_commands(received.append, COMMANDS)
         with client(endpoint) as session:
             message, gid = codec.twist_stamped_cdr(5, "base_link", 0.5, 0.1), bytes(range(16))
             attachment = ros2.attachment(1, 5, gid)
             wait_until(lambda: session.put(key, message, attachment=attachment) is None and bool(received))
-    assert received[0] == ("cmd/twist", message, gid.hex(), 5)
+    assert received[0][:4] == ("cmd/twist", message, gid.hex(), 5)
 
 
 @pytest.mark.parametrize("mode", ["client", "peer"])  # a node of ROS 2 is a peer
 def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> None:
-    endpoint, lines, received, poses = free_endpoint(), list[str](), list[tuple[str, bytes, str, int]](), list[bytes]()
+    endpoint, lines, received, poses = free_endpoint(), list[str](), list[Request](), list[bytes]()
     config = BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3)
     with (script(ROUTER, endpoint), contextlib.closing(Bus(config, lines.append)) as bus,
           client(endpoint, mode) as session):
         assert lines == [f"the zenoh router at {endpoint} is joined as a client: who may connect is decided there"]
         assert bus.status().values["mode"] == "client" and bus.needs_router
-        bus.subscribe_commands(lambda *message: received.append(message), COMMANDS)
+        bus.subscribe_commands(received.append, COMMANDS)
         key, twist = ros2.data_key(3, "/omnid/cmd/twist", "geometry_msgs/msg/Twist"), bytes(52)
         attachment = ros2.attachment(1, 5, bytes(16))
         odom = session.declare_subscriber(ros2.data_key(3, "/omnid/odom", codec.ODOMETRY_SCHEMA),

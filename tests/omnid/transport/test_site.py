@@ -11,14 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from omnid.client import Diagnostics, Robot, Unreachable
+from omnid.client import Answer, Diagnostics, Robot, Unreachable
 from omnid.config import load_config
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.requests import Request
 from omnid.transport.status_names import BUS
 from tests.omnid.transport.bus_fixtures import free_endpoint, script, wait_until
-from tests.omnid.transport.test_access import authority, certificate, needs_openssl
+from tests.omnid.transport.test_access import asks_to_arm, authority, certificate, needs_openssl
 
 PAGE = (Path(__file__).parents[3] / "omnid" / "transport" / "SITE.md").read_text()
 USERS = ("one", "two", "ada", "bob")
@@ -70,7 +71,12 @@ def robot(site: Path, user: str, name: str) -> Iterator[tuple[Bus, list[str]]]:
     received: list[str] = []
     with contextlib.closing(Bus(settings(site, user, name))) as bus:
         wait_until(lambda: bus.connect() is None and bus.status().message == "open")
-        bus.subscribe_commands(lambda key, *_: received.append(key), {})
+
+        def take(request: Request) -> None:
+            received.append(request.topic)
+            bus.answer(request.id, Answer(True, name))
+
+        bus.subscribe_commands(take, {})
         yield bus, received
 
 
@@ -93,6 +99,13 @@ def test_ada_drives_bob_stops_and_no_robot_speaks_for_another(site: Path) -> Non
             drivers[name].twist(0.1, 0.0)
         time.sleep(0.3)
         assert received.count("cmd/twist") == count
+        wait_until(lambda: asks_to_arm(drivers["ada"]))
+        arms = received.count("cmd/arm")
+        key = "hall/one/@request/arm"
+        with other._session.declare_queryable(key, lambda query: query.reply(key, '{"done": true, "text": "forged"}')):
+            assert drivers["ada"].arm() == (True, "hall/one")
+        assert not any(map(asks_to_arm, (drivers["bob"], drivers["two"])))
+        assert received.count("cmd/arm") == arms + 1
         with bob.subscribe(Diagnostics) as reports:
             bus.publish("status", status("mine"))
             wait_until(lambda: (report := reports.newest()) is not None and report.statuses[0].message == "mine")

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.monitor.arming import stop
+from omnid.monitor.stopping import stop
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.requests import Request
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopSender, addresses
 from tests.omnid.transport.bus_fixtures import free_endpoint, script, wait_until
 
@@ -37,9 +38,9 @@ def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), config=str(few)))) as bus:
         commands: list[str] = []
 
-        def execute(key: str, *_: object) -> None:
-            commands.append(key)
-            stopped[0] = key == "cmd/stop"
+        def execute(request: Request) -> None:
+            commands.append(request.topic)
+            stopped[0] = request.topic == "cmd/stop"
 
         bus.subscribe_commands(execute, {}, lambda: stopped[0])
         with script(CROWD, endpoint):
@@ -51,7 +52,7 @@ def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, *_: commands.append(key), {})
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
         with StopSender("rover", (endpoint,)) as sender:
             wait_until(lambda: sender.ask(0.1) == ASKED)
         assert commands
@@ -66,7 +67,7 @@ def test_nothing_else_stops_and_no_answer_is_longer_than_its_request() -> None:
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, \
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         commands: list[str] = []
-        bus.subscribe_commands(lambda key, *_: commands.append(key), {}, lambda: True)
+        bus.subscribe_commands(lambda request: commands.append(request.topic), {}, lambda: True)
         good = b"omnid stop 1 0123456789abcdef omnid" + b" " * 8
         for data in (b"", b"\xff" * 2000, good[:-12], good.upper(), good + b"\n", good.replace(b"omnid ", b"omni ")):
             stranger.sendto(data, (host, port))

@@ -35,7 +35,7 @@ class Robots:
         self.obeys = {"hall/one"}
         self._seq = 0
         for name, bus in self.buses.items():
-            bus.subscribe_commands(lambda key, *_, name=name: self._count(key, name), {})
+            bus.subscribe_commands(lambda request, name=name: self._count(request.topic, name), {})
 
     def _count(self, key: str, name: str) -> None:
         self.stops[name] += key == "cmd/stop"

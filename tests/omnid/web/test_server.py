@@ -226,7 +226,7 @@ def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> N
 
 def test_a_stop_is_repeated_until_the_status_confirms_it(server: WebServer, bus: Bus) -> None:
     received: list[str] = []
-    bus.subscribe_commands(lambda key, *_: received.append(key), {})
+    bus.subscribe_commands(lambda request: received.append(request.topic), {})
     status = DiagnosticStatus(WHEELS, 0, "driving", {"armed": "1"})
     with ThreadPoolExecutor(2) as threads:
         answers = [threads.submit(server.post, "/stop") for _ in range(2)]

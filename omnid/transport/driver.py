@@ -1,0 +1,151 @@
+"""Commands and requests to a robot: what omnid.client gives to the programs of others."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from omnid.errors import OmnidError
+from omnid.transport import codec, ros2
+from omnid.transport.navigation_codec import PlanarGoal, goal_cdr, string_cdr
+from omnid.transport.requests import Answer, answer_of
+from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TWIST, request_key
+
+CONNECT_S: Final = 2.0  # in which a connection is complete
+ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
+_POLL_S: Final = 0.002
+_SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
+# A stop must not be lost, and overtakes all else; requests go the same way.
+_QUALITY: Final[dict[str, Any]] = {"congestion_control": zenoh.CongestionControl.BLOCK,
+                                   "priority": zenoh.Priority.REAL_TIME, "express": True}
+
+
+class Driver:
+    """Sender of commands and requests.
+
+    A command is valid for controller.deadlines.command_s only: keep sending, or the wheels stop.
+
+    The wheels turn only while the robot is armed: it is disarmed at its start, by each stop and by each fault. Two
+    senders of one source do not drive at once: the first keeps it until it has been silent for a while.
+
+    Drive from one waypoint to the next:
+
+        import math
+        from omnid.client import Pose, Robot
+
+        with Robot("omnid") as robot:
+            driver, poses = robot.driver(), robot.subscribe(Pose)
+            print(driver.arm().text)
+            for x_m, y_m in [(1.0, 0.0), (1.0, 1.0)]:
+                for pose in poses:
+                    dx_m, dy_m = x_m - pose.x_m, y_m - pose.y_m
+                    if math.hypot(dx_m, dy_m) < 0.1 or pose.state == "lost":
+                        break
+                    driver.heading(0.3, math.atan2(dy_m, dx_m))
+            driver.twist(0.0, 0.0)
+    """
+
+    def __init__(self, session: zenoh.Session, robot: str, source: str = "") -> None:
+        prefix = f"cmd/{source}" if source else "cmd"
+        self._session, self._robot = session, robot
+        self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
+        self._publishers = {topic: _command_publisher(session, f"{robot}/{topic}")
+                            for topic in (self._twist, self._heading, STOP, ARM)}
+        self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
+        self.asked_ns = 0  # time of sending of the newest request, which the reports of a drive repeat
+
+    @property
+    def connected(self) -> bool:
+        """True if a robot subscribes to the commands."""
+        return _matches(self._publishers[self._twist])
+
+    def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
+        """Drive with this forward speed and yaw rate (counter-clockwise)."""
+        payload = codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps)
+        self.send(self._twist, payload)
+
+    def heading(self, velocity_mps: float, heading_rad: float) -> None:
+        """Drive with this speed and hold a heading in odom (counter-clockwise)."""
+        self.send(self._heading, codec.heading_cdr(time.time_ns(), velocity_mps, heading_rad))
+
+    def stop(self) -> None:
+        """Stop the wheels, whatever else was commanded, until `arm` is called."""
+        self.send(STOP, b"")
+
+    def arm(self, timeout_s: float = ANSWER_S) -> Answer:
+        """Ask the robot to arm; it refuses while a fault holds. Only commands that arrive after it move the wheels.
+
+        Raise OmnidError as `ask`.
+        """
+        return self.ask(ARM, codec.header_cdr, timeout_s)
+
+    def goal(self, x_m: float, y_m: float, heading_rad: float | None = None, frame: str = "odom") -> Answer:
+        """Ask the robot to drive to a pose in odom or map; None: with any heading. Raise OmnidError as `ask`."""
+        return self.ask(GOAL, lambda now_ns: goal_cdr(PlanarGoal(now_ns, frame, x_m, y_m, heading_rad)))
+
+    def navigate(self, verb: str) -> Answer:
+        """Ask the robot to cancel, pause or resume its drive. Raise OmnidError as `ask`."""
+        return self.ask(NAVIGATION, lambda _: string_cdr(verb))
+
+    def route(self, text: str) -> Answer:
+        """Ask for what a text of cmd/route says, such as "repeat hall". Raise OmnidError as `ask`."""
+        return self.ask(ROUTE, lambda _: string_cdr(text))
+
+    def save_map(self) -> Answer:
+        """Ask the robot to save its map now. Raise OmnidError as `ask`."""
+        return self.ask(MAP, lambda _: string_cdr(SAVE_MAP))
+
+    def ask(self, topic: str, payload_at: Callable[[int], bytes], timeout_s: float = ANSWER_S) -> Answer:
+        """Send the request that a message on a topic such as cmd/goal is, and wait for the robot's answer.
+
+        payload_at: returns the CDR bytes for a time of sending [ns of Unix time]. Raise OmnidError where no robot takes
+        such requests within CONNECT_S, or none answers.
+        """
+        key = f"{self._robot}/{request_key(topic)}"
+        with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
+            if not _is_matched(querier):
+                raise OmnidError(f"no robot {self._robot!r} takes such requests there: check --robot and --connect, "
+                                 "and that its daemon runs, with a motor where it is to drive")
+            self.asked_ns = now_ns = time.time_ns()
+            for reply in querier.get(payload=payload_at(now_ns), attachment=self._attachment(now_ns)):
+                if reply.ok is not None and (answer := answer_of(reply.ok.payload.to_bytes())) is not None:
+                    return answer
+        raise OmnidError(f"{self._robot} has not answered: either this program must not command it (bus.command_users, "
+                         "bus.command_names), or it gives no poses; see `omnid listen`")
+
+    def send(self, topic: str, payload: bytes) -> None:
+        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which tells senders apart.
+
+        The time of sending is attached: it is the stamp of a message that has none of its own.
+        """
+        if topic not in self._publishers:
+            self._publishers[topic] = _command_publisher(self._session, f"{self._robot}/{topic}")
+        publisher, attachment = self._publishers[topic], self._attachment(time.time_ns())
+        publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent), attachment=attachment)
+
+    def _attachment(self, sent_ns: int) -> bytes:
+        self._sent = (self._sent + 1) % _SEQUENCE
+        return ros2.attachment(self._sent, sent_ns, self._gid)
+
+
+def _is_matched(querier: zenoh.Querier) -> bool:
+    """Return True as soon as a robot takes the requests, False after CONNECT_S."""
+    deadline_s = time.monotonic() + CONNECT_S
+    while not _matches(querier):
+        if time.monotonic() > deadline_s:
+            return False
+        time.sleep(_POLL_S)
+    return True
+
+
+def _matches(declared: zenoh.Publisher | zenoh.Querier) -> bool:
+    status: Any = declared.matching_status  # zenoh's stub takes it for a bool
+    return bool(status.matching)
+
+
+def _command_publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
+    """Declare a publisher of CDR."""
+    return session.declare_publisher(key, encoding=zenoh.Encoding.APPLICATION_CDR, **_QUALITY)
