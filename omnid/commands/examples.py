@@ -70,13 +70,23 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "config": ("config --minimal > omnid.toml", "config check omnid.toml", "config migrate old.toml > new.toml"),
     "install-service": ("install-service --dry-run", "install-service --page"),
 })
+_EXAMPLES: Final = "examples:"  # the first line of an epilog
+
+
+class _ExamplesFormatter(argparse.HelpFormatter):
+    """Leaves the lines of the examples as they are, so that they can be copied; wraps all other text."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if text.startswith(_EXAMPLES):
+            return "".join(indent + line for line in text.splitlines(keepends=True))
+        return super()._fill_text(text, width, indent)
 
 
 def add_examples(parser: argparse.ArgumentParser, words: str = "") -> None:
     """Give a parser and those of its subcommands a description, which is their help, and examples."""
     if words in EXAMPLES:
-        parser.formatter_class = argparse.RawDescriptionHelpFormatter
-        parser.epilog = "\n".join(("examples:", *(f"  omnid {example}" for example in EXAMPLES[words])))
+        parser.formatter_class = _ExamplesFormatter
+        parser.epilog = "\n".join((_EXAMPLES, *(f"  omnid {example}" for example in EXAMPLES[words])))
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
             helps = {choice.dest: choice.help or "" for choice in action._choices_actions}

@@ -34,6 +34,18 @@ def test_every_command_has_a_description_and_an_example() -> None:
         assert f"  omnid {EXAMPLES[words][0]}" in parser.format_help()
 
 
+@pytest.mark.parametrize("words", EXAMPLES)
+def test_help_is_wrapped_and_examples_can_be_copied(words: str, capsys: pytest.CaptureFixture[str],
+                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    with pytest.raises(SystemExit):
+        main([*words.split(), "--help"])
+    text, _, examples = capsys.readouterr().out.partition("\nexamples:\n")
+    assert examples.splitlines() == [f"  omnid {example}" for example in EXAMPLES[words]]
+    _, _, below_usage = text.partition("\n\n")
+    assert [line for line in below_usage.splitlines() if len(line) > 60 and " " in line.strip()] == []
+
+
 @pytest.mark.parametrize("example", [example for examples in EXAMPLES.values() for example in examples])
 def test_every_example_is_accepted(example: str) -> None:
     words = shlex.split(example.partition(" > ")[0])
