@@ -16,7 +16,7 @@ Several kinds of message, and commands, share one connection: see Robot and Driv
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from typing import Any, Final, Generic, Self, TypeVar, cast
 
@@ -170,6 +170,15 @@ class Robot:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]  # the stub has no return type
 
         return end
+
+    def kept_messages(self, callback: Callable[[str, bytes, bytes], None], topics: Iterable[str]) -> None:
+        """Call callback(topic, payload, attachment) for the newest message of each topic that the robot keeps.
+
+        For those who come late to a topic that is rarely sent, such as `map` and `tf_static`; see `on_message`.
+        """
+        for topic in topics:
+            if (sample := _queried(self._session, f"{self.name}/{topic}")) is not None:
+                callback(topic, sample.payload.to_bytes(), _attachment(sample))
 
     def driver(self, source: str = "") -> Driver:
         """Return a sender of commands to the wheels.

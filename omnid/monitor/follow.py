@@ -9,16 +9,19 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final, TypeAlias
 
-from omnid.client import Diagnostics, Robot
+from omnid.client import Robot
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.monitor.screen import Screen
 from omnid.monitor.writers import BusLogWriter, TumWriter
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import Unreachable
+from omnid.transport.topics import PUBLISHED
 
 SHOW_PERIOD_S: Final = 1.0
 _RETRY_S: Final = 0.5
+# Topics of which the newest message may have been sent before this program came: frames, map, path, status.
+KEPT: Final = tuple(name.removeprefix("/") for name, topic in PUBLISHED.items() if topic.latched and not topic.realtime)
 Writer: TypeAlias = TumWriter | BusLogWriter
 
 
@@ -58,12 +61,9 @@ def _connected(bus: BusConfig, end_s: float, screen: Screen) -> Robot | None:
 
 def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[Writer], end_s: float) -> None:
     inbox = Inbox()
+    robot.kept_messages(inbox.put, KEPT)
     robot.on_message(inbox.put)
     robot.on_alive(state.set_alive)
-    with robot.subscribe(Diagnostics) as subscription:
-        latched = subscription.newest()  # published before this connection was made
-    if latched is not None:
-        state.add_diagnostics(latched)
     next_s = time.monotonic() + SHOW_PERIOD_S
     while (now_s := time.monotonic()) < end_s:
         message = inbox.get(min(next_s, end_s) - now_s)

@@ -70,6 +70,8 @@ def test_prints_a_line_per_second_and_writes_files(tmp_path: Path) -> None:
     endpoint, tum, log = free_endpoint(), tmp_path / "path.txt", tmp_path / "received.mcap"
     with contextlib.closing(Bus(BusConfig(robot="rover", listen=(endpoint,)))) as bus:
         bus.serve("rig", "name = 'rig'")
+        bus.publish("/tf_static", codec.transform_cdr(10**18, []))
+        bus.publish("map", codec.grid_cdr(10**18, "map", np.zeros((2, 3), np.int8), 0.05, (0.0, 0.0)))
         with listening("--robot", "rover", "--connect", endpoint, "--seconds", 2.2, "--tum", tum, "--mcap", log) as it:
             out, err = publish_until_it_ends(bus, it)
     assert it.returncode == 0 and err == ""
@@ -81,7 +83,8 @@ def test_prints_a_line_per_second_and_writes_files(tmp_path: Path) -> None:
         kinds = {connection.topic: connection.msgtype for connection in reader.connections}
         poses = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/rover/odom"]
     assert kinds == {"/rover/odom": "nav_msgs/msg/Odometry", "/tf": "tf2_msgs/msg/TFMessage",
-                     "/rover/status": "diagnostic_msgs/msg/DiagnosticArray"}
+                     "/tf_static": "tf2_msgs/msg/TFMessage", "/rover/map": "nav_msgs/msg/OccupancyGrid",
+                     "/rover/status": "diagnostic_msgs/msg/DiagnosticArray"}, "with what was sent before it came"
     assert len(poses) > 20 and {pose.pose.pose.position.x for pose in poses} == {0.5}
     assert b"name = 'rig'" in log.read_bytes()
 
