@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models.camera import Mask, OmniCamera
+from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import LENS_KEYS, LensCamera, lens_camera, lens_parameters
 from calib.models.names import model_name
 from calib.models.ocam import DISTANCE_M, NO_WAVEFRONT, VIEWS, OcamCamera, View
@@ -38,9 +39,13 @@ WAVEFRONT_KEYS = ("wavefront", "distance_m")
 def read_camera_table(table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
                       ) -> tuple[OmniCamera, Mask | None]:
     """Read camera and mask of a table; others: further keys that it may have; folder contains the mask's image."""
-    model = table.choice("model", ("omni", "ocam", *LENS_KEYS))
+    model = table.choice("model", ("omni", "ocam", *LENS_KEYS, "equirectangular"))
     table.allow_only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
-    camera: OmniCamera = _omni(table) if model == "omni" else _ocam(table) if model == "ocam" else _lens(table, model)
+    camera: OmniCamera
+    if model in ("omni", "ocam"):
+        camera = _omni(table) if model == "omni" else _ocam(table)
+    else:
+        camera = _equirectangular(table) if model == "equirectangular" else _lens(table, model)
     return camera, _mask(table, folder) if table.has("mask") else None
 
 
@@ -62,6 +67,16 @@ def _lens(table: ValidatedTable, model: str) -> LensCamera:
     parameters, (fu, fv, pu, pv) = [values.number(key) for key in keys], [values.number(key) for key in PINHOLE_KEYS]
     try:
         return lens_camera(model, parameters, (fu, fv), (pu, pv), table.size("size"))
+    except CalibError as error:
+        raise CalibError(f"{table.file}: {values.path}: {error}") from error
+
+
+def _equirectangular(table: ValidatedTable) -> EquirectangularCamera:
+    values = table.table("intrinsics")
+    values.allow_only(PINHOLE_KEYS)
+    fu, fv, pu, pv = (values.number(key) for key in PINHOLE_KEYS)
+    try:
+        return EquirectangularCamera((fu, fv), (pu, pv), table.size("size"))
     except CalibError as error:
         raise CalibError(f"{table.file}: {values.path}: {error}") from error
 
@@ -183,6 +198,9 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
         if any(camera.wavefront):
             named += [f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]",
                       f"distance_m = {number_text(camera.distance_m)}"]
+    elif isinstance(camera, EquirectangularCamera):
+        named = [f"{key} = {number_text(value)}"
+                 for key, value in zip(PINHOLE_KEYS, (*camera.focal, *camera.center), strict=True)]
     elif isinstance(camera, LensCamera):
         lens = zip((*LENS_KEYS[model_name(camera)], *PINHOLE_KEYS),
                    (*lens_parameters(camera), *camera.focal, *camera.center), strict=True)

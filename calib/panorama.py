@@ -29,8 +29,12 @@ SECTOR_STEPS = 96
 SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
 # Least azimuth that no camera pair shares beside which a panorama is a sector: a strut or a mast hides less.
 MIN_UNSEEN_RAD = math.radians(45)
-# Least length of the horizon of a camera that sees it: of a full turn, and of a radian of a sector.
-MIN_HORIZON_PX, MIN_HORIZON_PX_PER_RAD = 64, 32
+# Least elevations that both cameras see: 15 degrees have 60 rows at scale 1, four windows of the tracker.
+MIN_SHARED_DEG = 15.0
+# Least length of the horizon, a full turn, of a camera that sees it.
+MIN_HORIZON_PX = 64
+# Steps along the horizon are about as long as each other; a longer one leads from one end of the image to the other.
+MAX_STEP_RATIO = 20
 # Columns: more than cv2.remap's 32767 with padding cannot be used. Pixels: tables and images must fit the memory.
 MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
 # Rows of a table that are computed at once: the projection takes some 200 bytes a pixel.
@@ -141,6 +145,11 @@ def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float]
                          f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
                          "the transforms and the masks")
     slopes = slopes[both]
+    shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
+    if shared_deg < MIN_SHARED_DEG:
+        raise CalibError(f"rig: the cameras share {shared_deg:.0f} degrees of elevation about the line through both "
+                         f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
+                         "check the transforms and the masks")
     # 2. Columns.
     turn = width_px
     if not turn:
@@ -212,19 +221,17 @@ def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
 
     That of a full circle is the length of the horizon.
     """
-    azimuth = np.linspace(0, 2 * math.pi, 361)
-    if not sector.is_full:
-        azimuth = sector.right_rad + np.linspace(0, sector.span_rad, 361)
+    azimuth = np.linspace(0, 2 * math.pi, 361) if sector.is_full else (
+        sector.right_rad + np.linspace(0, sector.span_rad, 361))
     ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, 0.0 if sector.is_full else slope)])
     with np.errstate(over="ignore", invalid="ignore"):
         around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1) for m in (rig.lower, rig.upper)]
-    if sector.is_full:
-        lengths, least = [steps.sum() for steps in around], MIN_HORIZON_PX
-    else:
-        # At the ends of a sector one of the cameras may have no image: the median step stands for all.
-        lengths = [np.nanmedian(steps) * 360 * 2 * math.pi / sector.span_rad for steps in around]
-        least = MIN_HORIZON_PX_PER_RAD
-    if not np.isfinite(lengths).all() or min(lengths) < least:
+    # At the ends of a sector one of the cameras may have no image, and a stitched image has its ends somewhere on the
+    # horizon: the median step stands for those.
+    usual = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else math.nan for steps in around]
+    lengths = [np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * 2 * math.pi / sector.span_rad
+               for steps, step in zip(around, usual, strict=True)]
+    if not np.isfinite(lengths).all() or min(lengths) < MIN_HORIZON_PX:
         raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
     return float(min(lengths))
 

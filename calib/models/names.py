@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from calib.models.camera import OmniCamera
+from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
@@ -16,6 +17,8 @@ def model_name(camera: OmniCamera) -> str:
         return "ds"
     if isinstance(camera, ExtendedUnifiedCamera):
         return "eucm"
+    if isinstance(camera, EquirectangularCamera):
+        return "equirectangular"
     return "equidistant" if isinstance(camera, EquidistantCamera) else "omni"
 
 
@@ -23,4 +26,5 @@ def is_lens(camera: OmniCamera) -> bool:
     """True for a camera that sees the world directly: its image has no hub and need not have a rim."""
     if isinstance(camera, UnifiedCamera):
         return camera.xi == 0
-    return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera))
+    return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera,
+                               EquirectangularCamera))

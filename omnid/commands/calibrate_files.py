@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 from pathlib import Path
 
 import numpy as np
 
 from calib import se3
+from calib.equirectangular_file import import_helvipad, stacked_rig
 from calib.kalibr import export_kalibr, import_kalibr
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
@@ -24,7 +26,8 @@ from omnid.sinks.files import check_outputs
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `import` and `export` to the actions of `calibrate`."""
-    importing = actions.add_parser("import", help="a rig.toml from a Kalibr file, or from two OCamCalib files")
+    importing = actions.add_parser("import", help="a rig.toml from a Kalibr file, from two OCamCalib files, or of "
+                                   "two 360-degree cameras")
     exporting = actions.add_parser("export", help="Kalibr or OCamCalib files from a rig.toml")
     _add_import(importing)
     _add_export(exporting)
@@ -33,14 +36,17 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def _add_import(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml")
-    parser.add_argument("--lower", default="", help="the lower camera: its name in the camchain (cam0), or its "
-                        "calib_results.txt")
+    parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml, or Helvipad's "
+                        "calibration.json")
+    parser.add_argument("--lower", default="", help="the lower camera: its name in the camchain (cam0), its "
+                        "calib_results.txt, or with a calibration.json a folder of its images")
     parser.add_argument("--upper", default="", help="the same for the upper camera")
     between = parser.add_mutually_exclusive_group()
     between.add_argument("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers")
     between.add_argument("--baseline", type=float, metavar="M", help="metres from the lower viewpoint straight up to "
                          "the upper one; both cameras look up and are equally oriented")
+    parser.add_argument("--equirectangular", metavar="WIDTHxHEIGHT", help="two 360-degree cameras one above the other, "
+                        "with stitched images of this size; with --baseline")
     parser.add_argument("--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly "
                         "through a lens")
     add_height(parser)
@@ -58,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     """Import or export a rig, and print one line about it."""
     _must_be_writable(args.output)
     if args.action == "import":
-        rig = with_height(_kalibr(args) if args.camchain else _ocam(args), args)
+        rig = with_height(_imported(args), args)
         write_rig(args.output, rig)
         print(f"{args.output}: {describe(rig)}")
     else:
@@ -75,6 +81,28 @@ def _must_be_writable(path: Path) -> None:
         raise OmnidError(f"--output {path}: there is no folder {path.parent}; make it first")
     if not os.access(existing, os.W_OK):
         raise OmnidError(f"--output {path}: {existing} is not writable")
+
+
+def _imported(args: argparse.Namespace) -> Rig:
+    if args.equirectangular:
+        return _stitched(args)
+    if args.camchain and args.camchain.suffix == ".json":
+        check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
+        if not args.lower:
+            raise OmnidError(f"{args.camchain}: it does not tell the size of the images: give --lower FOLDER, the "
+                             "folder of the lower camera's images")
+        return import_helvipad(args.camchain, Path(args.lower))
+    return _kalibr(args) if args.camchain else _ocam(args)
+
+
+def _stitched(args: argparse.Namespace) -> Rig:
+    size = re.fullmatch(r"(\d{2,5})x(\d{2,5})", args.equirectangular)
+    if size is None:
+        raise OmnidError(f"--equirectangular: expected WIDTHxHEIGHT as 3840x1920, found {args.equirectangular!r}")
+    if args.baseline is None or args.camchain or args.transform or args.lower or args.upper or args.view:
+        raise OmnidError("--equirectangular goes with --baseline METRES, and with no file, because stitched images "
+                         "have no other numbers")
+    return stacked_rig((int(size[1]), int(size[2])), args.baseline)
 
 
 def _kalibr(args: argparse.Namespace) -> Rig:

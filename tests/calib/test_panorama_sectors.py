@@ -12,8 +12,9 @@ from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Mask
 from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
+from calib.rig import MountedCamera, Rig
 from tests.simulation import make_rig
-from tests.simulation.rigs import lens, lens_rig
+from tests.simulation.rigs import R_RIG_AHEAD, lens, lens_rig
 
 # Widest step at which a sector begins or ends, and what misaligned cameras and the corners of an image add or take.
 STEP_DEG, CORNERS_DEG = 3.75, 3.0
@@ -81,6 +82,20 @@ def test_cameras_that_share_no_view_are_refused() -> None:
     turned = rig.upper.T_cam_rig @ se3.transform(se3.rotation_exp([0, 0, math.pi]), np.zeros(3))
     with pytest.raises(CalibError, match="share no view"):
         fit_cylinder(replace(rig, upper=replace(rig.upper, T_cam_rig=turned)))
+
+
+@pytest.mark.parametrize(("field_deg", "is_enough"), [(190, False), (230, True)])
+def test_lenses_back_to_back_side_by_side_need_a_shared_ring(field_deg: float, is_enough: bool) -> None:
+    """Lenses of 190 degrees share 10 of them about their common axis, those of 230 share 50."""
+    camera = lens("equidistant", field_deg, (640, 640))
+    poses = [se3.transform(se3.rotation_exp([0.0, 0.0, turn]) @ R_RIG_AHEAD, np.array([x, 0.0, 0.0]))
+             for turn, x in ((0.0, 0.015), (math.pi, -0.015))]
+    rig = Rig(*(MountedCamera(camera, se3.inverse(T), Mask(camera.center, 0.0, 319.0)) for T in poses))
+    if is_enough:
+        assert fit_cylinder(rig).width > 500
+    else:
+        with pytest.raises(CalibError, match=r"degrees of elevation.*back to back"):
+            fit_cylinder(rig)
 
 
 def test_a_sector_may_have_finer_columns_than_a_full_turn() -> None:

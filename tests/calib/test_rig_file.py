@@ -104,7 +104,7 @@ def test_makes_a_rounded_rotation_orthonormal(omni_rig: Rig) -> None:
     ("xi = 0.93", "xi = 0.93\nk3 = 0.0", "lower.intrinsics.k3: unknown key"),
     ("fu = -205.0\n", "", "lower.intrinsics.fu: expected a finite number, found nothing"),
     ('model = "omni"', 'model = "pinhole"',
-     "lower.model: expected omni or ocam or ds or eucm or equidistant, found 'pinhole'"),
+     "lower.model: expected omni or ocam or ds or eucm or equidistant or equirectangular, found 'pinhole'"),
     ('model = "omni"', 'model = "omni"\nview = "mirror"', "lower.view: unknown key"),
     ('model = "omni"', "model = 3", "lower.model"),
     ("size = [768, 770]", "size = [768.0, 770]", "lower.size: expected [width, height]"),

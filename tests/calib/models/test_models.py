@@ -11,6 +11,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
+from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
@@ -29,6 +30,7 @@ CAMERAS: dict[str, OmniCamera] = {
     "ds near a pinhole": DoubleSphereCamera(0.1, 0.2, (310.0, 315.0), (380.0, 390.0), (768, 770)),
     "eucm": ExtendedUnifiedCamera(0.63, 1.1, (240.0, 244.0), (380.0, 390.0), (768, 770)),
     "equidistant": EquidistantCamera((-0.012, 0.003, -0.001, 0.0002), (225.0, 228.0), (380.0, 390.0), (768, 770)),
+    "equirectangular": EquirectangularCamera((200.0, 190.0), (380.0, 120.0), (768, 300)),
     "ocam turning": OcamCamera((-100.0, 0, 1e-3, 0, -1e-8), (300.0, 310.0), (1.0, 0.0, 0.0), (600, 600)),
 }
 
@@ -68,6 +70,8 @@ def test_projects_the_axis_to_the_centre_and_invalid_points_to_nan(camera: OmniC
     assert abs(axis[0, 2]) == pytest.approx(1, abs=1e-6)
     np.testing.assert_allclose(camera.project(3 * axis), [camera.center], rtol=0, atol=1e-6)
     nothing = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], -3 * axis[0]])
+    if isinstance(camera, EquirectangularCamera):  # it sees what is behind it
+        nothing = nothing[:3]
     assert np.isnan(camera.project(nothing)).any(axis=1).all()
     assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
 

@@ -1,0 +1,89 @@
+"""Pairs of lenses that see a sector: `python -m tests.benchmark.sectors [--seeds N ...] [--pairs N] [--only CASE ...]`.
+
+Each row is a pair of equal lenses one above the other, the upper one misaligned, that looks ahead in a corridor; steps
+of 5 cm. "open": the end wall is 8 m beyond the last pose. "wall": the drive ends 1.2 m before it, and the last metres
+show one plane, which tells a turn from a step aside only by its perspective.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final, NamedTuple
+
+import numpy as np
+
+import omnid
+from calib import se3
+from calib.panorama import fit_cylinder
+from omnid.formats.tum import Trajectory, read_tum
+from omnid.recordings.evaluation import evaluate
+from tests.benchmark.results import Column, ResultTable
+from tests.simulation import corridor, paths, write_log
+from tests.simulation.rigs import lens, lens_rig
+
+STEP_M: Final = 0.05
+
+
+class Case(NamedTuple):
+    """A lens, and where it drives."""
+
+    model: str
+    field_deg: float
+    size: tuple[int, int] = (640, 480)
+    beyond_m: float = 8.0  # from the last pose to the end wall
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return f"{self.model}_{self.field_deg:g}{'' if self.beyond_m > 2 else '_wall'}"
+
+
+CASES: Final = (
+    Case("pinhole", 30), Case("pinhole", 60), Case("pinhole", 90), Case("equidistant", 180), Case("ds", 180),
+    Case("eucm", 180), Case("equidistant", 270, (800, 480)), Case("pinhole", 30, beyond_m=1.2),
+    Case("pinhole", 90, beyond_m=1.2))
+
+
+def measure(case: Case, seed: int, pairs: int, table: ResultTable) -> None:
+    """Render a drive, replay it, and add its row."""
+    rig = lens_rig(lens(case.model, case.field_deg, case.size))
+    cylinder = fit_cylinder(rig)
+    poses = paths.spline_path(seed, pairs, STEP_M)
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        write_log(folder, rig, poses, corridor(seed, STEP_M * pairs + 2.0 + case.beyond_m), seed=seed)
+        result, truth = omnid.replay(folder / "log.mcap", rig=folder / "rig.toml"), read_tum(folder / "truth.txt")
+    found = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), truth)
+    wrong = se3.log(se3.inverse(se3.inverse(truth.T[0]) @ truth.T) @ (se3.inverse(result.T_odom_rig[0])
+                                                                      @ result.T_odom_rig))[1:]
+    covariance = result.covariances[1:]
+    squared = np.einsum("ni,nij,nj->n", wrong[:, :3], np.linalg.inv(covariance[:, :3, :3]), wrong[:, :3]) / 3
+    states = ", ".join(f"{state} {count}" for state, count in Counter(map(str, result.states)).items())
+    table.add(f"{case.name}, seed {seed}", 360 * cylinder.width / cylinder.turn_px, cylinder.width,
+              100 * found.length_error_ratio, 1e3 * found.ate_rmse_m, 1e3 * float(np.linalg.norm(wrong[-1, :3])),
+              math.sqrt(float(np.median(squared))), math.sqrt(float(squared.max())), states, seed=("sectors", seed))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 600])
+    parser.add_argument("--pairs", type=int, default=100)
+    parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES])
+    args = parser.parse_args(arguments)
+    columns = (Column("lens, field [deg]"), Column("sector", "deg", 1), Column("columns"), Column("length", "%", 2),
+               Column("ATE rmse", "mm", 1), Column("error at the end", "mm", 1),
+               Column("error over sigma, median", "", 1), Column("largest", "", 1), Column("states"))
+    table = ResultTable("sectors", "accuracy", "Lenses that see a sector", columns)
+    for case in CASES:
+        for seed in args.seeds if args.only is None or case.name in args.only else []:
+            measure(case, seed, args.pairs, table)
+
+
+if __name__ == "__main__":
+    main()

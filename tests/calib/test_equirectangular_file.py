@@ -1,0 +1,74 @@
+"""Rigs of stitched images: Helvipad's files, and stacked cameras of any size."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calib.equirectangular_file import import_helvipad, stacked_rig
+from calib.errors import CalibError
+from calib.panorama import fit_cylinder
+from calib.rig_file import parse_rig, rig_toml
+
+# As the data set has it: centimetres, and numbers of the lidar and of the lenses, which are not used.
+HELVIPAD = {"stereo_baseline": 19.1, "lidar_camera_baseline": 45.0,
+            "intrinsic_parameters": {"K": [[855.9, 0, 1451.2], [0, 852.77, 1451.71], [0, 0, 1]], "D": [0, 0, 0, 0]}}
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    folder = tmp_path / "images_bottom" / "20240124_REC_03_OUT"
+    folder.mkdir(parents=True)
+    cv2.imwrite(str(folder / "0001.png"), np.zeros((512, 1920, 3), np.uint8))
+    (tmp_path / "calibration.json").write_text(json.dumps(HELVIPAD))
+    return tmp_path / "calibration.json"
+
+
+def test_rows_of_helvipad_have_the_angles_that_its_authors_compute_with(calibration: Path) -> None:
+    """Row r of the 512 lies at (1535 - 2 r) / 1920 of half a turn from the nadir; the baseline is 19.1 cm."""
+    rig = import_helvipad(calibration, next((calibration.parent / "images_bottom").iterdir()))
+    assert rig.baseline_m == pytest.approx(0.191) and rig.upper.viewpoint[2] > rig.lower.viewpoint[2]
+    rows = np.array([0.0, 200, 511])
+    rays = rig.lower.camera.lift(np.column_stack([np.full(3, 959.5), rows]))
+    from_nadir = np.arccos(rays[:, 1])
+    np.testing.assert_allclose(np.rad2deg(from_nadir), (1535 - 2 * rows) / 1920 * 180, atol=0.1)
+    # The middle of the image is ahead, its right is right.
+    np.testing.assert_allclose(rig.lower.T_cam_rig[:3, :3].T @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(rig.lower.T_cam_rig[:3, :3].T @ [1, 0, 0], [0, -1, 0], atol=1e-12)
+
+
+def test_the_panorama_is_a_full_turn_with_the_columns_of_the_images() -> None:
+    """The two ends of a stitched image meet: no column is missing, and none is counted twice."""
+    rig = stacked_rig((1024, 512), 0.2)
+    cylinder = fit_cylinder(rig)
+    assert cylinder.width == cylinder.turn_px == 1024
+    behind = np.array([[-1.0, y, 0.0] for y in np.linspace(-0.01, 0.01, 101)])
+    pixels = rig.lower.camera.project(behind @ rig.lower.T_cam_rig[:3, :3].T)
+    assert (pixels[:, 0] >= 0).all() and (pixels[:, 0] <= 1023).all()
+
+
+def test_the_rig_file_keeps_the_model() -> None:
+    rig = stacked_rig((1920, 512), 0.191)
+    again = parse_rig(rig_toml(rig))
+    assert again.lower.camera == rig.lower.camera and 'model = "equirectangular"' in rig_toml(rig)
+
+
+@pytest.mark.parametrize(("text", "found"), [
+    ("{}", "stereo_baseline"), ('{"stereo_baseline": "19"}', "stereo_baseline"), ("[1]", "stereo_baseline"),
+    ("{", "not a JSON file"), ('{"stereo_baseline": 1910}', "expected 0.001 to 5.0 m"),
+    ('{"stereo_baseline": NaN}', "expected 0.001 to 5.0 m")])
+def test_other_files_are_refused_in_one_line(calibration: Path, text: str, found: str) -> None:
+    calibration.write_text(text)
+    with pytest.raises(CalibError, match=found):
+        import_helvipad(calibration, calibration.parent / "images_bottom" / "20240124_REC_03_OUT")
+
+
+def test_images_of_other_sizes_and_missing_ones_are_refused(calibration: Path, tmp_path: Path) -> None:
+    with pytest.raises(CalibError, match="twice as many columns as rows"):
+        stacked_rig((1920, 900), 0.2)
+    with pytest.raises(CalibError, match="found none"):
+        import_helvipad(calibration, tmp_path)
