@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.mapping.keyframe_grid import KeyframeScans
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
+from omnid.core.navigation.requests import TaughtRoute
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
@@ -116,6 +118,14 @@ class OdometryUpdate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MapKeyframes:
+    """The keyframes of the map as they are at a pose, by id in ascending order: copies, for the map goes on."""
+
+    stamps_ns: Mapping[int, int]
+    T_map_rect: Mapping[int, Array]  # (4, 4) of the rectified frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PlaceUpdate:
     """Pose in the map after a pair: odom stays smooth, and T_map_odom carries the corrections (REP 105)."""
 
@@ -128,6 +138,7 @@ class PlaceUpdate:
     keyframe: int = -1  # of the map, to which the pose belongs; -1: none
     T_keyframe_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) in it, by odometry
     scans: KeyframeScans | None = None  # of the part of the map in which the pose is; the same object while it stays
+    keyframes: MapKeyframes | None = None  # the same object while the map stays
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,6 +212,7 @@ class NavigationUpdate:
     loops_left: int = 0  # of a route, this one included
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0  # its length so far
+    taught: TaughtRoute | None = None  # that is to be written; the same object until that is done
     answers: tuple[RequestAnswer, ...] = ()  # to the newest requests, the newest one last
     plan: NavigationPlan | None = None  # where it differs from that of the message before
 

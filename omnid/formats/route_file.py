@@ -11,7 +11,7 @@ import numpy as np
 
 from omnid.core.navigation.path import FARTHEST_M
 from omnid.core.navigation.requests import route_name
-from omnid.core.navigation.route import MOST_POINTS, NO_KEYFRAME, Route
+from omnid.core.navigation.route import DECIMALS, MOST_POINTS, NO_KEYFRAME, Route
 from omnid.errors import OmnidError
 from omnid.formats.whole_file import write_whole
 
@@ -28,7 +28,7 @@ _KEYS: Final = {"format", "version", "name", "created_s", "map", "columns", "poi
 
 def route_bytes(route: Route) -> bytes:
     """Return the content of a route's file."""
-    rows = np.column_stack([route.poses, route.speeds, route.keyframes, route.in_keyframe]).round(6).tolist()
+    rows = np.column_stack([route.poses, route.speeds, route.keyframes, route.in_keyframe]).round(DECIMALS).tolist()
     points = [[int(v) if k == 4 else v for k, v in enumerate(row)] for row in rows]
     keyframes = [[int(id), int(stamp)] for id, stamp in sorted(route.stamps_ns.items())]
     content = {"format": FORMAT, "version": VERSION, "name": route.name, "created_s": route.created_s,

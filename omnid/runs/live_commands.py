@@ -10,6 +10,7 @@ from typing import Final, TypeAlias
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import ArmAnswer
 from omnid.core.control.command_sources import PLANNER
+from omnid.core.navigation.requests import NavigationCommand
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import Session
@@ -17,7 +18,7 @@ from omnid.sinks.command_log import command_recorder
 from omnid.sinks.recorder import Recorder
 from omnid.transport.bus import Bus
 from omnid.transport.commands import CommandReceiver
-from omnid.transport.navigation_commands import NavigationReceiver, RequestQueue
+from omnid.transport.navigation_commands import NavigationReceiver
 from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import DISARMED_BY_STOP
@@ -33,14 +34,14 @@ NO_MAP_FILE: Final = ("the robot keeps no map in a file: start its daemon with -
 class LiveCommands:
     """The receivers of commands, requests and samples; without a motor only samples and requests to save the map."""
 
-    def __init__(self, session: Session, bus: Bus, controller: DriveLink | None, requests: RequestQueue,
-                 report: Callable[[int, str], None]) -> None:
-        """requests: to the navigation. report: takes lines for the log, with a level of `logging`."""
+    def __init__(self, session: Session, bus: Bus, controller: DriveLink | None,
+                 navigate: Callable[[NavigationCommand], None], report: Callable[[int, str], None]) -> None:
+        """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`."""
         self._session, self._bus, self._controller = session, bus, controller
         settings, warn = session.config.controller, partial(report, logging.WARNING)
         stamps = StampRule(settings.deadlines.command_s,
                            synchronised=session.config.bus.command_clock == "synchronised")
-        self.navigation = NavigationReceiver(requests.put, stamps, report=warn)
+        self.navigation = NavigationReceiver(navigate, stamps, report=warn)
         self.commands: CommandReceiver | None = None
         if controller is not None:
             self.commands = CommandReceiver(controller, stamps, sources=settings.sources.names,

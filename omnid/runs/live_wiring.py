@@ -34,6 +34,7 @@ from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks,
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.rig_checks import LiveRig, live_health
+from omnid.runs.route_files import RouteFiles
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import TICKERS, Session
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
@@ -78,6 +79,7 @@ class LiveWiring:
         graph.sink("exposure", exposure, pairs, policy=NEWEST, depth=1)
         # 3. From pairs to poses, maps and setpoints.
         ladder, requests = LoadLadder(), RequestQueue()
+        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), requests.put)
         front_end = FrontEnd(geometry, config, live_health(geometry, config, self._refined), load=lambda: ladder.level)
         live_rig = LiveRig(session, front_end, ladder, self._refined)
         sinks = self._sinks(live_rig, bus)
@@ -88,14 +90,18 @@ class LiveWiring:
         if controller:
             sinks.rings["controller-ring"] = RingToController(controller)
             parts = replace(parts, drive=LiveDrive(controller, rig.T_base_rig, requests.end),
-                            navigation=self._navigation(controller, requests, bus))
+                            navigation=self._navigation(controller, requests, bus, files))
         stages = wire(graph, pairs, front_end, config, sinks, parts)
         if config.live.shed_load and not robot.waits:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
         saver = self._saver(run_places, stages.places, bus)
+        if controller:
+            graph.ticker("routes", files.PERIOD_S, files)
+        if stages.places:
+            files.save_map = stages.places.want_copy
         # 4. From the bus: commands, requests, samples.
-        received = LiveCommands(session, bus, controller, requests, self._report)
+        received = LiveCommands(session, bus, controller, files.put, self._report)
         received.subscribe(recorder, sensors, saver)
         # 5. Status.
         images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))
@@ -141,12 +147,12 @@ class LiveWiring:
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _navigation(self, controller: DriveLink, requests: RequestQueue, bus: Bus) -> NavigationParts | None:
+    def _navigation(self, controller: DriveLink, requests: RequestQueue, bus: Bus,
+                    files: RouteFiles) -> NavigationParts | None:
         """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
         config = self._session.config
         if PLANNER not in config.controller.sources.names:
             self._session.warn(NO_PLANNER)
             return None
-        routes = RouteFolder(Path(config.navigation.routes))
         return NavigationParts(requests, lambda: wheel_state(controller.statistics.state),
-                               PlannerDrive(controller, bus.answer), routes, config.places.map)
+                               PlannerDrive(controller, bus.answer, files), config.places.map)

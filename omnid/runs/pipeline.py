@@ -24,7 +24,6 @@ from omnid.messages import (
     OdometryUpdate,
     PlaceUpdate,
 )
-from omnid.runs.route_map import RunRouteMap
 from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.simulated_wheels import SimulatedWheels
@@ -37,7 +36,7 @@ from omnid.stages.mapping import Mapping
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import Obstacles
 from omnid.stages.places import Places
-from omnid.stages.routes import Routes, RouteStore
+from omnid.stages.routes import RouteMap, Routes
 
 
 class RecordingSink(NamedTuple):
@@ -94,7 +93,6 @@ class NavigationParts(NamedTuple):
     requests: RequestSource
     wheels: Callable[[], WheelState]
     drive: Sink[NavigationUpdate]
-    routes: RouteStore
     map_name: str  # of the file of the map; empty: it is not saved
 
 
@@ -131,7 +129,7 @@ def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Co
     places, in_map = _places(graph, odometry, front_end, config, sinks, parts)
     grids = _grids(graph, in_map, geometry, config, parts) if sinks.take_all else None
     obstacles, rings = _rings(graph, odometry, front_end, config, sinks, parts)
-    updates = _navigation(graph, geometry, config, parts.navigation, places,
+    updates = _navigation(graph, geometry, config, parts, places,
                           [odometry, *(stream for stream in (in_map, rings) if stream)])
     named = {"bus-map": maps, "bus-places": in_map, "bus-grid": grids, "bus-scan": rings, "bus-navigation": updates}
     outgoing.update({name: stream for name, stream in named.items() if stream})
@@ -193,18 +191,19 @@ def _rings(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, 
     return obstacles, rings
 
 
-def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: NavigationParts | None,
-                places: Places | None, inputs: Sequence[Stream[Any]]) -> Stream[NavigationUpdate] | None:
+def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: RunParts, places: Places | None,
+                inputs: Sequence[Stream[Any]]) -> Stream[NavigationUpdate] | None:
     """Join the navigation, whose setpoints go to the controller; None in a run without wheels."""
-    if parts is None:
+    given, T_base_rig = parts.navigation, geometry.rig.T_base_rig
+    if given is None:
         return None
-    T_base_rig = geometry.rig.T_base_rig
-    route_map = None if places is None else RunRouteMap(places, T_base_rig, parts.map_name)
-    navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, parts.wheels,
-                                 Routes(parts.routes, route_map))
-    requests = graph.source("requests", parts.requests.batches, wake=parts.requests.end)
+    is_new = parts.known_places is None or not parts.known_places.keyframes
+    route_map = RouteMap(given.map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
+    navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, given.wheels,
+                                 Routes(route_map))
+    requests = graph.source("requests", given.requests.batches, wake=given.requests.end)
     updates = graph.stage("navigation", navigation, *inputs, requests)
-    graph.sink("planner", parts.drive, updates, policy=NEWEST, depth=1)
+    graph.sink("planner", given.drive, updates, policy=NEWEST, depth=1)
     return updates
 
 

@@ -30,7 +30,7 @@ from omnid.transport.bus import Bus
 CAMERAS: Final[tuple[Camera, ...]] = ("lower", "upper")
 BUS_END_S: Final = 3.0
 # They drop deadlines, not messages.
-TICKERS: Final = frozenset({"load", "motor", "progress", "router", "save", "status", "terminal", "watchdog"})
+TICKERS: Final = frozenset({"load", "motor", "progress", "router", "routes", "save", "status", "terminal", "watchdog"})
 
 
 class Session:

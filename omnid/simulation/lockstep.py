@@ -34,6 +34,7 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.runs.pipeline import NavigationParts, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
+from omnid.runs.route_files import RouteFiles
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
@@ -145,6 +146,7 @@ class _Lockstep:
                                 lambda time_s, line: self._lines.append((time_s, line)))
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
+        self._files = RouteFiles(RouteFolder(Path(config.navigation.routes)), self._requests.put)
         self._ends = False
         self._truth: dict[int, Array] = {}
         self._odometry: OdometryUpdate | None = None
@@ -163,8 +165,7 @@ class _Lockstep:
         shape = geometry(self._rig, config.panorama)
         pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
         run_places = RunPlaces(config, shape, nothing)
-        navigation = NavigationParts(self._requests, self._wheels, Take(self._take_navigation),
-                                     RouteFolder(Path(config.navigation.routes)), config.places.map)
+        navigation = NavigationParts(self._requests, self._wheels, Take(self._take_navigation), config.places.map)
         sinks = Sinks(poses={"poses": Take(self._take_pose)}, rings={"rings": Take(self._take_ring)},
                       places={"in map": Take(self._places.append)} if config.places.map else {})
         self._stages = wire(graph, pairs, FrontEnd(shape, config), config, sinks,
@@ -226,7 +227,8 @@ class _Lockstep:
             elif request == "end":
                 self._ends = True
             else:
-                self._requests.put(NavigationCommand(request, arrival_ns, arrival_ns))
+                self._files.put(NavigationCommand(request, arrival_ns, arrival_ns))
+        self._files()
 
     def _wheels(self) -> WheelState:
         return wheel_state(self._vehicle.controller.state)
@@ -246,6 +248,7 @@ class _Lockstep:
 
     def _take_navigation(self, update: NavigationUpdate) -> None:
         self._navigation.append(update)
+        self._files.process(update)
         if update.setpoint is not None:
             due_ns = self._vehicle.now_ns + self._delay_ns
             command = TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER)

@@ -15,7 +15,7 @@ from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
-from omnid.engine.flow import nothing
+from omnid.engine.flow import Sink, nothing
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
@@ -52,16 +52,17 @@ class LiveDrive:
 
 
 class PlannerDrive:
-    """Pass the setpoints of the navigation on, which a source of higher priority keeps out, and its answers."""
+    """Pass on the setpoints of the navigation, which a source of higher priority keeps out, its answers and routes."""
 
-    def __init__(self, link: DriveLink, answer: Callable[[int, Answer], object]) -> None:
-        """answer: takes the id of a request; it does not wait, and a second call for a request does nothing."""
-        self._link, self._answer = link, answer
+    def __init__(self, link: DriveLink, answer: Callable[[int, Answer], object], files: Sink[NavigationUpdate]) -> None:
+        """answer: takes the id of a request; a second call for it does nothing. Neither it nor the files wait."""
+        self._link, self._answer, self._files = link, answer, files
 
     def process(self, update: NavigationUpdate) -> None:
-        """Send a setpoint, if there is one, and the answers."""
+        """Send a setpoint, if there is one, the answers, and a route that is to be written."""
         if update.setpoint is not None:
             self._link.send_setpoint(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
+        self._files.process(update)
         state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
         for answer in update.answers:
             self._answer(answer.id, Answer(not answer.refusal, answer.refusal or state))

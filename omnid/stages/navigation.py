@@ -29,6 +29,8 @@ from omnid.core.navigation.requests import (
     PathRequest,
     RouteAction,
     RouteRequest,
+    TaughtRoute,
+    is_halt,
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
@@ -64,6 +66,7 @@ class NavigationStage:
         self._tie: KeyframeTie | None = None
         self._ring: ObstacleRing | None = None
         self._seq = 0
+        self._halted = 0  # id of the newest request to halt: those from before it that come later begin nothing
         self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
         self._plan: NavigationPlan | None = None  # that was not given yet
         self._given: tuple[object, ...] = ()  # the state that was given last
@@ -126,15 +129,18 @@ class NavigationStage:
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
         self._tie = KeyframeTie(update.keyframe, planar(T_map_keyframe))
+        self._routes.follow_map(update.keyframes)
 
     def _request(self, command: NavigationCommand) -> NavigationUpdate:
         """Execute a request; return the new state with the answer."""
+        taught = self._routes.taught
         refusal = ""
         try:
             self._execute(command)
         except OmnidError as error:
             refusal = str(error)
-        self._answers.append(RequestAnswer(command.id, _word(command.request), refusal))
+        if self._routes.taught in (None, taught):  # else the answer comes when the route is written
+            self._answers.append(RequestAnswer(command.id, _word(command.request), refusal))
         navigator = self._navigator
         setpoint = STAND if navigator.stopping else None
         update = self._update(Navigation(setpoint, navigator.state, navigator.reason), always=True)
@@ -144,6 +150,12 @@ class NavigationStage:
     def _execute(self, command: NavigationCommand) -> None:
         """Execute a request. Raise OmnidError with the reason to refuse it."""
         request, navigator = command.request, self._navigator
+        if is_halt(request):
+            self._halted = max(self._halted, command.id)
+        elif 0 < command.id < self._halted and not isinstance(request, TaughtRoute):
+            raise OmnidError("a later request has ended it: ask again")
+        elif not isinstance(request, RouteRequest | TaughtRoute):
+            _raise_if(command.refusal)
         match request:
             case NavigationVerb.CANCEL:
                 navigator.cancel("cancelled by a request")
@@ -157,6 +169,8 @@ class NavigationStage:
                 self._start("path", request.frame, [self._given_path(request)], command)
             case RouteRequest():
                 self._route(request, command)
+            case TaughtRoute():
+                self._routes.written(command.refusal)
 
     def _route(self, request: RouteRequest, command: NavigationCommand) -> None:
         routes = self._routes
@@ -164,16 +178,17 @@ class NavigationStage:
             case RouteAction.TEACH:
                 if self._navigator.task.startswith("route") and self._navigator.drive is not None:
                     raise OmnidError("a route is being repeated: stop it first")
+                _raise_if(command.refusal)
                 routes.teach(request.name, self._situation(), replace=request.replace)
             case RouteAction.FINISH:
-                routes.finish(command.arrival_ns // 1_000_000_000)
+                routes.finish(command.arrival_ns // 1_000_000_000, command.id)
             case RouteAction.STOP:
                 if not routes.drop():
                     self._navigator.cancel("stopped by a request")
             case RouteAction.REPEAT:
                 if routes.teaching:
                     raise OmnidError(f"the route {routes.teaching} is being taught: finish or stop it first")
-                route = routes.read(request.name)  # first: who asks for another one need not arm it
+                route = routes.found(request, command.refusal)  # first: who asks for another one need not arm it
                 self._require_ready(NavigationFrame.MAP)
                 paths = routes.paths(route, request, self._situation())
                 self._start(f"route {request.name}", NavigationFrame.MAP, paths, command)
@@ -216,7 +231,7 @@ class NavigationStage:
         navigator, routes, answers = self._navigator, self._routes, tuple(self._answers)
         stamp_ns = 0 if self._now is None else self._now.stamp_ns
         plan, self._plan = self._plan, None
-        state = (now.state, now.reason, navigator.task, routes.teaching, answers)
+        state = (now.state, now.reason, navigator.task, routes.teaching, routes.taught, answers)
         same = state == self._given and now.setpoint is None and plan is None
         if same and not always and stamp_ns - self._given_ns < REPEAT_NS:
             return None
@@ -224,7 +239,8 @@ class NavigationStage:
         drive = navigator.drive
         return NavigationUpdate(
             self._seq, stamp_ns, now.setpoint, now.state, now.reason, navigator.task, navigator.command_ns, now.left_m,
-            now.offset_m, len(drive.paths) if drive else 0, routes.teaching, routes.taught_m, answers, plan)
+            now.offset_m, len(drive.paths) if drive else 0, routes.teaching, routes.taught_m, routes.taught, answers,
+            plan)
 
 
 def _word(request: NavigationRequest) -> str:
@@ -236,6 +252,8 @@ def _word(request: NavigationRequest) -> str:
             return "path"
         case RouteRequest():
             return f"{request.action} {request.name}".strip()
+        case TaughtRoute():
+            return RouteAction.FINISH
     return str(request)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,7 +14,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser, OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.load_level import Load, LoadLevel, full_load
-from omnid.messages import OdometryUpdate, PlaceUpdate, StereoDepth
+from omnid.messages import MapKeyframes, OdometryUpdate, PlaceUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
@@ -22,13 +24,15 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 
-def never() -> bool:
-    """Return False."""
-    return False
+COUNTED_NS: Final = 1_000_000_000  # between two counts, which take 1 ms of 1,000 keyframes; the status comes no oftener
 
 
 class Places:
-    """Localise the poses of odometry in a map of places, which grows with them."""
+    """Localise the poses of odometry in a map of places, which grows with them.
+
+    The map belongs to the thread of this stage until the run ends. It leaves it by copies: those of `take_copy`, and
+    what updates carry.
+    """
 
     def __init__(self, geometry: Geometry, config: Config, dense: DenseDepths, places: PlaceMap | None = None, *,
                  localize_only: bool = False, load: Load = full_load) -> None:
@@ -47,6 +51,9 @@ class Places:
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._to_rect = se3.adjoint(self._T_rect_rig)
         self.state = MapState.ODOMETRY_ONLY  # of the newest pose
+        self.counts = self._localiser.counts  # sizes and counters of the map; each second, and at the end
+        self._counted_ns = 0
+        self._keyframes: tuple[object, MapKeyframes] | None = None  # what they depend on, and they
         self._copy_wanted = False
         self._copy: PlaceMap | None = None
 
@@ -63,35 +70,26 @@ class Places:
         """Return the places whose poses are known relative to the first one: what can be saved."""
         return self._localiser.map()
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """Sizes and counters of the map."""
-        return self._localiser.counts
-
     def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
         """Return the pose in the map at a pair."""
         pose = self._localiser.process(self._frame(odometry), idle=self._load() >= LoadLevel.NO_MAP)
         self.state = pose.state
         if self._copy_wanted:
             self._copy_wanted, self._copy = False, self._localiser.places.part(self._localiser.places.keyframes)
+        if odometry.stamp_ns >= self._counted_ns + COUNTED_NS:
+            self._counted_ns, self.counts = odometry.stamp_ns, self._localiser.counts
         T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
         T_map_rig = T_map_odom @ odometry.T_odom_rig
         covariance = self._to_rig @ pose.covariance @ self._to_rig.T
         T_keyframe_rig = self._T_rig_rect @ pose.T_keyframe_rect @ self._T_rect_rig
+        scans = self._localiser.scans()
         return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state,
-                           pose.keyframe, T_keyframe_rig, self._localiser.scans())
+                           pose.keyframe, T_keyframe_rig, scans, self._copied_keyframes(scans))
 
-    def keyframe(self, id: int) -> tuple[int, Array] | None:
-        """Return stamp and T_map_rig (4, 4) of a keyframe as the map knows it now; from any thread."""
-        places = self._localiser.places
-        keyframe, T_map_rect = places.keyframes.get(id), places.poses.get(id)
-        if keyframe is None or T_map_rect is None:
-            return None
-        return keyframe.stamp_ns, np.asarray(self._T_rig_rect @ T_map_rect @ self._T_rect_rig)
-
-    def keyframe_ids(self) -> list[int]:
-        """Return the keyframes, in ascending order; from any thread."""
-        return sorted(self._localiser.places.keyframes.copy())
+    def finish(self) -> list[PlaceUpdate]:
+        """Count at the end."""
+        self.counts = self._localiser.counts
+        return []
 
     def corrected(self, update: PlaceUpdate) -> Array:
         """Return T_map_rig (4, 4) of an earlier pose as the map knows it now; as it was where its keyframe is gone."""
@@ -99,6 +97,15 @@ class Places:
         if T_map_rect is None:
             return update.T_map_rig
         return np.asarray(self._T_rig_rect @ T_map_rect @ self._T_rect_rig @ update.T_keyframe_rig)
+
+    def _copied_keyframes(self, scans: object) -> MapKeyframes:
+        """Return the keyframes of the map; scans: the same object while the map stays."""
+        if self._keyframes is None or self._keyframes[0] is not scans:
+            places = self._localiser.places
+            ids = sorted(places.keyframes)
+            self._keyframes = scans, MapKeyframes({id: places.keyframes[id].stamp_ns for id in ids},
+                                                  {id: places.poses[id] for id in ids})
+        return self._keyframes[1]
 
     def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
         """Return the frame in terms of the rectified frame."""

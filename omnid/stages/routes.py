@@ -1,51 +1,62 @@
-"""Teaching and repeating of routes: recorder, files, and the map that routes are tied to."""
+"""Teaching and repeating of routes: the recorder, and the map that routes are tied to."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
+from calib.se2_arrays import planar
 from omnid.core.navigation.path import DrivePath
-from omnid.core.navigation.requests import RouteRequest
+from omnid.core.navigation.requests import RouteRequest, TaughtRoute
 from omnid.core.navigation.route import KeyframePose, Route, RouteRecorder, repeated_paths
 from omnid.core.navigation.situation import Situation, refusal_of_map
 from omnid.errors import OmnidError
+from omnid.messages import MapKeyframes
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 
 
-class RouteStore(Protocol):
-    """Files of routes; reading and writing raise OmnidError where they cannot."""
-
-    def has(self, name: str) -> bool:
-        """True if there is a route of that name, readable or not."""
-
-    def read(self, name: str) -> Route:
-        """Return a route."""
-
-    def write(self, route: Route) -> None:
-        """Write a route."""
+MOST_NOTED: Final = 200  # keyframes that tell a map from others: a route of the same map has most of them
 
 
-class RouteMap(Protocol):
-    """The map of places that routes are tied to; called in the thread of the navigation."""
+class RouteMap:
+    """The map of places that routes are tied to, as the newest update has it."""
 
-    name: str  # of its file; empty: it is not saved, so that no route can be tied to it
-    is_new: bool  # it was empty before this run, and lies where odom began
+    def __init__(self, name: str, T_base_rig: Array, T_rig_rect: Array, *, is_new: bool) -> None:
+        """name: of its file; empty: it is not saved, so that no route can be tied to it.
+
+        is_new: it was empty before this run, and lies where odom began.
+        """
+        self.name, self.is_new = name, is_new
+        self._T_base_rig, self._T_rig_base = T_base_rig, se3.inverse(T_base_rig)
+        self._T_rig_rect, self._T_rect_rig = T_rig_rect, se3.inverse(T_rig_rect)
+        self.keyframes = MapKeyframes({}, {})
 
     def keyframe(self, id: int) -> KeyframePose | None:
-        """Return a keyframe as the map knows it now."""
+        """Return a keyframe, None without one."""
+        T_map_rect = self.keyframes.T_map_rect.get(id)
+        if T_map_rect is None:
+            return None
+        T_map_rig = self._T_rig_rect @ T_map_rect @ self._T_rect_rig
+        return KeyframePose(self.keyframes.stamps_ns[id], planar(self._T_base_rig @ T_map_rig @ self._T_rig_base))
 
     def noted(self) -> Mapping[int, int]:
-        """Return stamps of some of its keyframes, by which it is told from other maps."""
+        """Return stamps of some keyframes, evenly over the map."""
+        stamps_ns = self.keyframes.stamps_ns
+        chosen = list(stamps_ns)[:: max(1, len(stamps_ns) // MOST_NOTED)]
+        return {id: stamps_ns[id] for id in chosen}
 
-    def save(self) -> None:
-        """Have the map written as it is now, soon."""
+
+def refusal_of_name(name: str) -> str:
+    """Return why a route cannot be taught under a name that there is already."""
+    return (f"there is a route {name} already: choose another name, or replace it (`omnid route teach {name} "
+            "--replace`)")
 
 
 class KeyframeTie:
@@ -57,12 +68,14 @@ class KeyframeTie:
 
 
 class Routes:
-    """Record and read routes."""
+    """Record routes, and make paths of those that were read. Files are written and read by others."""
 
-    def __init__(self, store: RouteStore, places: RouteMap | None) -> None:
-        self._store, self._places = store, places
+    def __init__(self, places: RouteMap | None) -> None:
+        self._places = places
         self._recorder: RouteRecorder | None = None
         self._resets = 0  # of odometry when the recording began
+        self._finished: RouteRecorder | None = None  # that of the route that is to be written
+        self.taught: TaughtRoute | None = None  # that is to be written
 
     @property
     def teaching(self) -> str:
@@ -82,9 +95,8 @@ class Routes:
         places = self._map()
         if self._recorder is not None:
             raise OmnidError(f"the route {self._recorder.name} is being taught: finish or stop it first")
-        if not replace and self._store.has(name):
-            raise OmnidError(f"there is a route {name} already: choose another name, or replace it (`omnid route teach "
-                             f"{name} --replace`)")
+        if not replace and self.taught is not None and self.taught.route.name == name:
+            raise OmnidError(refusal_of_name(name))
         refusal = refusal_of_map(now, math.inf)
         if refusal and not (places.is_new and now.resets == 0 and now.in_map is not None):
             raise OmnidError(refusal)
@@ -104,36 +116,54 @@ class Routes:
             return str(error)
         return ""
 
-    def finish(self, created_s: int) -> Route:
-        """Write the recorded route, and the map. Raise OmnidError where that is impossible; then it is still there."""
+    def finish(self, created_s: int, id: int) -> None:
+        """Have the recorded route written; id: of the request. Raise OmnidError where there is none, or no end of it.
+
+        It can be repeated at once.
+        """
         if self._recorder is None:
             raise OmnidError('no route is being taught: begin with "teach NAME"')
+        if self.taught is not None:
+            raise OmnidError(f"the route {self.taught.route.name} is being written: wait for its end")
         places = self._map()
         route = self._recorder.route(places.keyframe, places.noted(), created_s, places.name)
-        self._store.write(route)
-        places.save()
-        self._recorder = None
-        return route
+        self.taught, self._finished, self._recorder = TaughtRoute(route, id), self._recorder, None
+
+    def written(self, refusal: str) -> None:
+        """End the writing. Raise OmnidError with the refusal: then the recording goes on, unless another has begun."""
+        if refusal:
+            self._recorder = self._recorder or self._finished
+        self.taught, self._finished = None, None
+        if refusal:
+            raise OmnidError(refusal)
 
     def drop(self) -> bool:
         """Forget what is recorded; True if there was a recording."""
         dropped, self._recorder = self._recorder is not None, None
         return dropped
 
-    def read(self, name: str) -> Route:
-        """Return a route of this map. Raise OmnidError where there is none of that name."""
-        places = self._map()
-        route = self._store.read(name)
-        if not route.fits(places.keyframe):
-            raise OmnidError(f"the route {route.name} was taught in another map ({route.map_name}) than "
+    def found(self, request: RouteRequest, refusal: str) -> Route:
+        """Return the route of a request if it is one of this map. Raise OmnidError else, or with the refusal."""
+        places, taught = self._map(), self.taught
+        if taught is not None and taught.route.name == request.name:
+            return taught.route
+        if refusal or request.route is None:
+            raise OmnidError(refusal or f"the route {request.name} was not read")
+        if not request.route.fits(places.keyframe):
+            raise OmnidError(f"the route {request.name} was taught in another map ({request.route.map_name}) than "
                              f"{places.name}: start with that map (`omnid run --map`), or teach it again")
-        return route
+        return request.route
 
     def paths(self, route: Route, request: RouteRequest, now: Situation) -> list[DrivePath]:
         """Return the paths of a repetition. Raise OmnidError where it is impossible."""
         places = self._map()
         return repeated_paths(route, places.keyframe, now.map_pose(), loops=request.loops, reverse=request.reverse,
                               from_start=request.from_start)
+
+    def follow_map(self, keyframes: MapKeyframes | None) -> None:
+        """Take the keyframes of the map as they are now."""
+        if self._places is not None and keyframes is not None:
+            self._places.keyframes = keyframes
 
     def _map(self) -> RouteMap:
         if self._places is None or not self._places.name:

@@ -21,10 +21,10 @@ from omnid.core.navigation.requests import (
     NavigationCommand,
     NavigationFrame,
     NavigationRequest,
-    NavigationVerb,
     PathRequest,
     RouteAction,
     RouteRequest,
+    is_halt,
     navigation_verb,
     route_request,
 )
@@ -67,7 +67,7 @@ class NavigationReceiver:
         try:
             request, stamp_ns = self._parsed(message.topic, message.payload)
             stamp_ns = stamp_ns or message.sent_ns
-            if not _is_halt(request):
+            if not (is_halt(request) or _is_finish(request)):
                 self._stamps.check(message.topic, stamp_ns)
         except OmnidError as error:
             self.refused[message.topic] += 1
@@ -101,10 +101,8 @@ def _stamp_of(text: str) -> tuple[str, int]:
     return (found[1], int(found[2])) if found else (text, 0)
 
 
-def _is_halt(request: NavigationRequest) -> bool:
-    if isinstance(request, RouteRequest):
-        return request.action in (RouteAction.STOP, RouteAction.FINISH)
-    return request in (NavigationVerb.CANCEL, NavigationVerb.PAUSE)
+def _is_finish(request: NavigationRequest) -> bool:
+    return isinstance(request, RouteRequest) and request.action is RouteAction.FINISH
 
 
 def _frame(name: str) -> NavigationFrame:

@@ -10,6 +10,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.navigation.route import Route
 from omnid.errors import OmnidError
 
 MAX_LOOPS: Final = 10_000  # so that the number is bounded
@@ -73,9 +74,18 @@ class RouteRequest:
     loops: int = 1
     from_start: bool = False  # the whole route; else from where the robot is on it
     replace: bool = False  # teach in the place of a route of that name
+    route: Route | None = None  # that is to be repeated, as its file has it
 
 
-NavigationRequest: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest
+@dataclass(frozen=True, slots=True, eq=False)
+class TaughtRoute:
+    """A route that is to be written; as a request: it was written, or its refusal says why not."""
+
+    route: Route
+    id: int  # of the request to finish it
+
+
+NavigationRequest: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest | TaughtRoute
 
 
 class NavigationCommand(NamedTuple):
@@ -85,6 +95,14 @@ class NavigationCommand(NamedTuple):
     arrival_ns: int  # of Unix time
     stamp_ns: int = 0  # of the sender, of Unix time; 0: it has none
     id: int = 0  # of the message that asks; the answer has it too
+    refusal: str = ""  # why it is refused already, as by a file that is missing
+
+
+def is_halt(request: NavigationRequest) -> bool:
+    """True if a request ends or halts a motion."""
+    if isinstance(request, RouteRequest):
+        return request.action is RouteAction.STOP
+    return request in (NavigationVerb.CANCEL, NavigationVerb.PAUSE)
 
 
 def navigation_verb(text: str) -> NavigationVerb:

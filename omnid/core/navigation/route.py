@@ -32,6 +32,7 @@ ENTRY_M: Final = 1.5  # from the robot to the route
 ENTRY_M_PER_RAD: Final = 0.5  # of heading, where several pieces of a route are near
 BESIDE_M: Final = 0.25  # from the robot to the route, beyond which it drives to a point ahead on it
 JOIN: Final = 2.5  # way along the route to that point, per distance beside it: at 22 degrees, which is no corner
+DECIMALS: Final = 6  # of a route, as its file has them: it is the same before and after it was read
 FarKeyframe = Callable[[int], "KeyframePose | None"]
 
 
@@ -136,9 +137,10 @@ class RouteRecorder:
             found = keyframe(id) if id != NO_KEYFRAME else None
             if found is not None:
                 stamps[id] = found.stamp_ns
-        route = Route(self.name, np.array(poses), np.array(speeds), np.array(keyframes, np.int64),
+        route = Route(self.name, np.array(poses), np.array(speeds).round(DECIMALS), np.array(keyframes, np.int64),
                       np.array(in_keyframe), stamps, created_s, map_name)
-        return replace(route, poses=route.in_map(keyframe))
+        return replace(route, poses=route.in_map(keyframe).round(DECIMALS),
+                       in_keyframe=route.in_keyframe.round(DECIMALS))
 
     def _to_its_end(self) -> list[tuple[Array, float, int, Array]]:
         """Return the points; the last one is where the recording ends, however near to that before it."""

@@ -40,6 +40,7 @@ from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
+from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
@@ -63,7 +64,9 @@ class Walk:
         self.rng, self.seen, self.t_s = random.Random(seed), Counter[str](), 1000.0
         self.law = ControlLaw(SETTINGS, -1)
         self.stage = NavigationStage(NAVIGATION, SETTINGS.collision, np.eye(4), self.wheels,
-                                     Routes(RouteFolder(folder), FixedMap(is_new=True)))
+                                     Routes(FixedMap(is_new=True)))
+        self.asked: list[NavigationCommand] = []
+        self.files = RouteFiles(RouteFolder(folder), self.asked.append)
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
         self.seq = self.resets = 0
         self.state, self.map_state, self.kind = TrackingState.TRACKING, MapState.LOCALIZED, "free"
@@ -138,7 +141,14 @@ class Walk:
     def ask(self, request: NavigationRequest) -> None:
         """Send a request, and take its answer into the oracle."""
         teaching = self.seen_teaching
-        update = self.stage.process(NavigationCommand(request, self.now_ns, self.now_ns))
+        self.files.put(NavigationCommand(request, self.now_ns, self.now_ns))
+        self.files()
+        update = self.stage.process(self.asked.pop(0))
+        assert update is not None
+        self.files.process(update)
+        self.files()
+        if self.asked:  # the route is written
+            update = self.stage.process(self.asked.pop(0))
         assert update is not None and update.answer is not None
         accepted = not update.answer.refusal
         word = type(request).__name__ if not isinstance(request, NavigationVerb | RouteRequest) else str(

@@ -32,6 +32,7 @@ from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState
+from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
@@ -71,7 +72,9 @@ class Robot:
         self.wheels = WheelState(True, False)
         self.places = FixedMap() if places is None else places
         self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, lambda: self.wheels,
-                                     Routes(RouteFolder(folder), self.places))
+                                     Routes(self.places))
+        self.asked: list[NavigationCommand] = []
+        self.files = RouteFiles(RouteFolder(folder), self.asked.append, self.places.save)
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
         self.seq = 0
         self.updates: list[NavigationUpdate] = []
@@ -79,11 +82,16 @@ class Robot:
         self.in_map = True
 
     def send(self, request: NavigationRequest, stamp_ns: int = 0, id: int = 0) -> NavigationUpdate:
-        """Return the answer to a request."""
-        update = self.stage.process(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id))
-        assert update is not None
-        self.updates.append(update)
-        return update
+        """Return the state after a request and what the files bring."""
+        self.files.put(NavigationCommand(request, 1_800_000_000 * 10**9, stamp_ns, id))
+        self.files()
+        while self.asked:
+            update = self.stage.process(self.asked.pop(0))
+            assert update is not None
+            self.updates.append(update)
+            self.files.process(update)
+            self.files()
+        return self.updates[-1]
 
     def pass_on(self) -> NavigationUpdate | None:
         """Advance by a period."""

@@ -1,0 +1,93 @@
+"""Files of routes for the navigation, whose stage waits for no disk."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from omnid.core.navigation.requests import (
+    NavigationCommand,
+    NavigationRequest,
+    RouteAction,
+    RouteRequest,
+    TaughtRoute,
+    is_halt,
+)
+from omnid.engine.flow import nothing
+from omnid.errors import OmnidError
+from omnid.formats.route_file import RouteFolder
+from omnid.messages import NavigationUpdate
+from omnid.stages.routes import refusal_of_name
+
+MOST_WAITING: Final = 64  # requests, as many as may wait in front of the stage
+
+
+class RouteFiles:
+    """Reads routes before the requests to repeat them reach the stage, and writes those that were taught.
+
+    A ticker calls it each PERIOD_S in a thread of its own.
+    """
+
+    PERIOD_S: Final = 0.05  # so that a person does not notice it
+
+    def __init__(self, folder: RouteFolder, pass_on: Callable[[NavigationCommand], None],
+                 save_map: Callable[[], object] = nothing) -> None:
+        """pass_on: takes requests, from any thread. save_map: asks for the map to be written, which routes need."""
+        self._folder, self._pass_on, self.save_map = folder, pass_on, save_map
+        self._waiting: deque[NavigationCommand] = deque()
+        self._taught: TaughtRoute | None = None  # the newest one that is to be written
+        self._written: TaughtRoute | None = None  # the one that was written last
+
+    def put(self, command: NavigationCommand) -> None:
+        """Take a request: one that needs a file waits until that was read, those after it too, but for halts."""
+        if is_halt(command.request) or not (self._waiting or _needs_file(command.request)):
+            self._pass_on(command)
+        elif len(self._waiting) >= MOST_WAITING:
+            self._pass_on(command._replace(refusal="too many requests wait for files: ask again"))
+        else:
+            self._waiting.append(command)
+
+    def process(self, update: NavigationUpdate) -> None:
+        """Take the route that is to be written, if there is one."""
+        self._taught = update.taught
+
+    def __call__(self) -> None:
+        """Write and read what waits."""
+        if self._taught is not None and self._taught is not self._written:
+            self._written = self._taught
+            self._pass_on(self._stored(self._taught))
+        while self._waiting:
+            self._pass_on(self._with_file(self._waiting[0]))
+            self._waiting.popleft()  # now only: what comes meanwhile must not overtake it
+
+    close = __call__
+
+    def _stored(self, taught: TaughtRoute) -> NavigationCommand:
+        """Write a route and have the map written; return what the stage has to know."""
+        done = NavigationCommand(taught, taught.route.created_s * 1_000_000_000, id=taught.id)
+        try:
+            self._folder.write(taught.route)
+        except OmnidError as error:
+            return done._replace(refusal=str(error))
+        self.save_map()
+        return done
+
+    def _with_file(self, command: NavigationCommand) -> NavigationCommand:
+        """Return a request with what the stage has to know of its file."""
+        request = command.request
+        if not isinstance(request, RouteRequest):
+            return command
+        try:
+            if request.action is RouteAction.REPEAT:
+                return command._replace(request=replace(request, route=self._folder.read(request.name)))
+            if request.action is RouteAction.TEACH and not request.replace and self._folder.has(request.name):
+                return command._replace(refusal=refusal_of_name(request.name))
+        except OmnidError as error:
+            return command._replace(refusal=str(error))
+        return command
+
+
+def _needs_file(request: NavigationRequest) -> bool:
+    return isinstance(request, RouteRequest) and request.action in (RouteAction.REPEAT, RouteAction.TEACH)
