@@ -1,7 +1,7 @@
 """Table of the numeric constants of omnid/core and calib: `python -m tests.benchmark.constants [--write] [--missing]`.
 
 A constant is a module-level name in capitals whose value contains a number, or a knob of a settings class. Its comment
-is behind it, directly above it, or at the start of its block of lines. A comment that only says what the constant is
+is behind it, or above it, where it holds for all lines up to the next comment or empty line. A comment that only says what the constant is
 describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives its reason. Words
 decide that: a person judges whether the reason is a good one. `--write` makes docs/constants.md, `--missing` lists what
 lacks a reason.
@@ -15,7 +15,7 @@ import io
 import re
 import tokenize
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -33,8 +33,9 @@ REASON: Final = re.compile(
     r"\b(because|so that|so many that|since|therefore|otherwise|enough|too (many|few|small|large|long|short|near|far)"
     r"|never|cannot|hardly|no (more|less)|set by|set on|set with|set to|by trial|measured|source|section|eq\.|et al|"
     r"default|the paper|the standard|IEEE|ROS|REP|ISO|RFC|OpenCV|covers|needed|needs|stay(s)? below|as in|as for|"
-    r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact)\b"
-    r"|\(\w[\w .]* (19|20)\d\d\)|[:;] ", re.IGNORECASE)
+    r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact|guards? against|larger than any"
+    r"|more than (the|any)|the limit of|are not resolved|(say|tell)s? (nothing|the same)|misread|to the last digit)\b"
+    r"|\(\w[\w .]* (19|20)\d\d\)|[:;] |, so (?!many|much)", re.IGNORECASE)
 SOURCE: Final = re.compile(
     r"\([A-Z][\w .&-]* (?:et al\.,? )?(?:19|20)\d\d[^)]*\)|Dang et al[^:;]*|(?:section|eq\.) [IVX()\d.A-Z]+"
     r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+")
@@ -101,28 +102,28 @@ class Comments:
                     if token.type == tokenize.COMMENT}
 
     def at(self, first: int, last: int) -> str:
-        """Return the comments of an assignment: at the start of its block, directly above it, and behind it.
+        """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason.
 
-        A block is a run of lines without an empty one.
+        A comment above holds up to the next one, or to the next empty line.
         """
-        behind = [line for line in range(first, last + 1) if line in self._of]
-        above = self._comments_up(first - 1)
-        start = first
-        while start > 1 and self._lines[start - 2].strip():
-            start -= 1
-        heading = []
-        while start < first and self._lines[start - 1].lstrip().startswith("#"):
-            heading.append(start)
-            start += 1
-        return " ".join(self._of[line] for line in dict.fromkeys([*heading, *above, *behind]))
+        behind = self._joined(line for line in range(first, last + 1) if line in self._of)
+        return behind if REASON.search(behind) else f"{self._above(first)} {behind}".strip()
 
-    def _comments_up(self, line: int) -> list[int]:
-        """Return the lines of comments directly above, from the first one on."""
-        found = list[int]()
-        while line > 0 and self._lines[line - 1].lstrip().startswith("#"):
-            found.insert(0, line)
+    def _above(self, line: int) -> str:
+        """Return the comment above a line that holds for it, empty where there is none."""
+        while line > 1 and self._lines[line - 2].strip() and not self._is_comment(line - 1):
             line -= 1
-        return found
+        first = line
+        while first > 1 and self._is_comment(first - 1):
+            first -= 1
+        return self._joined(range(first, line))
+
+    def _is_comment(self, line: int) -> bool:
+        """True if a line holds nothing but a comment."""
+        return self._lines[line - 1].lstrip().startswith("#")
+
+    def _joined(self, lines: Iterable[int]) -> str:
+        return " ".join(self._of[line] for line in lines)
 
 
 def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Iterator[Constant]:
@@ -135,6 +136,8 @@ def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Itera
         return
     names = target.elts if isinstance(target, ast.Tuple) else [target]
     parts = value.elts if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple) else [value] * len(names)
+    if is_structure(names, parts):
+        return
     for name, part in zip(names, parts, strict=True):
         if isinstance(name, ast.Name) and name.id.strip("_").isupper() and has_number(part):
             shown = " ".join((ast.get_source_segment(text, part) or "").split())
@@ -144,6 +147,19 @@ def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Itera
 def has_number(value: ast.expr) -> bool:
     """True if a number, which is no index and no part of a text, occurs in an expression."""
     return any(isinstance(part, ast.Constant) and type(part.value) in (int, float) for part in ast.walk(value))
+
+
+def is_structure(names: Sequence[ast.expr], parts: Sequence[ast.expr]) -> bool:
+    """True if the names count positions, as FIRST, SECOND = 0, 1, or spell the number, as ONE = np.float32(1.0).
+
+    Such names have no value that could be another one.
+    """
+    numbers = [part.value for part in parts if isinstance(part, ast.Constant)]
+    counts = len(names) > 1 and numbers == list(range(len(names)))
+    spelled = {"NOTHING": 0.0, "ZERO": 0.0, "HALF": 0.5, "ONE": 1.0, "FIRST": 1, "SECOND": 2, "THIRD": 3}
+    return counts or all(isinstance(name, ast.Name) and name.id in spelled and isinstance(part, ast.Call)
+                         and [arg.value for arg in part.args if isinstance(arg, ast.Constant)] == [spelled[name.id]]
+                         for name, part in zip(names, parts, strict=True))
 
 
 def _knob(node: ast.stmt, comments: Comments, path: str) -> Iterator[Constant]:
