@@ -1,10 +1,10 @@
 """Table of the numeric constants of omnid/core and calib: `python -m tests.benchmark.constants [--write] [--missing]`.
 
 A constant is a module-level name in capitals whose value contains a number, or a knob of a settings class. Its comment
-is behind it, or above it, where it holds for all lines up to the next comment or empty line. A comment that only says what the constant is
-describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives its reason. Words
-decide that: a person judges whether the reason is a good one. `--write` makes docs/constants.md, `--missing` lists what
-lacks a reason.
+is behind it, or above it, where it holds for all lines up to the next comment or empty line. A comment that only says
+what the constant is describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives
+its reason. Words decide that: a person judges whether the reason is a good one. `--write` makes docs/constants.md,
+`--missing` lists what lacks a reason.
 """
 
 from __future__ import annotations

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree.ElementTree import fromstring
 
 import cv2
 import numpy as np
 import pytest
 
-from tests.documents import images
+from tests.documents import diagrams, images
 
 
 def test_the_stills_show_one_pair(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,3 +29,11 @@ def test_the_drive_becomes_a_moving_image(tmp_path: Path, monkeypatch: pytest.Mo
     images.drive(seconds=3.0)
     with pillow.open(tmp_path / "drive.gif") as image:
         assert image.n_frames >= 3 and image.width == images.GIF_WIDTH_PX
+
+
+@pytest.mark.parametrize("name", list(diagrams.DIAGRAMS))
+def test_the_diagrams_are_as_their_tables(name: str) -> None:
+    text = diagrams.diagram(name)
+    assert (diagrams.FOLDER / f"{name}.svg").read_text() == text, "python -m tests.documents.diagrams"
+    assert fromstring(text).tag.endswith("svg")
+    assert f"docs/images/{name}.svg" in (diagrams.FOLDER.parents[1] / "ARCHITECTURE.md").read_text()
