@@ -29,7 +29,9 @@ td.bar{text-align:left;min-width:220px}.bar span{background:#777;height:.7em;dis
 .note{border-left:4px solid #999;padding-left:.7em;color:#333}.warn{border-left:4px solid #000;padding-left:.7em}
 .tiles{display:grid;grid-template-columns:repeat(auto-fill,minmax(230px,1fr));gap:.6em}
 .tiles.wide{grid-template-columns:repeat(auto-fill,minmax(400px,1fr))}.tiles figure{margin:0}
-.tiles figcaption{font-size:.8em;line-height:1.3}details{margin:1em 0}summary{cursor:pointer}"""
+.tiles figcaption{font-size:.8em;line-height:1.3}details{margin:1em 0}summary{cursor:pointer}
+@media screen and (prefers-color-scheme:dark){html{background:#12161a}body>*{filter:invert(.92) hue-rotate(180deg)}
+body>* img{filter:invert(1) hue-rotate(180deg)}}"""
 # Control characters except tab and newline, which a terminal would obey where the page is printed.
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"

@@ -43,15 +43,16 @@ def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
 
 
 class PanoramaSink:
-    """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second; offset_ns: the Encoder's."""
+    """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second, while somebody subscribes."""
 
     def __init__(self, bus: Bus, rate_hz: float, offset_ns: int = 0) -> None:
+        """offset_ns: the Encoder's."""
         self._bus, self._period_ns, self._offset_ns = bus, 1e9 / rate_hz, offset_ns
         self._next_ns = 0.0
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Publish the panorama of a pose, with its features as the attachment, when it is due."""
-        if odometry.stamp_ns < self._next_ns:
+        if odometry.stamp_ns < self._next_ns or not self._bus.is_received("panorama"):
             return
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)

@@ -65,7 +65,15 @@ class PlannerDrive:
         self._files.process(update)
         state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
         for answer in update.answers:
-            self._answer(answer.id, Answer(not answer.refusal, answer.refusal or state))
+            self._answer(answer.id, Answer(not answer.refusal, answer.refusal or granted_words(answer.request, state)))
+
+
+def granted_words(request: str, state: str) -> str:
+    """Return what the robot does after a request, in a word, that it has accepted; state: of the navigation."""
+    verb, _, name = request.partition(" ")
+    return {"goal": "it drives to the goal", "path": "it drives along the path", "resume": "it goes on",
+            "teach": f"it records the route {name}: drive it, then finish it", "finish": "the route is written",
+            "repeat": f"it repeats the route {name}", "stop": "the route has ended"}.get(verb, state)
 
 
 class RingToController:

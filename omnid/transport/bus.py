@@ -121,6 +121,10 @@ class Bus:
         except zenoh.ZError as error:
             raise OmnidError(f"bus cannot publish {topic}: {reason(error)}; restart") from error
 
+    def is_received(self, topic: str) -> bool:
+        """True if somebody subscribes to a topic."""
+        return self._session is not None and self._publishers[topic].is_received
+
     def serve(self, name: str, text: str) -> None:
         """Answer queries for `<robot>/<name>` with a text, such as the configuration; a second text replaces it."""
         is_new = name not in self._newest

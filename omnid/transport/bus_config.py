@@ -49,7 +49,8 @@ class BusConfig:
     ros2: str = knob("off", "connection to ROS 2: by rmw_zenoh or by zenoh-bridge-ros2dds",
                      choices=("off", "rmw_zenoh", "ros2dds"))
     ros2_domain: int = knob(0, "ROS_DOMAIN_ID, for rmw_zenoh", low=0, high=232)
-    panorama_hz: float = knob(0.0, "panoramas on the bus per second, as JPEG; 0: none", low=0, high=60)
+    panorama_hz: float = knob(2.0, "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none",
+                              low=0, high=60)
 
 
 def checked(config: BusConfig) -> BusConfig:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Final
+from typing import Any, Final
 
 import zenoh
 from zenoh import ext
@@ -70,6 +70,13 @@ class TopicPublisher:
         self._ros = declared(session, key, topic) if other else None
         self._gid = ros2.gid_of(token) if config.ros2 == "rmw_zenoh" else b""
         self._seq = 0
+
+    @property
+    def is_received(self) -> bool:
+        """True if there is a subscriber."""
+        found: list[Any] = [publisher.matching_status for publisher in (self._plain, self._ros)
+                            if isinstance(publisher, zenoh.Publisher)]  # zenoh's stub takes the status for a bool
+        return any(status.matching for status in found)
 
     def put(self, payload: bytes, attachment: bytes | None) -> None:
         """Send to all subscribers; microseconds where there are none."""

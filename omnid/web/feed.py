@@ -7,6 +7,7 @@ event loop. Nothing that a browser does can reach that far.
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
@@ -30,6 +31,7 @@ from omnid.web.snapshot import (
     navigation_message,
     parts_message,
     scan_message,
+    server_ms,
     state_message,
 )
 
@@ -41,6 +43,7 @@ PANORAMA: Final = "panorama"
 SCAN: Final = "scan"
 NAVIGATION: Final = "navigation"
 MAP_POSE: Final = "map_pose"
+PANORAMA_S: Final = 0.4  # least time between two panoramas: what a robot publishes more often is left out
 MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
 _LARGEST: Final = {"odom": 1 << 16, MAP_POSE: 1 << 16, "status": 1 << 20, SCAN: 1 << 20, "map": MOST_CELLS + (1 << 16),
                    PANORAMA: 1 << 23, NAVIGATION: 1 << 16}  # bytes
@@ -62,6 +65,7 @@ class RobotFeed:
         self.inbox = Inbox()
         self._map: Encoded = b""
         self._panorama: Encoded = b""
+        self._panorama_s = -PANORAMA_S  # when the newest one was taken
         self._scan: Encoded = ""
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
         self._navigation: Encoded = ""
@@ -195,9 +199,10 @@ class RobotFeed:
                 self._navigation_channel.changed()
             elif topic == "map":
                 await self._take_map(await asyncio.to_thread(decode_map, payload))
-            else:
+            elif time.monotonic() >= self._panorama_s + PANORAMA_S:
                 self._panorama = _panorama_message(payload)
                 self._panorama_channel.changed()
+                self._panorama_s = time.monotonic()
         except (OmnidError, FrameDecodeError):
             self.state.broken += 1
 
@@ -216,7 +221,7 @@ class RobotFeed:
 
     def _encode_state(self) -> str:
         return state_message(self.bus.robot, self.state, self.link,
-                             {"dropped": self.inbox.dropped, "browsers": len(self.browsers),
+                             {"server_ms": server_ms(), "dropped": self.inbox.dropped, "browsers": len(self.browsers),
                               "panoramas": self._panorama_channel.version, "map_in_odom": self._map_in_odom})
 
 

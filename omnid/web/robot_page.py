@@ -12,6 +12,7 @@ from omnid.web.feed import RobotFeed
 from omnid.web.guard import Guard
 from omnid.web.metrics import metrics
 from omnid.web.robot_requests import RobotRequests
+from omnid.web.stick import StickCommands
 from omnid.web.wheel_commands import WheelCommands
 
 
@@ -20,12 +21,14 @@ class RobotPage:
 
     def __init__(self, feed: RobotFeed) -> None:
         self.feed, self.wheels, self._requests = feed, WheelCommands(feed), RobotRequests(feed)
+        self._stick = StickCommands(feed, self.wheels)
 
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
         return [WebSocketRoute("/live", self._live), Route("/stop", self._stop, methods=["POST"]),
                 Route("/arm", self._arm, methods=["POST"]), Route("/route", self._route, methods=["POST"]),
-                Route("/navigation", self._navigation, methods=["POST"]), Route("/map", self._map, methods=["POST"])]
+                Route("/navigation", self._navigation, methods=["POST"]), Route("/map", self._map, methods=["POST"]),
+                Route("/drive", self._drive, methods=["POST"]), Route("/goal", self._goal, methods=["POST"])]
 
     def metrics(self, guard: Guard) -> str:
         """Return the metrics of the robot and of this server."""
@@ -48,6 +51,12 @@ class RobotPage:
 
     async def _navigation(self, request: Request) -> Response:
         return answered(await self._requests.navigation(request))
+
+    async def _drive(self, request: Request) -> Response:
+        return answered(await self._stick.drive(request))
+
+    async def _goal(self, request: Request) -> Response:
+        return answered(await self._requests.goal(request))
 
     async def _map(self, _: Request) -> Response:
         return answered(await self._requests.save_map())

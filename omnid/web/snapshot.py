@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 import zlib
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
@@ -25,12 +26,23 @@ FRAMES: Final = (PATH_FRAME, "map")  # of a map that is drawn
 BASE_FRAME: Final = "base_link"
 MOST_SECTORS: Final = 720  # of a scan
 _LARGEST_M: Final = 1e4  # range of a scan
+OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
 MOST_WARNINGS: Final = 20
 MOST_VALUES: Final = 60  # of a part
 LONGEST_VALUE: Final = 100  # characters
 LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
 MOST_CELLS: Final = 1 << 26
 _ROBOT_GONE: Final = "start the daemon on the robot: omnid run, or systemctl start omnid"
+
+
+def server_ms() -> int:
+    """Return the server's time, which states carry and requests of the stick repeat."""
+    return time.monotonic_ns() // 1_000_000
+
+
+def is_recent(stamp_ms: int) -> bool:
+    """True for a time of a state that was sent a moment ago: whoever repeats it sees what the robot does."""
+    return 0 <= server_ms() - stamp_ms <= 1000 * OLDEST_S
 
 
 def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, Any]) -> str:
@@ -43,6 +55,7 @@ def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, 
         "fresh": state.rate_hz > 0, "rate_hz": finite(state.rate_hz), "missed": state.missed, "broken": state.broken,
         "pose": None if state.pose is None else _pose(state.pose), "age_ms": _quantiles_ms(state.age),
         "network_ms": _quantiles_ms(state.network), "wheels": _wheels(state), "in_map": _in_map(state),
+        "pace": plain(state.real_time_factor),
         "warnings": _warnings(state, link),
         **extra,
     })

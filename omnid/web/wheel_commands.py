@@ -57,7 +57,7 @@ class WheelCommands:
         while time.monotonic() < begin_s + (ANSWER_S if self._is_received else CONNECT_S):
             if self._again:
                 self._again, begin_s = False, time.monotonic()
-            driver, reports = self._ready_driver(), self._feed.wheel_reports
+            driver, reports = self.ready_driver(), self._feed.wheel_reports
             if await asyncio.to_thread(self._stops_by_datagram) and not self._again:
                 return Answer(True, "the robot stops: its wheels stand until it is armed")
             if driver is not None:
@@ -67,7 +67,7 @@ class WheelCommands:
                     return Answer(True, "the robot stops: its wheels stand until it is armed")
             else:
                 await asyncio.sleep(_POLL_S)
-        return Answer(False, f"the stop is NOT confirmed: use the emergency stop. {self._reason()}")
+        return Answer(False, f"the stop is NOT confirmed: use the emergency stop. {self.why_not()}")
 
     def _stops_by_datagram(self) -> bool:
         """Ask for a stop beside the sessions of the bus, which may all be taken; return whether it is confirmed."""
@@ -75,7 +75,7 @@ class WheelCommands:
         with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
             return datagrams.ask(_DATAGRAM_S) == STOPPED
 
-    def _ready_driver(self) -> Driver | None:
+    def ready_driver(self) -> Driver | None:
         """Return the sender; None without a connection to the robot."""
         if self._driver is None and self._feed.robot is not None:
             self._driver = self._feed.robot.driver()
@@ -101,7 +101,7 @@ class WheelCommands:
         status = self._feed.state.statuses.get(WHEELS)
         return status is not None and status.values.get(Key.DISARMED_BY) == DISARMED_BY_STOP
 
-    def _reason(self) -> str:
+    def why_not(self) -> str:
         """Return why there may be no answer."""
         if self._feed.link:
             return f"There is no connection: {self._feed.link}"

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
+import tarfile
+import zipfile
 from importlib.resources import files
 from pathlib import Path
+
+import pytest
 
 from drivers.logs.log_reader import LogReader
 from omnid.version import __version__
@@ -49,3 +54,35 @@ def test_help_of_every_command(omnid: Command) -> None:
     for command in ("replay", "demo", "eval", "calibrate", "config"):
         assert command in listed
         assert f"omnid {command}" in omnid(command, "--help").out
+
+
+def tracked(*folders: str) -> set[str]:
+    """Return the files of the repository, those of some folders or all."""
+    listed = subprocess.run(["git", "ls-files", "-z", *folders], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("no clone: what the packages should hold is not known")
+    return {name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()}
+
+
+def test_wheel_and_sdist_are_complete_and_the_wheel_runs_by_itself(tmp_path: Path) -> None:
+    pytest.importorskip("hatchling", reason="needs hatchling, the build backend")
+    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(tmp_path)], cwd=ROOT, check=True,
+                   capture_output=True)
+    (wheel,), (sdist,) = tmp_path.glob("*.whl"), tmp_path.glob("*.tar.gz")
+    # 1. The wheel has each file of the three packages and the units of systemd; the sdist all of the repository.
+    with zipfile.ZipFile(wheel) as packed:
+        names = set(packed.namelist())
+        packed.extractall(tmp_path / "installed")
+    assert tracked("omnid", "drivers", "calib") - names == set()
+    assert {f"omnid/service/{name}" for name in tracked("systemd")} - names == set()
+    with tarfile.open(sdist) as source:
+        assert tracked() - {name.partition("/")[2] for name in source.getnames()} == set()
+    # 2. Away from the repository, with nothing but the wheel, the sample is replayed.
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed"), "PYTHONSAFEPATH": "1"}
+    found = subprocess.run([sys.executable, "-c", "import omnid; print(omnid.__file__)"], cwd=tmp_path, env=environment,
+                           capture_output=True, text=True, check=True).stdout
+    assert found.startswith(str(tmp_path / "installed"))
+    replay = [sys.executable, "-m", "omnid", "replay", str(tmp_path / "installed/omnid/sample/log.mcap"), "--quiet",
+              "--tum", str(tmp_path / "path.tum")]
+    subprocess.run(replay, cwd=tmp_path, env=environment, check=True, capture_output=True)
+    assert len((tmp_path / "path.tum").read_text().splitlines()) >= 99

@@ -44,7 +44,7 @@ export class Connection {
   request(name, wanted) {
     if (wanted) this.wanted.add(name);
     else this.wanted.delete(name);
-    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(`${wanted ? "show" : "hide"} ${name}`);
+    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(`${wanted ? "show" : "hide"} ${name}`);
   }
 
   closed(socket, event) {

@@ -3,7 +3,10 @@ import { Connection } from "./connection.js";
 import { Plan } from "./plan.js";
 import { wireCommands } from "./commands.js";
 import { showCalibration } from "./calibration.js";
-import { showNavigation, wireRoutes } from "./routes.js";
+import { wireRoutes } from "./routes.js";
+import { wireGoal } from "./goal.js";
+import { wireStick } from "./stick.js";
+import { inWords } from "./words.js";
 import { showMapFile, wireMap } from "./map.js";
 import { wireRecordings } from "./recordings.js";
 import { byId, element, fixed } from "./elements.js";
@@ -15,6 +18,9 @@ const STATES = { tracking: "good", degraded: "warn", lost: "bad" };
 const plan = new Plan(byId("plan"));
 const connection = new Connection(onMessage, onConnection);
 const commands = wireCommands();
+const goal = wireGoal(plan);
+const stick = wireStick();
+const routes = wireRoutes();
 let imageUrl = "";
 let nearest = null; // distance in m and direction in degrees of the nearest obstacle
 
@@ -29,7 +35,9 @@ function onMessage(message, body) {
       showCalibration(message.parts.find((part) => part.name === "calibration"));
       showMapFile(message.parts.find((part) => part.name === "map file"));
       return showParts(message.parts);
-    case "navigation": return showNavigation(message);
+    case "navigation":
+      goal.showNavigation(message);
+      return routes.showNavigation(message);
     case "scan":
       nearest = message.nearest;
       return plan.setObstacles(message.points);
@@ -44,6 +52,7 @@ function onConnection(text) {
   if (text) {
     setBadge("state", "no connection", "bad");
     setBadge("armed", "", "warn");
+    byId("well").hidden = true;
   }
 }
 
@@ -52,7 +61,11 @@ function showState(state) {
   byId("robot").textContent = state.robot;
   setBadge("state", state.state, state.fresh ? STATES[state.state] ?? "warn" : "bad");
   byId("rate").textContent = state.fresh ? `${fixed(state.rate_hz, 1)} poses/s` : "";
+  showWell(state);
   showWheels(state.wheels);
+  stick.show(state);
+  goal.show(state);
+  routes.show(state);
   showWarnings(state.warnings);
   showPose(state);
   byId("no-pose").hidden = state.pose !== null;
@@ -62,9 +75,22 @@ function showState(state) {
   document.dispatchEvent(new CustomEvent("omnid-state", { detail: state }));
 }
 
+// One line that says whether all is well.
+function showWell(state) {
+  const line = byId("well");
+  const [worst] = state.warnings;
+  const more = state.warnings.length > 1 ? ` (and ${state.warnings.length - 1} more below)` : "";
+  const moves = state.wheels === null ? "It has no wheels." : state.wheels.armed ? "It obeys commands." : "Arm it to drive.";
+  const pose = state.pose === null || !state.fresh;
+  line.hidden = false;
+  line.className = worst ? LEVELS[worst.level] : pose ? "warn" : "good";
+  line.textContent = worst ? `${worst.name}: ${worst.message}${more}` : pose ? `There is no pose: ${state.state}.`
+    : `All is well. ${moves}`;
+}
+
 function showWheels(wheels) {
   const armed = wheels !== null && wheels.armed;
-  setBadge("armed", wheels === null ? "" : armed ? "armed" : "not armed", armed ? "warn" : "good");
+  setBadge("armed", wheels === null ? "" : armed ? "armed" : "not armed", armed ? "warn" : "rest");
   const source = wheels !== null && wheels.source ? `, commanded by ${wheels.source}` : "";
   byId("wheels").textContent = wheels === null ? "not reported: the robot has no motor, or is not there"
     : `${wheels.message}${source}`;
@@ -93,7 +119,8 @@ function showPose(state) {
     ...(state.in_map === null ? [] : [["in the map", state.in_map]]),
     ...(nearest === null || !plan.obstacles.length ? [] : [["nearest obstacle", `${fixed(nearest[0], 2)} m, ${direction(nearest[1])}`]]),
     ["resets", `${pose.resets}`],
-    ["image to here, p50 / p99", `${fixed(state.age_ms[0], 0)} / ${fixed(state.age_ms[1], 0)} ms`],
+    ...(state.pace ? [["simulated time", `${state.pace} x real time`]]
+      : [["image to here, median and 99 %", `${fixed(state.age_ms[0], 0)} and ${fixed(state.age_ms[1], 0)} ms`]]),
     ["missed poses", `${state.missed}`],
   ];
   byId("pose").replaceChildren(...rows.map(([name, value]) => element("tr", {}, element("td", {}, name),
@@ -109,11 +136,18 @@ function direction(degrees) {
 }
 
 function showParts(parts) {
-  byId("parts").replaceChildren(...parts.flatMap((part) => [
-    element("h3", { className: LEVELS[part.level] }, `${part.name}: ${part.message || LEVEL_NAMES[part.level]}`),
-    element("table", {}, ...part.values.map(([key, value]) => element("tr", {}, element("td", {}, key),
-      element("td", {}, value)))),
-  ]));
+  const open = new Set([...byId("parts").querySelectorAll("details[open]")].map((part) => part.dataset.part));
+  byId("parts").replaceChildren(...parts.map((part) => {
+    const title = `${part.name}: ${part.message || LEVEL_NAMES[part.level]}`;
+    const values = part.values.map(([key, value]) => {
+      const [name, unit] = inWords(key);
+      return element("tr", {}, element("td", { title: key }, name), element("td", {}, unit ? `${value} ${unit}` : value));
+    });
+    const found = element("details", { open: open.has(part.name) },
+      element("summary", { className: LEVELS[part.level] }, title), element("table", {}, ...values));
+    found.dataset.part = part.name;
+    return found;
+  }));
 }
 
 function showPanorama(body) {
@@ -131,8 +165,12 @@ function setBadge(id, text, className) {
   badge.className = `badge ${className}`;
 }
 
-byId("panorama-box").addEventListener("toggle", (event) => connection.request("panorama", event.target.open));
-byId("panorama-note").textContent = "None comes yet. The robot publishes it with bus.panorama_hz = 5, off by default.";
+// The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
+const panorama = byId("panorama-box");
+const askForPanorama = () => connection.request("panorama", panorama.open && !document.hidden);
+panorama.addEventListener("toggle", askForPanorama);
+document.addEventListener("visibilitychange", askForPanorama);
+byId("panorama-note").textContent = "None comes yet: the robot publishes it unless bus.panorama_hz = 0.";
 byId("closer").addEventListener("click", () => plan.zoom(1.5));
 byId("wider").addEventListener("click", () => plan.zoom(1 / 1.5));
 byId("fit").addEventListener("click", () => plan.fit());
@@ -143,6 +181,6 @@ if (location.pathname.startsWith("/robot/")) { // one of several: recordings of 
 } else {
   wireRecordings();
 }
-wireRoutes();
 wireMap();
 connection.open();
+askForPanorama();

@@ -7,6 +7,7 @@ const NEAREST_PX = 2000; // per metre
 const WIDEST_PX = 0.05;
 const OBSTACLES_MS = 2000; // for which obstacles are shown
 const OBSTACLE_PX = 2.5;
+const AIM_PX = 18; // a finger that is drawn less far gives no heading
 const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
 
 export class Plan {
@@ -20,6 +21,8 @@ export class Plan {
     this.mapInOdom = null;
     this.obstacles = [];
     this.fits = true;
+    this.goal = null; // {x, y, yaw}: where it is to drive; yaw null: as it comes
+    this.onPick = null; // takes a goal that a finger points out, while one is looked for; null: fingers move the plan
     this.onFit = () => {};
     this.view = { x: 0, y: 0, scale: 50 }; // the centre in m, px per m
     this.pointers = new Map();
@@ -31,6 +34,7 @@ export class Plan {
     for (const name of ["pointerup", "pointercancel"]) {
       canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     }
+    this.picked = null; // where the finger came down that points out a goal, px on the screen
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY / 400));
@@ -110,7 +114,26 @@ export class Plan {
 
   press(event) {
     this.canvas.setPointerCapture(event.pointerId);
+    if (this.onPick !== null && this.pointers.size === 0) {
+      this.picked = [event.clientX, event.clientY];
+      this.pick(event);
+    }
     this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  }
+
+  // The goal is where the finger came down; where it is drawn from there is the heading.
+  pick(event) {
+    const box = this.canvas.getBoundingClientRect();
+    const [x, y] = [this.picked[0] - box.left - box.width / 2, this.picked[1] - box.top - box.height / 2];
+    const [dx, dy] = [event.clientX - this.picked[0], event.clientY - this.picked[1]];
+    this.setFit(false);
+    this.onPick({ x: this.view.x + x / this.view.scale, y: this.view.y - y / this.view.scale,
+      yaw: Math.hypot(dx, dy) < AIM_PX ? null : Math.atan2(-dy, dx) });
+  }
+
+  setGoal(goal) {
+    this.goal = goal;
+    this.draw();
   }
 
   // One pointer drags; two zoom by the ratio of their distances.
@@ -119,7 +142,9 @@ export class Plan {
     if (before === undefined) return;
     const now = [event.clientX, event.clientY];
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
-    if (other !== undefined) {
+    if (this.onPick !== null && other === undefined) {
+      this.pick(event);
+    } else if (other !== undefined) {
       const [old, spread] = [before, now].map((at) => Math.hypot(at[0] - other[0], at[1] - other[1]));
       if (old > 0 && spread > 0) this.zoom(spread / old);
     } else {
@@ -155,7 +180,8 @@ export class Plan {
     this.paintMap(toScreen);
     this.paintPath(toScreen);
     this.paintObstacles(toScreen);
-    if (this.pose !== null) this.paintRobot(toScreen);
+    if (this.goal !== null) this.paintGoal(toScreen);
+    if (this.pose !== null) this.paintRobot(toScreen, this.pose.x_m, this.pose.y_m, this.pose.yaw_rad, this.fresh ? "--accent" : "--bad");
     this.paintScale(width, height);
   }
 
@@ -234,19 +260,40 @@ export class Plan {
     this.context.fill();
   }
 
-  paintRobot(toScreen) {
+  // The straight way to the goal, which the robot leaves only for obstacles, and the goal.
+  paintGoal(toScreen) {
+    const { context, goal } = this;
+    const at = toScreen(goal.x, goal.y);
+    context.strokeStyle = context.fillStyle = this.colour("--goal");
+    context.lineWidth = 2;
+    if (this.pose !== null) {
+      context.setLineDash([6, 5]);
+      context.beginPath();
+      context.moveTo(...toScreen(this.pose.x_m, this.pose.y_m));
+      context.lineTo(...at);
+      context.stroke();
+      context.setLineDash([]);
+    }
+    if (goal.yaw !== null) return this.paintRobot(toScreen, goal.x, goal.y, goal.yaw, "--goal");
+    context.beginPath();
+    context.arc(...at, 0.7 * ROBOT_PX, 0, 2 * Math.PI);
+    context.fill();
+    return undefined;
+  }
+
+  paintRobot(toScreen, x_m, y_m, yaw_rad, colour) {
     const { context } = this;
-    const [x, y] = toScreen(this.pose.x_m, this.pose.y_m);
+    const [x, y] = toScreen(x_m, y_m);
     context.save();
     context.translate(x, y);
-    context.rotate(-this.pose.yaw_rad);
+    context.rotate(-yaw_rad);
     context.beginPath();
     context.moveTo(1.5 * ROBOT_PX, 0);
     context.lineTo(-ROBOT_PX, ROBOT_PX);
     context.lineTo(-0.5 * ROBOT_PX, 0);
     context.lineTo(-ROBOT_PX, -ROBOT_PX);
     context.closePath();
-    context.fillStyle = this.colour(this.fresh ? "--accent" : "--bad");
+    context.fillStyle = this.colour(colour);
     context.strokeStyle = this.colour("--back");
     context.lineWidth = 2;
     context.fill();

@@ -4,8 +4,13 @@ import { byId, fixed } from "./elements.js";
 
 const SURE_MS = 4000;
 
+const DRIVES = ["driving", "avoiding", "blocked", "not localised"];
+
+// Returns show(state) and showNavigation(report).
 export function wireRoutes() {
   const name = byId("route-name");
+  let armed = false;
+  let report = null;
   let sureUntil = 0;
   const ask = async (address, text) => {
     byId("route-answer").textContent = "asking the robot ...";
@@ -38,9 +43,33 @@ export function wireRoutes() {
   byId("route-stop").addEventListener("click", () => ask("route", "stop"));
   byId("route-pause").addEventListener("click", () => ask("navigation", "pause"));
   byId("route-resume").addEventListener("click", () => ask("navigation", "resume"));
+
+  // A button can be pressed where it does something.
+  function enable() {
+    const state = report?.state ?? "";
+    const taught = Boolean(report?.teaching);
+    byId("route-teach").disabled = state === "" || DRIVES.includes(state) && report.task.startsWith("route");
+    repeat.disabled = !armed || taught;
+    byId("route-stop").disabled = !taught && !DRIVES.includes(state) && state !== "paused";
+    byId("route-pause").disabled = !DRIVES.includes(state);
+    byId("route-resume").disabled = state !== "paused" || !armed;
+  }
+
+  enable();
+  return {
+    show(state) {
+      armed = state.wheels !== null && state.wheels.armed;
+      enable();
+    },
+    showNavigation(newest) {
+      report = newest;
+      showRoutes(report);
+      enable();
+    },
+  };
 }
 
-export function showNavigation(report) {
+function showRoutes(report) {
   byId("navigation-box").hidden = false;
   const left = report.left_m === null ? "" : `, ${fixed(report.left_m, 1)} m left`;
   const what = report.task ? `${report.task}: ` : "";

@@ -17,7 +17,7 @@ from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
 from omnid.messages import OdometryUpdate
-from omnid.sinks.drive import LiveDrive, ReplayDrive
+from omnid.sinks.drive import LiveDrive, ReplayDrive, granted_words
 from omnid.tracking_state import TrackingState
 
 AHEAD = Setpoint(0.3, 0.0)
@@ -92,3 +92,9 @@ def test_a_replay_counts_commands_errors_and_stops(link: Any) -> None:
 def test_a_live_pose_keeps_its_stamp(link: Any) -> None:
     LiveDrive(link, np.eye(4)).process(odometry(123))
     assert [pose.stamp_ns for pose in link.poses] == [123] and link.setpoints == []
+
+
+def test_what_a_robot_does_is_a_sentence() -> None:
+    assert granted_words("teach dock", "idle") == "it records the route dock: drive it, then finish it"
+    assert granted_words("repeat dock", "driving") == "it repeats the route dock"
+    assert granted_words("pause", "paused: by a request") == "paused: by a request"

@@ -8,7 +8,16 @@ from omnid.monitor.robot_state import RobotState
 from omnid.transport import status_names
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
-from omnid.transport.status_names import CALIBRATION, PREFIX, STAGE_PREFIX, SUMMARY, WHEELS, camera_name
+from omnid.transport.status_names import (
+    CALIBRATION,
+    PREFIX,
+    SIMULATION,
+    STAGE_PREFIX,
+    SUMMARY,
+    THREADS,
+    WHEELS,
+    camera_name,
+)
 from omnid.web.browsers import Browsers
 from omnid.web.metrics import metrics
 from omnid.web.remedies import remedy_of
@@ -36,7 +45,8 @@ def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
 
 def test_every_part_that_can_warn_has_a_remedy() -> None:
     names = {value for value in vars(status_names).values() if isinstance(value, str) and value.startswith(PREFIX)}
-    parts = {*names - {PREFIX, STAGE_PREFIX, SUMMARY, CALIBRATION}, camera_name("lower"), camera_name("upper")}
+    silent = {PREFIX, STAGE_PREFIX, SUMMARY, CALIBRATION, SIMULATION, THREADS}
+    parts = {*names - silent, camera_name("lower"), camera_name("upper")}
     assert WHEELS in parts and len(parts) > 8
     assert [name for name in parts if not remedy_of(DiagnosticStatus(name, 1, "", {}))] == []
     assert remedy_of(DiagnosticStatus("omnid: wheels", 1, "", {"remedy": "send cmd/arm"})) == "send cmd/arm"

@@ -6,8 +6,10 @@ Screenshots are written to the folder OMNID_SCREENSHOTS, if that is set.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import shutil
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,12 +30,12 @@ from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, 
 from tests.omnid.web.servers import PATIENCE_S, WebServer, served
 from tests.omnid.web.test_fleet_page import Robots
 from tests.omnid.web.test_routes import Navigator
-from tests.replay.live import robot, wait_until
+from tests.replay.live import robot, started, wait_until
 from tests.replay.test_arming import MANUAL
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]
-SIZES = {"phone": (390, 844), "desk": (1440, 900)}
+SIZES = {"phone": (390, 844), "desk": (1280, 800)}
 HOSTILE = "<img src=x onerror=document.title='hacked'><script>document.title='hacked'</script>"
 WAIT_MS = 20_000
 
@@ -139,8 +141,6 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, c
                 shows(page, "stop-answer", "the robot stops")
                 wait_until(lambda: not base.drives, "the stop")
                 shows(page, "armed", "not armed")
-                page.locator("#panorama-box > summary").scroll_into_view_if_needed()
-                press("#panorama-box > summary")
                 page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
                 page.locator("#recordings-box > summary").scroll_into_view_if_needed()
                 press("#recordings-box > summary")
@@ -204,6 +204,7 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
     with contextlib.ExitStack() as ends:
         bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
         navigator = Navigator(bus)
+        bus.publish("odom", odometry(8), PoseAttachment(8, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
         server = ends.enter_context(served("--connect", endpoint))
         publishing = threading.Event()
         thread = threading.Thread(
@@ -213,7 +214,15 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
         ends.callback(publishing.set)
         for size in SIZES:
             with opened(browser, server, size) as page:
+                navigator.state = "driving"
                 shows(page, "navigation", "route dock: driving, 3.5 m left")
+                buttons = {name: page.locator(f"#route-{name}")
+                           for name in ("teach", "repeat", "stop", "pause", "resume")}
+                page.wait_for_function("() => !document.getElementById('route-pause').disabled", timeout=WAIT_MS)
+                assert [name for name, button in buttons.items() if button.is_enabled()] == ["repeat", "stop", "pause"]
+                navigator.state = "idle"
+                page.wait_for_function("() => document.getElementById('route-pause').disabled", timeout=WAIT_MS)
+                assert [name for name, button in buttons.items() if button.is_enabled()] == ["teach", "repeat"]
                 count = len(navigator.asked)
                 page.fill("#route-name", "../x")
                 page.click("#route-teach")
@@ -222,7 +231,7 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
                 assert len(navigator.asked) == count
                 page.fill("#route-name", "dock-1")
                 page.click("#route-teach")
-                shows(page, "route-answer", "driving")
+                shows(page, "route-answer", "does teach dock-1")
                 page.click("#route-repeat")
                 assert navigator.asked[-1] == "teach dock-1", "one press only asks"
                 page.click("#route-repeat")
@@ -230,6 +239,87 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
                 page.locator("#navigation-box").scroll_into_view_if_needed()
                 expect_it_fits(page, size)
                 screenshot(page, f"{size}-routes")
+
+
+def heading_deg(page: Any) -> float:
+    """Return the heading that the page shows."""
+    return float(page.inner_text("#pose tr:nth-child(2) td:last-child").rstrip("\N{DEGREE SIGN}"))
+
+
+def position(page: Any) -> tuple[float, float]:
+    """Return x and y [m] that the page shows."""
+    x, y, _ = page.inner_text("#pose tr:first-child td:last-child").removesuffix(" m").split(", ")
+    return float(x), float(y)
+
+
+def held(page: Any, until: Callable[[], object], what: str) -> None:
+    """Wait with the page alive until something happens."""
+    end_s = time.monotonic() + PATIENCE_S
+    while not until():
+        assert time.monotonic() < end_s, f"{what}: {page.inner_text('#pose')} {page.inner_text('#stick-answer')}"
+        page.wait_for_timeout(50)
+
+
+def rests(page: Any) -> bool:
+    """True if the robot has not moved for a while."""
+    before = position(page)
+    page.wait_for_timeout(700)
+    return position(page) == pytest.approx(before, abs=0.005)
+
+
+@pytest.mark.parametrize(("size", "scheme"), [("phone", "light"), ("desk", "dark")])
+def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, scheme: str) -> None:
+    endpoint = free_endpoint()
+    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "256",
+               "--set", f'bus.listen=["{endpoint}"]', "--set", "live.status_s=0.5"]
+    with started(command, 0) as daemon, served("--connect", endpoint) as server, \
+            opened(browser, server, size, scheme) as page:
+        shows(page, "state", "tracking")
+        shows(page, "well", "All is well. Arm it to drive.")
+        assert page.locator("#goal").is_disabled() and page.get_attribute("#stick", "aria-disabled") == "true"
+        page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
+        assert page.locator("#panorama").bounding_box()["width"] >= 0.95 * SIZES[size][0]
+        arm(page, page.tap if size == "phone" else page.click)
+        shows(page, "well", "All is well. It obeys commands.")
+        # 1. The stick, released outside of it.
+        box = page.locator("#stick").bounding_box()
+        middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        page.mouse.move(*middle)
+        page.mouse.down()
+        page.mouse.move(middle[0], box["y"] + 4)
+        held(page, lambda: position(page)[0] > 0.15, "motion by the stick")
+        screenshot(page, f"{size}-stick")
+        page.mouse.move(middle[0], 5)
+        page.mouse.up()
+        held(page, lambda: rests(page), "the stop")
+        shows(page, "stick-answer", "the stick is released")
+        # 2. The keys; a page that loses the focus has released them.
+        before = heading_deg(page)
+        page.keyboard.down("ArrowLeft")
+        held(page, lambda: heading_deg(page) > before + 5, "a turn by the key")
+        page.evaluate("window.dispatchEvent(new Event('blur'))")
+        held(page, lambda: rests(page), "the stop")
+        page.keyboard.up("ArrowLeft")
+        # 3. A tap shows where it would drive; nothing moves before Go.
+        x, y = position(page)
+        page.click("#goal")
+        plan = page.locator("#plan").bounding_box()
+        page.mouse.move(plan["x"] + 0.5 * plan["width"], plan["y"] + 0.4 * plan["height"])
+        page.mouse.down()
+        page.mouse.move(plan["x"] + 0.5 * plan["width"] + 50, plan["y"] + 0.4 * plan["height"])
+        page.mouse.up()
+        shows(page, "goal-answer", "Go drives there, around obstacles.")
+        assert position(page) == pytest.approx((x, y), abs=0.02)
+        screenshot(page, f"{size}-goal")
+        page.click("#goal-go")
+        shows(page, "goal-answer", "it drives to the goal")
+        held(page, lambda: math.dist(position(page), (x, y)) > 0.1, "the drive to the goal")
+        page.click("#goal-leave")
+        shows(page, "goal-answer", "has ended")
+        page.click("#stop")
+        shows(page, "armed", "not armed")
+        expect_it_fits(page, size)
+        assert daemon.end()[0] == 0
 
 
 def test_the_page_of_all_robots(browser: Any) -> None:

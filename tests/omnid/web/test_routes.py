@@ -4,39 +4,56 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.monitor.teleop import FIRST_SHARE
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
-from omnid.transport.navigation_codec import string_from_cdr
+from omnid.transport.navigation_codec import PlanarGoal, goal_from_cdr, string_from_cdr
 from omnid.transport.requests import Answer, Request
-from omnid.transport.status_names import NAVIGATION, Key
+from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.transport.topics import command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.omnid.web.servers import Shown, WebServer, served
+from tests.replay.live import wait_until
 
 
 class Navigator:
     """A robot that grants every request but those for the route `lost`, and whose disk is full at the second save."""
 
     def __init__(self, bus: Bus) -> None:
-        self._bus, self.asked = bus, list[str]()
+        self._bus, self.asked, self.goals = bus, list[str](), list[PlanarGoal]()
+        self.twists: list[tuple[float, float]] = []
+        self.state = "driving"
         bus.subscribe_commands(self._take, command_topics(("operator",)))
 
     def _take(self, request: Request) -> None:
+        if request.topic == "cmd/twist":
+            command = codec.twist_from_cdr(request.payload)
+            self.twists.append((command.velocity_mps, command.yaw_rate_radps))
+            return
+        if request.topic == "cmd/goal":
+            self.goals.append(goal_from_cdr(request.payload))
+            self._bus.answer(request.id, Answer(True, "it drives there"))
+            return
         text = string_from_cdr(request.payload)
         self.asked.append(text)
         is_refused = text.endswith("lost") or self.asked.count("save") == 2
         self._bus.answer(request.id, Answer(not is_refused, "that cannot be" if is_refused else f"does {text}"))
 
     def publish(self) -> None:
-        """Report the navigation."""
-        values = {Key.STATE: "driving", Key.REASON: "", Key.TASK: "route dock", Key.LEFT_M: "3.5"}
+        """Report the navigation, and that it is armed."""
+        wheels = DiagnosticStatus(WHEELS, 0, "driving", {Key.ARMED: "1"})
+        self._bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [wheels]))
+        values = {Key.STATE: self.state, Key.REASON: "", Key.TASK: "route dock", Key.LEFT_M: "3.5"}
         entry = DiagnosticStatus(NAVIGATION, 0, "", {str(key): value for key, value in values.items()})
         self._bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
 
@@ -90,3 +107,59 @@ def test_other_texts_never_leave_the_server(robot: tuple[WebServer, Navigator], 
     assert found.status == 409 and not json.loads(found.text)["done"] and len(navigator.asked) == before
     assert server.request(path, "POST", {"Origin": f"http://{server.host}"}, text).status == 401
     assert server.request(path, headers=server.bearer).status == 405
+
+
+def server_ms(server: WebServer) -> int:
+    """Return the server's time in the newest state, as a page knows it."""
+    with server.live(server.bearer) as live:
+        return int(Shown(live).until("state")["server_ms"])
+
+
+def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[WebServer, Navigator]) -> None:
+    server, navigator = robot
+    told = answer(robot, "/goal", f"1.5 -0.25 90 {server_ms(server)}")
+    assert told == {"done": True, "text": "it drives there"}
+    goal = navigator.goals[-1]
+    assert (goal.frame, goal.x_m, goal.y_m) == ("odom", 1.5, -0.25)
+    assert goal.heading_rad == pytest.approx(math.pi / 2)
+    assert answer(robot, "/goal", f"1 2 {server_ms(server)}")["done"] and navigator.goals[-1].heading_rad is None
+    count = len(navigator.goals)
+    now_ms = server_ms(server)
+    for text in ("1 2", "1 2 3", f"nan 2 {now_ms}", f"1e9 2 {now_ms}", f"1 2 {now_ms - 2000}",
+                 f"1 2 {now_ms + 60_000}", ""):
+        assert not answer(robot, "/goal", text)["done"], text
+    assert len(navigator.goals) == count
+
+
+def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tuple[WebServer, Navigator]) -> None:
+    server, navigator = robot
+    limits = VelocityLimits()
+    assert answer(robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"] or answer(
+        robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"]  # the first one may wait for the limits
+    wait_until(lambda: navigator.twists)
+    assert navigator.twists[-1] == pytest.approx((FIRST_SHARE * limits.velocity_mps,
+                                                  -0.5 * FIRST_SHARE * limits.yaw_rate_radps))
+    assert "another page drives" in answer(robot, "/drive", f"1 0 {server_ms(server)} b2")["text"]
+    # 1. A request that waited in a network moves nothing; a release always counts.
+    count = len(navigator.twists)
+    assert "too slow" in answer(robot, "/drive", f"1 0 {server_ms(server) - 1500} a1")["text"]
+    assert "too slow" in answer(robot, "/drive", f"1 0 {server_ms(server) + 60_000} a1")["text"]
+    assert answer(robot, "/drive", f"0 0 {server_ms(server) - 1500} a1") == {
+        "done": True, "text": "the stick is released: it stands"}
+    wait_until(lambda: len(navigator.twists) > count)
+    assert navigator.twists[count:] == [(0.0, 0.0)]
+    # 2. Anything else is refused, and so are requests of other sites.
+    for text in ("2 0 1 a", "nan 0 1 a", "1 0 1", "1 0 -1 a", "1 0 1 <b>", "", "1 0 1 a b"):
+        assert not answer(robot, "/drive", text)["done"], text
+    body = f"1 0 {server_ms(server)} a1"
+    assert server.request("/drive", "POST", body=body).status == 403
+    assert server.request("/drive", "POST", {**server.bearer, "Origin": "http://evil.example"}, body).status == 403
+    assert len(navigator.twists) == count + 1
+
+
+def test_the_token_for_stops_neither_drives_nor_gives_goals(tmp_path: Path) -> None:
+    tokens = [tmp_path / name for name in ("all", "stop")]
+    with served("--connect", free_endpoint(), "--token-file", tokens[0], "--stop-token-file", tokens[1]) as server:
+        bearer = {"Authorization": f"Bearer {tokens[1].read_text().strip()}"}
+        for path, text in (("/drive", "1 0 1 a"), ("/goal", "1 2 3")):
+            assert server.request(path, "POST", bearer, text).status == 403
