@@ -94,8 +94,7 @@ def run_text(args: argparse.Namespace) -> int:
     from omnid.monitor.navigation import connected, granted
 
     with connected(config_of(args).bus) as robot:
-        text = granted(robot, robot.driver().route(args.action))
-        print("the route is written" if args.action == "finish" else text)
+        print(granted(robot, robot.driver().route(args.action)))
     return 0
 
 

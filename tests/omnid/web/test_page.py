@@ -315,7 +315,7 @@ def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, s
         shows(page, "goal-answer", "it drives to the goal")
         held(page, lambda: math.dist(position(page), (x, y)) > 0.1, "the drive to the goal")
         page.click("#goal-leave")
-        shows(page, "goal-answer", "has ended")
+        shows(page, "goal-answer", "cancelled")
         page.click("#stop")
         shows(page, "armed", "not armed")
         expect_it_fits(page, size)
