@@ -41,7 +41,7 @@ def server_ms() -> int:
 
 
 def is_recent(stamp_ms: int) -> bool:
-    """True for a time of a state that was sent a moment ago: whoever repeats it sees what the robot does."""
+    """True for the time of a state that was sent a moment ago: its sender has seen what the robot does."""
     return 0 <= server_ms() - stamp_ms <= 1000 * OLDEST_S
 
 

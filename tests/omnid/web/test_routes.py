@@ -117,8 +117,8 @@ def server_ms(server: WebServer) -> int:
 
 def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
-    told = answer(robot, "/goal", f"1.5 -0.25 90 {server_ms(server)}")
-    assert told == {"done": True, "text": "it drives there"}
+    given = answer(robot, "/goal", f"1.5 -0.25 90 {server_ms(server)}")
+    assert given == {"done": True, "text": "it drives there"}
     goal = navigator.goals[-1]
     assert (goal.frame, goal.x_m, goal.y_m) == ("odom", 1.5, -0.25)
     assert goal.heading_rad == pytest.approx(math.pi / 2)
