@@ -282,6 +282,7 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType({
     "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
     "stereo.rig_check": "rig.check",
     "live.check_s": "rig.check_s",
+    "navigation.blocked_s": "a blocked base gives way (navigation.give_way_s) and goes on by itself",
     "mapping.heights_m": "obstacles.ring.heights_m, which are above the floor",
 })
 

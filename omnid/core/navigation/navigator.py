@@ -6,8 +6,7 @@ Every end is a stop. Time is that of the poses. A drive in the frame map follows
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,9 @@ from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, IDLE
-from omnid.core.navigation.follower import STAND, Follower
+from omnid.core.navigation.drive import Drive, Navigation
+from omnid.core.navigation.follower import STAND, Follower, Following
+from omnid.core.navigation.giving_way import GivingWay, Phase, Trail, closed, give_way, is_free
 from omnid.core.navigation.local_planner import Detour, LocalPlanner
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
@@ -35,35 +36,11 @@ PLANNED_M: Final = 4.0  # of the path that the local planner is given; enough: i
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
-
-
-@dataclass(slots=True)
-class Drive:
-    """A drive that is under way."""
-
-    task: str  # in words
-    frame: NavigationFrame
-    paths: list[DrivePath]  # one after the other
-    follower: Follower
-    resets: int
-    command_ns: int = 0  # stamp of the request
-    paused: str = ""  # the reason; empty: it is not paused
-    waits: dict[NavigationState, float] = field(default_factory=dict)  # s, by what is waited for
-    unlocalised_m: float = 0.0  # way since the pose in the map was known
-    nearest_m: float = math.inf  # way left, at the last progress
-    heading_rad: float = 0.0  # at the last progress
-    stuck_s: float = 0.0  # since then
-    last_xy: Array | None = None  # in odom
-
-
-class Navigation(NamedTuple):
-    """The result of a step."""
-
-    setpoint: Setpoint | None  # in odom; None: nothing is sent
-    state: NavigationState
-    reason: str
-    left_m: float = math.nan  # way to the end of the path
-    offset_m: float = math.nan  # of the base to the left of the path
+GIVES_WAY: Final = "it drives back to let others pass"
+WAITS: Final = "it goes on by itself when the way is free"
+AGAIN_M: Final = 1.0  # of progress after which a block is a new one; by trial on development seeds
+MOST_DOUBLINGS: Final = 6  # of the time until it gives way again: to four minutes by default
+PAST_M: Final = 1.0  # of the path past the place where it was blocked, which must be free, too; by trial
 
 
 class Navigator:
@@ -72,7 +49,10 @@ class Navigator:
     def __init__(self, settings: NavigationSettings, collision: CollisionSettings | None = None) -> None:
         """collision: the outline of the base; None: the default one."""
         self._settings = settings
-        self._planner = LocalPlanner(settings, collision or CollisionSettings())
+        collision = collision or CollisionSettings()
+        self._planner = LocalPlanner(settings, collision)
+        self._half_width_m = collision.half_width_m + collision.side_m
+        self._trail = Trail(settings.give_way_m)
         self._last_ns: int | None = None
         self._stops = 0  # still to be sent
         self.drive: Drive | None = None
@@ -90,6 +70,7 @@ class Navigator:
               ) -> None:
         """Begin a drive, which replaces the one before."""
         self._planner.restart()
+        self._trail.restart()
         self.drive = Drive(task, frame, paths, Follower(paths[0], self._settings), now.resets, command_ns,
                            heading_rad=float(now.pose[2]))
         self.task, self.command_ns, self._stops = task, command_ns, 0
@@ -133,7 +114,10 @@ class Navigator:
         halt = self._halt(drive, now)
         if halt is not None:
             return self._wait(drive, *halt, dt_s)
-        # 3. The path.
+        # 3. Giving way, while it lasts.
+        if drive.giving_way is not None:
+            return self._give_way(drive, drive.giving_way, now, dt_s)
+        # 4. The path.
         pose = now.pose_in(drive.frame)
         following = drive.follower.step(now.stamp_ns, pose, now.speed_mps, now.yaw_rate_radps, now.obstacle_m)
         if following.done:
@@ -141,20 +125,19 @@ class Navigator:
         if abs(following.offset_m) > self._settings.corridor_m + BESIDE_M:
             return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
         setpoint = self._in_odom(following.setpoint, drive, now)
-        # 4. Obstacles.
-        plan = self._around_obstacles(drive, now, setpoint)
+        # 5. Obstacles.
+        plan = self._around_obstacles(drive.follower, self._path_ahead(drive, now, PLANNED_M), now, setpoint)
+        if plan.avoiding:
+            drive.follower.skip_corner(pose)
         if plan.setpoint is None:
-            return self._wait(drive, NavigationState.BLOCKED, plan.reason, dt_s)._replace(
-                left_m=following.left_m, offset_m=following.offset_m)
+            return self._blocked(drive, plan.reason, now, following, dt_s)
         if now.wheels.held_by:  # the setpoint is still sent: the monitor lets go by itself
-            held = self._wait(drive, NavigationState.BLOCKED, now.wheels.held_by, dt_s)
-            return held._replace(setpoint=plan.setpoint if self.drive else held.setpoint, left_m=following.left_m,
-                                 offset_m=following.offset_m)
-        # 5. What holds the wheels, and progress.
+            return self._blocked(drive, now.wheels.held_by, now, following, dt_s)._replace(setpoint=plan.setpoint)
+        # 6. What holds the wheels, and progress.
         if self._is_stuck(drive, now, following.left_m, dt_s):
-            why = now.wheels.reason if _holds(now) else AROUND if plan.avoiding else ""
-            return self._failed(f"no progress for {self._settings.stuck_s:g} s{': ' + why if why else ''}: look at the "
-                                "robot")
+            if plan.avoiding and not drive.gave_way and self._begins_to_give_way(drive, now, following.left_m):
+                return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
+            return self._no_progress(now, AROUND if plan.avoiding else "")
         self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
         self.reason = now.wheels.reason if _holds(now) else plan.reason
         drive.waits.clear()
@@ -180,7 +163,11 @@ class Navigator:
         moved_m = 0.0 if drive.last_xy is None else float(np.hypot(*(now.pose[:2] - drive.last_xy)))
         drive.last_xy = now.pose[:2].copy()
         drive.unlocalised_m += moved_m
+        if drive.giving_way is None:
+            self._trail.add(now.pose, now.speed_mps)
         if drive.resets != now.resets:
+            self._trail.restart()
+            drive.giving_way = None
             drive.resets, drive.unlocalised_m = now.resets, math.inf
             if drive.frame is NavigationFrame.ODOM:
                 self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
@@ -204,30 +191,91 @@ class Navigator:
         return None
 
     def _wait(self, drive: Drive, state: NavigationState, reason: str, dt_s: float) -> Navigation:
-        """Stand and count the time; fail where it is over."""
+        """Stand and count the time; fail where the pose in the map is missing for too long."""
         if self.drive is None:
             return self._idle()
-        longest_s = {NavigationState.BLOCKED: self._settings.blocked_s,
-                     NavigationState.NOT_LOCALISED: self._settings.unlocalised_s}.get(state, math.inf)
         drive.waits[state] = drive.waits.get(state, 0.0) + dt_s
-        if drive.waits[state] > longest_s:
+        longest_s = self._settings.unlocalised_s
+        if state is NavigationState.NOT_LOCALISED and drive.waits[state] > longest_s:
             return self._failed(f"{state} for {longest_s:g} s: {reason}")
         self.state, self.reason = state, reason
         setpoint = None if state is NavigationState.PAUSED else STAND
         return Navigation(setpoint, state, reason)
 
-    def _around_obstacles(self, drive: Drive, now: Situation, setpoint: Setpoint) -> Detour:
-        """Return the motion, by way of a detour where the path is blocked."""
+    def _blocked(self, drive: Drive, reason: str, now: Situation, following: Following, dt_s: float) -> Navigation:
+        """Wait for a free way, and give way where that takes too long."""
+        waiting = self._wait(drive, NavigationState.BLOCKED, f"{reason}: {WAITS}", dt_s)
+        if following.left_m < drive.gave_way_m - AGAIN_M:
+            drive.gave_way = 0
+        patience_s = self._settings.give_way_s * 2.0 ** min(drive.gave_way, MOST_DOUBLINGS)
+        if drive.waits[NavigationState.BLOCKED] > patience_s:
+            self._begins_to_give_way(drive, now, following.left_m)
+        return waiting._replace(left_m=following.left_m, offset_m=following.offset_m)
+
+    def _begins_to_give_way(self, drive: Drive, now: Situation, left_m: float) -> bool:
+        """Begin to drive back; False where there is no free way back, or it is switched off."""
+        drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
+        if now.obstacles is None or not self._settings.give_way_m:
+            return False
+        drive.giving_way = give_way(self._trail, self._settings, now.pose, now.stamp_ns, now.obstacles,
+                                    self._half_width_m)
+        if drive.giving_way is None:
+            return False
+        drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
+        return True
+
+    def _give_way(self, drive: Drive, giving: GivingWay, now: Situation, dt_s: float) -> Navigation:
+        """Drive back, rest, and come again to the place where the base was blocked. All in odom."""
+        obstacles = np.zeros((0, 2)) if now.obstacles is None else now.obstacles
+        # 1. Back, as far as it is seen to be free now.
+        if giving.phase is Phase.BACK:
+            following = giving.drive(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
+            is_closed = now.obstacles is None or closed(giving.look_back(), obstacles, self._half_width_m).any()
+            if following is not None and not is_closed and not now.wheels.held_by:
+                if self._is_stuck(drive, now, following.left_m, dt_s):
+                    return self._no_progress(now, GIVES_WAY)
+                self.state, self.reason = NavigationState.AVOIDING, GIVES_WAY
+                return Navigation(following.setpoint, self.state, self.reason, drive.gave_way_m)
+            giving.rest()
+            drive.nearest_m = math.inf
+        # 2. Rest until the way is free, or it is time to look for another one.
+        if giving.phase is Phase.REST:
+            way = np.vstack([giving.way_to_block(now.pose), self._path_ahead(drive, now, PAST_M)])
+            is_open = is_free(way, obstacles, self._half_width_m + self._settings.clearance_m)
+            if giving.move_on(now.pose, dt_s, is_open):
+                return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
+        # 3. To the place where it was blocked.
+        else:
+            following = giving.drive(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
+            if following is not None:
+                plan = self._around_obstacles(giving.follower, giving.follower.path_ahead(PLANNED_M), now,
+                                              following.setpoint)
+                if plan.setpoint is None or now.wheels.held_by:
+                    giving.rest()
+                    drive.nearest_m = math.inf
+                    return self._wait(drive, NavigationState.BLOCKED, plan.reason or now.wheels.held_by, dt_s)
+                if self._is_stuck(drive, now, following.left_m, dt_s):
+                    return self._no_progress(now, AROUND if plan.avoiding else "")
+                self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
+                self.reason = plan.reason
+                return Navigation(plan.setpoint, self.state, self.reason, drive.gave_way_m)
+        drive.giving_way, drive.nearest_m = None, math.inf
+        drive.waits.clear()
+        return Navigation(STAND, self.state, self.reason, drive.gave_way_m)
+
+    def _path_ahead(self, drive: Drive, now: Situation, way_m: float) -> Array:
+        """Return the path (N, 2) of the drive ahead, in odom."""
+        T_odom_frame = relative(now.T_frame_odom(drive.frame), np.zeros(3))
+        ahead = drive.follower.path_ahead(way_m)
+        path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
+        return np.asarray(path[:, :2])
+
+    def _around_obstacles(self, follower: Follower, path: Array, now: Situation, setpoint: Setpoint) -> Detour:
+        """Return the motion, by way of a detour where the path (N, 2) in odom is blocked."""
         if now.obstacles is None:
             return Detour(setpoint, False)
-        T_odom_frame = relative(now.T_frame_odom(drive.frame), np.zeros(3))
-        ahead = drive.follower.path_ahead(PLANNED_M)
-        path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
-        detour = self._planner.plan(now.pose, path[:, :2], now.obstacles, setpoint, moving=now.moving,
-                                    leg_left_m=drive.follower.leg_left_m, speed_mps=now.speed_mps)
-        if detour.avoiding:
-            drive.follower.skip_corner(now.pose_in(drive.frame))
-        return detour
+        return self._planner.plan(now.pose, path, now.obstacles, setpoint, moving=now.moving,
+                                  leg_left_m=follower.leg_left_m, speed_mps=now.speed_mps)
 
     def _in_odom(self, setpoint: Setpoint, drive: Drive, now: Situation) -> Setpoint:
         if setpoint.heading_rad is None:
@@ -255,6 +303,11 @@ class Navigator:
             return self._failed(f"the goal is missed by {100 * missed_m:.1f} cm")
         self._end(NavigationState.REACHED, "")
         return self._idle()._replace(left_m=0.0)
+
+    def _no_progress(self, now: Situation, does: str) -> Navigation:
+        why = now.wheels.reason if _holds(now) else does
+        return self._failed(f"no progress for {self._settings.stuck_s:g} s{': ' + why if why else ''}: look at the "
+                            "robot")
 
     def _failed(self, reason: str) -> Navigation:
         self._end(NavigationState.FAILED, reason)

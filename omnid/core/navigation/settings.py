@@ -38,7 +38,10 @@ class NavigationSettings:
                               "monitor demands (controller.collision), m", low=0, high=5)
     corridor_m: float = knob(0.8, "how far beside the path it may go around obstacles, m; 0: it stays on it and waits",
                              low=0, high=20)
-    blocked_s: float = knob(30.0, "wait for a free way before it fails, s", low=1, high=86_400)
+    give_way_s: float = knob(4.0, "wait for a free way before it drives back along its own way, so that others can "
+                             "pass; then it comes again, and waits twice as long, s", low=0.5, high=3600)
+    give_way_m: float = knob(3.0, "how far it drives back at most, m; 0: it stays where it is blocked", low=0,
+                             high=20)
     stuck_s: float = knob(15.0, "wait for progress, with the way free, before it fails, s", low=1, high=3600)
     unlocalised_m: float = knob(3.0, "way in the map that it drives by odometry alone before it stops, m", low=0,
                                 high=1000)

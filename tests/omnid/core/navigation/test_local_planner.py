@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.navigation.navigator import Navigator
+from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
@@ -20,7 +20,7 @@ from tests.omnid.core.navigation.driven_base import DrivenBase
 
 Array = NDArray[np.float64]
 AZIMUTHS = -math.pi + (np.arange(360) + 0.5) * math.tau / 360
-SETTINGS = NavigationSettings(blocked_s=5.0)
+SETTINGS = NavigationSettings(give_way_m=0.0)
 OUTLINE = CollisionSettings()
 
 
@@ -98,11 +98,12 @@ def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
 @pytest.mark.parametrize("boxes", [
     Boxes((2.5, -3.0, 2.7, 3.0)), Boxes((2.5, -0.7, 2.7, 0.7), (1.5, 0.7, 2.7, 0.9), (1.5, -0.9, 2.7, -0.7)),
     Boxes((4.8, -0.2, 5.2, 0.2))])
-def test_waits_where_there_is_no_way_and_then_says_so(boxes: Boxes) -> None:
+def test_waits_where_there_is_no_way_and_says_so(boxes: Boxes) -> None:
     base = drive(boxes, 1)
-    answer = base.run(90)
-    assert answer.state is NavigationState.FAILED and "blocked for 5 s" in answer.reason
-    assert any(sample.navigation.state is NavigationState.BLOCKED for sample in base.samples)
+    base.run(90, lambda answer: answer.state is NavigationState.BLOCKED)
+    for _ in range(40):
+        answer = base.run(2, lambda _: True, rest_s=1.0)
+    assert answer.state is NavigationState.BLOCKED and answer.reason.endswith(WAITS)
     assert 0.05 < clearance_m(base) < 1.0
     assert abs(base.v) < 0.01
 
@@ -115,8 +116,9 @@ def test_goes_on_when_the_way_becomes_free() -> None:
 
 
 def test_without_a_corridor_it_stays_on_the_path() -> None:
-    base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(blocked_s=3.0, corridor_m=0.0))
-    assert base.run(60).state is NavigationState.FAILED
+    base = drive(Boxes((2.5, -0.2, 2.9, 0.2)), 3, NavigationSettings(give_way_m=0.0, corridor_m=0.0))
+    base.run(60, lambda answer: answer.state is NavigationState.BLOCKED, rest_s=20.0)
+    assert base.samples[-1].navigation.state is NavigationState.BLOCKED
     assert max(abs(float(sample.pose[1])) for sample in base.samples) < 0.1
 
 

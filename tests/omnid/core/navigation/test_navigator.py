@@ -10,7 +10,7 @@ import pytest
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.navigation.navigator import STOPS, Navigation, Navigator
+from omnid.core.navigation.navigator import GIVES_WAY, STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
@@ -138,7 +138,8 @@ def test_says_that_it_stood_before_an_obstacle(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(base, "seen", lambda: without()._replace(obstacles=box))
     base.slip = 0.0
     answer = base.run(20)
-    assert answer.reason == "no progress for 3 s: it looks for a way around an obstacle: look at the robot"
+    assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
+    assert answer.reason == f"no progress for 3 s: {GIVES_WAY}: look at the robot", "it tried that, too"
 
 
 def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
@@ -157,7 +158,7 @@ def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
     base = driving()
     wheels = base.wheels._replace(held_by="an obstacle is in the way")
     answer = base.navigator.step(base.seen()._replace(wheels=wheels))
-    assert answer.state is NavigationState.BLOCKED and answer.reason == "an obstacle is in the way"
+    assert answer.state is NavigationState.BLOCKED and answer.reason == f"an obstacle is in the way: {WAITS}"
     assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
 
 
