@@ -103,6 +103,7 @@ class OdometryUpdate:
     motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
     is_keyframe: bool = False  # odometry needs its dense depth in any case
     witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
+    refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
 
     def __repr__(self) -> str:
         """Return one line: number, state, position, heading and sigma of the position."""

@@ -2,7 +2,8 @@
 
 The stamp of an image is its name without suffix (1403636579763555584.png, 1305031102.175304.jpg), or the line of its
 number in timestamps.txt or times.txt beside the images or in the folder above. A stamp is in nanoseconds where it is a
-whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC).
+whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers may have been
+meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say what is meant.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import stat
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -32,7 +34,9 @@ _MAX_FOLDERS: Final = 64
 _MAX_VISITED: Final = 10_000
 _MAX_STAMP_BYTES: Final = 64 * 2**20
 _MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
-_MAX_STAMP_NS: Final = 2**63
+# The year 2116: two stamps differ by what fits 64 bits, and trajectories (omnid/formats/tum.py) have the same limit.
+_MAX_STAMP_NS: Final = 2**62
+_LONGEST_GAP_NS: Final = 3600 * 10**9  # between two images of a log
 _NS_DIGITS: Final = 16
 _SECONDS: Final = re.compile(r"\d{1,12}(?:\.(\d{1,12}))?")
 
@@ -66,6 +70,8 @@ class ImageFolder:
         self.name = str(path)
         self._path, self._closed = path, False
         self._files = {folder.relative_to(path).as_posix(): list(_stamped(path, folder)) for folder in folders}
+        for files in self._files.values():
+            _require_no_gap(sorted(files))
         if sum(map(len, self._files.values())) > MAX_IMAGES:
             raise DriverError(f"{self.name!r} contains more than {MAX_IMAGES} images; give a part of them")
 
@@ -123,6 +129,23 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
             raise DriverError(f"{str(path)!r} {where} {text[:40]!r}; expected a stamp: nanoseconds of 16 digits or "
                               f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}")
         yield _StampedFile(stamp_ns, topic, path)
+
+
+def _require_no_gap(files: Sequence[_StampedFile]) -> None:
+    """Raise DriverError where two images that follow each other lie more than an hour apart: a question, not a log."""
+    for before, after in pairwise(files):
+        gap_ns = after.stamp_ns - before.stamp_ns
+        if gap_ns > _LONGEST_GAP_NS:
+            raise DriverError(f"{str(before.path)!r} and {after.path.name!r} are {_in_words(gap_ns)} apart by their "
+                              "stamps; whole numbers of fewer than 16 digits are seconds: give the stamps in seconds "
+                              f"or in nanoseconds since 1970 in {STAMP_FILES[0]}, or split the log at the gap")
+
+
+def _in_words(gap_ns: int) -> str:
+    """Return a time of hours, days or years."""
+    hours = gap_ns / 3600e9
+    return f"{hours:.1f} hours" if hours < 48 else f"{hours / 24:.0f} days" if hours < 9000 else (
+        f"{hours / 8766:.1f} years")
 
 
 def _require_own_files(top: Path, paths: Sequence[Path]) -> None:

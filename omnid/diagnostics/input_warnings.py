@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from omnid.config import PairConfig
+from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.stages.repeated_images import FROZEN_IMAGES
@@ -14,12 +14,13 @@ from omnid.tracking_state import TrackingState
 
 DARK_SHARE: Final = 0.1  # of the pairs
 LOST_PARTS_SHARE: Final = 0.1  # of the pairs
+LOST_SHARE: Final = 0.1  # of the pairs; fewer are a gap, whose first pose may imply any speed
 REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
                    "use": "they were used, as pair.repeated_images says"}
 
 
 def input_warnings(
-    pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: PairConfig
+    pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config
 ) -> Iterator[str]:
     """Return one line for each problem of the input."""
     counts = pairing.counts
@@ -34,7 +35,7 @@ def input_warnings(
     for camera, images in pairing.repeated.items():
         if images.longest >= FROZEN_IMAGES:
             yield (f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
-                   f"{images.longest} in a row; {REPEATED[config.repeated_images]}")
+                   f"{images.longest} in a row; {REPEATED[config.pair.repeated_images]}")
     if rig.warning:
         yield rig.warning
     if statistics.dark > statistics.poses * DARK_SHARE:
@@ -45,7 +46,11 @@ def input_warnings(
             yield (f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
                    f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver")
     lost = statistics.states[TrackingState.LOST]
-    if lost > statistics.poses / 2:
+    if statistics.too_fast and lost > statistics.poses * LOST_SHARE:
+        yield (f"the pose was lost in {lost} of {statistics.poses} pairs, and the images show up to "
+               f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
+               f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast")
+    elif lost > statistics.poses / 2:
         yield (f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "
                "is --lower the lower one, are the images bright and sharp?")
 

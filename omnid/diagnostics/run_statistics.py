@@ -24,6 +24,8 @@ class RunStatistics:
         self.resets = 0
         self.dark = 0  # pairs that were too dark
         self.lost_parts: Counter[Side] = Counter()  # pairs in which a part of a camera's image was frozen or blind
+        self.too_fast = 0  # pairs whose pose was refused for its speed alone
+        self.fastest_mps = 0.0  # of those
         self.newest: OdometryUpdate | None = None
         self._position: NDArray[np.float64] | None = None
 
@@ -38,6 +40,8 @@ class RunStatistics:
         columns = odometry.depth.panoramas.tiles.columns
         self.lost_parts.update(side for side, found in columns.items() if found.any())
         self.resets = odometry.reset_counter
+        self.too_fast += odometry.refused_mps > 0
+        self.fastest_mps = max(self.fastest_mps, odometry.refused_mps)
         self.poses += 1
 
 

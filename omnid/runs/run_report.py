@@ -66,7 +66,7 @@ class RunReport:
             if self._stages.floor is not None and self._stages.floor.summary():
                 yield self._stages.floor.summary()
             health = self._stages.front_end.health
-            yield from input_warnings(self._pairing, health, statistics, self._session.config.pair)
+            yield from input_warnings(self._pairing, health, statistics, self._session.config)
 
     def final_status(self, statistics: RunStatistics) -> list[DiagnosticStatus]:
         """Return the counters of the run and of its stages, for the log."""

@@ -27,6 +27,9 @@ Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 Tables = NDArray[np.int32]
 
+# Directions without floor in view side by side, 15 degrees, in which nothing is assumed about it: struts and masts are
+# narrower, and the robot looks past them as it moves.
+UNSEEN_RUN: Final = 20
 NEAREST_M: Final = 0.5  # range of a surface that is looked for
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
 FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian: that of images of 512 px
@@ -101,6 +104,7 @@ class Columns:
         self._visible = self._working(visible * np.uint8(255)) > 127
         in_view = self._visible[:, self._shown].mean(axis=1)
         self._first_row, self._last_row = (int(row) for row in np.flatnonzero(in_view > 0.5)[[0, -1]])
+        self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)):].any(axis=0)))
         self._warps = self._made_warps()
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         rows = np.arange(self._height)
@@ -139,8 +143,7 @@ class Columns:
         kernels.level_evidence(one, two, self._plane_rows, mask, self._floor_bins, self._offsets, OUTLIER,
                                np.float32(LEVEL_RATIO / 64 / UNITS), level)
         floor[~self._tested] = np.nan
-        if len(self._shown) < DIRECTIONS:
-            floor[:, np.setdiff1d(np.arange(DIRECTIONS), self._shown)] = np.nan
+        floor[:, self._unseen] = np.nan
         return ColumnEvidence(floor, surface, level, self.nearest_floor_m)
 
     def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -222,6 +225,12 @@ class Columns:
                 mine = math.ceil(max(floor * h / (h - low_m), floor + FLOOR_PX))
             found.append((first, end, max(self._first_bin, mine), max(last, 0), fall > 0))
         return np.array(found, np.int32)
+
+
+def _wide_runs(flags: Flags) -> Flags:
+    """Return the flags (DIRECTIONS,) of a circle that stand in runs of UNSEEN_RUN or more."""
+    starts = np.logical_and.reduce([np.roll(flags, -shift) for shift in range(UNSEEN_RUN)])
+    return np.asarray(np.logical_or.reduce([np.roll(starts, shift) for shift in range(UNSEEN_RUN)]))
 
 
 def _bounds(image: Bytes) -> Bytes:

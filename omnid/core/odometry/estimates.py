@@ -66,6 +66,7 @@ class OdometryEstimate:
     features: Features = field(default_factory=Features)
     step: tuple[Array, Array] | None = None  # T_prev_curr and its covariance (6, 6) by the cameras alone; None: a break
     is_keyframe: bool = False  # dense stereo of the frame is computed for the local map
+    refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     # The motion during the exposures, for dense stereo of the frame; None: not known.
     exposure: Exposure | None = None
 

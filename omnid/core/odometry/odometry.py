@@ -92,13 +92,17 @@ class VisualOdometry:
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
+        too_fast_mps = 0.0
+        if estimate is not None and self._has_support(estimate) and not self._is_plausible(estimate, dt_s):
+            too_fast_mps = self._moved_m(estimate) / self._since_fix_s(dt_s)
         if searched and after_break and not self._is_plausible(estimate, dt_s):
             estimate = self._relocaliser.locate(frame)
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
         if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
             known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
-            return self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
+            refused = self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
+            return replace(refused, refused_mps=too_fast_mps)
         self._resets += gap.is_turned  # odom has another heading than it was published with
 
         estimate = self._exposures.start_again(frame, usable, estimate, dt_s, request=self._request,
@@ -174,12 +178,22 @@ class VisualOdometry:
 
     def _is_plausible(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
-        if estimate is None or estimate.inliers < self._limits.min_inliers:
+        if estimate is None or not self._has_support(estimate):
             return False
-        if estimate.inlier_ratio < self._limits.min_inlier_ratio:
-            return False
-        moved_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
-        return moved_m <= self._limits.max_speed_mps * (max(dt_s, SHORTEST_STEP_S) + self._status.time_since_fix_s)
+        return self._moved_m(estimate) <= self._limits.max_speed_mps * self._since_fix_s(dt_s)
+
+    def _has_support(self, estimate: PoseEstimate) -> bool:
+        """True if the pose has enough inliers."""
+        limits = self._limits
+        return estimate.inliers >= limits.min_inliers and estimate.inlier_ratio >= limits.min_inlier_ratio
+
+    def _moved_m(self, estimate: PoseEstimate) -> float:
+        """Return the way from the last pose."""
+        return float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
+
+    def _since_fix_s(self, dt_s: float) -> float:
+        """Return the time since the last accepted pose, at a frame dt_s after the one before."""
+        return max(dt_s, SHORTEST_STEP_S) + self._status.time_since_fix_s
 
     def _is_textured(self, frame: StereoFrame, usable: Flags) -> bool:
         """True if the frame has enough corners for a map."""
@@ -223,7 +237,9 @@ class VisualOdometry:
         if not carried:
             self._motion.reset()
             self._resets += 1
-        return self._start_map(frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, 0.0, carried=carried))
+        known = elsewhere is not None
+        return self._start_map(frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known,
+                                                         carried=carried))
 
     def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
         """Start a map where there is none, after the motion that wheels and gyro know of."""
@@ -252,7 +268,7 @@ class VisualOdometry:
         self._previous = frame.lower
         self._exposures.map_started(frame)
         self._motion.found()
-        self._advance(FrameFacts(FrameOutcome.STARTED, failed.dt_s))
+        self._advance(replace(failed, outcome=FrameOutcome.STARTED))
         return replace(self._result(len(self._map), len(self._map), Features(new=new), exposure), is_keyframe=True)
 
     def _advance(self, facts: FrameFacts) -> None:

@@ -2,6 +2,7 @@
 
     NOT_STARTED ----------------------------------------------> LOST
     STARTED, ACCEPTED ----------------------------------------> TRACKING
+    STARTED again after an unknown motion --------------------> DEGRADED
     ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
     REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
     REFUSED from then on -------------------------------------> LOST, and the map is started again when
@@ -56,7 +57,9 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
     time_since_fix_s = status.time_since_fix_s + facts.dt_s
 
     if facts.outcome is FrameOutcome.STARTED:
-        return TrackingStatus(TrackingState.TRACKING)
+        # A map that takes the place of a lost one says nothing about the motion between the two.
+        unknown_motion = status.refused_frames > 0 and not (facts.carried or facts.elsewhere)
+        return TrackingStatus(TrackingState.DEGRADED if unknown_motion else TrackingState.TRACKING)
 
     if facts.outcome is FrameOutcome.NOT_STARTED:
         state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST

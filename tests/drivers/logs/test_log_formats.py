@@ -175,6 +175,22 @@ def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
     assert read(folder, lower="mav0/cam0/data", upper="mav0/cam1/data")[0] == expected(tmp_path)
 
 
+@pytest.mark.parametrize(("step", "apart"), [(100_000_000, "3.2 years"), (10_000, "2.8 hours"), (100_000, "27.8 hours"),
+                                             (1_000_000, "12 days")])
+def test_images_hours_apart_are_a_question(tmp_path: Path, step: int, apart: str) -> None:
+    """Names of 10 digits that count nanoseconds or so would be seconds; one line says so, names the images and asks."""
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp: f"{step * numbers[stamp]:010d}")
+    with pytest.raises(DriverError, match=f"0000000000.* are {apart} apart .*fewer than 16 digits are seconds"):
+        LogReader(folder)
+
+
+def test_images_less_than_an_hour_apart_are_a_log(tmp_path: Path) -> None:
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp: f"{3600 * numbers[stamp]:010d}")
+    assert len(read(folder)[0]) == 2 * PAIRS
+
+
 def test_an_image_without_stamp_is_refused(tmp_path: Path) -> None:
     folder = write_folders(tmp_path / "images", pairs(1), lambda stamp: f"frame{stamp % 100}")
     with pytest.raises(DriverError, match=r"is named 'frame0'; expected a stamp.* timestamps\.txt"):

@@ -48,7 +48,9 @@ TRANSITIONS = [
     (REFUSED_TWICE, FrameFacts(REFUSED, DT_S, textured=False, carried=True), replace(DARK, state=DEGRADED)),
     (UNMATCHED, FrameFacts(REFUSED, DT_S, carried=True), TrackingStatus(DEGRADED, 5, 2, 5 * DT_S, restart=True)),
     (FIX, FrameFacts(NOT_STARTED, DT_S, carried=True), TrackingStatus(DEGRADED, 0, 0, DT_S)),
-    (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0), FIX),
+    (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0), TrackingStatus(DEGRADED)),
+    (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0, elsewhere=True), FIX),
+    (TrackingStatus(DEGRADED, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0, carried=True), FIX),
     (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(NOT_STARTED, 0.0),
      TrackingStatus(LOST, 0, 0, 5 * DT_S)),
 ]
