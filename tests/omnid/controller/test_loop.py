@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
+from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller import process
 from omnid.controller.controller import Controller
 from omnid.controller.ipc import Channel, socket_pair
-from omnid.controller.messages import ControllerUpdate
-from omnid.controller.process import ControllerLoop
+from omnid.controller.messages import ControllerStart, ControllerUpdate
+from omnid.controller.motor_settings import MotorSettings
+from omnid.controller.process import ControllerLoop, run_controller
+from omnid.controller.statistics import TickReport
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.safety_rules import ENDS
+from omnid.engine.realtime import RealtimeSettings
 from tests.omnid.controller.bench import AHEAD, PERIOD_S, UNATTENDED, Wheels
 
 MANY = 100  # messages that wait together, more than one tick may leave over
@@ -130,3 +136,23 @@ def test_the_loop_ends_in_time_where_the_wheels_do_not_stop(bench: Bench, monkey
     monkeypatch.setattr(Controller, "stands", property(lambda _: False))
     bench.thread.start()
     bench.end()
+
+
+def test_ticks_keep_the_rhythm_of_the_settings() -> None:
+    """The times at which ticks were due are multiples of the period, however late each was."""
+    ours, theirs = socket_pair()
+    daemon, period_s = Channel(ours), 0.04
+    with contextlib.closing(SimulatedMotor()) as motor, ours:
+        settings = MotorSettings(port=motor.port, rate_hz=1 / period_s, watchdog_ms=5000)
+        daemon.send(ControllerStart(settings, UNATTENDED, RealtimeSettings(lock_memory=False, motor_priority=0)))
+        thread = threading.Thread(target=run_controller, args=(Channel(theirs),))
+        thread.start()
+        due_s: list[float] = []
+        while len(due_s) < 12:
+            report = daemon.receive(PATIENCE_S)
+            if isinstance(report, TickReport) and report.command is not None:
+                due_s.append(report.command.stamp_ns * 1e-9 - report.late_s)
+        daemon.finish_sending()
+        thread.join(PATIENCE_S)
+    periods = np.diff(due_s) / period_s
+    assert np.abs(periods - periods.round()).max() < 0.01 and periods.round().min() == 1

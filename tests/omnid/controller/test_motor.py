@@ -37,3 +37,9 @@ def test_refuses_a_watchdog_of_fewer_than_four_ticks() -> None:
 def test_reads_the_drive_from_its_section() -> None:
     config = parse(Config, b"[motor.drive]\ntrack_m = 0.62\nreverse_left = true\ncan_id = 7", origin="test")
     assert config.motor.drive == DriveSettings(track_m=0.62, reverse_left=True, can_id=7)
+
+
+def test_a_missing_answer_leaves_time_in_the_tick() -> None:
+    with ExitStack() as closing:
+        driver, _ = open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=200), closing)
+        assert driver._timeout_s == pytest.approx(0.8 * 0.05)
