@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
@@ -22,9 +23,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
                         help="the same format, of the same rig frame in any world frame")
     parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS",
                         help="largest difference between the stamps of two poses; default %(default)s")
-    parser.add_argument("--align", choices=("origin", "rigid", "scale"), default="origin", help="the first pose "
+    parser.add_argument("--align", choices=("origin", "rigid", "scale"), help="the first pose "
                         "(default), as evo's --align_origin; rigid: all positions, as its --align; scale: these and "
                         "the estimate's scale, as its --align --correct_scale")
+    parser.add_argument("--score", choices=("hilti", "kitti"), help="a score by which others compare. hilti: 100 "
+                        "exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree cameras, 0 where more than 1 %% of "
+                        "the truth's poses are missing, with --align rigid unless another one is given; kitti: drift "
+                        "over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -32,15 +37,24 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from omnid.formats.tum import read_tum
-    from omnid.recordings.evaluation import evaluate
+    from omnid.recordings.evaluation import associated, evaluate
+    from omnid.recordings.scores import drift_text, hilti_score, kitti_drift
 
-    metrics = evaluate(read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3, args.align)
+    estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
+    metrics = evaluate(estimate, truth, tolerance_s, args.align or ("rigid" if args.score == "hilti" else "origin"))
     if metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
         print(f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
               f"{metrics.length_truth_m:.2f} m: is this the truth of the same drive, in the same frame of the robot?",
               file=sys.stderr)
+    drift = kitti_drift(*associated(estimate, truth, tolerance_s)) if args.score == "kitti" else []
     if args.json:
-        print_json(metrics)
-    else:
-        print(metrics)
+        scores: dict[str, dict[str, object]] = {"hilti": {"hilti_score": hilti_score(metrics)},
+                                                "kitti": {"drift": drift}}
+        print_json(asdict(metrics) | scores.get(args.score, {}))
+        return 0
+    print(metrics)
+    if args.score == "hilti":
+        print(f"score (Hilti 2026)    {hilti_score(metrics):.2f} of 100")
+    elif args.score == "kitti":
+        print(drift_text(drift))
     return 0

@@ -17,7 +17,8 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType({
     "batch": ("batch logs/ --out results --rig rig.toml", "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
               "batch s3://bucket/*.mcap --out results --dask tcp://scheduler:8786"),
     "demo": ("demo", "demo --drive", "demo --output /tmp/demo --quiet"),
-    "eval": ("eval est.txt truth.txt", "eval est.txt truth.txt --align rigid --json"),
+    "eval": ("eval est.txt truth.txt", "eval est.txt truth.txt --align rigid --json",
+             "eval est.txt truth.txt --score hilti"),
     "calibrate board": ("calibrate board --corners 6x7 --square-mm 25 -o board.pdf",
                         "calibrate board --board charuco --corners 5x7 --square-mm 30 --marker-mm 22 "
                         "--dictionary 5X5_100 -o board.pdf"),
