@@ -15,23 +15,20 @@ A renamed or removed key is refused with its new name: `load(..., renamed={"ster
 
 from __future__ import annotations
 
-import difflib
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields, is_dataclass
 from functools import reduce
 from os import PathLike
 from types import MappingProxyType
-from typing import Any, Final, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Any, Final, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from calib.bounded_toml import parse_toml
 from omnid.errors import OmnidError
 from omnid.settings_file import bytes_of, table_of
+from omnid.settings_keys import Keys, Path, dotted, shown
 
 T = TypeVar("T")
-_Path: TypeAlias = tuple[str, ...]
-_SHOWN: Final = 60  # characters of a value in a message
 _MISFIT: Final = object()
 _KINDS: Final[dict[Any, tuple[str, str]]] = {
     bool: ("true or false", "booleans"),
@@ -84,55 +81,6 @@ def knob(
     return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices), finite)})
 
 
-MAX_UNIT_LETTERS = 3  # of the unit at the end of a key, such as mps: it says nothing about what is meant
-
-
-@dataclass(frozen=True, slots=True)
-class _Keys:
-    """The keys that exist and those of earlier versions: makes the errors for all others."""
-
-    known: tuple[_Path, ...]
-    renamed: Mapping[str, str]
-
-    def moved(self, path: _Path) -> OmnidError | None:
-        """Return the error for a key that was renamed or removed, itself or with a section that it stood in."""
-        for depth in range(len(path), 0, -1):
-            new = self.renamed.get(".".join(path[:depth]))
-            if new is None:
-                continue
-            if " " in new:
-                return OmnidError(f"{_dotted(path)} was removed: {new}")
-            moved = (*new.split("."), *path[depth:])
-            if not any(known[: len(moved)] == moved for known in self.known):
-                return OmnidError(f"{_dotted(path[:depth])} is now called {new}, which has no {_dotted(path[depth:])}")
-            return OmnidError(f"{_dotted(path)} is now called {_dotted(moved)}")
-        return None
-
-    def unknown(self, path: _Path) -> OmnidError:
-        """Return the error for a key that never existed; it proposes similar ones of the section, else of the file."""
-        neighbours = [other[: len(path)] for other in self.known if other[: len(path) - 1] == path[:-1]]
-        family = [other for other in self.known if other[0] == path[0]]
-        near = (_alike(path, neighbours) or _alike(path, family) or _sharing_a_word(path, family)
-                or _alike(path, self.known))
-        if near:
-            return OmnidError(f"unknown key {_dotted(path)}: did you mean {' or '.join(map(_dotted, near))}? "
-                              "`omnid config` explains each key")
-        names = ", ".join(map(_dotted, dict.fromkeys(neighbours)))
-        return OmnidError(f"unknown key {_dotted(path)}: known are {names}")
-
-
-def _alike(path: _Path, candidates: Sequence[_Path]) -> list[_Path]:
-    """Return the key whose last word is spelled most like that of a path, as a list of none or one."""
-    last = {other[-1]: other for other in candidates}
-    return [last[name] for name in difflib.get_close_matches(path[-1][:80], last, n=1, cutoff=0.7)]
-
-
-def _sharing_a_word(path: _Path, candidates: Sequence[_Path]) -> list[_Path]:
-    """Return at most three keys whose last part has a word of the path's last part, such as `velocity`."""
-    words = {word for word in path[-1][:80].split("_") if len(word) > MAX_UNIT_LETTERS}
-    return [other for other in candidates if words & set(other[-1].split("_"))][:3]
-
-
 def load(
     root: type[T],
     path: str | PathLike[str] | None = None,
@@ -158,7 +106,7 @@ def parse(
     renamed: Mapping[str, str] = MappingProxyType({}),
 ) -> T:
     """Return the settings of TOML bytes that were read from `origin`; the rest is as in `load`."""
-    keys = _Keys(tuple(_paths(root)), renamed)
+    keys = Keys(tuple(_paths(root)), renamed)
     changes = [_parsed_override(root, text, keys) for text in overrides]
     try:
         table = table_of(data)
@@ -172,7 +120,7 @@ def parse(
 def from_table(root: type[T], table: dict[str, Any], origin: str, renamed: Mapping[str, str]) -> T:
     """Return the settings of a table that was read from `origin`; the rest is as in `load`."""
     try:
-        return cast("T", _built(root(), table, (), _Keys(tuple(_paths(root)), renamed)))
+        return cast("T", _built(root(), table, (), Keys(tuple(_paths(root)), renamed)))
     except OmnidError as error:
         raise OmnidError(f"{origin}: {error}") from None
 
@@ -193,11 +141,11 @@ def value_at(settings: object, path: str) -> object:
     return reduce(getattr, path.split("."), settings)
 
 
-def _parsed_override(root: type, text: str, keys: _Keys) -> tuple[_Path, object]:
+def _parsed_override(root: type, text: str, keys: Keys) -> tuple[Path, object]:
     name, equals, raw = text.partition("=")
     path = tuple(part.strip() for part in name.split("."))
     if not equals:
-        raise OmnidError(f"override {_shown(text)}: expected section.key=value, found no '='")
+        raise OmnidError(f"override {shown(text)}: expected section.key=value, found no '='")
     try:
         kind, entry = _entry_at(root, path, keys)
         value = _scalar(raw.strip())
@@ -205,7 +153,7 @@ def _parsed_override(root: type, text: str, keys: _Keys) -> tuple[_Path, object]
             value = raw.strip()
         return path, _checked(kind, entry, value, path)
     except OmnidError as error:
-        raise OmnidError(f"override {_shown(text)}: {error}") from None
+        raise OmnidError(f"override {shown(text)}: {error}") from None
 
 
 def _scalar(raw: str) -> object:
@@ -216,22 +164,22 @@ def _scalar(raw: str) -> object:
     return table["value"] if table.keys() == {"value"} else raw
 
 
-def _entry_at(root: type, path: _Path, keys: _Keys) -> tuple[Any, Knob]:
+def _entry_at(root: type, path: Path, keys: Keys) -> tuple[Any, Knob]:
     kind: Any = root
     for depth, name in enumerate(path):
         if not is_dataclass(kind):
-            raise OmnidError(f"{_dotted(path[:depth])} is a key, not a section: it has no {_dotted(path[depth:])}")
+            raise OmnidError(f"{dotted(path[:depth])} is a key, not a section: it has no {dotted(path[depth:])}")
         entries = {entry.name: (hint, entry) for entry, hint in fields_of(kind)}
         if name not in entries:
             raise keys.moved(path) or keys.unknown(path[: depth + 1])
         kind, entry = entries[name]
     if is_dataclass(kind):
         first = next(_paths(cast("type", kind), path))
-        raise OmnidError(f"{_dotted(path)} is a section: name one of its keys, such as {_dotted(first)}")
+        raise OmnidError(f"{dotted(path)} is a section: name one of its keys, such as {dotted(first)}")
     return kind, knob_of(entry)
 
 
-def insert(table: dict[str, Any], path: _Path, value: object) -> None:
+def insert(table: dict[str, Any], path: Path, value: object) -> None:
     """Set a value in nested tables; OmnidError where a section would replace a value."""
     for depth, name in enumerate(path[:-1]):
         inner = table.setdefault(name, {})
@@ -240,7 +188,7 @@ def insert(table: dict[str, Any], path: _Path, value: object) -> None:
     table[path[-1]] = value
 
 
-def _built(default: object, table: dict[str, Any], path: _Path, keys: _Keys) -> object:
+def _built(default: object, table: dict[str, Any], path: Path, keys: Keys) -> object:
     entries = fields_of(type(default))
     for name in table.keys() - {entry.name for entry, _ in entries}:
         raise keys.moved(_first_leaf(table[name], (*path, name))) or keys.unknown((*path, name))
@@ -256,10 +204,10 @@ def _built(default: object, table: dict[str, Any], path: _Path, keys: _Keys) -> 
     return type(default)(**values)
 
 
-def _checked(kind: Any, entry: Knob, value: object, path: _Path) -> object:
+def _checked(kind: Any, entry: Knob, value: object, path: Path) -> object:
     fitted = _fitted(kind, entry, value)
     if fitted is _MISFIT:
-        raise OmnidError(f"{_dotted(path)}: expected {described(kind, entry)}, found {_shown(value)}")
+        raise OmnidError(f"{dotted(path)}: expected {described(kind, entry)}, found {shown(value)}")
     return fitted
 
 
@@ -283,12 +231,12 @@ def _fitted_tuple(kinds: tuple[Any, ...], entry: Knob, value: Any) -> object:
     return _MISFIT if _MISFIT in fitted else fitted
 
 
-def _require_section(value: object, path: _Path) -> None:
+def _require_section(value: object, path: Path) -> None:
     if not isinstance(value, dict):
-        raise OmnidError(f"{_dotted(path)}: expected a section, found {_shown(value)}")
+        raise OmnidError(f"{dotted(path)}: expected a section, found {shown(value)}")
 
 
-def _first_leaf(value: object, path: _Path) -> _Path:
+def _first_leaf(value: object, path: Path) -> Path:
     """Return the path of the first key below a value of a TOML file, or that of the value where it is no section."""
     while isinstance(value, dict) and value:
         name, value = next(iter(value.items()))
@@ -296,7 +244,7 @@ def _first_leaf(value: object, path: _Path) -> _Path:
     return path
 
 
-def _paths(cls: type, path: _Path = ()) -> Iterator[_Path]:
+def _paths(cls: type, path: Path = ()) -> Iterator[Path]:
     """Yield the paths of all knobs."""
     for entry, kind in fields_of(cls):
         here = (*path, entry.name)
@@ -326,18 +274,3 @@ def described(kind: Any, entry: Knob) -> str:
     kinds = get_args(kind)
     length = "" if kinds[-1] is Ellipsis else f"{len(kinds)} "
     return f"a list of {length}{_KINDS[kinds[0]][1]}{entry.bounds}"
-
-
-def _shown(value: object) -> str:
-    """Return a value from a file on one short line."""
-    if isinstance(value, dict):
-        return "a section"
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # an integer of thousands of digits, lists of lists of lists
-        return f"a huge {type(value).__name__}"
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
-
-
-def _dotted(path: Sequence[str]) -> str:
-    return ".".join(part if re.fullmatch(r"[\w-]{1,80}", part) else _shown(part) for part in path)

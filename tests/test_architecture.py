@@ -26,7 +26,8 @@ TIERS: Mapping[str, str] = {
     "hardware and logs": "drivers",
     "settings and states":
         "omnid.errors omnid.version omnid.load_level omnid.navigation_state omnid.tracking_state omnid.settings "
-        "omnid.settings_file omnid.settings_migration omnid.settings_dump omnid.sample omnid.plain_text omnid.utc",
+        "omnid.settings_file omnid.settings_keys omnid.settings_migration omnid.settings_dump omnid.sample "
+        "omnid.plain_text omnid.utc",
     "numerics": "omnid.core",
     "threads, queues, the controller process": "omnid.engine omnid.controller",
     "messages, formats, bus": "omnid.messages omnid.config omnid.config_use omnid.formats omnid.transport",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from typing import Final
 
 from omnid.client import HERE, Diagnostics, Driver, Robot, Subscription
@@ -17,17 +18,18 @@ _REPEAT_S: Final = 0.2  # between two stops
 _POLL_S: Final = 0.02
 
 
-def stop(bus: BusConfig, answer_s: float = ANSWER_S) -> bool:
+def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:
     """Stop the robot, and go on until its status confirms it; False where it has not in time.
 
     It goes as a datagram first, which needs no place among the sessions of the bus, and over the bus where that is not
-    answered. Raise OmnidError where the robot cannot be reached.
+    answered: over a connection that there is, else over a new one. Raise OmnidError where the robot cannot be reached.
     """
     deadline_s = time.monotonic() + answer_s
     with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
         if datagrams.ask(_DATAGRAM_S):
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
-        with Robot(settings=bus, timeout_s=CONNECT_S) as robot, robot.subscribe(Diagnostics) as statuses:
+        with (nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S)) as robot, \
+                robot.subscribe(Diagnostics) as statuses:
             driver = driver_of(robot)
             while time.monotonic() < deadline_s:
                 driver.stop()

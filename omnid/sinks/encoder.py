@@ -17,7 +17,7 @@ from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.sinks.navigation_status import navigation_status
 from omnid.tracking_state import MapState, TrackingState
-from omnid.transport import codec, navigation_codec
+from omnid.transport import codec, map_codec, navigation_codec
 from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
@@ -79,7 +79,8 @@ class Encoder:
                 yield from self._map(message)
             case GridUpdate():
                 grid = message.grid
-                payload = codec.grid_cdr(message.stamp_ns + self.offset_ns, "map", grid.cells, grid.cell_m, grid.corner)
+                stamp_ns = message.stamp_ns + self.offset_ns
+                payload = map_codec.grid_cdr(stamp_ns, "map", grid.cells, grid.cell_m, grid.corner)
                 yield OutgoingMessage("map", codec.GRID_SCHEMA, payload)
             case NavigationUpdate():
                 yield from self._navigation(message)
@@ -118,7 +119,7 @@ class Encoder:
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = update.stamp_ns + self.offset_ns
         points = _most_confident(update.points, self._map_encoding.points)
-        payload = codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
+        payload = map_codec.point_cloud_cdr(stamp_ns, "odom", *points, T_frame_points=self.T_base_rig)
         yield OutgoingMessage("cloud", codec.POINT_CLOUD_SCHEMA, payload)
 
     def _navigation(self, update: NavigationUpdate) -> Iterator[OutgoingMessage]:

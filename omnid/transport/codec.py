@@ -37,8 +37,6 @@ _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
 SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, MAP_POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA,
            TWIST_SCHEMA, VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
 
-CLOUD_FIELDS = ("x", "y", "z", "confidence")
-CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
 QUATERNION_TOLERANCE = 1e-3
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
@@ -117,7 +115,8 @@ def message_cdr(message: object, schema: str) -> bytes:
     return bytes(_typestore().serialize_cdr(message, schema))
 
 
-def _time(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
+def time_message(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
+    """Return a stamp. Raise OmnidError for one that is no ROS time."""
     seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
     if not 0 <= seconds <= MAX_SECONDS:
         raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
@@ -126,7 +125,7 @@ def _time(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
 
 def header_message(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
     """Return a header. Raise OmnidError for a stamp that is no ROS time."""
-    return ros.std_msgs__msg__Header(_time(stamp_ns), frame)
+    return ros.std_msgs__msg__Header(time_message(stamp_ns), frame)
 
 
 def _vector(xyz: ArrayLike) -> ros.geometry_msgs__msg__Vector3:
@@ -192,49 +191,6 @@ def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__Transf
     T = edge.T_parent_child
     motion = ros.geometry_msgs__msg__Transform(_vector(T[:3, 3]), _quaternion(T[:3, :3]))
     return ros.geometry_msgs__msg__TransformStamped(header_message(stamp_ns, edge.parent), edge.child, motion)
-
-
-def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *,
-                    T_frame_points: Array | None = None) -> bytes:
-    """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point.
-
-    T_frame_points (4, 4) maps the points into `frame`; None where they are given in it.
-    """
-    packed = _packed(points, confidence, T_frame_points)
-    number = ros.sensor_msgs__msg__PointField.FLOAT32
-    fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(CLOUD_FIELDS)]
-    message = ros.sensor_msgs__msg__PointCloud2(
-        header=header_message(stamp_ns, frame),
-        height=1, width=len(packed), fields=fields,
-        is_bigendian=False,
-        point_step=16,
-        row_step=16 * len(packed),
-        data=packed.reshape(-1).view(np.uint8),
-        is_dense=bool(np.isfinite(packed).all()),
-    )
-    return message_cdr(message, POINT_CLOUD_SCHEMA)
-
-
-def _packed(points: ArrayLike, confidence: ArrayLike, T: Array | None) -> NDArray[np.float32]:
-    """Return points, transformed in double precision, and confidence as (N, 4) little-endian float32."""
-    points, confidence = np.asarray(points).reshape(-1, 3), np.asarray(confidence).reshape(-1)
-    if len(points) != len(confidence):
-        raise OmnidError(f"{len(confidence)} confidences for {len(points)} points: expected one for each point")
-    packed = np.empty((len(points), 4), "<f4")
-    packed[:, 3] = confidence
-    for start in range(0, len(points), CLOUD_BLOCK):
-        at = slice(start, start + CLOUD_BLOCK)
-        packed[at, :3] = points[at] if T is None else se3.apply(T, points[at])
-    return packed
-
-
-def grid_cdr(stamp_ns: int, frame: str, cells: NDArray[np.int8], cell_m: float, corner: tuple[float, float]) -> bytes:
-    """Encode a nav_msgs/msg/OccupancyGrid of cells (H, W), z = 0 in `frame`; corner: x, y of cell (0, 0), m."""
-    height, width = cells.shape
-    T_frame_corner = se3.transform(np.eye(3), (*corner, 0.0))
-    info = ros.nav_msgs__msg__MapMetaData(_time(stamp_ns), cell_m, width, height, pose_message(T_frame_corner))
-    message = ros.nav_msgs__msg__OccupancyGrid(header_message(stamp_ns, frame), info, cells.reshape(-1))
-    return message_cdr(message, GRID_SCHEMA)
 
 
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:

@@ -15,7 +15,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
-from omnid.transport import codec, status_names
+from omnid.transport import codec, map_codec, status_names
 from omnid.transport.codec import NS_PER_S, DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.status_names import Key
@@ -164,13 +164,13 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     """Decode a PointCloud2 with omnid's fields. Raise OmnidError for any other bytes."""
     message = codec.message_from_cdr(payload, codec.POINT_CLOUD_SCHEMA)
     assert isinstance(message, ros.sensor_msgs__msg__PointCloud2)
-    step = 4 * len(codec.CLOUD_FIELDS)
+    step = 4 * len(map_codec.CLOUD_FIELDS)
     fields = [(entry.name, entry.offset) for entry in message.fields]
-    own = fields == [(name, 4 * i) for i, name in enumerate(codec.CLOUD_FIELDS)] and not message.is_bigendian
+    own = fields == [(name, 4 * i) for i, name in enumerate(map_codec.CLOUD_FIELDS)] and not message.is_bigendian
     if not own or message.point_step != step or message.data.size % step:
         raise OmnidError(f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
-                         f"expected the fields {', '.join(codec.CLOUD_FIELDS)} in {step} bytes")
-    packed = message.data.view("<f4").reshape(-1, len(codec.CLOUD_FIELDS))
+                         f"expected the fields {', '.join(map_codec.CLOUD_FIELDS)} in {step} bytes")
+    packed = message.data.view("<f4").reshape(-1, len(map_codec.CLOUD_FIELDS))
     return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 

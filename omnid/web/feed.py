@@ -21,7 +21,6 @@ from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation
 from omnid.transport.scan_codec import decode_scan
-from omnid.transport.status_names import WHEELS
 from omnid.web.browsers import Browsers
 from omnid.web.channels import Encoded, LivePath, Newest, with_header
 from omnid.web.snapshot import (
@@ -61,7 +60,6 @@ class RobotFeed:
         self.state, self.path = RobotState(), LivePath()
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
-        self.wheel_reports = 0  # received statuses with an entry of the wheels
         self.inbox = Inbox()
         self._map: Encoded = b""
         self._panorama: Encoded = b""
@@ -149,12 +147,11 @@ class RobotFeed:
             if message.topic == MAP_POSE:
                 self._take_map_pose(message.payload)
                 continue
-            before, wheels = self.state.pose, self.state.statuses.get(WHEELS)
+            before = self.state.pose
             pose = self.state.process(message)
             if pose is not None:
                 self._add_to_path(pose, before)
             elif message.topic == "status":
-                self.wheel_reports += self.state.statuses.get(WHEELS) is not wheels
                 self._parts_channel.changed()
 
     def _take_map_pose(self, payload: bytes) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from calib import se3
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
-from omnid.transport import codec
+from omnid.transport import codec, map_codec
 from omnid.transport.image_codec import image_cdr, image_topic
 from omnid.transport.status_names import ODOMETRY, Key
 
@@ -99,7 +99,7 @@ def _cloud(stamp_ns: int, numbers: np.random.Generator) -> tuple[str, str, bytes
     message = {"header": _header(stamp_ns, "odom"), "height": 1, "width": 50, "fields": fields, "is_bigendian": False,
                "point_step": 16, "row_step": 800, "data": digest(packed.tobytes()), "is_dense": True,
                "points": packed.astype(float).tolist()}
-    data = codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
+    data = map_codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
     return "/omnid/cloud", CLOUD, data, message
 
 

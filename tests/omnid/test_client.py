@@ -19,7 +19,7 @@ import omnid.client
 from calib import se3
 from omnid.client import Answer, Cloud, Diagnostics, Driver, Map, Pose, Robot, subscribe
 from omnid.errors import OmnidError
-from omnid.transport import codec
+from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
@@ -71,12 +71,12 @@ def test_decodes_diagnostics_clouds_and_maps() -> None:
     assert report.stamp_ns == 5 and [status.name for status in report.statuses] == ["a", "b"]
     assert (report.value("a", "k"), report.value("b", "k"), report.value("c", "k")) == ("v", "", "")
     points = np.random.default_rng(1).normal(size=(50, 3)).astype(np.float32)
-    cloud = decode_cloud(codec.point_cloud_cdr(6, "odom", points, np.arange(50.0)))
+    cloud = decode_cloud(map_codec.point_cloud_cdr(6, "odom", points, np.arange(50.0)))
     assert (cloud.stamp_ns, cloud.frame) == (6, "odom")
     np.testing.assert_array_equal(cloud.points, points)
     np.testing.assert_array_equal(cloud.confidence, np.arange(50.0))
     cells = np.arange(-1, 11, dtype=np.int8).reshape(3, 4)
-    grid = decode_map(codec.grid_cdr(7, "odom", cells, 0.5, (-2.0, 1.0)))
+    grid = decode_map(map_codec.grid_cdr(7, "odom", cells, 0.5, (-2.0, 1.0)))
     assert (grid.stamp_ns, grid.frame, grid.cell_m, grid.corner) == (7, "odom", 0.5, (-2.0, 1.0))
     np.testing.assert_array_equal(grid.cells, cells)
 
@@ -85,8 +85,8 @@ def test_decodes_diagnostics_clouds_and_maps() -> None:
     (Pose, "odom", odometry(3), lambda data: decode_pose(data, b"")),
     (Diagnostics, "status", codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]),
      decode_diagnostics),
-    (Cloud, "cloud", codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
-    (Map, "map", codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
+    (Cloud, "cloud", map_codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
+    (Map, "map", map_codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
 ])
 def test_any_bytes_are_decoded_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
     rng = random.Random(2)

@@ -12,7 +12,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from omnid.errors import OmnidError
-from omnid.transport import codec
+from omnid.transport import codec, map_codec
 from tests.omnid.allocations import taken
 
 STAMP_NS = 1_700_000_123_987_654_321
@@ -135,7 +135,7 @@ def test_transforms() -> None:
 def test_point_cloud() -> None:
     rng = np.random.default_rng(2)
     points, confidence = rng.normal(size=(50, 3)).astype(np.float32), rng.random(50, np.float32)
-    message = read(codec.point_cloud_cdr(STAMP_NS, "rig", points, confidence), codec.POINT_CLOUD_SCHEMA)
+    message = read(map_codec.point_cloud_cdr(STAMP_NS, "rig", points, confidence), codec.POINT_CLOUD_SCHEMA)
     assert [(f.name, f.offset, f.datatype, f.count) for f in message.fields] == [
         ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), ("confidence", 12, 7, 1)
     ]  # fmt: skip
@@ -152,7 +152,7 @@ def test_a_point_cloud_is_transformed_with_little_extra_memory() -> None:
     points, confidence = rng.normal(size=(50_000, 3)).astype(np.float32), rng.random(50_000, np.float32)
 
     def cloud() -> bytes:
-        return codec.point_cloud_cdr(STAMP_NS, "odom", points, confidence, T_frame_points=T_ODOM_BASE)
+        return map_codec.point_cloud_cdr(STAMP_NS, "odom", points, confidence, T_frame_points=T_ODOM_BASE)
 
     rows = read(cloud(), codec.POINT_CLOUD_SCHEMA).data.view("<f4").reshape(-1, 4)
     moved = se3.apply(T_ODOM_BASE, points).astype(np.float32)
@@ -162,7 +162,7 @@ def test_a_point_cloud_is_transformed_with_little_extra_memory() -> None:
 
 def test_grid() -> None:
     cells = np.arange(-1, 11, dtype=np.int8).reshape(3, 4)
-    message = read(codec.grid_cdr(STAMP_NS, "odom", cells, 0.1, (-2.0, 5.5)), codec.GRID_SCHEMA)
+    message = read(map_codec.grid_cdr(STAMP_NS, "odom", cells, 0.1, (-2.0, 5.5)), codec.GRID_SCHEMA)
     info = message.info
     assert message.header.frame_id == "odom" and message.data.tolist() == list(range(-1, 11))
     assert (info.width, info.height, info.resolution) == (4, 3, pytest.approx(0.1))
@@ -171,13 +171,13 @@ def test_grid() -> None:
 
 
 def test_empty_point_cloud() -> None:
-    message = read(codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0)), codec.POINT_CLOUD_SCHEMA)
+    message = read(map_codec.point_cloud_cdr(STAMP_NS, "rig", np.empty((0, 3)), np.empty(0)), codec.POINT_CLOUD_SCHEMA)
     assert message.width == 0 and len(message.data) == 0
 
 
 def test_point_cloud_needs_a_confidence_for_each_point() -> None:
     with pytest.raises(OmnidError, match="2 confidences for 3 points"):
-        codec.point_cloud_cdr(STAMP_NS, "rig", np.zeros((3, 3)), np.zeros(2))
+        map_codec.point_cloud_cdr(STAMP_NS, "rig", np.zeros((3, 3)), np.zeros(2))
 
 
 def test_diagnostics() -> None:

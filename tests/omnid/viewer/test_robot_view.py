@@ -22,7 +22,7 @@ import pytest
 
 from calib import se3
 from drivers.frame import Frame
-from omnid.transport import codec
+from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.features_attachment import features_to_bytes
@@ -55,7 +55,7 @@ def publish(bus: Bus, number: int) -> None:
     bus.publish("odom", pose if number % 7 else b"nonsense",
                 PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("map_pose", codec.pose_with_covariance_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
-    bus.publish("cloud", codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
+    bus.publish("cloud", map_codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]

@@ -27,8 +27,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from calib import se3
 from drivers.frame import Frame
-from omnid.core.control.safety_rules import ASKED
-from omnid.transport import codec
+from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.image_codec import image_cdr
@@ -150,7 +149,7 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
     def run() -> None:
         publish(bus, next(seq))
         bus.publish("status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(BUS, 0, "open", {"lost": "0"}), wheels]))
-        bus.publish("map", codec.grid_cdr(10**18, "odom", grid, 0.1, (-1.0, -2.0)))
+        bus.publish("map", map_codec.grid_cdr(10**18, "odom", grid, 0.1, (-1.0, -2.0)))
 
     with server.live(server.bearer) as live:
         shown = Shown(live)
@@ -166,7 +165,7 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         cells = np.frombuffer(zlib.decompress(received["body"]), np.uint8).reshape(40, 30)
         assert (cells[1:, 0] == 2).all() and (cells[0, 1:] == 1).all() and (cells[1:, 1:] == 0).all()
         assert (received["cell_m"], received["x_m"], received["y_m"]) == (pytest.approx(0.1), -1.0, -2.0)
-        other = codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
+        other = map_codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
         received = shown.until("map", lambda: bus.publish("map", other), lambda found: found["frame"] == "elsewhere")
         assert (received["width"], received["body"]) == (0, b"")
 
@@ -195,7 +194,7 @@ def test_a_map_in_its_own_frame_is_drawn_where_it_lies_in_odom(server: WebServer
     T_odom_map = se3.transform(se3.rotation_exp([0.0, 0.0, -0.25]), [1.0, -2.0, 0.0])
     odom = codec.odometry_cdr(10**9 + 55, T_odom_base, np.eye(6), np.zeros(6), np.eye(6))
     in_map = se3.inverse(T_odom_map) @ T_odom_base
-    grid = codec.grid_cdr(10**9, "map", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
+    grid = map_codec.grid_cdr(10**9, "map", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
 
     def run() -> None:
         bus.publish("odom", odom)
@@ -225,21 +224,13 @@ def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> N
 
 
 def test_a_stop_is_repeated_until_the_status_confirms_it(server: WebServer, bus: Bus) -> None:
-    received: list[str] = []
-    bus.subscribe_commands(lambda request: received.append(request.topic), {})
-    status = DiagnosticStatus(WHEELS, 0, "driving", {"armed": "1"})
+    received, is_stopped = list[str](), [False]
+    bus.subscribe_commands(lambda request: received.append(request.topic), {}, lambda: is_stopped[0])
     with ThreadPoolExecutor(2) as threads:
         answers = [threads.submit(server.post, "/stop") for _ in range(2)]
-        end_s = time.monotonic() + PATIENCE_S
-        while received.count("cmd/stop") < 5:
-            assert time.monotonic() < end_s
-            bus.publish("status", codec.diagnostics_cdr(10**18, [status]))
-            time.sleep(0.02)
+        wait_until(lambda: received.count("cmd/stop") >= 5)
         assert not any(answer.done() for answer in answers) and not server.post("/arm")["done"]
-        stopped = DiagnosticStatus(WHEELS, 0, ASKED, {"armed": "0", "disarmed_by": ASKED})
-        while not all(answer.done() for answer in answers):
-            bus.publish("status", codec.diagnostics_cdr(10**18, [stopped]))
-            time.sleep(0.02)
+        is_stopped[0] = True
         assert all(answer.result()["done"] for answer in answers) and "cmd/arm" not in received
 
 
