@@ -38,9 +38,8 @@ LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pair
 MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow each other are alike
 FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
 TAKEN_ODDS: Final = 0.0  # of a surface
-SURFACE_SHARE: Final = 0.5  # of the ratio of a run: its strips overlap by half
 PAIR_RUN: Final = 4.0  # of a surface in one pair, that may move
-CONTRADICTION: Final = -1.2  # to a surface where the floor is seen and no surface
+CONTRADICTION: Final = -2.5  # to a surface where the floor is seen and no surface; by trial on development seeds
 APART_M: Final = 0.05  # between places whose errors differ
 APART_S: Final = 0.2  # of pairs from one place that are one more
 FRESH_NS: Final = 500_000_000  # time constant of the mean evidence by which a cell is watched
@@ -114,7 +113,7 @@ class ObstacleGrid:
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         in_view = np.isfinite(floor)
         floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
-        surface = np.minimum(np.float32(SURFACE_SHARE) * surface, np.float32(MOST_RATIO))
+        surface = np.minimum(surface, np.float32(MOST_RATIO))
         # 2. Log-odds.
         odds, weight = self._odds[:, rows, columns], self._weight(stamp_ns, T_odom_base[:2, 3])
         is_surface = surface > 0

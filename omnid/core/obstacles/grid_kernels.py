@@ -18,7 +18,7 @@ Bytes = NDArray[np.uint8]
 def gather(floor: Floats, surface: Floats, level: Floats, origin: Doubles, at_1m: float, cell_m: float, reach_m: float,
            thin_m: float, cells: Floats) -> None:
     """Write the evidence (4, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
-    floor against planes above and below it; the strongest surface.
+    floor against planes above and below it; a surface that stands anywhere in it.
 
     floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
     compared.
@@ -48,13 +48,12 @@ def gather(floor: Floats, surface: Floats, level: Floats, origin: Doubles, at_1m
                 continue
             last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
             first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
-            least, most, above, below = np.inf, np.float32(0.0), 0.0, 0.0
+            least, likelihood, above, below = np.inf, 0.0, 0.0, 0.0
             run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             for u in range(first, last + 1):
                 at_u = (u + width) % width
                 for k in range(first_surface, last_surface + 1):
-                    if surface[k, at_u] > most:
-                        most = surface[k, at_u]
+                    likelihood += math.exp(surface[k, at_u])
                 for k in range(far, near + 1):
                     above += level[0, k, at_u]
                     below += level[1, k, at_u]
@@ -69,9 +68,8 @@ def gather(floor: Floats, surface: Floats, level: Floats, origin: Doubles, at_1m
             cells[0, i, j] = least / (near - far + 1)
             patches = (last - first + 1) * (near - far + 1)
             cells[1, i, j], cells[2, i, j] = above / patches, below / patches
-            # The best of many is less evidence than one.
             count = (last - first + 1) * (last_surface - first_surface + 1)
-            cells[3, i, j] = max(most - np.float32(math.log(count)), np.float32(0.0))
+            cells[3, i, j] = math.log(likelihood / count)
 
 
 @compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("hit", "free"))
