@@ -21,6 +21,9 @@ S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
 TURN_MPS: Final = 0.01  # slower motions turn on the spot; in 0.1 s no more than 1 mm
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
+# A base that was stopped goes on in that direction only faster than this (half as fast as a slower command), because
+# free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
+RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on; because the rest is for lag
 # Consecutive ones without a range that make a direction unknown; by trial on development seeds.
 UNKNOWN_SECTORS: Final = 5
@@ -96,6 +99,7 @@ class CollisionMonitor:
         self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
         self.reason = ""  # of the last step: why the motion was changed
         self.share = 1.0  # of the motion that was allowed
+        self._stopped_mps = 0.0  # motion that the last step stopped
 
     def set_ring(self, ring: ControllerRing) -> None:
         """Replace the ring, unless it is older."""
@@ -118,11 +122,20 @@ class CollisionMonitor:
 
     def step(self, now_ns: int, motion: Twist) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc."""
-        allowance = self._judged(now_ns, motion)
+        allowance = self._held(self._judged(now_ns, motion), motion)
         self.share, self.reason = allowance
+        self._stopped_mps = motion.velocity_mps if allowance.share == 0.0 else 0.0
         if allowance.share >= 1.0:
             return motion
         return Twist(allowance.share * motion.velocity_mps, allowance.share * motion.yaw_rate_radps)
+
+    def _held(self, allowance: Allowance, motion: Twist) -> Allowance:
+        """Return the allowance, none as long as a base that was stopped could only creep on."""
+        speed_mps = abs(motion.velocity_mps)
+        if not 0.0 < allowance.share < 1.0 or self._stopped_mps * motion.velocity_mps <= 0.0:
+            return allowance
+        creeps = allowance.share * speed_mps < min(RESUME_MPS, speed_mps / 2)
+        return Allowance(0.0, self.reason) if creeps else allowance
 
     def follow(self, now_ns: int, motion: Twist) -> None:
         """Take the motion that the base follows from now on."""

@@ -71,6 +71,26 @@ def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -
         expected < 0.5)
 
 
+def test_a_stopped_base_does_not_creep_on_when_the_ring_changes_by_a_cell() -> None:
+    monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 1.5)
+    speeds, reasons = [], []
+    for n, distance_m in enumerate((0.5, 0.44, 0.41, 0.46, 0.41, 0.46, 0.6, 0.46)):
+        monitor.set_ring(ControllerRing((10 + n) * S, with_points((distance_m, 0.0))))
+        speeds.append(monitor.step((10 + n) * S, AHEAD).velocity_mps)
+        reasons.append(monitor.reason)
+    assert [speed > 0 for speed in speeds] == [True, True, False, False, False, False, True, True]
+    assert reasons[2:6] == [monitor_module.BLOCKED] * 4
+    assert monitor.step(17 * S, Twist(0.0, 1.0)) == Twist(0.0, 1.0)
+
+
+def test_a_stopped_base_obeys_another_direction_and_a_slow_command() -> None:
+    monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 1.5)
+    for distance_m, motion, moves in ((0.405, AHEAD, False), (0.44, AHEAD, False), (0.44, Twist(0.03), True),
+                                      (0.405, AHEAD, False), (0.44, Twist(-0.4), True)):
+        monitor.set_ring(ControllerRing(10 * S, with_points((distance_m, 0.0))))
+        assert (monitor.step(10 * S, motion).velocity_mps != 0) == moves
+
+
 def test_weak_brakes_slow_down_earlier() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 0.1)
     monitor.set_ring(ControllerRing(10 * S, with_points((1.8, 0.0))))
