@@ -36,6 +36,8 @@ FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pairs
 MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow each other are alike
+# Of a surface: four pairs are needed. With 3.0, set by trial, one that was none stopped a base in a corridor.
+MOST_SURFACE: Final = 1.5
 FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
 TAKEN_ODDS: Final = 0.0  # of a surface
 PAIR_RUN: Final = 4.0  # of a surface in one pair, that may move
@@ -113,7 +115,7 @@ class ObstacleGrid:
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         in_view = np.isfinite(floor)
         floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
-        surface = np.minimum(surface, np.float32(MOST_RATIO))
+        surface = np.minimum(surface, np.float32(MOST_SURFACE))
         # 2. Log-odds.
         odds, weight = self._odds[:, rows, columns], self._weight(stamp_ns, T_odom_base[:2, 3])
         is_surface = surface > 0
