@@ -96,7 +96,8 @@ class RobotState:
         self.pose = pose
         self.poses += 1
         self._arrivals_s.append(pose.received_ns * 1e-9)
-        for histogram, since_ns in ((self.age, pose.stamp_ns), (self.network, pose.attachment.sent_ns)):
+        of_robot = [] if self.real_time_factor else [(self.age, pose.stamp_ns)]
+        for histogram, since_ns in (*of_robot, (self.network, pose.attachment.sent_ns)):
             if 0 <= pose.received_ns - since_ns < _MAX_AGE_NS:
                 histogram.add((pose.received_ns - since_ns) * 1e-9)
         return pose

@@ -79,7 +79,10 @@ def _nearest(sector: Counts, ranges: Array, limits: ScanLimits) -> tuple[RangeSc
     known = near[rows, first]
     with np.errstate(divide="ignore", invalid="ignore"):
         found = np.where(known, pair[rows, first] / _with_next(inverse)[rows, first], np.nan)
-    return found.astype(np.float32), ~known & supported[:, limit + 1 :].any(axis=1)
+    # The last two bins reach beyond the longest range.
+    is_beyond = found > limits.max_range_m
+    found[is_beyond] = np.nan
+    return found.astype(np.float32), is_beyond | (~known & supported[:, limit + 1 :].any(axis=1))
 
 
 def _with_next(sums: Array) -> Array:

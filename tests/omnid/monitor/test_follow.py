@@ -25,7 +25,7 @@ from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.status_names import BUS, THREADS, WHEELS
+from omnid.transport.status_names import BUS, SIMULATION, THREADS, WHEELS, Key
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, wait_until
 from tests.replay.command import Command, rows
 
@@ -207,3 +207,19 @@ def test_the_load_is_shown_by_threads() -> None:
     out = io.StringIO()
     Screen("rover", out, shows_load=True).show(state)
     assert out.getvalue() == load_line("rover", state) + "\n"
+
+
+def test_poses_of_a_simulated_clock_have_no_age() -> None:
+    state = RobotState()
+
+    def receive(number: int) -> None:
+        payload = codec.odometry_cdr(time.time_ns(), np.eye(4), 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
+        attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
+        state.process(ReceivedMessage(time.time_ns(), "odom", payload, attachment))
+
+    receive(1)
+    assert state.age.count == 1
+    pace = DiagnosticStatus(SIMULATION, 0, "", {Key.REAL_TIME_FACTOR: "0.50"})
+    state.process(ReceivedMessage(time.time_ns(), "status", codec.diagnostics_cdr(10**18, [pace]), b""))
+    receive(2)
+    assert state.age.count == 0 and "0.50 x real time" in summary_line("rover", state)

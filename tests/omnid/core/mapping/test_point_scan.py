@@ -66,6 +66,16 @@ def test_few_points_are_no_obstacle() -> None:
     np.testing.assert_allclose(ring[within(-50, 50)], 3.0, atol=0.02)
 
 
+def test_no_range_is_longer_than_the_longest() -> None:
+    """A bin of inverse range may begin before it and end beyond: a map with such a range is refused when it is read."""
+    for range_m in np.arange(5.55, 8.0, 0.1):
+        ring = seen(arc(range_m, (-30, 30), (-0.5, 0.5), 20_000))[within(-29, 29)]
+        if range_m <= LIMITS.max_range_m:
+            np.testing.assert_allclose(ring, range_m, atol=0.01)
+        else:
+            assert np.isposinf(ring).all(), range_m
+
+
 def test_beyond_the_longest_range_is_free_and_above_the_band_is_nothing() -> None:
     ring = seen(arc(9.0, (-30, 30), (-0.5, 0.5), 20_000), arc(2.0, (90, 120), (1.0, 1.4)))
     assert np.isposinf(ring[within(-28, 28)]).all()
