@@ -135,7 +135,7 @@ def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float]
     sector = _shared_sector(rig, slopes)
     if sector is None:
         raise CalibError(f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
-                         "of elevation; check the transforms and the masks")
+                         "of elevation; check the intrinsics, the transforms and the masks")
     # 1. Slopes that both cameras see over most of the sector.
     seen = [_seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE
             for mounted in (rig.lower, rig.upper)]

@@ -72,7 +72,7 @@ class LogReader:
     @property
     def topics(self) -> dict[Camera, str]:
         """The topic of each camera."""
-        return {camera: topic for topic, camera in self._cameras.items()}
+        return dict(self._cameras)
 
     def frames(self) -> Iterator[Frame]:
         """Yield the frames of both cameras in the order of their stamps; seq counts each camera's from 0."""
@@ -93,9 +93,10 @@ class LogReader:
                 if sample is not None:
                     yield from samples.push(sample)
                 continue
-            camera = self._cameras.get(logged.topic)
-            image = None if camera is None else self._image(logged)
-            if camera is not None and image is not None:
+            cameras = [camera for camera, topic in self._cameras.items() if topic == logged.topic]
+            image = self._image(logged) if cameras else None
+            for camera in cameras if image is not None else []:
+                assert image is not None
                 for frame in buffer.push(camera, image):
                     yield from samples.until(frame.stamp_ns)
                     yield frame
@@ -131,7 +132,9 @@ class LogReader:
         """Return the largest possible number of pairs, for a progress bar; None where the log does not state it, or
         is read in part."""
         counts = self._log.counts()
-        return None if counts is None or self._span_s != WHOLE else min(counts.get(topic, 0) for topic in self._cameras)
+        if counts is None or self._span_s != WHOLE:
+            return None
+        return min(counts.get(topic, 0) for topic in self._cameras.values())
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""

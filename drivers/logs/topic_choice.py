@@ -25,8 +25,8 @@ _MAX_LISTED = 16
 Wanted = Mapping[Camera, str | None]
 
 
-def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[str, Camera]:
-    """Return topic -> camera of the two cameras.
+def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[Camera, str]:
+    """Return the topics of the two cameras; one and the same is both if it is wanted so: its images hold both views.
 
     log: its name for error messages. topics: name -> type. wanted: requested topics, which must exist; a camera
     without one is identified by a word of its topic's name. Raises DriverError, which lists the candidates, where the
@@ -118,16 +118,14 @@ def _camera_named(topic: str) -> Camera | None:
     return next((_WORDS[word] for word in words if word in _WORDS), None)
 
 
-def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None]) -> dict[str, Camera]:
+def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None]) -> dict[Camera, str]:
     lower, upper = found["lower"], found["upper"]
     if lower is None and upper is None and len(_images(images)) > 1:
         raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
     if lower is None or upper is None:
         missing = "lower" if lower is None else "upper"
         raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
-    if lower == upper:
-        raise DriverError(f"topic {lower!r} of {log} cannot be both cameras; give two of {_listed(images)}")
-    return {lower: "lower", upper: "upper"}
+    return {"lower": lower, "upper": upper}
 
 
 def _images(names: Iterable[str]) -> set[str]:

@@ -177,10 +177,12 @@ class _Replay:
         return open_log(lower, upper)
 
     def _rig(self, reader: LogReader) -> Rig:
-        rig = self._options.rig
-        if rig is None:
+        found = self._options.rig
+        if found is None:
             return attached_rig(reader, self._log)
-        return read_rig(rig) if isinstance(rig, Path) else rig
+        rig = read_rig(found) if isinstance(found, Path) else found
+        lower, upper = reader.topics["lower"], reader.topics["upper"]
+        return rig.of_one_image(lower) if lower == upper else rig
 
     def _messages(self, graph: Graph, reader: LogReader, pairing: Synchronise) -> Stream[Frame | MotionSample]:
         if not self._options.paced:

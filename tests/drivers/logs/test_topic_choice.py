@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ from drivers.errors import DriverError
 from drivers.frame import Camera
 from drivers.logs.log_reader import LogReader
 from drivers.logs.topic_choice import choose_topics
-from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
+from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, START_NS, Entry, pairs, text, write_log
 
 CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
 
@@ -51,11 +52,22 @@ def test_prefers_compressed_images_and_ignores_depth() -> None:
     both = IMAGES | {name + "/compressed": COMPRESSED for name in IMAGES}
     both |= {name + "/compressedDepth": COMPRESSED for name in IMAGES}
     assert choose_topics("log", both, {"lower": None, "upper": None}) == {
-        "/a/lower/image_raw/compressed": "lower",
-        "/a/upper/image_raw/compressed": "upper",
+        "lower": "/a/lower/image_raw/compressed",
+        "upper": "/a/upper/image_raw/compressed",
     }
     raw = "/a/lower/image_raw"
-    assert choose_topics("log", both, {"lower": raw, "upper": None})[raw] == "lower"
+    assert choose_topics("log", both, {"lower": raw, "upper": None})["lower"] == raw
+
+
+def test_one_topic_is_both_cameras_only_if_it_is_given_for_both(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", [entry for entry in pairs(3) if entry.topic == LOWER])
+    with pytest.raises(DriverError, match="no upper camera"):
+        LogReader(path)
+    with closing(LogReader(path, lower=LOWER, upper=LOWER)) as reader:
+        frames = list(reader.frames())
+        assert [frame.camera for frame in frames] == ["lower", "upper"] * 3 and reader.pair_estimate() == 3
+        assert all(a.stamp_ns == b.stamp_ns and a.data is b.data
+                   for a, b in zip(frames[::2], frames[1::2], strict=True))
 
 
 @pytest.mark.parametrize(
@@ -77,7 +89,6 @@ def test_prefers_compressed_images_and_ignores_depth() -> None:
         (IMAGES, {"lower": "/nowhere"}, "no topic '/nowhere' in log: found /a/lower/image_raw, /a/upper"),
         (IMAGES | {"/imu": "sensor_msgs/msg/Imu"}, {"lower": "/imu"}, "'/imu' in log holds sensor_msgs/msg/Imu"),
         (IMAGES, {"lower": "/a/upper/image_raw"}, "no upper camera in log"),
-        (IMAGES, dict.fromkeys(("lower", "upper"), "/a/upper/image_raw"), "cannot be both cameras"),
         (IMAGES | {"/b/lower": IMAGE}, {}, "several lower cameras in log: found /a/lower/image_raw, /b/lower"),
         ({"/lower\n\x1b[2J": IMAGE}, {}, r"/lower\\n\\x1b"),
         ({f"/t{n:02}": "" for n in range(40)}, {}, "/t15 and 24 more"),
