@@ -104,6 +104,8 @@ class OdometryUpdate:
     is_keyframe: bool = False  # odometry needs its dense depth in any case
     witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
+    T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated
+    covariance_rect: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of it, [t; r] in the rectified axes
 
     def __repr__(self) -> str:
         """Return one line: number, state, position, heading and sigma of the position."""

@@ -86,7 +86,8 @@ class OdometryStage:
             self._to_rig @ estimate.velocity, self._in_rig(estimate.velocity_covariance),
             _state(estimate.state, pair), estimate.resets, estimate.inliers, estimate.tracked,
             StereoDepth(pair, _moving(estimate.exposure)), estimate.features, pair.light, pair.motion,
-            estimate.is_keyframe, self._agreement.result, estimate.refused_mps,
+            estimate.is_keyframe, self._agreement.result, estimate.refused_mps, estimate.T_odom_rect,
+            estimate.covariance,
         )
 
     def after(self) -> None:

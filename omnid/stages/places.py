@@ -49,7 +49,6 @@ class Places:
         self.floor = CameraFloor(geometry.rig, config.obstacles.ring.floor_m)
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._to_rig = se3.adjoint(self._T_rig_rect)
-        self._to_rect = se3.adjoint(self._T_rect_rig)
         self.state = MapState.ODOMETRY_ONLY  # of the newest pose
         self.counts = self._localiser.counts  # sizes and counters of the map; each second, and at the end
         self._counted_ns = 0
@@ -113,10 +112,9 @@ class Places:
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
         stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, lambda _: self._dense.of(depth).disparity, usable,
                              pair.times)
-        T_odom_rect = self._T_rect_rig @ odometry.T_odom_rig @ self._T_rig_rect
-        covariance = self._to_rect @ odometry.covariance @ self._to_rect.T
-        return OdometryFrame(stereo, odometry.stamp_ns, T_odom_rect, covariance, odometry.state is TrackingState.LOST,
-                             odometry.reset_counter, odometry.is_keyframe, lambda: self._scan(depth))
+        return OdometryFrame(stereo, odometry.stamp_ns, odometry.T_odom_rect, odometry.covariance_rect,
+                             odometry.state is TrackingState.LOST, odometry.reset_counter, odometry.is_keyframe,
+                             lambda: self._scan(depth))
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""
