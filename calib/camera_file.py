@@ -10,7 +10,7 @@ from calib.camera_table import camera_text, intrinsics_text, mask_text, read_cam
 from calib.models.camera import Mask, OmniCamera
 from calib.validation import read_bytes, require_schema, toml_table
 
-SCHEMA = 1
+SCHEMA = 1  # the first: it rises when an earlier program would misread the file
 # Name, value, standard deviation.
 Parameter = tuple[str, float, float]
 

@@ -20,10 +20,10 @@ from calib.models.ocam import DISTANCE_M, NO_WAVEFRONT, VIEWS, OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.validation import ValidatedTable, read_bytes
 
-# Signature, length and name of the first chunk, then width and height (PNG 1.2, 3.1 and 4.1.1).
+# Signature, length and name of the first chunk, then width and height. Source: PNG 1.2, sections 3.1 and 4.1.1.
 PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 PNG_FIRST_CHUNK = 8
-# Length, name and CRC.
+# Length, name and CRC. Source: PNG 1.2, section 3.2.
 PNG_CHUNK_BYTES = 12
 MAX_PNG_CHUNKS = 1000
 EMBEDDED = "data:image/png;base64,"

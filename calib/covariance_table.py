@@ -11,7 +11,7 @@ from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera
 from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
 from calib.validation import ValidatedTable
 
-VERSION = 1
+VERSION = 1  # the first: it rises when an earlier program would misread the file
 OCAM_NAMES = (*(f"a{power}" for power in range(MAX_COEFFICIENTS)), "center_row", "center_column", "c", "d", "p1", "p2",
               "s1", "s2", "w_a", "w_b", "w_x", "w_y", "w_s")
 

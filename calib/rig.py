@@ -12,7 +12,7 @@ from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask, whole_i
 from calib.models.names import is_lens
 from calib.rig_covariance import RigCovariance
 
-MIN_BASELINE_M = 1e-3
+MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
 # A T_base_rig with the cameras on the floor states no height: as the identity, which it is where none was measured.
 LEAST_HEIGHT_M = 0.1
 MAX_HEIGHT_M = 10.0

@@ -23,7 +23,7 @@ from calib.models.camera import Array
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.validation import ValidatedTable, read_bytes, require_schema, toml_table
 
-SCHEMA = 1
+SCHEMA = 1  # the first: it rises when an earlier program would misread the file
 SIDES = ("lower", "upper")
 LOG_BEGINNINGS = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG")
 OTHER_CALIBRATIONS = (".yaml", ".yml", ".json", ".txt")  # as of Kalibr, Basalt, OCamCalib

@@ -18,7 +18,7 @@ MIN_CORNERS = 4
 MAX_SYSTEMATIC_PART, MAX_SYSTEMATIC_PX = 0.5, 0.03
 # Residuals longer than this many times their median length are outliers.
 OUTLIER_RATIO = 5.0
-MIN_BOARD_M = 1e-6
+MIN_BOARD_M = 1e-6  # guards against division by zero where all corners are one
 
 
 @dataclass(frozen=True, slots=True)

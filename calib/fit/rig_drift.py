@@ -29,7 +29,7 @@ MIN_SIGMA_RAD = 1e-5
 CONVERGED_RAD = 1e-6
 # Ratio of the standard deviation to the median absolute deviation of a normal distribution.
 SIGMA_PER_MAD = 1.4826
-# Step of numeric derivatives.
+# Step of numeric derivatives by central differences: near the cube root of a double's rounding, 6e-6, which is best.
 DIFFERENCE_STEP_RAD = 1e-6
 # Prior of the upper viewpoint's lateral shift: a mirror moves by no more than some degrees of the baseline.
 SHIFT_SIGMA_RAD = np.deg2rad(3.0)

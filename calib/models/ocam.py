@@ -41,9 +41,9 @@ DISTANCE_M, MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 0.05, 1e4
 NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
 # Newton steps that invert the tangential and astigmatic terms; pixels without convergence have no ray.
 TANGENTIAL_STEPS, TANGENTIAL_TOLERANCE_PX = 8, 1e-8
-# Least determinant of the affine.
+# Least determinant of the affine: less would squeeze the image to a line.
 MIN_DETERMINANT = 1e-6
-# A root of a polynomial counts as real if its imaginary part is below this part of the image diagonal.
+# A root of a polynomial counts as real if its imaginary part is below this part of the image diagonal, as rounding is.
 REAL_ROOT_PART = 1e-9
 
 

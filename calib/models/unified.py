@@ -17,7 +17,7 @@ from calib.models.camera import Array
 # Newton steps that invert the lens distortion; a mild one converges in 3 to 5, and pixels without convergence are NaN.
 UNDISTORT_STEPS = 12
 UNDISTORT_TOLERANCE = 1e-9
-# Smallest denominator of the projection.
+# Smallest denominator of the projection: guards against division by zero.
 MIN_SCALE = 1e-12
 
 

@@ -17,12 +17,12 @@ import numpy as np
 
 from calib.models.camera import Array
 
-TERMS = 5
+TERMS = 5  # as many as files have names: w_a, w_b, w_x, w_y, w_s
 # Largest coefficient [m]; a wavefront of larger ones is no small error of a mirror.
 MAX_COEFFICIENT_M = 0.1
 # Iterations of the direction: each reduces its error by the offset in parts of the distance, about 1 / 1000.
 STEPS = 4
-# Least 1 + z, at which directions opposite to the axis are held.
+# Least 1 + z, at which directions opposite to the axis are held: guards against division by zero.
 MIN_DENOMINATOR = 0.05
 
 

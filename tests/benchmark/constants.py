@@ -35,7 +35,7 @@ REASON: Final = re.compile(
     r"default|the paper|the standard|IEEE|ROS|REP|ISO|RFC|OpenCV|covers|needed|needs|stay(s)? below|as in|as for|"
     r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact|guards? against|larger than any"
     r"|more than (the|any)|the limit of|are not resolved|(say|tell)s? (nothing|the same)|misread|to the last digit)\b"
-    r"|\(\w[\w .]* (19|20)\d\d\)|[:;] |, so (?!many|much)", re.IGNORECASE)
+    r"|\([^()]* (19|20)\d\d\)|[:;] |, so (?!many|much)", re.IGNORECASE)
 SOURCE: Final = re.compile(
     r"\([A-Z][\w .&-]* (?:et al\.,? )?(?:19|20)\d\d[^)]*\)|Dang et al[^:;]*|(?:section|eq\.) [IVX()\d.A-Z]+"
     r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+")
@@ -126,6 +126,15 @@ class Comments:
         return " ".join(self._of[line] for line in lines)
 
 
+def _is_neutral(value: ast.expr) -> bool:
+    """True if a value is built of zeros and ones, as Pose2(0.0, 0.0, 0.0) and np.eye(3): what changes nothing."""
+    if not isinstance(value, ast.Call):
+        return False
+    numbers = [part.value for part in ast.walk(value)
+               if isinstance(part, ast.Constant) and type(part.value) in (int, float)]
+    return ast.unparse(value.func) in ("np.eye", "np.zeros") or (len(numbers) > 0 and {*numbers} <= {0, 1})
+
+
 def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Iterator[Constant]:
     """Yield the constants of a module-level assignment; a tuple of names has one value each."""
     if isinstance(node, ast.Assign) and len(node.targets) == 1:
@@ -152,14 +161,16 @@ def has_number(value: ast.expr) -> bool:
 def is_structure(names: Sequence[ast.expr], parts: Sequence[ast.expr]) -> bool:
     """True if the names count positions, as FIRST, SECOND = 0, 1, or spell the number, as ONE = np.float32(1.0).
 
-    Such names have no value that could be another one.
+    Such names have no value that could be another one, nor have neutral elements.
     """
     numbers = [part.value for part in parts if isinstance(part, ast.Constant)]
     counts = len(names) > 1 and numbers == list(range(len(names)))
     spelled = {"NOTHING": 0.0, "ZERO": 0.0, "HALF": 0.5, "ONE": 1.0, "FIRST": 1, "SECOND": 2, "THIRD": 3}
-    return counts or all(isinstance(name, ast.Name) and name.id in spelled and isinstance(part, ast.Call)
-                         and [arg.value for arg in part.args if isinstance(arg, ast.Constant)] == [spelled[name.id]]
-                         for name, part in zip(names, parts, strict=True))
+    if counts or all(map(_is_neutral, parts)):
+        return True
+    return all(isinstance(name, ast.Name) and name.id in spelled and isinstance(part, ast.Call)
+               and [arg.value for arg in part.args if isinstance(arg, ast.Constant)] == [spelled[name.id]]
+               for name, part in zip(names, parts, strict=True))
 
 
 def _knob(node: ast.stmt, comments: Comments, path: str) -> Iterator[Constant]:

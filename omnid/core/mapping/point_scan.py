@@ -18,7 +18,7 @@ from omnid.core.mapping.range_scan import SECTORS, RangeScan, fill_gaps
 Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
 
-HEIGHT_SIGMAS: Final = 2.0  # of the height, between the floor and an obstacle
+HEIGHT_SIGMAS: Final = 2.0  # of the height, above the floor, so that 2 % of the floor's points are obstacles
 INVERSE_STEP: Final = 0.02  # 1/m: width of a bin; two of them are about four sigma of a usual rig
 NEAREST_M: Final = 0.2  # of the bins
 

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
-OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used
+OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 
 
 @compiled("(i8[:], f8[:], f8[:], i8[:], f8[:, :, ::1], f8[:, :, ::1], UniTuple(f8, 5), f8, "

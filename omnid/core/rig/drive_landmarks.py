@@ -32,7 +32,8 @@ Indices = NDArray[np.intp]
 LANDMARKS: Final = 500
 # Most keyframes that see one landmark: from farther away its patch has another appearance, and images are kept so long.
 MAX_KEYFRAMES: Final = 25
-# Two keyframes and the landmark's own three coordinates leave almost nothing that the rig could contradict.
+# Two keyframes and the landmark's own three coordinates leave almost nothing that the rig could contradict, so that
+# there must be a third.
 MIN_KEYFRAMES: Final = 3
 # Least distance of a new landmark from another, as that of corners (`corners.py`).
 APART_PX: Final = 9
