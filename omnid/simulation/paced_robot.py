@@ -89,7 +89,7 @@ class PacedRobot:
         self.offset_ns = 0  # from the simulated time to Unix time
         self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
         self._pace = RealTimeFactor(1.0 / robot.rate_hz)
-        self._touches = self._closed = False
+        self._touches = self._closed = self._ends = False
         self.contacts = 0
         self.truth: dict[int, Pose] = {}  # of the base in the world, by the stamps of the pairs
 
@@ -106,8 +106,12 @@ class PacedRobot:
         self.offset_ns = session.offset_ns
         config = replace(session.config, controller=session.with_obstacles_known(session.config.controller))
         self._link = PacedLink(session.graph.telemetry.add(StageStats("motor")), self._period_ns)
-        self._vehicle = Vehicle(self._world, self._robot, config, self._seed, self._take_tick,
-                                lambda _, line: session.warn(line), self._start_ns)
+
+        def warn(_: float, line: str) -> None:
+            if not self._ends:  # no more poses come then, which needs no line
+                session.warn(line)
+
+        self._vehicle = Vehicle(self._world, self._robot, config, self._seed, self._take_tick, warn, self._start_ns)
         return self._link
 
     def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
@@ -163,6 +167,7 @@ class PacedRobot:
                 self._pace.count()
                 yield from pair
         finally:
+            self._ends = True
             vehicle.controller.end()
             self._advance(vehicle, link, vehicle.now_ns + STOPPING_NS)
             link.end()
