@@ -39,7 +39,7 @@ FOLDER: Final = Path(__file__).parents[2] / "docs" / "images"
 PAIR: Final = 40  # of the sample's 99: the start of the turn, with walls and boxes around
 WIDTH_PX: Final = 720  # of a still
 GIF_WIDTH_PX: Final = 480
-GREYS: Final = 12  # of the GIF's panorama; with the colours of the plan this keeps the file below 1 MB
+GREYS: Final = 8  # of the GIF's panorama; with 20 colours in all this keeps the file below 1 MB
 DRIVE_S: Final = 90.0  # of simulated time at most, as in `omnid demo --drive`
 FRAME_MS: Final = 125  # a GIF's image stands for a second of the drive: eight times as fast
 PAUSE_MS: Final = 2500  # of the last image
@@ -95,7 +95,7 @@ def drive(seconds: float = DRIVE_S, seed: int = 1) -> None:
         run = simulate(world, robot, script, seconds=seconds, seed=seed, config=config)
     print("end:", script.end)
     cameras = SimulatedCameras(with_masks(robot.rig), robot.sensor, world, seed, robot.samples)
-    images = [PillowImage.fromarray(frame).quantize(32, dither=PillowImage.Dither.NONE)
+    images = [PillowImage.fromarray(frame).quantize(20, dither=PillowImage.Dither.NONE)
               for frame in _drive_frames(world, run, script.repeated_s, cameras, robot.rig)]
     durations = [FRAME_MS] * (len(images) - 1) + [PAUSE_MS]
     images[0].save(FOLDER / "drive.gif", save_all=True, append_images=images[1:], duration=durations, loop=0,

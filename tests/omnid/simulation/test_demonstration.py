@@ -98,6 +98,9 @@ def test_both_paths_and_what_was_seen_are_drawn() -> None:
     bare = draw(world, obstacles[:0], first[:0], first[:0]).astype(int)
     seen = (without != bare).any(axis=2)
     assert seen.sum() == pytest.approx(4.0 / 0.05 * math.ceil(0.05 * PX_PER_M)**2, rel=0.2)
-    # 3. The legend stands below, and the scale bar above.
+    # 3. The start is marked and named: a ring of 18 px and a word.
+    marked = draw(world, obstacles[:0], first[:1], first[:0]).astype(int)
+    assert (marked.max(axis=2) < 40).sum() - (bare.max(axis=2) < 40).sum() > 120
+    # 4. The legend stands below, and the scale bar above.
     assert (image[-20:] < 255).any() and (image[40:60, -3 * MARGIN_PX:] < 40).any()
     np.testing.assert_allclose(cross_track_m(first, np.array([(-0.5, -1.2), (0.3, -0.5), (-1.0, -1.0)])), [0.2, 0.3, 0])

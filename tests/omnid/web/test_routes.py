@@ -149,7 +149,9 @@ def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tup
     wait_until(lambda: len(navigator.twists) > count)
     assert navigator.twists[count:] == [(0.0, 0.0)]
     # 2. Anything else is refused, and so are requests of other sites.
-    for text in ("2 0 1 a", "nan 0 1 a", "1 0 1", "1 0 -1 a", "1 0 1 <b>", "", "1 0 1 a b"):
+    now_ms = server_ms(server)
+    for text in (f"1.5 0 {now_ms} a1", f"0 -1.01 {now_ms} a1", f"nan 0 {now_ms} a1", f"1 0 {now_ms}", "1 0 -1 a1",
+                 f"1 0 {now_ms} <b>", "", f"1 0 {now_ms} a1 b"):
         assert not answer(robot, "/drive", text)["done"], text
     body = f"1 0 {server_ms(server)} a1"
     assert server.request("/drive", "POST", body=body).status == 403
