@@ -28,3 +28,8 @@ def is_lens(camera: OmniCamera) -> bool:
         return camera.xi == 0
     return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera,
                                EquirectangularCamera))
+
+
+def sees_directly(camera: OmniCamera) -> bool:
+    """True for a camera without a mirror, of whichever model."""
+    return is_lens(camera) or (isinstance(camera, OcamCamera) and camera.view == "direct")

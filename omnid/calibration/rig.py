@@ -20,6 +20,7 @@ from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
+from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
@@ -241,8 +242,10 @@ def _masked_rig(found: RigCalibration, images: PairedImages, cameras: GivenCamer
     rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
     masks = [_mask(camera.center, side, file, with_struts=with_struts) for camera, side, file in zip(
         (found.lower, found.upper), images.sides, cameras or (None, None), strict=True)]
+    mirrors = [name for name, camera, mask in zip(SIDES, (found.lower, found.upper), masks, strict=True)
+               if mask is None and not sees_directly(camera)]
     warnings = [f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
-                f"add [{name}.mask] by hand" for name, mask in zip(SIDES, masks, strict=True) if mask is None]
+                f"add [{name}.mask] by hand" for name in mirrors]
     return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), warnings
 
 

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 from typing import Final
 
-from calib.models.names import is_lens
+from calib.models.names import sees_directly
 from calib.rig import Rig
 from calib.rig_file import rig_toml
 from drivers.frame import Camera, Frame
@@ -53,7 +53,7 @@ class Session:
         """Return the geometry of the rig; its missing masks are found in the frames, which are read only for that."""
         rig = with_rims(rig, frames)
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
-            if camera.mask is None and not is_lens(camera.camera):
+            if camera.mask is None and not sees_directly(camera.camera):
                 self.warn(f"no mirror rim was found in the first images of the {name} camera: the whole image is used; "
                           f"the mask can be given in the rig's file under [{name}.mask]")
         return geometry(rig, self.config.panorama)

@@ -39,6 +39,23 @@ def test_imports_and_exports_kalibr_files(omni_rig: Rig, tmp_path: Path, capsys:
     assert read_rig(tmp_path / "swapped.toml").lower.camera == omni_rig.upper.camera
 
 
+def test_the_line_says_how_far_a_lens_sees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A rectified camera of 1241x376 px reaches 42 degrees to its corners, not the 15 to its upper edge."""
+    cameras = "".join(f"""
+cam{n}:
+  camera_model: pinhole
+  intrinsics: [718.9, 718.9, 607.2, 185.2]
+  distortion_model: radtan
+  distortion_coeffs: [0, 0, 0, 0]
+  resolution: [1241, 376]
+  rostopic: /{name}/image
+""" for n, name in enumerate(("lower", "upper")))
+    chain = "  T_cn_cnm1: [[1, 0, 0, 0], [0, 1, 0, 0.54], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
+    (tmp_path / "k.yaml").write_text(cameras + chain)
+    assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
+    assert "lower omni 1241x376, 0 to 42 deg from its axis" in capsys.readouterr().out
+
+
 def test_imports_and_exports_ocam_files(ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_rig(tmp_path / "rig.toml", ocam_rig)
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "o") == 0
@@ -50,7 +67,7 @@ def test_imports_and_exports_ocam_files(ocam_rig: Rig, tmp_path: Path, capsys: p
     np.testing.assert_allclose(again.lower.T_cam_rig @ se3.inverse(again.upper.T_cam_rig),
                                ocam_rig.lower.T_cam_rig @ se3.inverse(ocam_rig.upper.T_cam_rig), atol=1e-11)
     assert omnid("import", *files, "--baseline", 0.2, "--view", "direct", "-o", tmp_path / "up.toml") == 0
-    assert "upper ocam direct 1000x780, 0 to 118 deg from its axis, baseline 200.0 mm, upper rotated by 0.00 deg" in \
+    assert "upper ocam direct 1000x780, 0 to 138 deg from its axis, baseline 200.0 mm, upper rotated by 0.00 deg" in \
         capsys.readouterr().out
     (tmp_path / "folder").mkdir()
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "folder") == 0
