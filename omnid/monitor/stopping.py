@@ -6,8 +6,7 @@ import time
 from contextlib import nullcontext
 from typing import Final
 
-from omnid.client import HERE, Diagnostics, Driver, Robot, Subscription
-from omnid.errors import OmnidError
+from omnid.client import HERE, Diagnostics, Robot, Subscription
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.driver import ANSWER_S, CONNECT_S
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
@@ -15,7 +14,6 @@ from omnid.transport.stop_datagram import STOPPED, StopSender
 
 _DATAGRAM_S: Final = 0.15  # after which a stop goes over the bus, too: the robot is behind a router, or far away
 _REPEAT_S: Final = 0.2  # between two stops
-_POLL_S: Final = 0.02
 
 
 def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:
@@ -30,23 +28,13 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
         with (nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S)) as robot, \
                 robot.subscribe(Diagnostics) as statuses:
-            driver = driver_of(robot)
+            driver = robot.driver()
+            driver.require_connected()
             while time.monotonic() < deadline_s:
                 driver.stop()
                 if _is_stopped(statuses) or datagrams.ask(0.0) == STOPPED:
                     return True
     return False
-
-
-def driver_of(robot: Robot) -> Driver:
-    """Return a sender as soon as the robot receives its commands. Raise OmnidError where it does not."""
-    driver, deadline_s = robot.driver(), time.monotonic() + CONNECT_S
-    while not driver.connected:
-        if time.monotonic() > deadline_s:
-            raise OmnidError(f"no robot {robot.name!r} receives commands there: check --robot and --connect, and that "
-                             "its daemon runs with a motor")
-        time.sleep(_POLL_S)
-    return driver
 
 
 def _is_stopped(statuses: Subscription[Diagnostics]) -> bool:

@@ -18,7 +18,6 @@ from calib.bounded_toml import parse_toml
 from omnid.client import Diagnostics, Driver, Robot
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.errors import OmnidError
-from omnid.monitor.stopping import driver_of
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import header_cdr
@@ -95,7 +94,8 @@ def teleoperate(bus: BusConfig) -> int:
         raise OmnidError("omnid drive needs a keyboard: run it in a terminal")
     with raw_keys() as keys, Robot(settings=bus, timeout_s=CONNECT_S) as robot, \
             robot.subscribe(Diagnostics) as statuses:
-        driver, stick = driver_of(robot), Stick(limits_of(robot))
+        driver, stick = robot.driver(), Stick(limits_of(robot))
+        driver.require_connected()
         print(HELP)
         pressed_s = -math.inf  # keys that were typed while it connected still stop, arm and quit; motions are over
         try:

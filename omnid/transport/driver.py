@@ -62,6 +62,12 @@ class Driver:
         """True if a robot subscribes to the commands."""
         return _matches(self._publishers[self._twist])
 
+    def require_connected(self) -> None:
+        """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
+        if not _happens(lambda: self.connected):
+            raise OmnidError(f"no robot {self._robot!r} receives commands there: check --robot and --connect, and that "
+                             "its daemon runs with a motor")
+
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """Drive with this forward speed and yaw rate (counter-clockwise)."""
         payload = codec.twist_stamped_cdr(time.time_ns(), "base_link", velocity_mps, yaw_rate_radps)
@@ -106,7 +112,7 @@ class Driver:
         """
         key = f"{self._robot}/{request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
-            if not _is_matched(querier):
+            if not _happens(lambda: _matches(querier)):
                 raise OmnidError(f"no robot {self._robot!r} takes such requests there: check --robot and --connect, "
                                  "and that its daemon runs, with a motor where it is to drive")
             self.asked_ns = now_ns = time.time_ns()
@@ -131,10 +137,10 @@ class Driver:
         return ros2.attachment(self._sent, sent_ns, self._gid)
 
 
-def _is_matched(querier: zenoh.Querier) -> bool:
-    """Return True as soon as a robot takes the requests, False after CONNECT_S."""
+def _happens(is_so: Callable[[], bool]) -> bool:
+    """Return True as soon as it is so, False after CONNECT_S."""
     deadline_s = time.monotonic() + CONNECT_S
-    while not _matches(querier):
+    while not is_so():
         if time.monotonic() > deadline_s:
             return False
         time.sleep(_POLL_S)

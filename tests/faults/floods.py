@@ -22,7 +22,7 @@ from omnid.transport.codec import twist_stamped_cdr
 from tests.faults.crowds import timed_stop
 from tests.replay.live import ROOT, Operator, free_port, robot
 
-KEYS: Final = ("cmd/imu", "cmd/route", "cmd/arm", "cmd/twist", "cmd/stop", "cmd/nothing")
+KEYS: Final = ("cmd/imu", "cmd/route", "cmd/arm", "cmd/twist", "cmd/stop", "cmd/nothing", "@request/arm")
 SENDERS: Final = 2
 MEASURED_S: Final = 8.0
 LEAST_SHARE: Final = 0.9
@@ -35,12 +35,15 @@ for name, value in (("mode", "client"), ("connect/endpoints", [endpoint]), ("sco
     config.insert_json5(name, json.dumps(value))
 with zenoh.open(config) as session:
     publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
+    send = publisher.put
+    if "@" in key:
+        send = lambda payload: session.get(key, lambda reply: None, payload=payload, timeout=1.0)
     print("ready", flush=True)
     begin_s, sent = time.monotonic(), 0
     while True:
         due = (time.monotonic() - begin_s) * rate_hz
         while sent < due:
-            publisher.put(payload)
+            send(payload)
             sent += 1
         if sent % 20000 < 200:
             print(sent, flush=True)
@@ -53,6 +56,7 @@ for name, value in (("mode", "peer"), ("listen/endpoints", [sys.argv[1]]), ("sco
     config.insert_json5(name, json.dumps(value))
 with zenoh.open(config) as session:
     ring = session.declare_subscriber("omnid/cmd/**", zenoh.handlers.RingChannel(16))
+    queries = session.declare_queryable("omnid/@request/*", zenoh.handlers.RingChannel(16))
     print("ready", flush=True)
     time.sleep(3600)
 """

@@ -16,9 +16,11 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
-from omnid.messages import OdometryUpdate
-from omnid.sinks.drive import LiveDrive, ReplayDrive, granted_words
+from omnid.messages import NavigationUpdate, OdometryUpdate, RequestAnswer
+from omnid.navigation_state import NavigationState
+from omnid.sinks.drive import LiveDrive, PlannerDrive, ReplayDrive, granted_words
 from omnid.tracking_state import TrackingState
+from omnid.transport.requests import Answer
 
 AHEAD = Setpoint(0.3, 0.0)
 
@@ -98,3 +100,24 @@ def test_what_a_robot_does_is_a_sentence() -> None:
     assert granted_words("teach dock", "idle") == "it records the route dock: drive it, then finish it"
     assert granted_words("repeat dock", "driving") == "it repeats the route dock"
     assert granted_words("pause", "paused: by a request") == "paused: by a request"
+
+
+def test_the_answers_of_the_navigation_are_given_and_its_route_is_handed_on(link: Any) -> None:
+    answered: list[tuple[int, Answer]] = []
+    files = Files()
+    drive = PlannerDrive(link, lambda id, answer: answered.append((id, answer)), files)
+    answers = (RequestAnswer(4, "pause", ""), RequestAnswer(5, "repeat lost", "no route lost"))
+    update = NavigationUpdate(1, 1, AHEAD, NavigationState.PAUSED, "by a request", answers=answers)
+    drive.process(update)
+    assert answered == [(4, Answer(True, "paused: by a request")), (5, Answer(False, "no route lost"))]
+    assert files.updates == [update] and [setpoint for setpoint, _ in link.setpoints] == [AHEAD]
+
+
+class Files:
+    """A sink that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.updates: list[NavigationUpdate] = []
+
+    def process(self, update: NavigationUpdate) -> None:
+        self.updates.append(update)
