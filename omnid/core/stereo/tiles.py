@@ -180,9 +180,13 @@ class TileMonitor:
         ratio = energy / np.maximum(other, 1e-6)
         usual = float(np.median(ratio[textured]))
         is_faint = textured & (ratio < BLURRED_SHARE * usual)
+        # The ends of a sector are no neighbours.
+        ends = BLURRED_COLUMNS + 1 if self._columns < TILE_COLUMNS else 0
+        is_faint = np.pad(is_faint, ends)
         wide = np.logical_and.reduce([np.roll(is_faint, -shift) for shift in range(BLURRED_COLUMNS)])
         # All of such a run, and the columns beside it, which dirt covers in part.
         is_faint = np.logical_or.reduce([np.roll(wide, shift) for shift in range(-1, BLURRED_COLUMNS + 1)])
+        is_faint = np.asarray(is_faint)[ends : ends + self._columns]
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
         return np.asarray(self._faint[side] >= IN_A_ROW)
 

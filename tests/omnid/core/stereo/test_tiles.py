@@ -157,6 +157,23 @@ def test_a_part_that_only_one_camera_shows_blurred_is_blind(side: Side) -> None:
     assert states.blind[side][:, INSIDE].all() and not states.unknown[OUTSIDE[1:-1]].any()
 
 
+@pytest.mark.parametrize(("tiles", "is_blind"), [(60, True), (45, False)])
+def test_the_ends_of_a_sector_are_no_neighbours(tiles: int, is_blind: bool) -> None:
+    """Blur at the left end and at the right one, of which too little by itself, is a drop only where the ends meet."""
+    cameras, states = Cameras(), ALL_LIVE
+    cameras.monitor = TileMonitor(np.ones(SHAPE, bool), tiles)
+    side_px = SHAPE[1] // tiles
+    for number in range(IN_A_ROW):
+        images = cameras.images(moved_px=3 * number)
+        smooth = cv2.GaussianBlur(images["lower"], (0, 0), 9).astype(float)
+        noise = np.random.default_rng(number).normal(0, 2, SHAPE)
+        blurred = np.clip(np.rint(smooth + noise), 0, 255).astype(np.uint8)
+        for part in (slice(0, 2 * side_px), slice(SHAPE[1] - 3 * side_px, SHAPE[1])):
+            images["lower"][:, part] = blurred[:, part]
+        states = cameras.update(images)
+    assert bool(states.blind and states.blind["lower"][:, [0, -1]].all()) == is_blind
+
+
 def test_texture_that_only_one_camera_sees_is_no_dirt_on_the_other() -> None:
     """A poster at the edge of the view, two columns of tiles wide."""
     cameras, states = Cameras(), ALL_LIVE
