@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Final
 
 from drivers.cameras.v4l2_settings import EXPOSURE_MODES, PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
+from drivers.errors import DriverError
 from drivers.logs.log_folder import RotationSettings
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
@@ -65,6 +66,9 @@ class CamerasConfig:
 
     def settings(self, camera: str) -> V4l2Settings:
         """Return the settings of the lower or the upper camera; DriverError if they contradict each other."""
+        if self.lower == self.upper:
+            raise DriverError(f"cameras.lower and cameras.upper are both {self.lower!r}, expected two devices: images "
+                              "that hold both views are read from logs only")
         shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 

@@ -57,6 +57,12 @@ def test_one_topic_gives_both_cameras(recording: Path, tmp_path: Path, omnid: Co
     assert abs(errors["length_error_ratio"]) < 0.002 and errors["ate_rmse_m"] < 0.003, errors
 
 
+def test_one_device_is_not_two_cameras(recording: Path, omnid: Command) -> None:
+    """Live, it would be waited for twice; one line says that logs can."""
+    device = ("--lower", "/dev/video9", "--upper", "/dev/video9")
+    assert "expected two devices" in omnid.refused("run", *device, "--rig", recording / "rig.toml")
+
+
 def test_masks_must_tell_which_part_is_whose(recording: Path, tmp_path: Path, omnid: Command) -> None:
     rig = tmp_path / "rig.toml"
     text = (recording / "rig.toml").read_text()
