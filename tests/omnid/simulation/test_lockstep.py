@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -83,3 +84,22 @@ def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
     assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
     noticed_s = (run.stamps_ns[run.slipping] - run.stamps_ns[0]) * 1e-9
     assert len(noticed_s) >= 5 and noticed_s.min() > 1.5
+
+
+def test_a_robot_that_was_lost_at_rest_finds_back_and_drives_again() -> None:
+    blind = replace(make_robot(SIZE), has_gyro=False, has_odometry=False)  # nothing but the images tells that it stands
+    armed_s: list[float] = []
+
+    def rest_and_drive(moment: Moment) -> Iterator[Request]:
+        if moment.controller.armed:
+            armed_s.append(moment.time_s)
+        if moment.time_s > 4.0:
+            yield from forward(moment)
+
+    run = simulate(WORLD, blind, rest_and_drive, seconds=6.0, seed=1, config=CONFIG, faults=[Fault("dark", 1.0, 3.0)])
+    at_s = (run.stamps_ns - run.stamps_ns[0]) * 1e-9
+    states = np.array(run.states)
+    assert "lost" in states[(at_s > 1.0) & (at_s < 3.1)]
+    assert "lost" not in states[at_s > 3.3] and states[-1] == "tracking"
+    assert armed_s and run.truth_in_odom[-1][0, 3] > 0.2
+    np.testing.assert_allclose(run.T_odom_base[-1][:2, 3], run.truth_in_odom[-1][:2, 3], atol=0.03)
