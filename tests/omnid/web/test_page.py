@@ -270,7 +270,7 @@ def rests(page: Any) -> bool:
 @pytest.mark.parametrize(("size", "scheme"), [("phone", "light"), ("desk", "dark")])
 def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, scheme: str) -> None:
     endpoint = free_endpoint()
-    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "256",
+    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320",
                "--set", f'bus.listen=["{endpoint}"]', "--set", "live.status_s=0.5"]
     with started(command, 0) as daemon, served("--connect", endpoint) as server, \
             opened(browser, server, size, scheme) as page:
