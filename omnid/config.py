@@ -66,11 +66,14 @@ class CamerasConfig:
 
     def settings(self, camera: str) -> V4l2Settings:
         """Return the settings of the lower or the upper camera; DriverError if they contradict each other."""
+        shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
+        return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
+
+    def require_two_devices(self) -> None:
+        """Raise DriverError where both cameras are one device, which cannot be opened twice."""
         if self.lower == self.upper:
             raise DriverError(f"cameras.lower and cameras.upper are both {self.lower!r}, expected two devices: images "
                               "that hold both views are read from logs only")
-        shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
-        return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 
 
 @dataclass(frozen=True, slots=True)

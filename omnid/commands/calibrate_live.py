@@ -104,6 +104,7 @@ def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Ima
     from omnid.calibration.camera_pairs import newest_pairs
     from omnid.engine.logging_setup import log
 
+    config.cameras.require_two_devices()
     sources = []
     for camera in ("lower", "upper"):
         sources.append(V4l2Camera(config.cameras.settings(camera), camera, on_event=log))

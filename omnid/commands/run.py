@@ -83,6 +83,7 @@ def _devices(config: Config) -> OpenCamera:
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.engine.logging_setup import log
 
+    config.cameras.require_two_devices()
     return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 

@@ -27,7 +27,7 @@ NO_FILE = "No such file or directory"
 NO_RIG = "there is no such rig"
 # Words of each command -> its arguments, and what it then says: it has run far enough to load its packages.
 COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
-    "run": (("--lower", "/dev/null", "--upper", "/dev/null", "--rig", "none.toml"), NO_RIG),
+    "run": (("--lower", "/dev/null", "--upper", "/dev/zero", "--rig", "none.toml"), NO_RIG),
     "simulate": (("nowhere",), "world 'nowhere' is not known"),
     "replay": (("none.mcap",), "none.mcap"),
     "demo": (("--output", "/dev/null/demo"), "/dev/null/demo"),
@@ -57,7 +57,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "view": (("none.mcap", "-o", "view.rrd"), "none.mcap" if find_spec("rerun") else "rerun, which is not installed"),
     "web": (("--listen", "127.0.0.1:99999"), "expected HOST:PORT"),
     "batch": (("none.mcap", "--out", "out"), "no log 'none.mcap'"),
-    "record": (("rec", "--lower", "/dev/null", "--upper", "/dev/null"), "not a video device"),
+    "record": (("rec", "--lower", "/dev/null", "--upper", "/dev/zero"), "not a video device"),
     "report": (("none.mcap", "-o", "report.html"), "none.mcap"),
     "log info": (("none.mcap",), "none.mcap"),
     "log recover": (("none.mcap",), "none.mcap"),
