@@ -222,17 +222,22 @@ class ObstacleGrid:
         self._odds[FLOOR][(reached & free) > 0] = PRIOR[FLOOR]
 
     def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
-        """End the flood too near to be seen where the nearest floor in view is watched: a person would hide it."""
+        """End the flood too near to be seen where what is behind it is watched: a person would hide that.
+
+        Behind it is the nearest floor in view, or a surface that stands nearer, as the walls of a corridor do.
+        """
         if not nearest_m or not self._flooded.any():
             return
         steps = int(nearest_m / CELL_M) + 2
         direction = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
         ways = np.arange(1, steps + 1)[None, :, None] * direction[:, None]
         columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
-        ends = rows[:, -2:], columns[:, -2:]
-        past = ((self._fresh[ends] > LEAST_FRESH) & self._is_floor()[ends]).all(axis=1)
+        watched = self._fresh[rows, columns] > LEAST_FRESH
+        before_surface = ~np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
+        past = (watched & self._is_floor()[rows, columns])[:, -2:].all(axis=1) | ~before_surface[:, -1]
         past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
-        cells = rows[past], columns[past]
+        chosen = past[:, None] & before_surface
+        cells = rows[chosen], columns[chosen]
         flooded = self._flooded[cells] > 0
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._flooded[cells] = 0

@@ -7,7 +7,7 @@ import pytest
 
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
-from omnid.core.obstacles.grid import FLOOD_MPS, FRESH_NS, GridRing, ObstacleGrid
+from omnid.core.obstacles.grid import FLOOD_MPS, FLOOR, FRESH_NS, PRIOR, GridRing, ObstacleGrid
 from omnid.core.obstacles.settings import RingSettings
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
@@ -118,6 +118,20 @@ def test_what_comes_into_view_ends_the_free_floor_until_it_goes(grid: ObstacleGr
 def test_floor_is_kept_too_near_to_be_seen_as_long_as_the_way_to_it_is_watched(grid: ObstacleGrid, seen: Pairs
                                                                              ) -> None:
     assert after(grid, seen, 60).free_m.min() > seen[0].nearest_floor_m - 0.2
+
+
+@pytest.mark.parametrize(("wall", "is_known"), [(striped, True), (plain, False)])
+def test_floor_before_a_wall_too_near_for_floor_is_kept_where_the_wall_is_seen(grid: ObstacleGrid, wall: Pattern,
+                                                                              is_known: bool) -> None:
+    """As beside the walls of a corridor: a person who came between would hide the wall; a plain one shows nothing."""
+    near_m = 0.75
+    found = evidence(stains, wall, wall_m=near_m)
+    assert found[0].nearest_floor_m > near_m
+    after(grid, found, 20)
+    grid._flooded[:] = 1  # something may have come from all sides
+    grid._odds[FLOOR] = PRIOR[FLOOR]
+    ring = after(grid, found, 3, first=20)
+    assert (np.median(ring.free_m) > near_m - 0.25) == is_known
 
 
 def test_nothing_is_known_after_clear(grid: ObstacleGrid, seen: Pairs) -> None:
