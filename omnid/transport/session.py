@@ -27,6 +27,9 @@ _MAX_PENDING: Final = 1000
 _ACCEPT_TIMEOUT_MS: Final = 1000
 _MAX_COMMAND_BYTES: Final = 16_384  # of all but paths
 _MAX_SESSIONS: Final = 128  # each holds received fragments in memory
+# Of each link and key: zenoh ends each query that a ring drops by a message of its own, which takes time. No program
+# that waits for its answers asks so often.
+_MAX_QUERIES_HZ: Final = 1000.0
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",
     "tls_listen_key": "listen_private_key",
@@ -138,6 +141,7 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
         yield "transport/unicast/accept_timeout", _ACCEPT_TIMEOUT_MS, ""
         yield "transport/unicast/max_sessions", _MAX_SESSIONS, ""
         yield "low_pass_filter", _size_limits(config), ""
+        yield "downsampling", _query_rates(config), ""
         yield "access_control", access_control(config), "command_names" if config.command_names else "command_users"
 
 
@@ -149,6 +153,13 @@ def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
     requests = [f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS - {PATH})]
     return [{"id": "commands", "flows": ["ingress"], "messages": ["put", "query"], "key_exprs": plain + ros + requests,
              "size_limit": _MAX_COMMAND_BYTES}]
+
+
+def _query_rates(config: BusConfig) -> list[dict[str, Any]]:
+    """Return the rules that bound how often a link may ask."""
+    keys = [f"{config.robot}/*", *(f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS))]
+    return [{"id": "queries", "flows": ["ingress"], "messages": ["query"],
+             "rules": [{"key_expr": key, "freq": _MAX_QUERIES_HZ} for key in keys]}]
 
 
 def _users(config: BusConfig) -> Iterator[tuple[str, Any, str]]:
