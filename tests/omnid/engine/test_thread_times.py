@@ -17,7 +17,6 @@ from omnid.engine.thread_times import (
     shares,
     thread_times,
 )
-
 from tests.replay.live import wait_until
 
 BURNT_S = 0.15
