@@ -1,9 +1,9 @@
 """Stops before obstacles in a closed loop: `python -m tests.benchmark.obstacle_stops CASE --seeds FIRST LAST`.
 
 An operator holds the stick ahead in a corridor at 0.5 m/s; the collision monitor alone keeps the simulated robot from
-what it meets. A contact is one of the robot's true outline; a stop of the monitor is false where nothing true stands or
-walks within 1 m of the outline, in the robot's way or 0.2 m beside it. Printed beside that: the highest speed within
-1 m of what stands ahead, and how many of the obstacle rings there told the way as unknown.
+what it meets. A contact is one of the robot's true outline, over an edge, too; a stop of the monitor is false where
+nothing true stands or walks within 1 m of the outline, in the robot's way or 0.2 m beside it. Printed beside that: the
+highest speed within 1 m of what stands ahead, and how many of the obstacle rings there told the way as unknown.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import math
 import random
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -21,9 +22,10 @@ from numpy.typing import NDArray
 
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
-from omnid.simulation.clearance import footprints
+from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.people import Walkers
+from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
@@ -37,7 +39,8 @@ FALSE_M: Final = 1.0
 BESIDE_M: Final = 0.2  # of the robot's outline: what stands there may be its reason to stop
 AHEAD: Final = slice(170, 190)  # sectors of the ring
 CASES: Final = {"person at 0.8 m": 12.0, "person at 1.5 m": 12.0, "box": 12.0, "low box": 12.0, "plain pole": 12.0,
-                "pole": 12.0, "white wall": 20.0, "free": 24.0}
+                "pole": 12.0, "white wall": 20.0, "free": 24.0, "person crosses": 9.0, "edge 8 cm": 10.0,
+                "edge 15 cm": 10.0}
 
 
 class Drive(NamedTuple):
@@ -56,6 +59,8 @@ class Drive(NamedTuple):
 def world_text(case: str, rng: random.Random) -> str:
     """Return a corridor along x with what the case says in it, as a world file."""
     left, right, length = rng.uniform(0.9, 1.5), -rng.uniform(0.9, 1.5), 12.0
+    if case == "person crosses":
+        left, right = rng.uniform(2.0, 2.6), -rng.uniform(2.0, 2.6)
     walls = [rng.choice(("brick", "granite", "plaster")) for _ in range(2)]
     end = "plain" if case == "white wall" else "brick"
     end_m = rng.uniform(3.5, 4.5) if case == "white wall" else length
@@ -81,7 +86,14 @@ def world_text(case: str, rng: random.Random) -> str:
         texture = "white" if case == "plain pole" else "granite"
         lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
                   f"size_m = [{side}, {side}, 1.8]", f'texture = "{texture}"', f"yaw_deg = {rng.uniform(-40, 40)}"]
-    if case.startswith("person"):
+    if case == "person crosses":
+        # Where nobody stops, the person is on the middle line when the robot comes there, or up to 0.8 s before.
+        at_m, side, speed_mps = rng.uniform(2.8, 3.5), rng.choice((1, -1)), rng.uniform(0.8, 1.6)
+        aside = side * (min(left, -right) - 0.3)
+        before_m = SPEED_MPS * (abs(aside) / speed_mps + rng.uniform(0.0, 0.8))
+        lines += ["[[person]]", f"path = [[{at_m}, {aside}], [{at_m}, {-aside}]]", f"speed_mps = {speed_mps}",
+                  f"starts_within_m = {math.hypot(before_m, aside)}"]
+    elif case.startswith("person"):
         within_m, side = float(case.split()[2]), rng.choice((1, -1))
         at_m, aside = rng.uniform(2.3, 3.0), side * (min(left, -right) - 0.3)
         lines += ["[[person]]", f"path = [[{at_m}, {aside}], [{at_m}, {rng.uniform(-0.1, 0.1)}]]",
@@ -102,15 +114,40 @@ def run(case: str, seed: int, size_px: int, overrides: list[str]) -> Drive:
         path = Path(folder) / "world.toml"
         path.write_text(world_text(case, random.Random(seed)))
         world = load_world(str(path), seed)
+        edges = np.zeros((0, 2, 2))
+        if case.startswith("edge"):
+            world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
         done = simulate(world, make_robot(size_px), ahead, seconds=CASES[case], seed=seed,
                         config=load_config(None, ["places.enabled=false", *overrides]))
-    return judged(done, world)
+    return judged(done, world, edges)
 
 
-def judged(done: SimulatedRun, world: World) -> Drive:
-    """Return the result of a run, from the truth at its ticks."""
+def with_edge(world: World, at_m: float, drop_m: float) -> tuple[World, Array]:
+    """Return the world with its floor lower from a place on along x, and the edge (1, 2, 2)."""
+    standing = []
+    for part in world.standing:
+        if part.name != "floor":
+            standing.append(part)
+            continue
+        share = (at_m - part.origin[0]) / part.edge_u[0]
+        column = round(share * part.texture.shape[1])
+        along, across, end = part.edge_u * share, part.edge_v, part.edge_u * (1 - share)
+        corner, down = part.origin + along - (0, 0, drop_m), np.array([0.0, 0.0, -drop_m])
+        standing += [replace(part, edge_u=along, texture=part.texture[:, :column].copy()),
+                     replace(part, origin=corner, edge_u=end, texture=part.texture[:, column:].copy())]
+        # What closes the walls below the old floor.
+        standing += [Rectangle(first - down, way, down, part.texture[:64].copy(), "wall") for first, way in
+                     ((corner, end), (corner + across, end), (corner + end, across))]
+        edge = np.array([[(corner)[:2], (corner + across)[:2]]])
+    return replace(world, standing=tuple(standing)), edge
+
+
+def judged(done: SimulatedRun, world: World, edges: Array) -> Drive:
+    """Return the result of a run, from the truth at its ticks; edges (N, 2, 2): where the floor falls."""
     robot = make_robot()
-    standing, people = footprints(world.standing, robot.height_m), Walkers(world.people)
+    standing, people = np.concatenate([footprints(world.standing, robot.height_m), edges]), Walkers(world.people)
+    to_edge_m = [clearance_m(edges, tick.pose[:2], robot.radius_m) for tick in done.ticks]
+    over = int(min(to_edge_m) <= 0.0)
     ahead_m = []
     for tick in done.ticks:
         people.advance(tick.time_s, tick.pose[:2])
@@ -127,8 +164,8 @@ def judged(done: SimulatedRun, world: World) -> Drive:
     driven_m = math.dist(done.ticks[0].pose[:2], done.ticks[-1].pose[:2])
     reasons = "; ".join(f"{at_s:.1f} s {text.removeprefix('the wheels stop: ').partition(';')[0]}"
                         for at_s, text in lines)
-    return Drive(len(done.contacts), done.clearance_m, len(lines), false, driven_m, float(near_mps),
-                 (unknown, len(rings)), reasons)
+    return Drive(len(done.contacts) + over, min(done.clearance_m, *to_edge_m), len(lines), false, driven_m,
+                 float(near_mps), (unknown, len(rings)), reasons)
 
 
 def room_ahead_m(segments: Array, pose: tuple[float, float, float], radius_m: float) -> float:

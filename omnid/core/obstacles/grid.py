@@ -36,8 +36,8 @@ FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pairs
 MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow each other are alike
-# Of a surface: four pairs are needed. With 3.0, set by trial, one that was none stopped a base in a corridor.
-MOST_SURFACE: Final = 1.5
+# Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
+MOST_SURFACE: Final = 1.0
 FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
 TAKEN_ODDS: Final = 0.0  # of a surface
 PAIR_RUN: Final = 4.0  # of a surface in one pair, that may move
@@ -52,6 +52,9 @@ NARROW_CELLS: Final = 5  # what comes in is wider
 ONCE_FREE_S: Final = 30.0  # for which a cell that was free and is hidden now is a way by which something may have come
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
+WIDE_CELLS: Final = 3  # of something low, and of an edge: the noise of single cells would be an obstacle that stays
+# The same where no step is seen either, because what hides so little floor is no higher than one.
+LEVEL_SPECK_CELLS: Final = 16
 THIN_M: Final = 0.03  # width of the thinnest obstacle
 END_BINS: Final = 2  # a cell takes the evidence of a patch so much farther: one at the foot of something shows both
 END_M: Final = 0.1  # before the end of the free floor, for the same reason
@@ -141,19 +144,22 @@ class ObstacleGrid:
     @property
     def floor_odds(self) -> Floats:
         """Log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
-        return np.asarray(self._odds[FLOORS].min(axis=0))
+        return np.asarray(np.minimum(self._odds[FLOOR], self._level_odds()))
 
     def state(self) -> Bytes:
         """Return the cells: 0 unknown, 1 free, 2 taken."""
         taken = self._odds[SURFACE] > TAKEN_ODDS
-        free = self._is_floor() | taken
+        level = self._level_odds()
+        free = ((self._odds[FLOOR] > FREE_ODDS) & (level > FREE_ODDS)) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
-        free |= about[patch, cv2.CC_STAT_AREA] <= SPECK_CELLS
+        cells = about[patch, cv2.CC_STAT_AREA]
+        free |= (cells <= SPECK_CELLS) | ((cells <= LEVEL_SPECK_CELLS) & (level > FREE_ODDS))
         return np.where(taken, np.uint8(2), free.astype(np.uint8))
 
-    def _is_floor(self) -> Flags:
-        """Return the cells (CELLS, CELLS) that are the floor rather than any other explanation."""
-        return np.asarray(self._odds[FLOORS].min(axis=0) > FREE_ODDS)
+    def _level_odds(self) -> Floats:
+        """Return the least log-odds (CELLS, CELLS) against steps up and down, which are wider than a cell."""
+        above, below = (cv2.blur(self._odds[layer], (WIDE_CELLS, WIDE_CELLS)) for layer in (ABOVE, BELOW))
+        return np.asarray(cv2.min(above, below), np.float32)
 
     def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
         """Return the evidence (4, N, N) of the cells of the view, the first of which has its middle at first_m."""
@@ -207,7 +213,7 @@ class ObstacleGrid:
         steps, self._carry = int(self._carry), self._carry % 1.0
         watched = (self._fresh > LEAST_FRESH).astype(np.uint8)
         box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
-        free = self._is_floor().astype(np.uint8)
+        free = (self._odds[FLOOR] > FREE_ODDS).astype(np.uint8)
         visible = np.zeros((CELLS, CELLS), np.uint8)
         visible[rows, columns] = in_view
         self._free_ns[free > 0] = stamp_ns
@@ -234,7 +240,7 @@ class ObstacleGrid:
         columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
         watched = self._fresh[rows, columns] > LEAST_FRESH
         before_surface = ~np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
-        past = (watched & self._is_floor()[rows, columns])[:, -2:].all(axis=1) | ~before_surface[:, -1]
+        past = (watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS))[:, -2:].all(axis=1) | ~before_surface[:, -1]
         past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
         chosen = past[:, None] & before_surface
         cells = rows[chosen], columns[chosen]
