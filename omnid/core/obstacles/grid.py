@@ -54,7 +54,7 @@ ONCE_FREE_S: Final = 30.0  # for which a cell that was free and is hidden now is
 SPECK_CELLS: Final = 6
 WIDE_CELLS: Final = 3  # of something low, and of an edge: the noise of single cells would be an obstacle that stays
 # The same where no step is seen either, because what hides so little floor is no higher than one.
-LEVEL_SPECK_CELLS: Final = 16
+LEVEL_SPECK_CELLS: Final = 9
 THIN_M: Final = 0.03  # width of the thinnest obstacle
 END_BINS: Final = 2  # a cell takes the evidence of a patch so much farther: one at the foot of something shows both
 END_M: Final = 0.1  # before the end of the free floor, for the same reason
