@@ -87,7 +87,7 @@ def world_text(case: str, rng: random.Random) -> str:
         lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
                   f"size_m = [{side}, {side}, 1.8]", f'texture = "{texture}"', f"yaw_deg = {rng.uniform(-40, 40)}"]
     if case == "person crosses":
-        # If nobody stops, the person is on the robot's way when it comes there, or up to 0.8 s earlier.
+        # Unless one of them stops, the person is in the way when the robot comes there, or 0.8 s before at most.
         at_m, side, speed_mps = rng.uniform(2.8, 3.5), rng.choice((1, -1)), rng.uniform(0.8, 1.6)
         aside = side * (min(left, -right) - 0.3)
         before_m = SPEED_MPS * (abs(aside) / speed_mps + rng.uniform(0.0, 0.8))
