@@ -49,6 +49,7 @@ MOST_FRESH: Final = 1.2  # evidence of floor or surface in a pair that counts in
 LEAST_FRESH: Final = 0.4  # mean in a cell that is watched; that of noise is 0.2
 FLOOD_MPS: Final = 1.6  # speed at which something may come in unseen
 NARROW_CELLS: Final = 5  # what comes in is wider
+GAP: Final = np.ones((3, 3), np.uint8)  # nothing comes through narrower gaps, which noise opens in walls
 ONCE_FREE_S: Final = 30.0  # for which a cell that was free and is hidden now is a way by which something may have come
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
@@ -219,7 +220,7 @@ class ObstacleGrid:
         self._free_ns[free > 0] = stamp_ns
         was_free = (self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9)).astype(np.uint8)
         lost = np.asarray((1 - watched) & (visible | (1 - free)) & was_free, np.uint8)
-        passable = (free & (1 - watched)) | lost
+        passable = np.asarray(cv2.morphologyEx((free & (1 - watched)) | lost, cv2.MORPH_OPEN, GAP), np.uint8)
         reached = np.asarray(cv2.morphologyEx(lost, cv2.MORPH_OPEN, box), np.uint8) | (self._flooded & lost)
         for step in range(steps):
             kernel = np.ones((3, 3), np.uint8) if step % 2 else CROSS

@@ -7,7 +7,17 @@ import pytest
 
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
-from omnid.core.obstacles.grid import FLOOD_MPS, FLOOR, FRESH_NS, PRIOR, GridRing, ObstacleGrid
+from omnid.core.obstacles.grid import (
+    CELL_M,
+    FLOOD_MPS,
+    FLOOR,
+    FREE_ODDS,
+    FRESH_NS,
+    NEVER,
+    PRIOR,
+    GridRing,
+    ObstacleGrid,
+)
 from omnid.core.obstacles.settings import RingSettings
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
@@ -101,6 +111,23 @@ def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: 
     seconds = 3 * FRESH_NS * 1e-9 + seen[0].nearest_floor_m / FLOOD_MPS
     ring = after(grid, [dark], int(seconds * 1e9 / PERIOD_NS) + 1, first=20)
     assert ring.free_m.max() < 0.45
+
+
+@pytest.mark.parametrize(("gap_cells", "comes_in"), [(2, False), (6, True)])
+def test_nothing_comes_in_through_a_narrow_gap(grid: ObstacleGrid, seen: Pairs, gap_cells: int, comes_in: bool) -> None:
+    """A ring about the base that was never free, with a gap; in the dark something may have come to all other floor."""
+    after(grid, seen, 20)
+    middle = np.floor(-grid.corner_m / CELL_M).astype(int)
+    y, x = np.ogrid[: grid._fresh.shape[0], : grid._fresh.shape[1]]
+    x, y = x - middle[0], y - middle[1]
+    away = np.hypot(x, y)
+    ring = (away > 8) & (away < 12) & ~((x > 0) & (y >= 0) & (y < gap_cells))
+    grid._odds[FLOOR][ring], grid._free_ns[ring] = PRIOR[FLOOR], NEVER
+    dark = seen[0]._replace(surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor,
+                            level=np.zeros_like(seen[0].level))
+    after(grid, [dark], 40, first=20)
+    is_free = grid._odds[FLOOR][(away > 5) & (away < 7)] > FREE_ODDS
+    assert is_free.any() != comes_in and is_free.all() != comes_in
 
 
 @pytest.mark.parametrize(("range_m", "free_m"), [(1.3, 1.35), (0.8, 0.4)])
