@@ -60,6 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command and return the exit code: 0 good, 1 not good (see the command), 2 wrong input, 130 Ctrl-C."""
     _open_closed_streams()
     bound_image_size()
+    limit_blas_threads()
     words = list(sys.argv[1:] if argv is None else argv)
     args = _parser(words).parse_args(words)
     return _guarded(args)
@@ -79,6 +80,15 @@ def bound_image_size() -> None:
     there, frames are bounded by their headers (drivers/frame.py).
     """
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(64 * 2**20))
+
+
+def limit_blas_threads() -> None:
+    """Let BLAS work with one thread, unless the user wants more; it reads the variable when numpy is loaded.
+
+    The matrices are small, and threads that wait for the next one took 8 % of a core of a daemon
+    (`python -m tests.benchmark.daemon`).
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def _parser(words: Sequence[str]) -> Parser:

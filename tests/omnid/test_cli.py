@@ -84,3 +84,14 @@ def test_a_mistyped_word_is_named_with_the_nearest_one(words: list[str], line: s
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == 2 and capsys.readouterr().err == f"omnid: {line}\n"
+
+
+@pytest.mark.parametrize(("wanted", "found"), [(None, "1"), ("2", "2")])
+def test_commands_use_one_thread_of_blas_unless_more_are_wanted(wanted: str | None, found: str) -> None:
+    """Set before numpy is loaded, which reads it."""
+    script = ("import os, sys\nfrom omnid.cli import main\nassert 'numpy' not in sys.modules\nmain(['config'])\n"
+              "print(os.environ['OPENBLAS_NUM_THREADS'], file=sys.stderr)")
+    environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
+                          env=environment | ({} if wanted is None else {"OPENBLAS_NUM_THREADS": wanted}))
+    assert done.stderr.split() == [found]
