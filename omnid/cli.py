@@ -85,8 +85,8 @@ def bound_image_size() -> None:
 def limit_blas_threads() -> None:
     """Let BLAS work with one thread, unless the user wants more; it reads the variable when numpy is loaded.
 
-    The matrices are small, and threads that wait for the next one took 8 % of a core of a daemon
-    (`python -m tests.benchmark.daemon`).
+    The matrices are small, and its threads wait for the next one without sleeping: see the row `libraries` of
+    `OPENBLAS_NUM_THREADS=2 python -m tests.benchmark.daemon`.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

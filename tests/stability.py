@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from tests.faults.__main__ import busy_processes
+from tests.busy import busy_processes
 
 ROOT: Final = Path(__file__).parents[1]
 COMMAND: Final = re.compile(r"-e '\.\[test\]' && \S+/python (-m pytest .*)$", re.MULTILINE)

@@ -9,11 +9,8 @@ from __future__ import annotations
 
 import argparse
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -36,6 +33,7 @@ from omnid.stages.synchronise import Synchronise
 from tests.benchmark.accuracy import rig_of
 from tests.benchmark.budget_steps import STEPS, StepClock, measured_steps
 from tests.benchmark.results import Cell, Column, ResultTable
+from tests.busy import busy_processes
 from tests.replay.test_memory import to_and_fro
 
 REFERENCE_EVERY: Final = 10  # pairs between two runs of the reference kernels
@@ -138,16 +136,6 @@ def _row(budgets: Sequence[Budget], path: Labels) -> list[Cell]:
     ratio = median(ms / (budget.sgbm_ms + budget.lk_ms) for ms, budget in zip(spent, budgets, strict=True))
     calls = median(budget.calls.get(path, 0.0) for budget in budgets)
     return [" > ".join(path), median(spent), ratio, calls]
-
-
-@contextmanager
-def busy_processes(count: int) -> Iterator[None]:
-    """Run processes that only compute."""
-    with ExitStack() as ends:
-        for _ in range(count):
-            process = ends.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
-            ends.callback(process.kill)
-        yield
 
 
 def main() -> None:

@@ -7,7 +7,6 @@ sample's at 10 Hz.
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -40,13 +39,3 @@ def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, 
         code, err = process.end()
         assert code == 0, err
         assert "Traceback" not in err
-
-
-@contextmanager
-def busy_processes(count: int) -> Iterator[None]:
-    """Run processes that only compute."""
-    with ExitStack() as ends:
-        for _ in range(count):
-            process = ends.enter_context(subprocess.Popen([sys.executable, "-c", "while True: pass"]))
-            ends.callback(process.kill)
-        yield

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmark.live_daemon import HZ, busy_processes, daemon
+from tests.benchmark.live_daemon import HZ, daemon
 from tests.benchmark.results import Column, ResultTable
+from tests.busy import busy_processes
 from tests.replay.live import Operator
 
 MEASURE_S = float(os.environ.get("OMNID_BENCHMARK_S", "60"))

@@ -9,13 +9,12 @@ The campaign is seeded and bounded; with the numbers of the defaults it takes so
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
+from tests.busy import busy_processes
 from tests.faults import crowds, floods, hostile_commands, hostile_files, images, route_stops, stop_times
 from tests.faults.trials import TRIALS, Outcome, Setting
 from tests.simulation import build, write_log
@@ -45,16 +44,6 @@ def run_trials(recorded: Path, folder: Path, words: list[str], report: Report) -
             outcome = Outcome("FAILED", "", " ".join(str(error).split())[:200])
         report(f"| {fault} | {' | '.join(outcome)} |")
     return failed
-
-
-@contextmanager
-def busy_processes(count: int) -> Iterator[None]:
-    """Keep so many other processes busy in this block."""
-    with ExitStack() as ends:
-        for _ in range(count):
-            process = ends.enter_context(subprocess.Popen([sys.executable, "-c", BUSY_LOOP]))
-            ends.callback(process.kill)
-        yield
 
 
 def parser() -> argparse.ArgumentParser:

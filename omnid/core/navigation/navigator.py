@@ -122,8 +122,8 @@ class Navigator:
         following = drive.follower.step(now.stamp_ns, pose, now.speed_mps, now.yaw_rate_radps, now.obstacle_m)
         if following.done:
             return self._finished(drive, following.missed_m)
-        if abs(following.offset_m) > self._settings.corridor_m + BESIDE_M:
-            return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
+        if self._is_beside(following):
+            return self._taken_away(following)
         setpoint = self._in_odom(following.setpoint, drive, now)
         # 5. Obstacles.
         plan = self._around_obstacles(drive.follower, self._path_ahead(drive, now, PLANNED_M), now, setpoint)
@@ -227,9 +227,12 @@ class Navigator:
     def _give_way(self, drive: Drive, giving: GivingWay, now: Situation, dt_s: float) -> Navigation:
         """Drive back, rest, and come again to the place where the base was blocked. All in odom."""
         obstacles = np.zeros((0, 2)) if now.obstacles is None else now.obstacles
+        motion = now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps
+        following = None if giving.phase is Phase.REST else giving.drive(*motion)
+        if following is not None and self._is_beside(following):
+            return self._taken_away(following)
         # 1. Back, as far as it is seen to be free now.
         if giving.phase is Phase.BACK:
-            following = giving.drive(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
             is_closed = now.obstacles is None or closed(giving.look_back(), obstacles, self._half_width_m).any()
             if following is not None and not is_closed and not now.wheels.held_by:
                 if self._is_stuck(drive, now, following.left_m, dt_s):
@@ -241,24 +244,22 @@ class Navigator:
         # 2. Rest until the way is free, or it is time to look for another one.
         if giving.phase is Phase.REST:
             way = np.vstack([giving.way_to_block(now.pose), self._path_ahead(drive, now, PAST_M)])
-            is_open = is_free(way, obstacles, self._half_width_m + self._settings.clearance_m)
-            if giving.move_on(now.pose, dt_s, is_open):
+            room_m = self._half_width_m + self._settings.clearance_m
+            if giving.move_on(now.pose, dt_s, is_free(way, obstacles, room_m)):
                 return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
         # 3. To the place where it was blocked.
-        else:
-            following = giving.drive(now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps)
-            if following is not None:
-                plan = self._around_obstacles(giving.follower, giving.follower.path_ahead(PLANNED_M), now,
-                                              following.setpoint)
-                if plan.setpoint is None or now.wheels.held_by:
-                    giving.rest()
-                    drive.nearest_m = math.inf
-                    return self._wait(drive, NavigationState.BLOCKED, plan.reason or now.wheels.held_by, dt_s)
-                if self._is_stuck(drive, now, following.left_m, dt_s):
-                    return self._no_progress(now, AROUND if plan.avoiding else "")
-                self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
-                self.reason = plan.reason
-                return Navigation(plan.setpoint, self.state, self.reason, drive.gave_way_m)
+        elif following is not None:
+            plan = self._around_obstacles(giving.follower, giving.follower.path_ahead(PLANNED_M), now,
+                                          following.setpoint)
+            if plan.setpoint is None or now.wheels.held_by:
+                giving.rest()
+                drive.nearest_m = math.inf
+                return self._wait(drive, NavigationState.BLOCKED, plan.reason or now.wheels.held_by, dt_s)
+            if self._is_stuck(drive, now, following.left_m, dt_s):
+                return self._no_progress(now, AROUND if plan.avoiding else "")
+            self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
+            self.reason = plan.reason
+            return Navigation(plan.setpoint, self.state, self.reason, drive.gave_way_m)
         drive.giving_way, drive.nearest_m = None, math.inf
         drive.waits.clear()
         return Navigation(STAND, self.state, self.reason, drive.gave_way_m)
@@ -304,10 +305,16 @@ class Navigator:
         self._end(NavigationState.REACHED, "")
         return self._idle()._replace(left_m=0.0)
 
+    def _is_beside(self, following: Following) -> bool:
+        """True if the base is not on its way any more, as where an operator has taken it away."""
+        return abs(following.offset_m) > self._settings.corridor_m + BESIDE_M
+
+    def _taken_away(self, following: Following) -> Navigation:
+        return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
+
     def _no_progress(self, now: Situation, does: str) -> Navigation:
-        why = now.wheels.reason if _holds(now) else does
-        return self._failed(f"no progress for {self._settings.stuck_s:g} s{': ' + why if why else ''}: look at the "
-                            "robot")
+        why = [why] if (why := now.wheels.reason if _holds(now) else does) else []
+        return self._failed(": ".join([f"no progress for {self._settings.stuck_s:g} s", *why, "look at the robot"]))
 
     def _failed(self, reason: str) -> Navigation:
         self._end(NavigationState.FAILED, reason)

@@ -169,3 +169,11 @@ def test_goes_back_around_a_corner_and_comes_again() -> None:
     x, y, _ = np.array([sample.pose for sample in base.samples]).T
     assert np.minimum(abs(y), abs(x - 1.5)).max() < 0.25, "it never leaves its path"
     assert clearance_m(base) > 0.02
+
+
+def test_fails_where_it_is_taken_away_while_it_gives_way() -> None:
+    base = BaseAmongOthers((), lambda _: person(3.0, 0.0), 9, NavigationSettings(corridor_m=0.0))
+    base.run(60, lambda answer: answer.reason == GIVES_WAY, rest_s=0.5)
+    base.pose = base.pose + np.array([0.0, 2.0, 0.0])
+    answer = base.run(10)
+    assert answer.state is NavigationState.FAILED and "2.0 m beside the path" in answer.reason
