@@ -219,10 +219,9 @@ class Navigator:
             return False
         drive.giving_way = give_way(self._trail, self._settings, now.pose, now.stamp_ns, now.obstacles,
                                     self._half_width_m)
-        if drive.giving_way is None:
-            return False
-        drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
-        return True
+        if drive.giving_way is not None:
+            drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
+        return drive.giving_way is not None
 
     def _give_way(self, drive: Drive, giving: GivingWay, now: Situation, dt_s: float) -> Navigation:
         """Drive back, rest, and come again to the place where the base was blocked. All in odom."""
@@ -313,8 +312,9 @@ class Navigator:
         return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
 
     def _no_progress(self, now: Situation, does: str) -> Navigation:
-        why = [why] if (why := now.wheels.reason if _holds(now) else does) else []
-        return self._failed(": ".join([f"no progress for {self._settings.stuck_s:g} s", *why, "look at the robot"]))
+        why = now.wheels.reason if _holds(now) else does
+        words = f"no progress for {self._settings.stuck_s:g} s", why, "look at the robot"
+        return self._failed(": ".join(word for word in words if word))
 
     def _failed(self, reason: str) -> Navigation:
         self._end(NavigationState.FAILED, reason)
