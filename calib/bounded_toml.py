@@ -23,7 +23,8 @@ _STRINGS: Final = re.compile(
     r'|"(?!"")[^"\\\n]*+(?:\\.[^"\\\n]*+)*+"'
     r"|'(?!'')[^'\n]*+'"
     r"""|(?P<open>["'])"""
-    r"|#[^\n]*+")
+    r"|#[^\n]*+"
+)
 _SEPARATORS: Final = re.compile(r"[^\w.\"+-]+")
 _BLANKS: Final = str.maketrans("", "", " \t")
 

@@ -15,8 +15,7 @@ MAX_SCALAR: Final = 1000
 
 
 def parse_yaml(text: str) -> Any:
-    """Parse a YAML text; raise ValueError for one beyond the limits, and what ruamel.yaml raises for a malformed one.
-    """
+    """Parse a YAML text; raise ValueError for one beyond the limits, and ruamel.yaml's error for a malformed one."""
     if len(text) > MAX_BYTES:
         raise ValueError(f"expected at most {MAX_BYTES} characters, found {len(text)}")
     depth = nodes = 0

@@ -47,8 +47,7 @@ def parse_camera(text: str | bytes, folder: Path | None = None, name: str = "cam
 
 def camera_toml(file: CameraFile, quality: Quality | None = None, mask_image: str = "") -> str:
     """Return the text of a `camera.toml`; mask_image is the file name of the mask's image, "" embeds it."""
-    parts = [f"schema = {SCHEMA}\n", camera_text("camera", file.camera, ""),
-             intrinsics_text("camera", file.camera)]
+    parts = [f"schema = {SCHEMA}\n", camera_text("camera", file.camera, ""), intrinsics_text("camera", file.camera)]
     if file.mask is not None:
         parts.append(mask_text("camera", file.mask, mask_image))
     if quality is not None:
@@ -57,7 +56,13 @@ def camera_toml(file: CameraFile, quality: Quality | None = None, mask_image: st
 
 
 def _quality_text(quality: Quality) -> str:
-    lines = ["", "[quality]", f"mean_error_px = {round(quality.mean_error_px, 6)}", f"views = {quality.views}", "",
-             "[quality.standard_deviations]"]
+    lines = [
+        "",
+        "[quality]",
+        f"mean_error_px = {round(quality.mean_error_px, 6)}",
+        f"views = {quality.views}",
+        "",
+        "[quality.standard_deviations]",
+    ]
     lines += [f"{string_text(name)} = {sigma:.6g}" for name, _, sigma in quality.parameters]
     return "\n".join(lines) + "\n"

@@ -36,8 +36,9 @@ TANGENTIAL_KEYS, ASTIGMATISM_KEYS = ("p1", "p2"), ("s1", "s2")
 WAVEFRONT_KEYS = ("wavefront", "distance_m")
 
 
-def read_camera_table(table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
-                      ) -> tuple[OmniCamera, Mask | None]:
+def read_camera_table(
+    table: ValidatedTable, folder: Path | None, others: Collection[str] = ()
+) -> tuple[OmniCamera, Mask | None]:
     """Read camera and mask of a table; others: further keys that it may have; folder contains the mask's image."""
     model = table.choice("model", ("omni", "ocam", *LENS_KEYS, "equirectangular"))
     table.allow_only(("model", "size", "topic", "intrinsics", "mask", *others, *(["view"] if model == "ocam" else [])))
@@ -130,19 +131,20 @@ def _mask_image(values: ValidatedTable, folder: Path | None, size: tuple[int, in
 
 def _require_size(values: ValidatedTable, size: tuple[int, int], found: tuple[int, ...]) -> None:
     if found != size:
-        raise CalibError(f"{values.file}: {values.path}.image: expected {size} pixels (width, height) like the "
-                         f"camera's images, found {found}")
+        raise CalibError(
+            f"{values.file}: {values.path}.image: expected {size} pixels (width, height) like the "
+            f"camera's images, found {found}"
+        )
 
 
 def _is_animated(data: bytes) -> bool:
-    """True if a PNG has a chunk acTL before its pixels, or no pixels; OpenCV takes 10 bytes a pixel for an animation.
-    """
+    """True if a PNG has a chunk acTL before its pixels, or no pixels; OpenCV takes 10 bytes a pixel for animations."""
     offset = PNG_FIRST_CHUNK
     for _ in range(MAX_PNG_CHUNKS):
-        name = data[offset + 4:offset + 8]
+        name = data[offset + 4 : offset + 8]
         if name in (b"IDAT", b"acTL", b""):
             return name != b"IDAT"
-        offset += int.from_bytes(data[offset:offset + 4], "big") + PNG_CHUNK_BYTES
+        offset += int.from_bytes(data[offset : offset + 4], "big") + PNG_CHUNK_BYTES
     return True
 
 
@@ -156,7 +158,7 @@ def _decoded(values: ValidatedTable, data: bytes) -> NDArray[np.uint8]:
 
 def _embedded(values: ValidatedTable, source: str) -> bytes:
     try:
-        return base64.b64decode(source[len(EMBEDDED):], validate=True)
+        return base64.b64decode(source[len(EMBEDDED) :], validate=True)
     except (binascii.Error, ValueError):
         values.fail("image", "base64 after its prefix")
 
@@ -174,8 +176,7 @@ def png(image: NDArray[np.uint8]) -> bytes:
 
 def camera_text(name: str, camera: OmniCamera, topic: str) -> str:
     """Return the head of a camera's table; topic "" if unknown."""
-    lines = ["", f"[{name}]", f'model = "{model_name(camera)}"',
-             f"size = {[int(pixels) for pixels in camera.size]}"]
+    lines = ["", f"[{name}]", f'model = "{model_name(camera)}"', f"size = {[int(pixels) for pixels in camera.size]}"]
     if isinstance(camera, OcamCamera):
         lines.append(f'view = "{camera.view}"')
     if topic:
@@ -196,14 +197,21 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
             if any(terms):
                 named += [f"{key} = {number_text(value)}" for key, value in zip(keys, terms, strict=True)]
         if any(camera.wavefront):
-            named += [f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]",
-                      f"distance_m = {number_text(camera.distance_m)}"]
+            named += [
+                f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]",
+                f"distance_m = {number_text(camera.distance_m)}",
+            ]
     elif isinstance(camera, EquirectangularCamera):
-        named = [f"{key} = {number_text(value)}"
-                 for key, value in zip(PINHOLE_KEYS, (*camera.focal, *camera.center), strict=True)]
+        named = [
+            f"{key} = {number_text(value)}"
+            for key, value in zip(PINHOLE_KEYS, (*camera.focal, *camera.center), strict=True)
+        ]
     elif isinstance(camera, LensCamera):
-        lens = zip((*LENS_KEYS[model_name(camera)], *PINHOLE_KEYS),
-                   (*lens_parameters(camera), *camera.focal, *camera.center), strict=True)
+        lens = zip(
+            (*LENS_KEYS[model_name(camera)], *PINHOLE_KEYS),
+            (*lens_parameters(camera), *camera.focal, *camera.center),
+            strict=True,
+        )
         named = [f"{key} = {number_text(value)}" for key, value in lens]
     else:
         raise CalibError(f"rig file: {name}: expected a camera of a known model, found {type(camera).__name__}")
@@ -212,8 +220,12 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
 
 def mask_text(name: str, mask: Mask, image: str) -> str:
     """Return the table of the mask within a camera's table; image is the file name of its image, "" embeds it."""
-    lines = ["", f"[{name}.mask]", f"center = [{number_text(mask.center[0])}, {number_text(mask.center[1])}]",
-             f"inner_px = {number_text(mask.inner_px)}"]
+    lines = [
+        "",
+        f"[{name}.mask]",
+        f"center = [{number_text(mask.center[0])}, {number_text(mask.center[1])}]",
+        f"inner_px = {number_text(mask.inner_px)}",
+    ]
     if np.isfinite(mask.outer_px):
         lines.append(f"outer_px = {number_text(mask.outer_px)}")
     if mask.image is not None:

@@ -12,8 +12,22 @@ from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
 from calib.validation import ValidatedTable
 
 VERSION = 1  # the first: it rises when an earlier program would misread the file
-OCAM_NAMES = (*(f"a{power}" for power in range(MAX_COEFFICIENTS)), "center_row", "center_column", "c", "d", "p1", "p2",
-              "s1", "s2", "w_a", "w_b", "w_x", "w_y", "w_s")
+OCAM_NAMES = (
+    *(f"a{power}" for power in range(MAX_COEFFICIENTS)),
+    "center_row",
+    "center_column",
+    "c",
+    "d",
+    "p1",
+    "p2",
+    "s1",
+    "s2",
+    "w_a",
+    "w_b",
+    "w_x",
+    "w_y",
+    "w_s",
+)
 
 
 def read_covariance(table: ValidatedTable, cameras: tuple[OmniCamera, OmniCamera]) -> RigCovariance:
@@ -32,10 +46,19 @@ def read_covariance(table: ValidatedTable, cameras: tuple[OmniCamera, OmniCamera
 
 def _names(table: ValidatedTable, cameras: tuple[OmniCamera, OmniCamera]) -> tuple[str, ...]:
     names = table.values.get("parameters")
-    known = {*TRANSFORM_NAMES, *(f"{side} {name}" for side, camera in zip(("lower", "upper"), cameras, strict=True)
-                                 for name in (OCAM_NAMES if isinstance(camera, OcamCamera) else OMNI_KEYS))}
-    if not isinstance(names, list) or not 1 <= len(names) <= MAX_PARAMETERS or not all(
-            isinstance(name, str) and name in known for name in names):
+    known = {
+        *TRANSFORM_NAMES,
+        *(
+            f"{side} {name}"
+            for side, camera in zip(("lower", "upper"), cameras, strict=True)
+            for name in (OCAM_NAMES if isinstance(camera, OcamCamera) else OMNI_KEYS)
+        ),
+    }
+    if (
+        not isinstance(names, list)
+        or not 1 <= len(names) <= MAX_PARAMETERS
+        or not all(isinstance(name, str) and name in known for name in names)
+    ):
         table.fail("parameters", f"1 to {MAX_PARAMETERS} names of the cameras' parameters and of the transform's")
     return tuple(names)
 
@@ -57,5 +80,18 @@ def covariance_text(covariance: RigCovariance) -> str:
     names = ", ".join(map(string_text, covariance.names))
     sigmas = ", ".join(map(number_text, covariance.sigmas))
     rows = [f"    [{', '.join(map(number_text, row[:k]))}]," for k, row in enumerate(covariance.correlation)]
-    return "\n".join(["", "[covariance]", f"version = {VERSION}", f"parameters = [{names}]", f"sigma = [{sigmas}]",
-                      "correlation = [", *rows, "]"]) + "\n"
+    return (
+        "\n".join(
+            [
+                "",
+                "[covariance]",
+                f"version = {VERSION}",
+                f"parameters = [{names}]",
+                f"sigma = [{sigmas}]",
+                "correlation = [",
+                *rows,
+                "]",
+            ]
+        )
+        + "\n"
+    )

@@ -33,12 +33,16 @@ def stacked_rig(size: tuple[int, int], baseline_m: float) -> Rig:
     if not (np.isfinite(baseline_m) and MIN_BASELINE_M <= baseline_m <= MAX_BASELINE_M):
         raise CalibError(f"baseline: expected {MIN_BASELINE_M} to {MAX_BASELINE_M} m, found {baseline_m}")
     if size[0] != 2 * size[1] and size != HELVIPAD_SIZE:
-        raise CalibError(f"equirectangular images: expected twice as many columns as rows, a full turn by half a turn, "
-                         f"or {HELVIPAD_SIZE[0]}x{HELVIPAD_SIZE[1]} as Helvipad has, found {size[0]}x{size[1]}; rows "
-                         "that were cut off are told by pv in a rig.toml of the model equirectangular")
+        raise CalibError(
+            f"equirectangular images: expected twice as many columns as rows, a full turn by half a turn, "
+            f"or {HELVIPAD_SIZE[0]}x{HELVIPAD_SIZE[1]} as Helvipad has, found {size[0]}x{size[1]}; rows "
+            "that were cut off are told by pv in a rig.toml of the model equirectangular"
+        )
     camera = full_turn(size, HELVIPAD_TOP_PX if size == HELVIPAD_SIZE else 0)
-    lower, upper = (MountedCamera(camera, se3.inverse(se3.transform(R_RIG_CAM, np.array([0.0, 0.0, height_m]))))
-                    for height_m in (0.0, baseline_m))
+    lower, upper = (
+        MountedCamera(camera, se3.inverse(se3.transform(R_RIG_CAM, np.array([0.0, 0.0, height_m]))))
+        for height_m in (0.0, baseline_m)
+    )
     return Rig(lower, upper)
 
 
@@ -51,8 +55,10 @@ def import_helvipad(path: Path, images: Path) -> Rig:
         raise CalibError(f"{name}: not a JSON file: {' '.join(str(error).split())[:200]}") from error
     baseline = values.get("stereo_baseline") if isinstance(values, dict) else None
     if not isinstance(baseline, int | float) or isinstance(baseline, bool):
-        raise CalibError(f"{name}: expected the number 'stereo_baseline' [cm], as in Helvipad's calibration.json; "
-                         "`omnid calibrate import --equirectangular WIDTHxHEIGHT --baseline METRES` needs no file")
+        raise CalibError(
+            f"{name}: expected the number 'stereo_baseline' [cm], as in Helvipad's calibration.json; "
+            "`omnid calibrate import --equirectangular WIDTHxHEIGHT --baseline METRES` needs no file"
+        )
     return stacked_rig(_image_size(images), 0.01 * float(baseline))
 
 

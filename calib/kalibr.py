@@ -76,9 +76,11 @@ def _chain(cameras: dict[str, ValidatedTable]) -> tuple[dict[str, Array], bool]:
     """Return transforms from one common frame into each camera; True if that frame is the rig's, False if cam0's."""
     poses = {key: table.transform("T_cam_imu") for key, table in cameras.items() if table.has("T_cam_imu")}
     has_rig_frame = bool(poses)
-    links = [(before, key, cameras[key].transform("T_cn_cnm1"))
-             for before, key in pairwise(cameras)
-             if int(key[3:]) == int(before[3:]) + 1 and cameras[key].has("T_cn_cnm1")]
+    links = [
+        (before, key, cameras[key].transform("T_cn_cnm1"))
+        for before, key in pairwise(cameras)
+        if int(key[3:]) == int(before[3:]) + 1 and cameras[key].has("T_cn_cnm1")
+    ]
     if not has_rig_frame:
         poses[next(iter(cameras))] = np.eye(4)
     for before, key, T_key_before in links:
@@ -96,8 +98,10 @@ def _require_consistency(table: ValidatedTable, by_imu: Array, by_chain: Array) 
     gap = se3.inverse(by_imu) @ by_chain
     distance, angle = np.linalg.norm(by_imu[:3, 3] - by_chain[:3, 3]), np.linalg.norm(se3.rotation_log(gap[:3, :3]))
     if distance > MAX_DISAGREEMENT_M or angle > MAX_DISAGREEMENT_RAD:
-        raise CalibError(f"{table.file}: {table.path}: T_cam_imu and T_cn_cnm1 contradict each other by "
-                         f"{distance * 1e3:.1f} mm and {np.rad2deg(angle):.2f} deg; remove the one that is wrong")
+        raise CalibError(
+            f"{table.file}: {table.path}: T_cam_imu and T_cn_cnm1 contradict each other by "
+            f"{distance * 1e3:.1f} mm and {np.rad2deg(angle):.2f} deg; remove the one that is wrong"
+        )
 
 
 def _lower_and_upper(file: ValidatedTable, named: tuple[str, str], poses: dict[str, Array]) -> tuple[str, str]:
@@ -129,8 +133,10 @@ def _by_topic(file: ValidatedTable, names: list[str]) -> tuple[str, str] | None:
 def _by_height(file: ValidatedTable, names: list[str], poses: dict[str, Array]) -> tuple[str, str]:
     heights = [float(se3.inverse(poses[name])[2, 3]) for name in names if name in poses]
     if len(heights) < 2 or abs(heights[0] - heights[1]) < MIN_HEIGHT_M:
-        raise CalibError(f"{file.file}: neither topics nor heights identify the lower camera; name it, "
-                         f"--lower {names[0]} or --lower {names[1]}")
+        raise CalibError(
+            f"{file.file}: neither topics nor heights identify the lower camera; name it, "
+            f"--lower {names[0]} or --lower {names[1]}"
+        )
     return (names[0], names[1]) if heights[0] < heights[1] else (names[1], names[0])
 
 
@@ -174,14 +180,18 @@ def export_kalibr(rig: Rig) -> str:
 def _camera_text(mounted: MountedCamera, topic: str) -> str:
     camera = mounted.camera
     if not isinstance(camera, UnifiedCamera):
-        raise CalibError("export: Kalibr's camchain.yaml holds omni cameras, "
-                         f"found one of the model {model_name(camera)}; use --format ocam for an ocam camera")
+        raise CalibError(
+            "export: Kalibr's camchain.yaml holds omni cameras, "
+            f"found one of the model {model_name(camera)}; use --format ocam for an ocam camera"
+        )
     has_distortion = any(camera.distortion)
-    return (f"  camera_model: omni\n  intrinsics: {_row((camera.xi, *camera.focal, *camera.center))}\n"
-            f"  distortion_model: {'radtan' if has_distortion else 'none'}\n"
-            f"  distortion_coeffs: {_row(camera.distortion) if has_distortion else '[]'}\n"
-            f"  resolution: [{int(camera.size[0])}, {int(camera.size[1])}]\n"
-            f"  rostopic: {json.dumps(topic)}\n  T_cam_imu:\n{_matrix(mounted.T_cam_rig)}")
+    return (
+        f"  camera_model: omni\n  intrinsics: {_row((camera.xi, *camera.focal, *camera.center))}\n"
+        f"  distortion_model: {'radtan' if has_distortion else 'none'}\n"
+        f"  distortion_coeffs: {_row(camera.distortion) if has_distortion else '[]'}\n"
+        f"  resolution: [{int(camera.size[0])}, {int(camera.size[1])}]\n"
+        f"  rostopic: {json.dumps(topic)}\n  T_cam_imu:\n{_matrix(mounted.T_cam_rig)}"
+    )
 
 
 def _matrix(T: Array) -> str:

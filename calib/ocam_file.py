@@ -61,11 +61,16 @@ def parse_ocam(text: str | bytes, view: View = "mirror", name: str = "calib_resu
     """Parse the camera of a calib_results.txt's text; the inverse polynomial is checked and not used."""
     if len(text) > MAX_BYTES:
         raise CalibError(f"{name}: expected at most {MAX_BYTES} bytes, found {len(text)}")
-    lines = [_Line(number, line.split(), name) for number, line in enumerate(decode(text, name).splitlines(), 1)
-             if line.strip() and not line.lstrip().startswith("#")]
+    lines = [
+        _Line(number, line.split(), name)
+        for number, line in enumerate(decode(text, name).splitlines(), 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     if len(lines) != 5:
-        raise CalibError(f"{name}: expected 5 lines of numbers (polynomial, inverse polynomial, centre, affine, image "
-                         f"size), found {len(lines)}")
+        raise CalibError(
+            f"{name}: expected 5 lines of numbers (polynomial, inverse polynomial, centre, affine, image "
+            f"size), found {len(lines)}"
+        )
     polynomial = lines[0].counted("polynomial coefficients")
     lines[1].counted("inverse polynomial coefficients")
     row, column = lines[2].numbers("row and column of the centre", 2)
@@ -89,13 +94,17 @@ def export_ocam(camera: OmniCamera) -> str:
     if not isinstance(camera, OcamCamera):
         raise CalibError("export: calib_results.txt holds ocam cameras, found an omni camera; use --format kalibr")
     if any(camera.tangential) or any(camera.astigmatism) or any(camera.wavefront):
-        raise CalibError("export: calib_results.txt cannot hold the terms p1, p2, s1, s2, wavefront of this camera; "
-                         "calibrate with --model ocam")
+        raise CalibError(
+            "export: calib_results.txt cannot hold the terms p1, p2, s1, s2, wavefront of this camera; "
+            "calibrate with --model ocam"
+        )
     width, height = camera.size
     sections = (
         ("polynomial coefficients for the direct mapping: f(rho), constant first", _counted(camera.polynomial)),
-        ("polynomial coefficients for the inverse mapping: rho of the angle, constant first",
-         _counted(inverse_polynomial(camera))),
+        (
+            "polynomial coefficients for the inverse mapping: rho of the angle, constant first",
+            _counted(inverse_polynomial(camera)),
+        ),
         ('center: "row" and "column", starting from 0 (C convention)', _row(camera.center_row_column)),
         ('affine parameters "c", "d", "e"', _row(camera.affine)),
         ('image size: "height" and "width"', f"{int(height)} {int(width)}"),

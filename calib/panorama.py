@@ -124,32 +124,40 @@ class _Sector:
         return self.span_rad == 2 * math.pi
 
 
-def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0), scale: float = 1.0
-                 ) -> Cylinder:
+def fit_cylinder(
+    rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float] = (-50.0, 40.0), scale: float = 1.0
+) -> Cylinder:
     """Return the panorama of what both cameras see: a full turn or a sector of it, within elevations.
 
     width_px: columns of a full turn; 0: the resolution of the images, scaled.
     """
-    low, high = (np.tan(np.deg2rad(elevation_deg)))
+    low, high = np.tan(np.deg2rad(elevation_deg))
     slopes: Array = np.linspace(low, high, SLOPES)
     sector = _shared_sector(rig, slopes)
     if sector is None:
-        raise CalibError(f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
-                         "of elevation; check the intrinsics, the transforms and the masks")
+        raise CalibError(
+            f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
+            "of elevation; check the intrinsics, the transforms and the masks"
+        )
     # 1. Slopes that both cameras see over most of the sector.
-    seen = [_seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE
-            for mounted in (rig.lower, rig.upper)]
+    seen = [
+        _seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE for mounted in (rig.lower, rig.upper)
+    ]
     both = seen[0] & seen[1]
     if not both.any():
-        raise CalibError(f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no "
-                         f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
-                         "the transforms and the masks")
+        raise CalibError(
+            f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no "
+            f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
+            "the transforms and the masks"
+        )
     slopes = slopes[both]
     shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
     if shared_deg < MIN_SHARED_DEG:
-        raise CalibError(f"rig: the cameras share {shared_deg:.0f} degrees of elevation about the line through both "
-                         f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
-                         "check the transforms and the masks")
+        raise CalibError(
+            f"rig: the cameras share {shared_deg:.0f} degrees of elevation about the line through both "
+            f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
+            "check the transforms and the masks"
+        )
     # 2. Columns.
     turn = width_px
     if not turn:
@@ -174,9 +182,11 @@ def fit_cylinder(rig: Rig, width_px: int = 0, elevation_deg: tuple[float, float]
 
 
 def _too_large(found: str) -> CalibError:
-    return CalibError(f"rig: a panorama with the resolution of its images would have {found}, expected at most "
-                      f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or "
-                      "set panorama.width_px")
+    return CalibError(
+        f"rig: a panorama with the resolution of its images would have {found}, expected at most "
+        f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or "
+        "set panorama.width_px"
+    )
 
 
 def _shared_sector(rig: Rig, slopes: Array) -> _Sector | None:
@@ -209,8 +219,9 @@ def _azimuths(sector: _Sector) -> Array:
 
 def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> NDArray[np.bool_]:
     """Return flags (S, A) of slopes z/r (S,) that a camera sees at azimuths (A,)."""
-    grid = np.column_stack([np.tile(np.cos(azimuth), len(slopes)), np.tile(np.sin(azimuth), len(slopes)),
-                            np.repeat(slopes, len(azimuth))])
+    grid = np.column_stack(
+        [np.tile(np.cos(azimuth), len(slopes)), np.tile(np.sin(azimuth), len(slopes)), np.repeat(slopes, len(azimuth))]
+    )
     pixels = _project(rig, mounted, grid)
     seen = inside_image(mounted.camera, pixels) & mounted.visible.contains(pixels)
     return np.asarray(seen.reshape(len(slopes), -1))
@@ -221,16 +232,21 @@ def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
 
     That of a full circle is the length of the horizon.
     """
-    azimuth = np.linspace(0, 2 * math.pi, 361) if sector.is_full else (
-        sector.right_rad + np.linspace(0, sector.span_rad, 361))
+    azimuth = (
+        np.linspace(0, 2 * math.pi, 361)
+        if sector.is_full
+        else (sector.right_rad + np.linspace(0, sector.span_rad, 361))
+    )
     ring = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full_like(azimuth, 0.0 if sector.is_full else slope)])
     with np.errstate(over="ignore", invalid="ignore"):
         around = [np.linalg.norm(np.diff(_project(rig, m, ring), axis=0), axis=1) for m in (rig.lower, rig.upper)]
     # At the ends of a sector one of the cameras may have no image, and a stitched image has its ends somewhere on the
     # horizon: the median step stands for those.
     usual = [float(np.nanmedian(steps)) if np.isfinite(steps).any() else math.nan for steps in around]
-    lengths = [np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * 2 * math.pi / sector.span_rad
-               for steps, step in zip(around, usual, strict=True)]
+    lengths = [
+        np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * 2 * math.pi / sector.span_rad
+        for steps, step in zip(around, usual, strict=True)
+    ]
     if not np.isfinite(lengths).all() or min(lengths) < MIN_HORIZON_PX:
         raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
     return float(min(lengths))

@@ -16,8 +16,10 @@ from calib.rig import MountedCamera, Rig
 from calib.rig_file import parse_rig, rig_toml
 from calib.validation import read_bytes, toml_table
 
-HEADER = ("# A rig that omnid has refined while the robot drove. Delete this file to go back to the calibration.\n"
-          "# rig.refine in the configuration says whether a start uses it.\n")
+HEADER = (
+    "# A rig that omnid has refined while the robot drove. Delete this file to go back to the calibration.\n"
+    "# rig.refine in the configuration says whether a start uses it.\n"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,22 +39,28 @@ class RefinedRig:
     @property
     def summary(self) -> str:
         """Time of the refinement and the change, in one line."""
-        return (f"refined {self.written}: lengths {100 * self.lengths:+.3f} % (sigma {100 * self.lengths_sigma:.3f}) "
-                f"against the calibration, landmarks {self.error_px:.3f} -> {self.refined_error_px:.3f} px")
+        return (
+            f"refined {self.written}: lengths {100 * self.lengths:+.3f} % (sigma {100 * self.lengths_sigma:.3f}) "
+            f"against the calibration, landmarks {self.error_px:.3f} -> {self.refined_error_px:.3f} px"
+        )
 
     def applied_to(self, base: Rig) -> Rig:
         """Return the calibration with the refined cameras, transforms, times and covariance."""
-        lower, upper = (replace(own, camera=refined.camera, T_cam_rig=refined.T_cam_rig)
-                        for own, refined in ((base.lower, self.rig.lower), (base.upper, self.rig.upper)))
+        lower, upper = (
+            replace(own, camera=refined.camera, T_cam_rig=refined.T_cam_rig)
+            for own, refined in ((base.lower, self.rig.lower), (base.upper, self.rig.upper))
+        )
         return replace(base, lower=lower, upper=upper, covariance=self.rig.covariance, times=self.rig.times)
 
     def toml(self) -> str:
         """Return the text of the file."""
-        table = ("\n[refined]\n"
-                 f'base_sha256 = "{self.base_sha256}"\nwritten = "{self.written}"\n'
-                 f"keyframes = {self.keyframes}\nlandmarks = {self.landmarks}\n"
-                 f"error_px = {self.error_px:.6f}\nrefined_error_px = {self.refined_error_px:.6f}\n"
-                 f"lengths = {self.lengths:.8f}\nlengths_sigma = {self.lengths_sigma:.8f}\n")
+        table = (
+            "\n[refined]\n"
+            f'base_sha256 = "{self.base_sha256}"\nwritten = "{self.written}"\n'
+            f"keyframes = {self.keyframes}\nlandmarks = {self.landmarks}\n"
+            f"error_px = {self.error_px:.6f}\nrefined_error_px = {self.refined_error_px:.6f}\n"
+            f"lengths = {self.lengths:.8f}\nlengths_sigma = {self.lengths_sigma:.8f}\n"
+        )
         return HEADER + rig_toml(self.rig) + table
 
 
@@ -76,5 +84,14 @@ def read_refined_rig(path: Path) -> RefinedRig | None:
     names = ("error_px", "refined_error_px", "lengths", "lengths_sigma")
     refined.allow_only(("base_sha256", "written", "keyframes", "landmarks", *names))
     error_px, refined_error_px, lengths, lengths_sigma = (refined.number(name) for name in names)
-    return RefinedRig(rig, refined.text("base_sha256"), refined.text("written"), int(refined.number("keyframes")),
-                      int(refined.number("landmarks")), error_px, refined_error_px, lengths, lengths_sigma)
+    return RefinedRig(
+        rig,
+        refined.text("base_sha256"),
+        refined.text("written"),
+        int(refined.number("keyframes")),
+        int(refined.number("landmarks")),
+        error_px,
+        refined_error_px,
+        lengths,
+        lengths_sigma,
+    )

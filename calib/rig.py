@@ -28,8 +28,10 @@ class ShutterTimes:
 
     def __post_init__(self) -> None:
         if not (abs(self.upper_delay_s) <= MAX_UPPER_DELAY_S and abs(self.line_time_s) <= MAX_LINE_TIME_S):
-            raise CalibError(f"times of exposure: expected a delay of at most {MAX_UPPER_DELAY_S:g} s and a line time "
-                             f"of at most {MAX_LINE_TIME_S:g} s, found {self.upper_delay_s:g} and {self.line_time_s:g}")
+            raise CalibError(
+                f"times of exposure: expected a delay of at most {MAX_UPPER_DELAY_S:g} s and a line time "
+                f"of at most {MAX_LINE_TIME_S:g} s, found {self.upper_delay_s:g} and {self.line_time_s:g}"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +70,18 @@ class Rig:
     times: ShutterTimes = ShutterTimes()
 
     def __post_init__(self) -> None:
-        for name, T in (("lower T_cam_rig", self.lower.T_cam_rig), ("upper T_cam_rig", self.upper.T_cam_rig),
-                        ("T_base_rig", self.T_base_rig)):
+        for name, T in (
+            ("lower T_cam_rig", self.lower.T_cam_rig),
+            ("upper T_cam_rig", self.upper.T_cam_rig),
+            ("T_base_rig", self.T_base_rig),
+        ):
             if not se3.is_rigid(T):
                 raise CalibError(f"rig: {name} must be a 4x4 rotation and translation, found {np.round(T, 4).tolist()}")
         if self.baseline_m < MIN_BASELINE_M:
-            raise CalibError(f"rig: the viewpoints must lie apart, found {self.baseline_m * 1e3:.3f} mm; "
-                             "check that the transforms are T_cam_rig in metres")
+            raise CalibError(
+                f"rig: the viewpoints must lie apart, found {self.baseline_m * 1e3:.3f} mm; "
+                "check that the transforms are T_cam_rig in metres"
+            )
 
     @property
     def baseline_m(self) -> float:
@@ -92,8 +99,10 @@ class Rig:
     def at_height(self, height_m: float) -> Rig:
         """Return the rig with its lower viewpoint at a height above the base's origin."""
         if not LEAST_HEIGHT_M <= height_m <= MAX_HEIGHT_M:
-            raise CalibError(f"height of the cameras: expected {LEAST_HEIGHT_M:g} to {MAX_HEIGHT_M:g} m from the floor "
-                             f"to the lower viewpoint, found {height_m:g}")
+            raise CalibError(
+                f"height of the cameras: expected {LEAST_HEIGHT_M:g} to {MAX_HEIGHT_M:g} m from the floor "
+                f"to the lower viewpoint, found {height_m:g}"
+            )
         T_base_rig = self.T_base_rig.copy()
         T_base_rig[2, 3] = height_m - float(T_base_rig[2, :3] @ self.lower.viewpoint)
         return replace(self, T_base_rig=T_base_rig)
@@ -114,8 +123,10 @@ class Rig:
     def of_one_image(self, topic: str) -> Rig:
         """Return the rig whose two views are parts of the images of one topic; CalibError without masks for them."""
         if self.lower.mask is None or self.upper.mask is None:
-            raise CalibError(f"rig: topic {topic!r} is that of both cameras: [lower.mask] and [upper.mask] must tell "
-                             "which part of its images is whose")
+            raise CalibError(
+                f"rig: topic {topic!r} is that of both cameras: [lower.mask] and [upper.mask] must tell "
+                "which part of its images is whose"
+            )
         return replace(self, topics=(topic, topic))
 
     @property

@@ -38,8 +38,10 @@ class RigCovariance:
         if not 1 <= count <= MAX_PARAMETERS or len(set(self.names)) != count:
             raise CalibError(f"covariance: expected 1 to {MAX_PARAMETERS} different parameters, found {count}")
         if self.sigmas.shape != (count,) or self.correlation.shape != (count, count):
-            raise CalibError(f"covariance: expected {count} sigmas and {count} x {count} correlations, found "
-                             f"{self.sigmas.shape} and {self.correlation.shape}")
+            raise CalibError(
+                f"covariance: expected {count} sigmas and {count} x {count} correlations, found "
+                f"{self.sigmas.shape} and {self.correlation.shape}"
+            )
         if not ((self.sigmas >= 0) & (self.sigmas <= MAX_SIGMA)).all():
             raise CalibError(f"covariance: expected sigmas of 0 to {MAX_SIGMA:g}")
         unit = np.isfinite(self.correlation).all() and (np.diag(self.correlation) == 1).all()

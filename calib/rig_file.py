@@ -38,11 +38,13 @@ def read_rig(path: Path) -> Rig:
         raise CalibError(f"{path}: there is no such rig: `omnid calibrate import` or `omnid calibrate rig` makes one")
     text = read_bytes(path)
     if text.startswith(LOG_BEGINNINGS):
-        raise CalibError(f"{path}: a log, but a rig.toml was expected: without --rig the one attached to the log is "
-                         "used")
+        raise CalibError(
+            f"{path}: a log, but a rig.toml was expected: without --rig the one attached to the log is used"
+        )
     if path.suffix in OTHER_CALIBRATIONS:
-        raise CalibError(f"{path}: a rig.toml was expected: `omnid calibrate import {path} -o rig.toml` makes one of "
-                         "this file")
+        raise CalibError(
+            f"{path}: a rig.toml was expected: `omnid calibrate import {path} -o rig.toml` makes one of this file"
+        )
     return parse_rig(text, path.parent, str(path))
 
 

@@ -28,8 +28,9 @@ IDENTITY: Final = Pose2(0.0, 0.0, 0.0)
 def composed(first: Pose2, then: Pose2) -> Pose2:
     """Return the pose `then`, which is given in the axes of `first`, in the frame of `first`."""
     c, s = math.cos(first.yaw_rad), math.sin(first.yaw_rad)
-    return Pose2(first.x_m + c * then.x_m - s * then.y_m, first.y_m + s * then.x_m + c * then.y_m,
-                 first.yaw_rad + then.yaw_rad)
+    return Pose2(
+        first.x_m + c * then.x_m - s * then.y_m, first.y_m + s * then.x_m + c * then.y_m, first.yaw_rad + then.yaw_rad
+    )
 
 
 def relative(first: Pose2, second: Pose2) -> Pose2:

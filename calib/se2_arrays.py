@@ -1,5 +1,4 @@
-"""Poses on the floor (x, y, yaw) [m, m, rad] in arrays (3,) or (N, 3), and their transforms; single floats: `se2.py`.
-"""
+"""Poses on the floor (x, y, yaw) [m, m, rad] in arrays (3,) or (N, 3), and transforms; single floats: `se2.py`."""
 
 from __future__ import annotations
 

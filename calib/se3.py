@@ -170,8 +170,12 @@ def quaternion(R: ArrayLike) -> Array:
 def _quaternion_of_one(R: Array) -> Array:
     """Return `quaternion` of one matrix (3, 3)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
-    columns = ((1 + xx - yy - zz, xy + yx, xz + zx, zy - yz), (xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx),
-               (xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy), (zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz))
+    columns = (
+        (1 + xx - yy - zz, xy + yx, xz + zx, zy - yz),
+        (xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx),
+        (xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy),
+        (zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz),
+    )
     diagonal = [column[k] for k, column in enumerate(columns)]
     longest = columns[diagonal.index(max(diagonal))]
     length = math.hypot(*longest)

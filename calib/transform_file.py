@@ -30,7 +30,7 @@ def read_transform(path: Path) -> Array:
         numbers: list[object] = [float(word) for word in words]
     except ValueError as error:
         raise CalibError(f"{path}: expected 16 numbers, the rows of {KEY}: {error}") from error
-    rows = [numbers[start:start + 4] for start in range(0, len(numbers), 4)]
+    rows = [numbers[start : start + 4] for start in range(0, len(numbers), 4)]
     return ValidatedTable({KEY: rows}, str(path)).transform(KEY)
 
 

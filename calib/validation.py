@@ -68,8 +68,10 @@ class ValidatedTable:
         """Raise CalibError for unknown keys: a misspelt one must not stand for its default."""
         unknown = [str(key) for key in self.values if key not in known]
         if unknown:
-            raise CalibError(f"{self.file}: {self._dotted(repr(unknown[0])[1:-1][:SHOWN_CHARACTERS])}: unknown key, "
-                             f"expected one of {', '.join(sorted(known))}")
+            raise CalibError(
+                f"{self.file}: {self._dotted(repr(unknown[0])[1:-1][:SHOWN_CHARACTERS])}: unknown key, "
+                f"expected one of {', '.join(sorted(known))}"
+            )
 
     def has(self, key: str) -> bool:
         """True if the table has the key."""

@@ -132,8 +132,7 @@ def _png_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:
 
 
 def _is_animated(data: NDArray[np.uint8]) -> bool:
-    """True if a chunk acTL precedes the pixels, or they do not follow: OpenCV takes 10 bytes a pixel for an animation.
-    """
+    """True if a chunk acTL precedes the pixels, or they do not follow: OpenCV takes 10 bytes a pixel for animations."""
     offset = _PNG_FIRST_CHUNK
     for _ in range(_MAX_PNG_CHUNKS):
         length, name = data[offset : offset + 4].tobytes(), data[offset + 4 : offset + 8].tobytes()

@@ -33,13 +33,37 @@ if TYPE_CHECKING:
     from omnid.runs.run_result import RunResult
     from omnid.tracking_state import TrackingState
 
-__all__ = ["Board", "Config", "Odometry", "OdometryUpdate", "OmnidError", "RunResult", "TrackingState", "__version__",
-           "calibrate_camera", "calibrate_drive", "calibrate_height", "calibrate_rig", "load_config", "replay"]
-_MODULES = {"Board": "calib.boards.board", "Config": "omnid.config", "Odometry": "omnid.api",
-            "OdometryUpdate": "omnid.messages", "OmnidError": "omnid.errors", "RunResult": "omnid.runs.run_result",
-            "TrackingState": "omnid.tracking_state", "calibrate_camera": "omnid.calibration.camera",
-            "calibrate_drive": "omnid.calibration.drive", "calibrate_height": "omnid.calibration.height",
-            "calibrate_rig": "omnid.calibration.rig", "load_config": "omnid.config", "replay": "omnid.api"}
+__all__ = [
+    "Board",
+    "Config",
+    "Odometry",
+    "OdometryUpdate",
+    "OmnidError",
+    "RunResult",
+    "TrackingState",
+    "__version__",
+    "calibrate_camera",
+    "calibrate_drive",
+    "calibrate_height",
+    "calibrate_rig",
+    "load_config",
+    "replay",
+]
+_MODULES = {
+    "Board": "calib.boards.board",
+    "Config": "omnid.config",
+    "Odometry": "omnid.api",
+    "OdometryUpdate": "omnid.messages",
+    "OmnidError": "omnid.errors",
+    "RunResult": "omnid.runs.run_result",
+    "TrackingState": "omnid.tracking_state",
+    "calibrate_camera": "omnid.calibration.camera",
+    "calibrate_drive": "omnid.calibration.drive",
+    "calibrate_height": "omnid.calibration.height",
+    "calibrate_rig": "omnid.calibration.rig",
+    "load_config": "omnid.config",
+    "replay": "omnid.api",
+}
 
 if not TYPE_CHECKING:  # a type checker would take any name for one of this package
 

@@ -69,9 +69,12 @@ def replay(
     with _user_errors():
         loaded = _config(config, settings)
         ignored = unused_settings(loaded, "replay", settings)
-        options = ReplayOptions(rig=rig if rig is None or isinstance(rig, Rig) else Path(rig), topics=(lower, upper),
-                                collect=True,
-                                progress=None if progress is None else partial(_CallbackProgress, progress))
+        options = ReplayOptions(
+            rig=rig if rig is None or isinstance(rig, Rig) else Path(rig),
+            topics=(lower, upper),
+            collect=True,
+            progress=None if progress is None else partial(_CallbackProgress, progress),
+        )
         result = run_log(Path(log), loaded, options)
     if result.signal:
         signal.raise_signal(result.signal)  # the run has ended in order: now the caller's own handler
@@ -83,8 +86,9 @@ class _CallbackProgress:
 
     period_s = 0.2
 
-    def __init__(self, report: Callable[[int, int | None], object], statistics: RunStatistics, expected: int | None
-                 ) -> None:
+    def __init__(
+        self, report: Callable[[int, int | None], object], statistics: RunStatistics, expected: int | None
+    ) -> None:
         self._report, self._statistics, self._expected = report, statistics, expected
 
     def __call__(self) -> None:
@@ -131,8 +135,9 @@ class Odometry:
         self._skew = Skew()
         self._stamp_ns: int | None = None
 
-    def process(self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None = None
-                ) -> OdometryUpdate:
+    def process(
+        self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None = None
+    ) -> OdometryUpdate:
         """Return the pose at a pair of grey images (H, W) uint8 that were taken at stamp_ns, in ns of any clock.
 
         upper_stamp_ns: of the upper image, in the same clock, where the cameras are not synchronised; the motion in
@@ -168,16 +173,20 @@ class Odometry:
             return 0.0
         skew_ns = _nanoseconds("upper_stamp_ns", upper_stamp_ns) - stamp_ns
         if abs(skew_ns) >= MAX_SKEW_S * 1e9:
-            raise OmnidError(f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
-                             f"found {upper_stamp_ns}: give both in nanoseconds of one clock")
+            raise OmnidError(
+                f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
+                f"found {upper_stamp_ns}: give both in nanoseconds of one clock"
+            )
         self._skew.add(skew_ns)
         return self._skew.exposure_ns * 1e-9
 
     def _later_stamp_ns(self, stamp_ns: int) -> int:
         stamp_ns = _nanoseconds("stamp_ns", stamp_ns)
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            raise OmnidError(f"stamp_ns: expected a stamp after that of the previous pair, {self._stamp_ns}, found "
-                             f"{stamp_ns}: give the pairs in the order of time, each once")
+            raise OmnidError(
+                f"stamp_ns: expected a stamp after that of the previous pair, {self._stamp_ns}, found "
+                f"{stamp_ns}: give the pairs in the order of time, each once"
+            )
         return stamp_ns
 
     def _checked(self, name: Camera, image: InputImage) -> GreyImage:

@@ -16,9 +16,33 @@ from typing import Any, NoReturn
 from omnid.commands.examples import add_examples
 from omnid.version import __version__
 
-COMMANDS = ("run", "simulate", "replay", "demo", "eval", "calibrate", "cameras", "arm", "stop", "drive", "goto",
-            "route", "listen", "view", "web", "batch", "record", "report", "log", "map", "diff", "doctor",
-            "motor", "config", "install-service")
+COMMANDS = (
+    "run",
+    "simulate",
+    "replay",
+    "demo",
+    "eval",
+    "calibrate",
+    "cameras",
+    "arm",
+    "stop",
+    "drive",
+    "goto",
+    "route",
+    "listen",
+    "view",
+    "web",
+    "batch",
+    "record",
+    "report",
+    "log",
+    "map",
+    "diff",
+    "doctor",
+    "motor",
+    "config",
+    "install-service",
+)
 MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
 WRONG_INPUT = 2
 # What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.

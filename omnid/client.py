@@ -44,8 +44,24 @@ from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.transport.session import Unreachable
 from omnid.transport.topics import STOP
 
-__all__ = ["CONNECT_S", "HERE", "Answer", "Cloud", "Diagnostics", "Driver", "Fleet", "Map", "NavigationReport", "Pose",
-           "PoseAttachment", "Robot", "Scan", "Subscription", "Unreachable", "subscribe"]
+__all__ = [
+    "CONNECT_S",
+    "HERE",
+    "Answer",
+    "Cloud",
+    "Diagnostics",
+    "Driver",
+    "Fleet",
+    "Map",
+    "NavigationReport",
+    "Pose",
+    "PoseAttachment",
+    "Robot",
+    "Scan",
+    "Subscription",
+    "Unreachable",
+    "subscribe",
+]
 
 T = TypeVar("T")
 _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
@@ -63,8 +79,13 @@ _POLL_S: Final = 0.002
 class Subscription(Generic[T]):
     """The newest message of one kind; broken: messages that could not be decoded."""
 
-    def __init__(self, session: zenoh.Session, key: str, decode: Callable[[bytes, bytes], T],
-                 on_close: Callable[[], None] | None = None) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        decode: Callable[[bytes, bytes], T],
+        on_close: Callable[[], None] | None = None,
+    ) -> None:
         self._decode, self._on_close = decode, on_close
         self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         self._latched = _queried(session, key)
@@ -133,8 +154,13 @@ class Robot:
     settings: for TLS, user and password; the same as section [bus] of omnid's configuration.
     """
 
-    def __init__(self, robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None,
-                 timeout_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        robot: str = "omnid",
+        connect: tuple[str, ...] = (HERE,),
+        settings: BusConfig | None = None,
+        timeout_s: float = 0.0,
+    ) -> None:
         """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
         given = settings or BusConfig(robot=robot, connect=connect)
         self.name = given.robot
@@ -254,8 +280,13 @@ class Fleet:
 
     def stop(self, robot: str) -> None:
         """Stop the wheels of a robot until it is armed; may block while it does not read."""
-        self._session.put(f"{robot}/{STOP}", b"", congestion_control=zenoh.CongestionControl.BLOCK,
-                          priority=zenoh.Priority.REAL_TIME, express=True)
+        self._session.put(
+            f"{robot}/{STOP}",
+            b"",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        )
 
     def close(self) -> None:
         """End the connection; a second call does nothing."""
@@ -269,8 +300,9 @@ class Fleet:
         self.close()
 
 
-def subscribe(robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None,
-              timeout_s: float = 0.0) -> Subscription[Pose]:
+def subscribe(
+    robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None, timeout_s: float = 0.0
+) -> Subscription[Pose]:
     """Subscribe to a robot's poses over a connection of their own; arguments as those of Robot."""
     connection = Robot(robot, connect, settings, timeout_s)
     return connection._subscription(Pose, connection.close)

@@ -44,19 +44,25 @@ class CamerasConfig:
     height_px: int = knob(960, "height of the images, px", low=16, high=16384)
     rate_hz: float = knob(30.0, "images per second; 0: the camera's own rate", low=0, high=1000)
     pixel_format: str = knob("auto", "pixel format of the images on USB", choices=PIXEL_FORMATS)
-    auto_exposure: str = knob("rig", "automatic exposure; 'rig': omnid run sets exposure and gain of both cameras "
-                              "alike, by what the mirrors show without the black corners; where they cannot be set, "
-                              "and in other commands, as 'on'; 'on': each camera's own; 'keep': as it is",
-                              choices=EXPOSURE_MODES)
-    exposure_limit_ms: float = knob(20.0, "longest exposure of 'rig', ms, and at most 90 % of the images' period; "
-                                    "1 ms blurs by 0.16 px in a turn of 45 deg/s (panorama of 1300 columns)",
-                                    low=0.1, high=1000)
+    auto_exposure: str = knob(
+        "rig",
+        "automatic exposure; 'rig': omnid run sets exposure and gain of both cameras "
+        "alike, by what the mirrors show without the black corners; where they cannot be set, "
+        "and in other commands, as 'on'; 'on': each camera's own; 'keep': as it is",
+        choices=EXPOSURE_MODES,
+    )
+    exposure_limit_ms: float = knob(
+        20.0,
+        "longest exposure of 'rig', ms, and at most 90 % of the images' period; "
+        "1 ms blurs by 0.16 px in a turn of 45 deg/s (panorama of 1300 columns)",
+        low=0.1,
+        high=1000,
+    )
     exposure_us: int = knob(0, "fixed exposure, us; 0: not fixed", low=0, high=10_000_000)
     auto_gain: str = knob("keep", "automatic gain", choices=SWITCH)
     gain: int = knob(-1, "fixed gain in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
     auto_white_balance: str = knob("keep", "automatic white balance", choices=SWITCH)
-    auto_focus: str = knob("keep", "automatic focus; best off: each focus has another calibration",
-                           choices=SWITCH)
+    auto_focus: str = knob("keep", "automatic focus; best off: each focus has another calibration", choices=SWITCH)
     focus: int = knob(-1, "fixed focus in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
     power_line: str = knob("keep", "mains frequency against the flicker of lamps, Hz", choices=POWER_LINE)
     controls: tuple[str, ...] = knob((), "other controls by their names in v4l2-ctl --list-ctrls: 'sharpness=2'")
@@ -72,8 +78,10 @@ class CamerasConfig:
     def require_two_devices(self) -> None:
         """Raise DriverError where both cameras are one device, which cannot be opened twice."""
         if self.lower == self.upper:
-            raise DriverError(f"cameras.lower and cameras.upper are both {self.lower!r}, expected two devices: images "
-                              "that hold both views are read from logs only")
+            raise DriverError(
+                f"cameras.lower and cameras.upper are both {self.lower!r}, expected two devices: images "
+                "that hold both views are read from logs only"
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +90,9 @@ class LiveConfig:
 
     status_s: float = knob(1.0, "period of the status, s", low=0.1, high=60)
     cloud_s: float = knob(2.0, "period of the maps on the bus, s; 0: only at the end", low=0, high=3600)
-    cloud_points: int = knob(50_000, "largest number of map points on the bus: the most confident ones", low=0,
-                             high=10_000_000)
+    cloud_points: int = knob(
+        50_000, "largest number of map points on the bus: the most confident ones", low=0, high=10_000_000
+    )
     shed_load: bool = knob(True, "give up the map, then half the landmarks, while the computer is too slow")
 
 
@@ -91,13 +100,21 @@ class LiveConfig:
 class RigConfig:
     """Is the rig right? Checks, and refinement; the file of the calibration, cameras.rig, is never written."""
 
-    check: str = knob("refuse", "if the first images contradict the rig: end with an error, warn only, or do not "
-                      "check", choices=("refuse", "warn", "off"))
-    check_s: float = knob(5.0, "time between two views that a live run compares with the rig, s; 0: none", low=0,
-                          high=3600)
-    refine: str = knob("report", "estimate all parameters of the rig from windows of keyframes, in a process of low "
-                       "priority; where they do not fit, report it and write the refined rig to refined_file; 'use': "
-                       "the next start uses that file", choices=("off", "report", "use"))
+    check: str = knob(
+        "refuse",
+        "if the first images contradict the rig: end with an error, warn only, or do not check",
+        choices=("refuse", "warn", "off"),
+    )
+    check_s: float = knob(
+        5.0, "time between two views that a live run compares with the rig, s; 0: none", low=0, high=3600
+    )
+    refine: str = knob(
+        "report",
+        "estimate all parameters of the rig from windows of keyframes, in a process of low "
+        "priority; where they do not fit, report it and write the refined rig to refined_file; 'use': "
+        "the next start uses that file",
+        choices=("off", "report", "use"),
+    )
     refined_file: str = knob("rig.refined.toml", "file of the refined rig; delete it to go back to the calibration")
     refine_keyframes: int = knob(20, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
     refine_s: float = knob(300.0, "time between two windows, s", low=0, high=86_400)
@@ -107,22 +124,37 @@ class RigConfig:
 class PairConfig:
     """Synchronisation of the cameras."""
 
-    tolerance_ms: float = knob(0.0, "largest difference between the stamps of a pair, ms; 0: half the period of the "
-                               "images, so that cameras may run freely", low=0, high=1000)
-    repeated_images: str = knob("drop", "images with all pixels as before, which a frozen camera delivers; 'use' only "
-                                "for simulators without noise", choices=("drop", "use"))
+    tolerance_ms: float = knob(
+        0.0,
+        "largest difference between the stamps of a pair, ms; 0: half the period of the "
+        "images, so that cameras may run freely",
+        low=0,
+        high=1000,
+    )
+    repeated_images: str = knob(
+        "drop",
+        "images with all pixels as before, which a frozen camera delivers; 'use' only for simulators without noise",
+        choices=("drop", "use"),
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class TimingConfig:
     """Times of exposure of the cameras, beside the stamps; 0: as the rig's file says, see `omnid calibrate drive`."""
 
-    line_time_us: float = knob(0.0, "rolling shutter: time from the exposure of an image row to that of the next, us; "
-                               "the stamp is that of the first row; 0: as in the rig's file, or global", low=0,
-                               high=1000)
-    upper_delay_ms: float = knob(0.0, "time by which the upper camera's exposure is later than the stamps say, ms; "
-                                 "0: as in the rig's file",
-                                 low=-1000, high=1000)
+    line_time_us: float = knob(
+        0.0,
+        "rolling shutter: time from the exposure of an image row to that of the next, us; "
+        "the stamp is that of the first row; 0: as in the rig's file, or global",
+        low=0,
+        high=1000,
+    )
+    upper_delay_ms: float = knob(
+        0.0,
+        "time by which the upper camera's exposure is later than the stamps say, ms; 0: as in the rig's file",
+        low=-1000,
+        high=1000,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,13 +195,19 @@ class PlacesConfig:
     """Recognition of places: loops, and the pose in the map."""
 
     enabled: bool = knob(True, "recognise places and correct the pose in the map; off: it is that of odometry")
-    map: str = knob("", "map of places (.omap) to localise in; a run that recognises it extends it, and makes it "
-                    "where there is none")
+    map: str = knob(
+        "",
+        "map of places (.omap) to localise in; a run that recognises it extends it, and makes it where there is none",
+    )
     localize_only: bool = knob(False, "leave the map as it is: do not extend the file, do not move its keyframes")
-    save_s: float = knob(60.0, "time between two saves of the extended map, s; it is also saved at the end",
-                         low=1, high=86400)
-    tags: str = knob("", "TOML file of AprilTags (36h11) that are to be landmarks, with names, numbers and sizes; a "
-                     "map knows its own ones")
+    save_s: float = knob(
+        60.0, "time between two saves of the extended map, s; it is also saved at the end", low=1, high=86400
+    )
+    tags: str = knob(
+        "",
+        "TOML file of AprilTags (36h11) that are to be landmarks, with names, numbers and sizes; a "
+        "map knows its own ones",
+    )
     limits: PlaceLimits = field(default_factory=PlaceLimits)
 
 
@@ -181,10 +219,15 @@ class MappingConfig:
     voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
     log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
     max_sigma_m: float = knob(0.15, "largest sigma of a point that enters the map, m", low=0.001, high=100)
-    min_frames: int = knob(6, "frames that must have observed a voxel that is written; fewer in a short run",
-                           low=1, high=1000)
-    path_poses: int = knob(10_000, "vertices of the path in the plan view; when full, every second one is dropped",
-                           low=100, high=10_000_000)
+    min_frames: int = knob(
+        6, "frames that must have observed a voxel that is written; fewer in a short run", low=1, high=1000
+    )
+    path_poses: int = knob(
+        10_000,
+        "vertices of the path in the plan view; when full, every second one is dropped",
+        low=100,
+        high=10_000_000,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,19 +249,20 @@ class RecordConfig:
     file_s: float = knob(600.0, "duration at which a new file begins, s", low=1, high=86_400)
     keep_files: int = knob(1000, "number of files kept; the oldest are deleted", low=1, high=100_000)
     keep_mb: int = knob(20_000, "total size of all files, MB; the oldest are deleted", low=2, high=1_000_000_000)
-    free_mb: int = knob(1000, "free space left on the disk, MB; with less nothing is recorded", low=0,
-                        high=1_000_000)
-    sync_s: float = knob(3.0, "period of syncing the files to the disk, s: a power cut loses no more", low=0.1,
-                         high=3600)
-    queue: int = knob(20, "messages of each kind that may wait for the disk; more drop the oldest",
-                      low=1, high=1000)
-    cloud_points: int = knob(200_000, "largest number of map points in the log: the most confident ones", low=0,
-                             high=10_000_000)
+    free_mb: int = knob(1000, "free space left on the disk, MB; with less nothing is recorded", low=0, high=1_000_000)
+    sync_s: float = knob(
+        3.0, "period of syncing the files to the disk, s: a power cut loses no more", low=0.1, high=3600
+    )
+    queue: int = knob(20, "messages of each kind that may wait for the disk; more drop the oldest", low=1, high=1000)
+    cloud_points: int = knob(
+        200_000, "largest number of map points in the log: the most confident ones", low=0, high=10_000_000
+    )
 
     def rotation(self) -> RotationSettings:
         """Return these settings in the units of the driver."""
-        return RotationSettings(self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6,
-                                self.free_mb * 10**6, self.sync_s)
+        return RotationSettings(
+            self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6, self.free_mb * 10**6, self.sync_s
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,8 +277,9 @@ class GraphConfig:
 class ServiceConfig:
     """Supervision by systemd."""
 
-    stall_timeout_s: float = knob(10.0, "systemd restarts the daemon if a stage works on one message for longer, s",
-                                  low=0.5, high=600)
+    stall_timeout_s: float = knob(
+        10.0, "systemd restarts the daemon if a stage works on one message for longer, s", low=0.5, high=600
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,22 +321,24 @@ class Config:
 
 
 # Keys of earlier versions: old dotted path of a key or section -> its new path, or what to do where there is none.
-RENAMED: Final[Mapping[str, str]] = MappingProxyType({
-    "guidance": "controller.setpoint",
-    "guidance.limits": "controller.heading",
-    "helm": "controller",
-    "service.hung_s": "service.stall_timeout_s",
-    "motor.stale_s": "controller.deadlines.command_s",
-    "stereo.matching.rival": "stereo.matching.runner_up_ratio",
-    "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",
-    "odometry.limits.min_share": "odometry.limits.min_inlier_ratio",
-    "odometry.limits.sure_inliers": "odometry.limits.good_inliers",
-    "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
-    "stereo.rig_check": "rig.check",
-    "live.check_s": "rig.check_s",
-    "navigation.blocked_s": "a blocked base gives way (navigation.give_way_s) and goes on by itself",
-    "mapping.heights_m": "obstacles.ring.heights_m, which are above the floor",
-})
+RENAMED: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "guidance": "controller.setpoint",
+        "guidance.limits": "controller.heading",
+        "helm": "controller",
+        "service.hung_s": "service.stall_timeout_s",
+        "motor.stale_s": "controller.deadlines.command_s",
+        "stereo.matching.rival": "stereo.matching.runner_up_ratio",
+        "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",
+        "odometry.limits.min_share": "odometry.limits.min_inlier_ratio",
+        "odometry.limits.sure_inliers": "odometry.limits.good_inliers",
+        "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
+        "stereo.rig_check": "rig.check",
+        "live.check_s": "rig.check_s",
+        "navigation.blocked_s": "a blocked base gives way (navigation.give_way_s) and goes on by itself",
+        "mapping.heights_m": "obstacles.ring.heights_m, which are above the floor",
+    }
+)
 
 
 def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:
@@ -308,7 +355,20 @@ def migrated_config(path: str | PathLike[str]) -> tuple[Config, list[str]]:
 
 
 # The settings that a new robot needs, in `omnid config --minimal`.
-FIRST_SETTINGS: Final = ("cameras.rig", "cameras.lower", "cameras.upper", "cameras.width_px", "cameras.height_px",
-                         "cameras.rate_hz", "controller.limits.velocity_mps", "controller.limits.yaw_rate_radps",
-                         "motor.port", "motor.protocol", "motor.drive.track_m", "bus.robot", "bus.listen",
-                         "record.enabled", "record.folder")
+FIRST_SETTINGS: Final = (
+    "cameras.rig",
+    "cameras.lower",
+    "cameras.upper",
+    "cameras.width_px",
+    "cameras.height_px",
+    "cameras.rate_hz",
+    "controller.limits.velocity_mps",
+    "controller.limits.yaw_rate_radps",
+    "motor.port",
+    "motor.protocol",
+    "motor.drive.track_m",
+    "bus.robot",
+    "bus.listen",
+    "record.enabled",
+    "record.folder",
+)

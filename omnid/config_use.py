@@ -11,24 +11,26 @@ from omnid.errors import OmnidError
 from omnid.settings import changed
 
 # Keys and sections that only one of `omnid run` and `omnid replay` uses; the longest path counts. "": both use it.
-USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType({
-    "bus.panorama_hz": "run",
-    "cameras": "run",
-    "controller.arming": "run",
-    "controller.setpoint": "replay",
-    "controller.sources": "run",
-    "graph.depth": "replay",
-    "live": "run",
-    "log": "replay",
-    "places.save_s": "run",
-    "navigation": "run",
-    "realtime": "run",
-    "record": "run",
-    "record.cloud_points": "",
-    "rig": "run",
-    "rig.check": "",
-    "service": "run",
-})
+USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "bus.panorama_hz": "run",
+        "cameras": "run",
+        "controller.arming": "run",
+        "controller.setpoint": "replay",
+        "controller.sources": "run",
+        "graph.depth": "replay",
+        "live": "run",
+        "log": "replay",
+        "places.save_s": "run",
+        "navigation": "run",
+        "realtime": "run",
+        "record": "run",
+        "record.cloud_points": "",
+        "rig": "run",
+        "rig.check": "",
+        "service": "run",
+    }
+)
 
 
 def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> list[str]:
@@ -45,8 +47,10 @@ def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> l
     if command == "run":
         for path in ignored:
             if path.startswith("controller.setpoint."):
-                raise OmnidError(f"{path} is set, but `omnid run` drives by the setpoints that it receives, as "
-                                 "cmd/twist or cmd/heading: remove it from the configuration")
+                raise OmnidError(
+                    f"{path} is set, but `omnid run` drives by the setpoints that it receives, as "
+                    "cmd/twist or cmd/heading: remove it from the configuration"
+                )
     return [f"`omnid {command}` does not use these settings: {', '.join(ignored)}"] if ignored else []
 
 

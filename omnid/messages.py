@@ -111,8 +111,10 @@ class OdometryUpdate:
         """Return one line: number, state, position, heading and sigma of the position."""
         x_m, y_m, z_m = self.position
         sigma_mm = 1e3 * math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
-        return (f"<pose {self.seq}: {self.state}, x {x_m:+.3f} y {y_m:+.3f} z {z_m:+.3f} m, "
-                f"heading {math.degrees(se3.yaw(self.T_odom_rig)):+.2f} deg, sigma {sigma_mm:.1f} mm>")
+        return (
+            f"<pose {self.seq}: {self.state}, x {x_m:+.3f} y {y_m:+.3f} z {z_m:+.3f} m, "
+            f"heading {math.degrees(se3.yaw(self.T_odom_rig)):+.2f} deg, sigma {sigma_mm:.1f} mm>"
+        )
 
     @property
     def position(self) -> Array:

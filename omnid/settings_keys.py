@@ -55,11 +55,17 @@ class Keys:
         """Return the error for a key that never existed; it proposes similar ones of the section, else of the file."""
         neighbours = [other[: len(path)] for other in self.known if other[: len(path) - 1] == path[:-1]]
         family = [other for other in self.known if other[0] == path[0]]
-        near = (_alike(path, neighbours) or _alike(path, family) or _sharing_a_word(path, family)
-                or _alike(path, self.known))
+        near = (
+            _alike(path, neighbours)
+            or _alike(path, family)
+            or _sharing_a_word(path, family)
+            or _alike(path, self.known)
+        )
         if near:
-            return OmnidError(f"unknown key {dotted(path)}: did you mean {' or '.join(map(dotted, near))}? "
-                              "`omnid config` explains each key")
+            return OmnidError(
+                f"unknown key {dotted(path)}: did you mean {' or '.join(map(dotted, near))}? "
+                "`omnid config` explains each key"
+            )
         names = ", ".join(map(dotted, dict.fromkeys(neighbours)))
         return OmnidError(f"unknown key {dotted(path)}: known are {names}")
 

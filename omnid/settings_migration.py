@@ -18,8 +18,11 @@ def load_renamed(root: type[T], path: str | PathLike[str], renamed: Mapping[str,
     renamed: as in `omnid.settings.load`. Raises OmnidError as `load` does, also for a removed key.
     """
     table = read_table(path)
-    lines = [line for old in sorted(renamed, key=lambda old: -old.count("."))  # keys before their sections
-             for line in _moved(table, tuple(old.split(".")), renamed[old])]
+    lines = [
+        line
+        for old in sorted(renamed, key=lambda old: -old.count("."))  # keys before their sections
+        for line in _moved(table, tuple(old.split(".")), renamed[old])
+    ]
     return from_table(root, table, str(path), renamed), lines
 
 

@@ -26,8 +26,10 @@ from tests.busy import busy_processes
 
 ROOT: Final = Path(__file__).parents[1]
 COMMAND: Final = re.compile(r"-e '\.\[test\]' && \S+/python (-m pytest .*)$", re.MULTILINE)
-HEADER: Final = ("| run | busy processes | passed | failed | skipped | time, s | processor time, s | failures |\n"
-                 "|---|---|---|---|---|---|---|---|")
+HEADER: Final = (
+    "| run | busy processes | passed | failed | skipped | time, s | processor time, s | failures |\n"
+    "|---|---|---|---|---|---|---|---|"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +49,10 @@ class Run:
     def row(self) -> str:
         """Return the row of the table."""
         what = ", ".join(f"`{name}`" for name in self.failures) or ("" if self.is_good else f"exit {self.exit_code}")
-        return (f"| {self.number} | {self.busy} | {self.passed} | {self.failed} | {self.skipped} | {self.took_s:.0f} "
-                f"| {self.processor_s:.0f} | {what} |")
+        return (
+            f"| {self.number} | {self.busy} | {self.passed} | {self.failed} | {self.skipped} | {self.took_s:.0f} "
+            f"| {self.processor_s:.0f} | {what} |"
+        )
 
     @property
     def is_good(self) -> bool:
@@ -69,8 +73,9 @@ def one_run(number: int, busy: int, words: Sequence[str], timeout_s: float, *, b
         report = Path(name) / "report.xml"
         command = [sys.executable, *readme_command(), "-q", f"--junitxml={report}", *words]
         begin_s, before_s = time.monotonic(), _children_s()
-        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL,
-                                   preexec_fn=_ignore_interrupts if background else None)
+        process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.DEVNULL, preexec_fn=_ignore_interrupts if background else None
+        )
         try:
             code = process.wait(timeout_s)
         except subprocess.TimeoutExpired:

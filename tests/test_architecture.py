@@ -24,16 +24,15 @@ LAYERS = ("calib", "drivers", "omnid")
 TIERS: Mapping[str, str] = {
     "geometry": "calib",
     "hardware and logs": "drivers",
-    "settings and states":
-        "omnid.errors omnid.version omnid.load_level omnid.navigation_state omnid.tracking_state omnid.settings "
-        "omnid.settings_file omnid.settings_keys omnid.settings_migration omnid.settings_dump omnid.sample "
-        "omnid.plain_text omnid.utc",
+    "settings and states": "omnid.errors omnid.version omnid.load_level omnid.navigation_state omnid.tracking_state "
+    "omnid.settings omnid.settings_file omnid.settings_keys omnid.settings_migration omnid.settings_dump omnid.sample "
+    "omnid.plain_text omnid.utc",
     "numerics": "omnid.core",
     "threads, queues, the controller process": "omnid.engine omnid.controller",
     "messages, formats, bus": "omnid.messages omnid.config omnid.config_use omnid.formats omnid.transport",
     "parts of a run": "omnid.stages omnid.recordings omnid.service",
-    "what watches and writes a run":
-        "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration omnid.refinement omnid.batch",
+    "what watches and writes a run": "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration "
+    "omnid.refinement omnid.batch",
     "runs and clients": "omnid.runs omnid.simulation omnid.client omnid.monitor omnid.doctor",
     "interfaces": "omnid omnid.api omnid.web omnid.viewer omnid.examples omnid.commands omnid.cli omnid.__main__",
 }
@@ -59,14 +58,33 @@ RULES = (
     Rule("omnid.web", ("omnid.stages", "omnid.runs", "omnid.controller", "drivers.cameras", "drivers.motors")),
     Rule("calib", ("threading", "_thread", "time", "socket", "logging")),
     Rule("drivers.motors", ("numpy", "cv2")),
-    Rule("omnid", ("threading", "_thread"),
-         excepted=("omnid/engine/graph.py", "omnid/engine/inbox.py", "omnid/engine/bounded_call.py",
-                   "omnid/engine/one_at_a_time.py", "omnid/engine/poller.py", "omnid/engine/ticker.py")),
-    Rule("omnid", ("zenoh",),
-         excepted=("omnid/transport/bus.py", "omnid/transport/command_intake.py", "omnid/transport/namesakes.py",
-                   "omnid/transport/open_requests.py", "omnid/transport/publishers.py",
-                   "omnid/transport/session.py", "omnid/transport/client_session.py", "omnid/transport/driver.py",
-                   "omnid/client.py")),
+    Rule(
+        "omnid",
+        ("threading", "_thread"),
+        excepted=(
+            "omnid/engine/graph.py",
+            "omnid/engine/inbox.py",
+            "omnid/engine/bounded_call.py",
+            "omnid/engine/one_at_a_time.py",
+            "omnid/engine/poller.py",
+            "omnid/engine/ticker.py",
+        ),
+    ),
+    Rule(
+        "omnid",
+        ("zenoh",),
+        excepted=(
+            "omnid/transport/bus.py",
+            "omnid/transport/command_intake.py",
+            "omnid/transport/namesakes.py",
+            "omnid/transport/open_requests.py",
+            "omnid/transport/publishers.py",
+            "omnid/transport/session.py",
+            "omnid/transport/client_session.py",
+            "omnid/transport/driver.py",
+            "omnid/client.py",
+        ),
+    ),
     Rule("omnid.core", ("threading", "time", "logging", "socket", "subprocess")),
     Rule("omnid.core.control", ("numpy", "cv2")),
     Rule("omnid.controller", ("cv2",)),
@@ -173,8 +191,12 @@ def test_every_room_has_a_tier_and_every_tier_names_rooms_that_exist() -> None:
 
 
 def test_imports_point_to_the_same_or_a_lower_tier() -> None:
-    upward = [f"{room} -> {target}" for room, targets in measured_arrows(ROOT).items() for target in sorted(targets)
-              if (tier_of(room) or 0) < (tier_of(target) or 0)]
+    upward = [
+        f"{room} -> {target}"
+        for room, targets in measured_arrows(ROOT).items()
+        for target in sorted(targets)
+        if (tier_of(room) or 0) < (tier_of(target) or 0)
+    ]
     assert upward == []
 
 

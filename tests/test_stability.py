@@ -22,9 +22,27 @@ def test_reads_the_command_and_the_outcomes() -> None:
 
 def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path) -> None:
     (tmp_path / "test_one.py").write_text("def test_good():\n    pass\n\ndef test_bad():\n    assert False\n")
-    command = [sys.executable, "-m", "tests.stability", "--idle", "1", "--busy", "1", "--processes", "1", "--json",
-               str(tmp_path / "rows.json"), "--", "-n", "0", "--rootdir", str(tmp_path), "--override-ini",
-               "testpaths=", str(tmp_path / "test_one.py")]
+    command = [
+        sys.executable,
+        "-m",
+        "tests.stability",
+        "--idle",
+        "1",
+        "--busy",
+        "1",
+        "--processes",
+        "1",
+        "--json",
+        str(tmp_path / "rows.json"),
+        "--",
+        "-n",
+        "0",
+        "--rootdir",
+        str(tmp_path),
+        "--override-ini",
+        "testpaths=",
+        str(tmp_path / "test_one.py"),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "2 runs, 2 with failures" in done.stdout, done.stderr
     rows = json.loads((tmp_path / "rows.json").read_text())

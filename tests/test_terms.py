@@ -28,7 +28,7 @@ PROSE = ("whoever", "nobody", "amiss", "anew", "heed", "heeds", "sight", "sights
 FIRST_WORDS = ("What", "Whether", "Where", "How", "Which", "Who", "Whose", "Why", "When")
 # Only files in which one of these occurs are tokenized or parsed, which takes much longer.
 ANY_WORD = re.compile("|".join(WORDS))
-ANY_FIRST_WORD = re.compile(rf"""["'](?:\\?\s)*(?:{'|'.join(FIRST_WORDS)})\s""")
+ANY_FIRST_WORD = re.compile(rf"""["'](?:\\?\s)*(?:{"|".join(FIRST_WORDS)})\s""")
 
 
 def python_files() -> list[Path]:
@@ -38,8 +38,9 @@ def python_files() -> list[Path]:
 
 def identifiers(text: str) -> set[str]:
     """Return the names in a file."""
-    return {token.string for token in tokenize.generate_tokens(io.StringIO(text).readline)
-            if token.type == tokenize.NAME}
+    return {
+        token.string for token in tokenize.generate_tokens(io.StringIO(text).readline) if token.type == tokenize.NAME
+    }
 
 
 def words_of(identifier: str) -> list[str]:
@@ -63,24 +64,37 @@ def relative(path: Path) -> str:
 
 def test_identifiers_use_standard_terms() -> None:
     texts = {path: path.read_text("utf-8") for path in python_files()}
-    found = [f"{relative(path)}: {name} ({WORDS[word]}?)" for path, text in texts.items()
-             if ANY_WORD.search(text.lower())
-             for name in sorted(identifiers(text)) for word in words_of(name) if word in WORDS]
+    found = [
+        f"{relative(path)}: {name} ({WORDS[word]}?)"
+        for path, text in texts.items()
+        if ANY_WORD.search(text.lower())
+        for name in sorted(identifiers(text))
+        for word in words_of(name)
+        if word in WORDS
+    ]
     assert found == []
 
 
 def test_comments_and_texts_use_ordinary_words() -> None:
     pattern = re.compile(rf"\b({'|'.join(PROSE)})\b", re.IGNORECASE)
-    found = [f"{relative(path)}:{number}: {line.strip()}" for path in python_files()
-             for number, line in enumerate(path.read_text("utf-8").splitlines(), 1) if pattern.search(line)]
+    found = [
+        f"{relative(path)}:{number}: {line.strip()}"
+        for path in python_files()
+        for number, line in enumerate(path.read_text("utf-8").splitlines(), 1)
+        if pattern.search(line)
+    ]
     assert found == []
 
 
 def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
     texts = {path: path.read_text("utf-8") for path in python_files()}
-    found = [f"{relative(path)}:{line}: {text.splitlines()[0]}" for path, source in texts.items()
-             if ANY_FIRST_WORD.search(source)
-             for line, text in docstrings(ast.parse(source)) if text.split()[0] in FIRST_WORDS]
+    found = [
+        f"{relative(path)}:{line}: {text.splitlines()[0]}"
+        for path, source in texts.items()
+        if ANY_FIRST_WORD.search(source)
+        for line, text in docstrings(ast.parse(source))
+        if text.split()[0] in FIRST_WORDS
+    ]
     assert found == []
 
 

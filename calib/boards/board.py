@@ -49,8 +49,10 @@ class Board:
 
     def __post_init__(self) -> None:
         if not all(MIN_SIDE <= side <= MAX_SIDE for side in (self.columns, self.rows)):
-            raise CalibError(f"board: expected {MIN_SIDE} to {MAX_SIDE} inner corners a side, found "
-                             f"{self.columns}x{self.rows}; count the points where four squares meet, not the squares")
+            raise CalibError(
+                f"board: expected {MIN_SIDE} to {MAX_SIDE} inner corners a side, found "
+                f"{self.columns}x{self.rows}; count the points where four squares meet, not the squares"
+            )
         if not MIN_SQUARE_M <= self.square_m <= MAX_SQUARE_M:
             raise CalibError(f"board: expected squares of 0.1 mm to 10 m, found {self.square_m * 1e3:g} mm")
 

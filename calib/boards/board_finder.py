@@ -110,8 +110,9 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
         floors += [grid for grid in grids if _is_floor(grid, board)]
         for grid in grids:
             found = _detection(image, blurred, (grid, floors), board)
-            if found is not None and (found.is_complete
-                                      or (thorough and _is_confirmed(image, found, board, unconfirmed))):
+            if found is not None and (
+                found.is_complete or (thorough and _is_confirmed(image, found, board, unconfirmed))
+            ):
                 return BoardSearch(found.view(name))
             partial = max(partial, grid, key=lambda one: _likeness(one, board))
             largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
@@ -151,9 +152,10 @@ def _opencv_view(image: Image, blurred: Grey, shown: tuple[Board, Grid, list[Gri
         detected.append(grid)
     for number, grid in enumerate(detected):
         found = _detection(image, blurred, (grid, floors), board)
-        agree = any(are_same(grid, other) for other in detected[number + 1:])
-        if found is not None and (agree or (found.is_bounded and found.part >= MIN_LONE_PART
-                                            and found.corners.size // 2 >= MIN_LONE_CORNERS)):
+        agree = any(are_same(grid, other) for other in detected[number + 1 :])
+        if found is not None and (
+            agree or (found.is_bounded and found.part >= MIN_LONE_PART and found.corners.size // 2 >= MIN_LONE_CORNERS)
+        ):
             return found.view(name)
     return None
 

@@ -49,7 +49,7 @@ def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
         if known.shape[0] >= board.rows + 2 and known.shape[1] >= board.columns + 2:
             around = np.lib.stride_tricks.sliding_window_view(known, (board.rows + 2, board.columns + 2))
             for j, i in np.argwhere(_are_isolated(around)) + 1:
-                yield upright[j:j + board.rows, i:i + board.columns]
+                yield upright[j : j + board.rows, i : i + board.columns]
 
 
 def _are_isolated(around: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -76,7 +76,7 @@ def largest_rectangle(grid: Grid) -> tuple[int, int]:
         heights = np.where(row, heights + 1, 0)
         for i in np.flatnonzero(heights):
             lowest = np.minimum.accumulate(heights[i:])
-            width = int(np.argmax(lowest * widths[:len(lowest)])) + 1
+            width = int(np.argmax(lowest * widths[: len(lowest)])) + 1
             best = max(best, (width, int(lowest[width - 1])), key=lambda sides: sides[0] * sides[1])
     return best
 

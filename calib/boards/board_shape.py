@@ -36,8 +36,10 @@ def local_mapping(corners: Array, j: int, i: int, without: bool = False) -> Arra
     corners (rows, columns, 2), NaN if unknown; without=True excludes the corner itself. None if too few are known.
     """
     rows, columns = corners.shape[:2]
-    y, x = np.mgrid[max(0, j - NEIGHBOURS):min(rows, j + NEIGHBOURS + 1),
-                    max(0, i - NEIGHBOURS):min(columns, i + NEIGHBOURS + 1)]
+    y, x = np.mgrid[
+        max(0, j - NEIGHBOURS) : min(rows, j + NEIGHBOURS + 1),
+        max(0, i - NEIGHBOURS) : min(columns, i + NEIGHBOURS + 1),
+    ]
     near = corners[y, x].reshape(-1, 2)
     x, y = (x - i).ravel().astype(float), (y - j).ravel().astype(float)
     known = np.isfinite(near[:, 0]) & ((x != 0) | (y != 0) | (not without))
@@ -78,11 +80,11 @@ def prediction_spread(corners: Array) -> Array:
     spread = np.full(corners.shape[:2], np.nan)
     known = np.isfinite(corners[..., 0])
     padded = np.pad(known, NEIGHBOURS)
-    y, x = (part.ravel().astype(float) for part in np.mgrid[-NEIGHBOURS:NEIGHBOURS + 1, -NEIGHBOURS:NEIGHBOURS + 1])
+    y, x = (part.ravel().astype(float) for part in np.mgrid[-NEIGHBOURS : NEIGHBOURS + 1, -NEIGHBOURS : NEIGHBOURS + 1])
     weight, terms = np.exp(-(x * x + y * y) / WEIGHT_WIDTH) * ((x != 0) | (y != 0)), quadratic_terms(x, y)
     side = 2 * NEIGHBOURS + 1
     for j, i in np.argwhere(known):
-        own = weight * padded[j:j + side, i:i + side].ravel()
+        own = weight * padded[j : j + side, i : i + side].ravel()
         if np.count_nonzero(own) >= MIN_NEIGHBOURS:
             # The value at the corner is the constant term of the weighted fit.
             gain = np.linalg.pinv(terms * own[:, None], rcond=1e-6)[0] * own
@@ -141,10 +143,22 @@ def _outer_steps(image: Grey, corners: Array) -> tuple[list[Array], list[list[Ar
     down, along = np.diff(level, axis=0) * sign[1:], np.diff(level, axis=1) * sign[:, 1:]
     usual = float(np.nanmedian(np.concatenate([down[2:-2, 2:-2].ravel(), along[2:-2, 2:-2].ravel()])))
     down, along = down / usual, along / usual
-    beyond = [[along[0, 1:-1], down[0, 1:-1]], [along[-1, 1:-1], down[-1, 1:-1]],
-              [down[1:-1, 0], along[1:-1, 0]], [down[1:-1, -1], along[1:-1, -1]]]
-    around = [along[1, 1:-1], along[-2, 1:-1], down[1:-1, 1], down[1:-1, -2], down[1, 1:-1], down[-2, 1:-1],
-              along[1:-1, 1], along[1:-1, -2]]
+    beyond = [
+        [along[0, 1:-1], down[0, 1:-1]],
+        [along[-1, 1:-1], down[-1, 1:-1]],
+        [down[1:-1, 0], along[1:-1, 0]],
+        [down[1:-1, -1], along[1:-1, -1]],
+    ]
+    around = [
+        along[1, 1:-1],
+        along[-2, 1:-1],
+        down[1:-1, 1],
+        down[1:-1, -2],
+        down[1, 1:-1],
+        down[-2, 1:-1],
+        along[1:-1, 1],
+        along[1:-1, -2],
+    ]
     return around, beyond
 
 

@@ -64,14 +64,19 @@ class CornerCandidates:
 
     def select(self, chosen: NDArray[np.intp] | NDArray[np.bool_]) -> CornerCandidates:
         """Return the candidates of an index or mask."""
-        return CornerCandidates(self.pixels[chosen], self.angles[chosen], self.light[chosen], self.contrast[chosen],
-                       self.quality[chosen], self.ring_px[chosen])
+        return CornerCandidates(
+            self.pixels[chosen],
+            self.angles[chosen],
+            self.light[chosen],
+            self.contrast[chosen],
+            self.quality[chosen],
+            self.ring_px[chosen],
+        )
 
 
 def find_corners(image: NDArray[np.uint8]) -> CornerCandidates:
     """Find all candidates in an image (H, W) at all scales; of several at one place the best is kept."""
-    levels = [level for level in LEVELS
-              if min(image.shape) * level.scale >= MIN_LEVEL_SIDE_PX or level.scale == 1.0]
+    levels = [level for level in LEVELS if min(image.shape) * level.scale >= MIN_LEVEL_SIDE_PX or level.scale == 1.0]
     return _merge_levels([_at_level(image, level) for level in levels])
 
 
@@ -87,10 +92,10 @@ def sample(image: Grey, pixels: Array) -> Array:
     """Return grey values (...) at pixels (..., 2), bilinear, with the border repeated."""
     flat = pixels.reshape(-1, 2).astype(np.float32)
     padded = np.zeros((max(1, -(-len(flat) // REMAP_COLUMNS)) * REMAP_COLUMNS, 2), np.float32)
-    padded[:len(flat)] = flat
+    padded[: len(flat)] = flat
     u, v = padded.T.reshape(2, -1, REMAP_COLUMNS)
     values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values.ravel()[:len(flat)].reshape(pixels.shape[:-1]), float)
+    return np.asarray(values.ravel()[: len(flat)].reshape(pixels.shape[:-1]), float)
 
 
 def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
@@ -99,14 +104,23 @@ def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
 
 
 def _at_level(image: NDArray[np.uint8], level: ScaleLevel) -> CornerCandidates:
-    shrunk = image if level.scale == 1 else cv2.resize(image, None, fx=level.scale, fy=level.scale,
-                                                       interpolation=cv2.INTER_AREA)
+    shrunk = (
+        image
+        if level.scale == 1
+        else cv2.resize(image, None, fx=level.scale, fy=level.scale, interpolation=cv2.INTER_AREA)
+    )
     blurred = smoothed(shrunk, level.blur_px)
     places = _saddles(blurred, int(np.ceil(level.ring_px)))
     found = describe_corners(blurred, places, level.ring_px)
     found = found.select(found.quality > 0)
-    return CornerCandidates((found.pixels + 0.5) / level.scale - 0.5, found.angles, found.light, found.contrast,
-                            found.quality, found.ring_px / level.scale)
+    return CornerCandidates(
+        (found.pixels + 0.5) / level.scale - 0.5,
+        found.angles,
+        found.light,
+        found.contrast,
+        found.quality,
+        found.ring_px / level.scale,
+    )
 
 
 def _saddles(blurred: Grey, border: int) -> Array:
@@ -126,8 +140,9 @@ def _saddles(blurred: Grey, border: int) -> Array:
 def _saddle_strength(blurred: Grey) -> tuple[Grey, list[Grey]]:
     """Return the negative determinant of the Hessian, and the derivatives x, y, xx, yy, xy."""
     orders = ((1, 0, 1 / 8), (0, 1, 1 / 8), (2, 0, 1 / 4), (0, 2, 1 / 4), (1, 1, 1 / 4))
-    derivatives = [np.asarray(cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=scale), np.float32)
-                   for dx, dy, scale in orders]
+    derivatives = [
+        np.asarray(cv2.Sobel(blurred, cv2.CV_32F, dx, dy, ksize=3, scale=scale), np.float32) for dx, dy, scale in orders
+    ]
     _, _, xx, yy, xy = derivatives
     return np.asarray(xy * xy - xx * yy, np.float32), derivatives
 
@@ -165,8 +180,12 @@ def _edges(wave: Array) -> tuple[Array, NDArray[np.bool_], NDArray[np.int64]]:
 
 def _merge_levels(levels: list[CornerCandidates]) -> CornerCandidates:
     """Merge the candidates of all scales; of several within a part of their ring's radius the best is kept."""
-    both = CornerCandidates(*(np.concatenate([getattr(level, name) for level in levels])
-                              for name in ("pixels", "angles", "light", "contrast", "quality", "ring_px")))
+    both = CornerCandidates(
+        *(
+            np.concatenate([getattr(level, name) for level in levels])
+            for name in ("pixels", "angles", "light", "contrast", "quality", "ring_px")
+        )
+    )
     worth = both.quality * np.minimum(1, both.contrast / FULL_CONTRAST)
     both = both.select(np.argsort(-worth, kind="stable"))
     return both.select(_suppress_duplicates(both.pixels, np.maximum(SAME_PX, SAME_RING_PART * both.ring_px)))

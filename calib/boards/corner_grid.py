@@ -58,8 +58,10 @@ def _in_square(neighbour: NDArray[np.int64], back: NDArray[np.int64]) -> NDArray
     """Return the mask (N, 4) of links that are a side of a closed square, to the left or to the right."""
     closed = np.zeros(neighbour.shape, bool)
     for turn in (1, 3):
-        node, arm = (np.broadcast_to(values, neighbour.shape).copy()
-                     for values in (np.arange(len(neighbour))[:, None], np.arange(4)))
+        node, arm = (
+            np.broadcast_to(values, neighbour.shape).copy()
+            for values in (np.arange(len(neighbour))[:, None], np.arange(4))
+        )
         whole = np.ones(neighbour.shape, bool)
         for _ in range(4):
             ahead, arriving = neighbour[node, arm], back[node, arm]
@@ -139,19 +141,29 @@ def _extrapolations(grid: Grid, cell: Cell) -> Iterator[Array]:
 def spacing(grid: Grid, cell: Cell) -> float:
     """Return the smallest distance [px] of a cell from adjacent corners, measured among its neighbours; 0: unknown."""
     i, j = cell
-    steps = [math.dist(one, other) for di, dj in STEPS
-             if (one := grid.get((i + di, j + dj))) is not None
-             and (other := grid.get(cell, grid.get((i + 2 * di, j + 2 * dj)))) is not None]
-    beside = [math.dist(one, other) for di, dj in STEPS for side in (1, -1)
-              if (one := grid.get((i + di, j + dj))) is not None
-              and (other := grid.get((i + di - side * dj, j + dj + side * di))) is not None]
+    steps = [
+        math.dist(one, other)
+        for di, dj in STEPS
+        if (one := grid.get((i + di, j + dj))) is not None
+        and (other := grid.get(cell, grid.get((i + 2 * di, j + 2 * dj)))) is not None
+    ]
+    beside = [
+        math.dist(one, other)
+        for di, dj in STEPS
+        for side in (1, -1)
+        if (one := grid.get((i + di, j + dj))) is not None
+        and (other := grid.get((i + di - side * dj, j + dj + side * di))) is not None
+    ]
     return float(min(steps or beside, default=0.0))
 
 
 def with_clockwise_axes(grid: Grid) -> Grid:
     """Return the grid, its axes swapped if necessary, so that columns turn clockwise to rows."""
-    turns = [np.linalg.det(np.stack([along - corner, down - corner])) for (i, j), corner in grid.items()
-             if (along := grid.get((i + 1, j))) is not None and (down := grid.get((i, j + 1))) is not None]
+    turns = [
+        np.linalg.det(np.stack([along - corner, down - corner]))
+        for (i, j), corner in grid.items()
+        if (along := grid.get((i + 1, j))) is not None and (down := grid.get((i, j + 1))) is not None
+    ]
     if np.sum(np.sign(turns)) >= 0:
         return grid
     return {(row, column): pixel for (column, row), pixel in grid.items()}
@@ -171,7 +183,7 @@ def _accept_predicted(image: Grey, grid: Grid, guesses: Grid, contrast: float) -
 
 def _usual_contrast(image: Grey, grid: Grid) -> float:
     """Return the median contrast of the grid's corners, of some evenly chosen ones if there are many."""
-    cells = list(grid)[::-(-len(grid) // CONTRAST_CELLS)]
+    cells = list(grid)[:: -(-len(grid) // CONTRAST_CELLS)]
     rings = np.array([max(MIN_RING_PX, RING_PART * spacing(grid, cell)) for cell in cells])
     return float(np.median(describe_corners(image, np.array([grid[cell] for cell in cells]), rings).contrast))
 

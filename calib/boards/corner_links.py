@@ -57,8 +57,9 @@ def _pairs(pixels: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     return first[other], second[other], length[other]
 
 
-def _arms(corners: CornerCandidates, a: NDArray[np.int64], b: NDArray[np.int64]
-          ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _arms(
+    corners: CornerCandidates, a: NDArray[np.int64], b: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the arm of a that points to b and the arm of b that points to a (M,); NO_NEIGHBOUR if there is none."""
     step = corners.pixels[b] - corners.pixels[a]
     angle = np.arctan2(step[:, 1], step[:, 0])
@@ -77,8 +78,9 @@ def _left_is_light(corners: CornerCandidates, index: NDArray[np.int64], arm: NDA
     return np.asarray(corners.light[index] ^ (arm % 2 == 1))
 
 
-def _edge_seen(image: Grey, corners: CornerCandidates, pair: tuple[NDArray[np.int64], NDArray[np.int64]],
-               arm: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _edge_seen(
+    image: Grey, corners: CornerCandidates, pair: tuple[NDArray[np.int64], NDArray[np.int64]], arm: NDArray[np.int64]
+) -> NDArray[np.bool_]:
     """True (M,) if light and dark along the line from a to b lie on the same sides as at a's arm."""
     start, step = corners.pixels[pair[0]], corners.pixels[pair[1]] - corners.pixels[pair[0]]
     # Perpendicular to the line, towards larger angles.

@@ -51,8 +51,9 @@ def refine_corners(image: NDArray[np.uint8], corners: Array) -> Array:
     return refined
 
 
-def refine_with_camera(image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array,
-                       view: tuple[CalibrationBoard, Array]) -> Array:
+def refine_with_camera(
+    image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array, view: tuple[CalibrationBoard, Array]
+) -> Array:
     """Move the pixels (N, 2) of a view (board, pixels) onto the image's corners, with a camera as the mapping."""
     (board, pixels), grey = view, image.astype(np.float32)
     refined = pixels.copy()
@@ -92,6 +93,7 @@ def refine_in_mapping(grey: Grey, mapping: Array, start: Array, window: float = 
 
     mapping: see local_mapping; window: half side [squares].
     """
+
     def to_image(xy: Array) -> Array:
         return np.asarray(quadratic_terms(xy[..., 0], xy[..., 1]) @ mapping)
 

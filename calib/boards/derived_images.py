@@ -84,6 +84,7 @@ def _strip_maps(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np
     inner, outer, scale = _strip_scale(shape)
     azimuth = np.arange(int(STRIP_TURNS * 2 * np.pi * scale)) / scale
     radius = outer * np.exp(-np.arange(int(np.log(outer / inner) * scale)) / scale)
-    u, v = (middle + np.outer(radius, way(azimuth)) for middle, way in zip(_middle(shape), (np.cos, np.sin),
-                                                                          strict=True))
+    u, v = (
+        middle + np.outer(radius, way(azimuth)) for middle, way in zip(_middle(shape), (np.cos, np.sin), strict=True)
+    )
     return u.astype(np.float32), v.astype(np.float32)

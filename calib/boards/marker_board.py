@@ -19,8 +19,9 @@ from calib.models.camera import Array
 
 Dictionary = cv2.aruco.Dictionary
 # The predefined dictionaries of OpenCV by name, like 5X5_100 and APRILTAG_36h11.
-DICTIONARIES = {name.removeprefix("DICT_"): int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco)
-                if name.startswith("DICT_")}
+DICTIONARIES = {
+    name.removeprefix("DICT_"): int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")
+}
 # Least part of a square that a marker fills, and largest: a light margin must remain.
 MIN_MARKER_PART, MAX_MARKER_PART = 0.3, 0.95
 # Largest and least space between two tags, in parts of a tag.
@@ -59,8 +60,10 @@ class CharucoBoard:
         _check_sides("charuco", (self.columns, self.rows), 2, "inner corners")
         _check_length("squares", self.square_m)
         if not MIN_MARKER_PART <= self.marker_m / self.square_m <= MAX_MARKER_PART:
-            raise CalibError(f"board: expected markers of {MIN_MARKER_PART:g} to {MAX_MARKER_PART:g} of the squares' "
-                             f"side, found {1e3 * self.marker_m:g} mm in squares of {1e3 * self.square_m:g} mm")
+            raise CalibError(
+                f"board: expected markers of {MIN_MARKER_PART:g} to {MAX_MARKER_PART:g} of the squares' "
+                f"side, found {1e3 * self.marker_m:g} mm in squares of {1e3 * self.square_m:g} mm"
+            )
         _check_capacity(self.dictionary, len(self._board().getIds()))
 
     @property
@@ -108,8 +111,10 @@ class AprilGrid:
         _check_sides("aprilgrid", (self.columns, self.rows), 1, "tags")
         _check_length("tags", self.tag_m)
         if not MIN_SPACING <= self.spacing <= MAX_SPACING:
-            raise CalibError(f"board: expected a space between tags of {MIN_SPACING:g} to {MAX_SPACING:g} of a tag's "
-                             f"side, like Kalibr's tagSpacing, found {self.spacing:g}")
+            raise CalibError(
+                f"board: expected a space between tags of {MIN_SPACING:g} to {MAX_SPACING:g} of a tag's "
+                f"side, like Kalibr's tagSpacing, found {self.spacing:g}"
+            )
         _check_capacity(TAG_FAMILY, self.columns * self.rows)
 
     @property
@@ -175,5 +180,7 @@ def _check_length(what: str, length_m: float) -> None:
 def _check_capacity(name: str, markers: int) -> None:
     capacity = len(predefined(name).bytesList)
     if markers > capacity:
-        raise CalibError(f"board: {name} has {capacity} markers, and this board needs {markers}; check the numbers of "
-                         "corners or tags, and the dictionary")
+        raise CalibError(
+            f"board: {name} has {capacity} markers, and this board needs {markers}; check the numbers of "
+            "corners or tags, and the dictionary"
+        )

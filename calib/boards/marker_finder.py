@@ -111,11 +111,14 @@ def local_mapping_at(place: Array, at: Array, where: Array, *, exact: bool = Fal
     near = near[distance[near] < REACH]
     if len(near) < MIN_AFFINE or distance[near[0]] > MAX_AHEAD:
         return None
-    weight = np.exp(-(distance[near] / WEIGHT_WIDTH) ** 2 / 2)[:, None]
+    weight = np.exp(-((distance[near] / WEIGHT_WIDTH) ** 2) / 2)[:, None]
     x, y = offset[near].T
     terms = np.column_stack([quadratic_terms(x, y), x**3, x * x * y, x * y * y, y**3])
-    counts = [count for count, least in ((10, MIN_CUBIC), (6, MIN_QUADRATIC), (3, MIN_AFFINE))
-              if len(near) >= least and (exact or count < 10)]
+    counts = [
+        count
+        for count, least in ((10, MIN_CUBIC), (6, MIN_QUADRATIC), (3, MIN_AFFINE))
+        if len(near) >= least and (exact or count < 10)
+    ]
     for count in counts:
         left, values, right = np.linalg.svd(terms[:, :count] * weight, full_matrices=False)
         if values[-1] > MIN_CONDITION * values[0]:

@@ -58,8 +58,11 @@ def seen_dictionary(image: Image, border_bits: int) -> str | None:
     if most < MIN_HINT_MARKERS:
         return None
     # The smaller dictionaries of a family hold the first markers of the larger ones.
-    sizes = {name: len(predefined(name).bytesList) for name in DICTIONARIES
-             if name.rsplit("_", 1)[0] == family.rsplit("_", 1)[0]}
+    sizes = {
+        name: len(predefined(name).bytesList)
+        for name in DICTIONARIES
+        if name.rsplit("_", 1)[0] == family.rsplit("_", 1)[0]
+    }
     return min((name for name in sizes if sizes[name] > largest), key=lambda name: sizes[name]) if sizes else family
 
 
@@ -67,8 +70,10 @@ def consistent_markers(markers: Markers, layout: MarkerLayout) -> Markers:
     """Return the largest set of markers each of which predicts the position of its neighbours in the set."""
     on_board = {int(number): corners for number, corners in zip(layout.ids, layout.corners, strict=True)}
     known = [number for number in markers if number in on_board]
-    links = {number: [other for other in known if other != number and _is_neighbour(number, other, markers, on_board)]
-             for number in known}
+    links = {
+        number: [other for other in known if other != number and _is_neighbour(number, other, markers, on_board)]
+        for number in known
+    }
     best, left = list[int](), set(known)
     while left:
         group, queue = set[int](), [left.pop()]
@@ -86,7 +91,8 @@ def _is_neighbour(number: int, other: int, markers: Markers, on_board: Markers) 
     sides = [float(np.linalg.norm(on_board[one][0] - on_board[one][1])) for one in (number, other)]
     apart = float(np.linalg.norm(on_board[number].mean(axis=0) - on_board[other].mean(axis=0)))
     return apart <= NEIGHBOUR_SIDES * max(sides) and all(
-        _predicts(markers[a], on_board[a], markers[b], on_board[b]) for a, b in ((number, other), (other, number)))
+        _predicts(markers[a], on_board[a], markers[b], on_board[b]) for a, b in ((number, other), (other, number))
+    )
 
 
 def _predicts(image_a: Array, board_a: Array, image_b: Array, board_b: Array) -> bool:
@@ -108,8 +114,9 @@ def _detector(border_bits: int) -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(0), parameters)
 
 
-def _detected(detector: cv2.aruco.ArucoDetector, layout: MarkerLayout, derived: DerivedImage, reflected: bool
-              ) -> Markers:
+def _detected(
+    detector: cv2.aruco.ArucoDetector, layout: MarkerLayout, derived: DerivedImage, reflected: bool
+) -> Markers:
     """Return the markers of a derived image in pixels of the source."""
     detector.setDictionary(layout.dictionary)
     corners, ids, _ = detector.detectMarkers(_reflected(derived.image, reflected))

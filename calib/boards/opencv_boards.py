@@ -61,7 +61,7 @@ def _part_around(image: Image, pixels: Array, margin_part: float) -> tuple[Image
     margin = max(MIN_MARGIN_PX, margin_part * float(np.ptp(pixels, axis=0).max()))
     low = np.maximum(pixels.min(axis=0) - margin, 0).astype(int)
     high = (pixels.max(axis=0) + margin).astype(int)
-    return np.ascontiguousarray(image[low[1]:high[1], low[0]:high[0]]), low.astype(float)
+    return np.ascontiguousarray(image[low[1] : high[1], low[0] : high[0]]), low.astype(float)
 
 
 def are_same(grid: Grid, other: Grid) -> bool:

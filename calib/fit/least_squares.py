@@ -34,8 +34,7 @@ State = TypeVar("State")
 
 
 def robust_sigma(residual: Array, least: float) -> float:
-    """Return the standard deviation of residuals by the median of their sizes (NaN: none), and not less than `least`.
-    """
+    """Return the standard deviation of residuals by the median of their sizes (NaN: none), not less than `least`."""
     return max(least, SIGMA_PER_MAD * float(np.nanmedian(np.abs(residual))))
 
 
@@ -123,8 +122,9 @@ def minimise(problem: Problem[State], state: State, ending: Ending) -> State:
     return state
 
 
-def _trial(problem: Problem[State], state: State, system: ArrowSystem, scaled: tuple[float, float]
-           ) -> tuple[State, float]:
+def _trial(
+    problem: Problem[State], state: State, system: ArrowSystem, scaled: tuple[float, float]
+) -> tuple[State, float]:
     """Return the state after a step, and its cost; infinite if the step leads to no camera."""
     scale, damping = scaled
     try:

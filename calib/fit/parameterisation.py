@@ -41,8 +41,9 @@ class CameraParameterisation:
         return [(name, float(value), float(sigma)) for name, value, sigma in found]
 
 
-def parameterise(camera: OmniCamera, distortion: Collection[str] = (), *, wavefront: bool = False
-                 ) -> CameraParameterisation:
+def parameterise(
+    camera: OmniCamera, distortion: Collection[str] = (), *, wavefront: bool = False
+) -> CameraParameterisation:
     """Return the parameterisation about a camera: all parameters, and of distortion and polynomial the terms not 0.
 
     distortion: names of an omni camera's terms that are parameters although they are 0. wavefront: with the terms of an
@@ -56,21 +57,47 @@ def parameterise(camera: OmniCamera, distortion: Collection[str] = (), *, wavefr
         units = np.array([1, scale, scale, scale, scale, 1, 1, 1, 1]) / scale
         return CameraParameterisation(camera, tuple(np.array(OMNI_NAMES)[kept].tolist()), values[kept], units[kept])
     if not isinstance(camera, OcamCamera):
-        raise CalibError(f"calibrate: expected an omni or ocam camera, whose parameters can be fitted, found "
-                         f"{type(camera).__name__}: calibrate lenses by Kalibr")
+        raise CalibError(
+            f"calibrate: expected an omni or ocam camera, whose parameters can be fitted, found "
+            f"{type(camera).__name__}: calibrate lenses by Kalibr"
+        )
     powers = [power for power, value in enumerate(camera.polynomial) if value != 0]
     # p1 and p2 are correlated, so both are adjusted or neither.
     tangential = camera.tangential if any(camera.tangential) else ()
     astigmatism = camera.astigmatism if wavefront or any(camera.astigmatism) else ()
     waves = camera.wavefront if wavefront else ()
-    start = np.array([*(camera.polynomial[power] for power in powers), *camera.center_row_column, *camera.affine[:2],
-                      *tangential, *astigmatism, *waves])
-    units = np.array([*(scale ** -float(power) for power in powers), 1.0, 1.0, 1 / scale, 1 / scale,
-                      *[1 / scale**2 for _ in tangential], *[1 / scale**3 for _ in astigmatism],
-                      *[WAVEFRONT_UNIT_M for _ in waves]])
-    names = (*(f"a{power}" for power in powers), "center_row", "center_column", "c", "d",
-             *OCAM_TANGENTIAL_NAMES[:len(tangential)], *OCAM_ASTIGMATISM_NAMES[:len(astigmatism)],
-             *WAVEFRONT_NAMES[:len(waves)])
+    start = np.array(
+        [
+            *(camera.polynomial[power] for power in powers),
+            *camera.center_row_column,
+            *camera.affine[:2],
+            *tangential,
+            *astigmatism,
+            *waves,
+        ]
+    )
+    units = np.array(
+        [
+            *(scale ** -float(power) for power in powers),
+            1.0,
+            1.0,
+            1 / scale,
+            1 / scale,
+            *[1 / scale**2 for _ in tangential],
+            *[1 / scale**3 for _ in astigmatism],
+            *[WAVEFRONT_UNIT_M for _ in waves],
+        ]
+    )
+    names = (
+        *(f"a{power}" for power in powers),
+        "center_row",
+        "center_column",
+        "c",
+        "d",
+        *OCAM_TANGENTIAL_NAMES[: len(tangential)],
+        *OCAM_ASTIGMATISM_NAMES[: len(astigmatism)],
+        *WAVEFRONT_NAMES[: len(waves)],
+    )
     return CameraParameterisation(camera, names, start, units)
 
 
@@ -88,5 +115,12 @@ def _ocam_camera(base: OmniCamera, values: dict[str, float]) -> OcamCamera:
     p1, p2 = (values.get(name, 0.0) for name in OCAM_TANGENTIAL_NAMES)
     s1, s2 = (values.get(name, 0.0) for name in OCAM_ASTIGMATISM_NAMES)
     wavefront = tuple(values.get(name, now) for name, now in zip(WAVEFRONT_NAMES, base.wavefront, strict=True))
-    return replace(base, polynomial=polynomial, center_row_column=(values["center_row"], values["center_column"]),
-                   affine=affine, tangential=(p1, p2), astigmatism=(s1, s2), wavefront=wavefront)
+    return replace(
+        base,
+        polynomial=polynomial,
+        center_row_column=(values["center_row"], values["center_column"]),
+        affine=affine,
+        tangential=(p1, p2),
+        astigmatism=(s1, s2),
+        wavefront=wavefront,
+    )

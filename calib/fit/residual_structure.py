@@ -41,8 +41,9 @@ class ResidualStructure:
         return f"systematic residuals of {self.systematic_px:.3f} px, noise of {self.noise_px:.3f} px"
 
 
-def residual_structure(pixels: Array, residuals: Array, points: Array, center: tuple[float, float]
-                       ) -> ResidualStructure:
+def residual_structure(
+    pixels: Array, residuals: Array, points: Array, center: tuple[float, float]
+) -> ResidualStructure:
     """Return the structure of residuals (K, N, 2) at pixels (K, N, 2) of K views of board points (N, 3).
 
     The noise is measured within each view, without a quadratic function of the board's x and y: a misfit of the model

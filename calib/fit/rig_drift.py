@@ -87,8 +87,12 @@ def _residuals(x: Array, lower: Array, upper: Array) -> Array:
 
 def _jacobian(x: Array, lower: Array, upper: Array) -> Array:
     """Return the derivatives (N, 5) of the residuals by rotation and shift."""
-    return np.column_stack([(_residuals(x + d, lower, upper) - _residuals(x - d, lower, upper))
-                            / (2 * DIFFERENCE_STEP_RAD) for d in DIFFERENCE_STEP_RAD * np.eye(5)])
+    return np.column_stack(
+        [
+            (_residuals(x + d, lower, upper) - _residuals(x - d, lower, upper)) / (2 * DIFFERENCE_STEP_RAD)
+            for d in DIFFERENCE_STEP_RAD * np.eye(5)
+        ]
+    )
 
 
 def apply_drift(rig: Rig, drift: RigDrift) -> Rig:

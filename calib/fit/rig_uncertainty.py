@@ -34,8 +34,7 @@ class DriveUncertainty:
     heading_rad_m: float
 
     def __str__(self) -> str:
-        return (f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} "
-                "degree/m")
+        return f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} degree/m"
 
 
 def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
@@ -47,8 +46,10 @@ def perturbed_rig(rig: Rig, names: tuple[str, ...], changes: Array) -> Rig:
     cameras = []
     for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
         parameters = parameterise(mounted.camera, wavefront=has_wavefront(mounted.camera))
-        steps = [change.pop(f"{side} {name}", 0.0) / unit
-                 for name, unit in zip(parameters.names, parameters.units, strict=True)]
+        steps = [
+            change.pop(f"{side} {name}", 0.0) / unit
+            for name, unit in zip(parameters.names, parameters.units, strict=True)
+        ]
         cameras.append(parameters.camera_at(np.array(steps)))
     r_x, r_y, r_z, e_x, e_y, longer = (change.pop(name, 0.0) for name in TRANSFORM_NAMES)
     if change:
@@ -81,20 +82,24 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
 
 def _seen_points(rig: Rig) -> Array:
     """Return points (N, 3) in the rectified frame, on walls around the rig, that both cameras see."""
-    azimuth, slope, distance = (part.ravel() for part in np.meshgrid(
-        2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M))
+    azimuth, slope, distance = (
+        part.ravel() for part in np.meshgrid(2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M)
+    )
     points = distance[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth), slope])
     pixels = _pixels(rig, points)
-    seen = [mounted.visible.contains(side) for mounted, side in zip((rig.lower, rig.upper), np.split(pixels, 2, axis=1),
-                                                                     strict=True)]
+    seen = [
+        mounted.visible.contains(side)
+        for mounted, side in zip((rig.lower, rig.upper), np.split(pixels, 2, axis=1), strict=True)
+    ]
     return np.asarray(points[np.isfinite(pixels).all(axis=1) & seen[0] & seen[1]])
 
 
 def _pixels(rig: Rig, points: Array) -> Array:
     """Return the pixels (N, 4) in the lower and the upper camera of points (N, 3) in the rectified frame."""
     in_rig = se3.apply(se3.inverse(rig.T_rect_rig), points)
-    return np.column_stack([mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig))
-                            for mounted in (rig.lower, rig.upper)])
+    return np.column_stack(
+        [mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (rig.lower, rig.upper)]
+    )
 
 
 def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
@@ -125,7 +130,8 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
 
     def pixels(changes: Array) -> Array:
         changed = perturbed_rig(rig, names, changes * units)
-        return np.column_stack([mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig))
-                                for mounted in (changed.lower, changed.upper)])
+        return np.column_stack(
+            [mounted.camera.project(se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (changed.lower, changed.upper)]
+        )
 
     return central_differences(pixels, SIGMA_STEP * np.ones(len(names)))

@@ -62,7 +62,7 @@ def _levels(image: NDArray[np.uint8]) -> tuple[float, float] | None:
     corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
     height, width = image.shape
     dark = float(np.median([np.median(corner) for corner in corners]))
-    light = float(np.median(image[height // 4:-height // 4, width // 4:-width // 4]))
+    light = float(np.median(image[height // 4 : -height // 4, width // 4 : -width // 4]))
     return (dark, light) if light - dark >= MIN_CONTRAST else None
 
 
@@ -93,11 +93,11 @@ def _last_edge(profile: Array, threshold: float) -> float:
     last = int(light[-1]) if light.size else 0
     if last < EDGE_PX or last + 2 * EDGE_PX >= len(profile):
         return 0.0
-    inside, outside = profile[last - EDGE_PX + 1:last + 1].mean(), profile[last + EDGE_PX:last + 2 * EDGE_PX].mean()
+    inside, outside = profile[last - EDGE_PX + 1 : last + 1].mean(), profile[last + EDGE_PX : last + 2 * EDGE_PX].mean()
     if inside - outside < MIN_STEP:
         return 0.0
     half = (inside + outside) / 2
-    at = last - EDGE_PX + 1 + int(np.flatnonzero(profile[last - EDGE_PX + 1:last + 1] >= half)[-1])
+    at = last - EDGE_PX + 1 + int(np.flatnonzero(profile[last - EDGE_PX + 1 : last + 1] >= half)[-1])
     return at + float(profile[at] - half) / float(profile[at] - profile[at + 1])
 
 
@@ -145,6 +145,6 @@ def _hub(image: NDArray[np.uint8], center: tuple[float, float], rim_px: float, t
     polar = _polar(image, center, int(MAX_HUB * rim_px))
     dark = np.mean(polar < threshold, axis=0)
     inside = np.convolve(dark, np.ones(HUB_RING_PX) / HUB_RING_PX, "valid")[:-HUB_RING_PX]
-    edge, beyond = dark[HUB_RING_PX - 1:-HUB_RING_PX], dark[2 * HUB_RING_PX - 1:]
+    edge, beyond = dark[HUB_RING_PX - 1 : -HUB_RING_PX], dark[2 * HUB_RING_PX - 1 :]
     ends = np.flatnonzero((edge >= HUB_EDGE_DARK) & (inside >= HUB_INSIDE_DARK) & (beyond <= edge - HUB_DROP))
     return float(ends[-1] + HUB_RING_PX) if ends.size else 0.0

@@ -28,14 +28,19 @@ class EquirectangularCamera:
 
     def __post_init__(self) -> None:
         if not np.isfinite((*self.focal, *self.center)).all():
-            raise CalibError("equirectangular camera: every parameter must be a finite number, found "
-                             f"{(*self.focal, *self.center)}")
+            raise CalibError(
+                f"equirectangular camera: every parameter must be a finite number, found {(*self.focal, *self.center)}"
+            )
         if min(self.focal) <= 0 or min(self.size) < 1:
-            raise CalibError("equirectangular camera: expected fu and fv above 0 and a size, found focal "
-                             f"{self.focal}, size {self.size}")
+            raise CalibError(
+                "equirectangular camera: expected fu and fv above 0 and a size, found focal "
+                f"{self.focal}, size {self.size}"
+            )
         if self.size[0] > 2 * math.pi * self.focal[0] + SEAM_PX:
-            raise CalibError(f"equirectangular camera: {self.size[0]} columns are more than a full turn of "
-                             f"{2 * math.pi * self.focal[0]:.1f}")
+            raise CalibError(
+                f"equirectangular camera: {self.size[0]} columns are more than a full turn of "
+                f"{2 * math.pi * self.focal[0]:.1f}"
+            )
 
     def project(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3); NaN for the origin and for what is not finite.

@@ -34,8 +34,9 @@ class DoubleSphereCamera:
     def __post_init__(self) -> None:
         _check("ds", (self.xi, self.alpha), self.focal, self.center, self.size)
         if not (-1 < self.xi < 1 and 0 <= self.alpha <= 1):
-            raise CalibError(f"ds camera: expected xi between -1 and 1 and alpha of 0 to 1, found {self.xi} and "
-                             f"{self.alpha}")
+            raise CalibError(
+                f"ds camera: expected xi between -1 and 1 and alpha of 0 to 1, found {self.xi} and {self.alpha}"
+            )
 
     def project(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3); NaN where the lens does not see them. Eq. (40) to (45)."""
@@ -85,7 +86,8 @@ class ExtendedUnifiedCamera:
         mx, my, r2 = _plane(self, pixels)
         root = 1 - (2 * self.alpha - 1) * self.beta * r2
         mz = (1 - self.beta * self.alpha**2 * r2) / (
-            self.alpha * np.sqrt(np.where(root >= 0, root, np.nan)) + 1 - self.alpha)
+            self.alpha * np.sqrt(np.where(root >= 0, root, np.nan)) + 1 - self.alpha
+        )
         return np.asarray(np.column_stack([mx, my, mz]) / np.sqrt(r2 + mz**2)[:, None])
 
 
@@ -146,12 +148,18 @@ class EquidistantCamera:
 
 LensCamera = DoubleSphereCamera | ExtendedUnifiedCamera | EquidistantCamera
 # Parameters of each model beside the focal lengths and the centre, by the names of their keys in files.
-LENS_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType({
-    "ds": ("xi", "alpha"), "eucm": ("alpha", "beta"), "equidistant": ("k1", "k2", "k3", "k4")})
+LENS_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"ds": ("xi", "alpha"), "eucm": ("alpha", "beta"), "equidistant": ("k1", "k2", "k3", "k4")}
+)
 
 
-def lens_camera(model: str, parameters: Sequence[float], focal: tuple[float, float], center: tuple[float, float],
-                size: tuple[int, int]) -> LensCamera:
+def lens_camera(
+    model: str,
+    parameters: Sequence[float],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    size: tuple[int, int],
+) -> LensCamera:
     """Return a camera of a model; parameters as LENS_KEYS lists them. Raise CalibError for wrong ones."""
     if model == "equidistant":
         k1, k2, k3, k4 = parameters
@@ -168,8 +176,13 @@ def lens_parameters(camera: LensCamera) -> tuple[float, ...]:
     return (camera.xi, camera.alpha) if isinstance(camera, DoubleSphereCamera) else (camera.alpha, camera.beta)
 
 
-def _check(name: str, parameters: tuple[float, ...], focal: tuple[float, float], center: tuple[float, float],
-           size: tuple[int, int]) -> None:
+def _check(
+    name: str,
+    parameters: tuple[float, ...],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    size: tuple[int, int],
+) -> None:
     """Raise CalibError for parameters that no camera has."""
     values = (*parameters, *focal, *center)
     if not np.isfinite(values).all():

@@ -26,8 +26,7 @@ def is_lens(camera: OmniCamera) -> bool:
     """True for a camera that sees the world directly: its image has no hub and need not have a rim."""
     if isinstance(camera, UnifiedCamera):
         return camera.xi == 0
-    return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera,
-                               EquirectangularCamera))
+    return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera, EquirectangularCamera))
 
 
 def sees_directly(camera: OmniCamera) -> bool:

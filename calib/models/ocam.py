@@ -76,24 +76,38 @@ class OcamCamera:
 
     def _check(self) -> None:
         if len(self.polynomial) > MAX_COEFFICIENTS:
-            raise CalibError(f"ocam camera: expected at most {MAX_COEFFICIENTS} polynomial coefficients, found "
-                             f"{len(self.polynomial)}")
-        values = (*self.polynomial, *self.center_row_column, *self.affine, *self.tangential,
-                  *self.astigmatism, *self.wavefront, self.distance_m)
+            raise CalibError(
+                f"ocam camera: expected at most {MAX_COEFFICIENTS} polynomial coefficients, found "
+                f"{len(self.polynomial)}"
+            )
+        values = (
+            *self.polynomial,
+            *self.center_row_column,
+            *self.affine,
+            *self.tangential,
+            *self.astigmatism,
+            *self.wavefront,
+            self.distance_m,
+        )
         if not self.polynomial or not np.isfinite(values).all():
             raise CalibError(f"ocam camera: every parameter must be a finite number, found {values}")
         largest = max(map(abs, self.wavefront), default=np.inf)
         if len(self.wavefront) != wavefronts.TERMS or largest > wavefronts.MAX_COEFFICIENT_M:
-            raise CalibError(f"ocam camera: expected a wavefront of {wavefronts.TERMS} lengths below "
-                             f"{wavefronts.MAX_COEFFICIENT_M} m, found {self.wavefront}")
+            raise CalibError(
+                f"ocam camera: expected a wavefront of {wavefronts.TERMS} lengths below "
+                f"{wavefronts.MAX_COEFFICIENT_M} m, found {self.wavefront}"
+            )
         if not MIN_DISTANCE_M <= self.distance_m <= MAX_DISTANCE_M:
-            raise CalibError(f"ocam camera: expected distance_m of {MIN_DISTANCE_M} to {MAX_DISTANCE_M:g}, found "
-                             f"{self.distance_m}")
+            raise CalibError(
+                f"ocam camera: expected distance_m of {MIN_DISTANCE_M} to {MAX_DISTANCE_M:g}, found {self.distance_m}"
+            )
         c, d, e = self.affine
         if self.polynomial[0] >= 0 or abs(c - d * e) < MIN_DETERMINANT or min(self.size) < 1 or self.view not in VIEWS:
-            raise CalibError("ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, "
-                             f"found a0 {self.polynomial[0]}, affine {self.affine}, size {self.size}, "
-                             f"view {self.view!r}")
+            raise CalibError(
+                "ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, "
+                f"found a0 {self.polynomial[0]}, affine {self.affine}, size {self.size}, "
+                f"view {self.view!r}"
+            )
 
     @property
     def center(self) -> tuple[float, float]:
@@ -117,8 +131,10 @@ class OcamCamera:
         return min(diagonal, float(real.min())) if real.size else diagonal
 
     def _not_evaluable(self) -> CalibError:
-        return CalibError("ocam camera: the polynomial overflows on the image; check its coefficients, the largest of "
-                          f"which is {max(self.polynomial, key=abs):g}")
+        return CalibError(
+            "ocam camera: the polynomial overflows on the image; check its coefficients, the largest of "
+            f"which is {max(self.polynomial, key=abs):g}"
+        )
 
     def _turning(self) -> Array:
         """Return the coefficients of rho * f'(rho) - f(rho): rho^2 times the slope of f(rho)/rho."""
@@ -183,8 +199,10 @@ class OcamCamera:
         (p1, p2), (s1, s2) = self.tangential, self.astigmatism
         x2, xy, y2 = x * x, x * y, y * y
         x3, y3, rho2 = x2 * x, y2 * y, x2 + y2  # numpy's x**3 takes ten times as long
-        return (x + 2 * p1 * xy + p2 * (rho2 + 2 * x2) + 4 * s1 * x3 + s2 * (6 * x2 * y + 2 * y3),
-                y + p1 * (rho2 + 2 * y2) + 2 * p2 * xy - 4 * s1 * y3 + s2 * (2 * x3 + 6 * x * y2))
+        return (
+            x + 2 * p1 * xy + p2 * (rho2 + 2 * x2) + 4 * s1 * x3 + s2 * (6 * x2 * y + 2 * y3),
+            y + p1 * (rho2 + 2 * y2) + 2 * p2 * xy - 4 * s1 * y3 + s2 * (2 * x3 + 6 * x * y2),
+        )
 
     def _undistort(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Invert the tangential and astigmatic terms by Newton steps; NaN for points without convergence."""

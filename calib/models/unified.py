@@ -36,8 +36,10 @@ class UnifiedCamera:
         if not np.isfinite(values).all():
             raise CalibError(f"omni camera: every parameter must be a finite number, found {values}")
         if self.xi < 0 or 0 in self.focal or min(self.size) < 1:
-            raise CalibError(f"omni camera: expected xi >= 0, fu and fv not 0 and a size, found xi {self.xi}, "
-                             f"focal {self.focal}, size {self.size}")
+            raise CalibError(
+                f"omni camera: expected xi >= 0, fu and fv not 0 and a size, found xi {self.xi}, "
+                f"focal {self.focal}, size {self.size}"
+            )
 
     def project(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3); NaN beyond the projection's edge. Mei and Rives 2007, eq. (1), (4)."""
@@ -64,8 +66,9 @@ class UnifiedCamera:
         x, y = m.T
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + k2 * r2)
-        return np.column_stack([x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y])
+        return np.column_stack(
+            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y]
+        )
 
     def _undistort(self, distorted: Array) -> Array:
         if not any(self.distortion):

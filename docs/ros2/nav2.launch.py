@@ -5,18 +5,28 @@ from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-SERVERS = {"planner_server": "nav2_planner", "controller_server": "nav2_controller",
-           "behavior_server": "nav2_behaviors", "bt_navigator": "nav2_bt_navigator"}
+SERVERS = {
+    "planner_server": "nav2_planner",
+    "controller_server": "nav2_controller",
+    "behavior_server": "nav2_behaviors",
+    "bt_navigator": "nav2_bt_navigator",
+}
 VELOCITY = [("cmd_vel", "/omnid/cmd/planner/twist")]
 
 
 def generate_launch_description():
     """Return the servers, and the manager that activates them."""
     parameters = LaunchConfiguration("params_file")
-    servers = [Node(package=package, executable=name, name=name, parameters=[parameters], remappings=VELOCITY,
-                    output="screen") for name, package in SERVERS.items()]
-    manager = Node(package="nav2_lifecycle_manager", executable="lifecycle_manager",
-                   name="lifecycle_manager_navigation", output="screen",
-                   parameters=[{"autostart": True, "node_names": list(SERVERS)}])
+    servers = [
+        Node(package=package, executable=name, name=name, parameters=[parameters], remappings=VELOCITY, output="screen")
+        for name, package in SERVERS.items()
+    ]
+    manager = Node(
+        package="nav2_lifecycle_manager",
+        executable="lifecycle_manager",
+        name="lifecycle_manager_navigation",
+        output="screen",
+        parameters=[{"autostart": True, "node_names": list(SERVERS)}],
+    )
     file = DeclareLaunchArgument("params_file", default_value="nav2_params.yaml")
     return LaunchDescription([file, *servers, manager])

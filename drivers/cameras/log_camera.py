@@ -35,8 +35,9 @@ class LogImages:
     warnings: tuple[str, ...] = ()  # of the reader, a line each
 
     @staticmethod
-    def load(path: Path, lower: str | None = None, upper: str | None = None, motion: MotionTopics | None = None
-             ) -> LogImages:
+    def load(
+        path: Path, lower: str | None = None, upper: str | None = None, motion: MotionTopics | None = None
+    ) -> LogImages:
         """Load the images of a log. lower, upper: topics, where their names do not identify the cameras.
 
         motion: topics of wheels and IMU; None: they are not read. Raises DriverError where a camera has fewer than two
@@ -49,13 +50,17 @@ class LogImages:
         finally:
             reader.close()
         timed = [(frame.stamp_ns - frames[0].stamp_ns, frame) for frame in frames]
-        images = LogImages(lower=tuple(entry for entry in timed if entry[1].camera == "lower"),
-                           upper=tuple(entry for entry in timed if entry[1].camera == "upper"),
-                           motion=tuple((sample.stamp_ns - frames[0].stamp_ns, sample) for sample in samples),
-                           warnings=tuple(reader.warnings))
+        images = LogImages(
+            lower=tuple(entry for entry in timed if entry[1].camera == "lower"),
+            upper=tuple(entry for entry in timed if entry[1].camera == "upper"),
+            motion=tuple((sample.stamp_ns - frames[0].stamp_ns, sample) for sample in samples),
+            warnings=tuple(reader.warnings),
+        )
         if min(len(images.lower), len(images.upper)) < 2:
-            raise DriverError(f"{path}: {len(images.lower)} images of the lower and {len(images.upper)} of the "
-                              "upper camera: give a log with two or more of each")
+            raise DriverError(
+                f"{path}: {len(images.lower)} images of the lower and {len(images.upper)} of the "
+                "upper camera: give a log with two or more of each"
+            )
         return images
 
     @property
@@ -81,8 +86,9 @@ def _limited(messages: Iterator[Frame | MotionSample], samples: list[MotionSampl
         if total_bytes > MAX_LOG_BYTES:
             raise DriverError(f"{path}: more than {MAX_LOG_BYTES >> 20} MiB of images: cut the log into shorter ones")
         if len(samples) > MAX_SAMPLES:
-            raise DriverError(f"{path}: more than {MAX_SAMPLES} samples of wheels and IMU: cut the log into shorter "
-                              "ones")
+            raise DriverError(
+                f"{path}: more than {MAX_SAMPLES} samples of wheels and IMU: cut the log into shorter ones"
+            )
 
 
 class LogClock:
@@ -112,11 +118,14 @@ class LogCamera:
     delivered. Raises DriverError for a pace out of range.
     """
 
-    def __init__(self, images: LogImages, camera: Camera, clock: LogClock, *, pace: float = 1.0, once: bool = False
-                 ) -> None:
+    def __init__(
+        self, images: LogImages, camera: Camera, clock: LogClock, *, pace: float = 1.0, once: bool = False
+    ) -> None:
         if not MIN_PACE <= pace <= MAX_PACE:
-            raise DriverError(f"the pace of a log is {pace:g}; give a number from {MIN_PACE:g} to {MAX_PACE:g}; above "
-                              "1 is faster than it was recorded")
+            raise DriverError(
+                f"the pace of a log is {pace:g}; give a number from {MIN_PACE:g} to {MAX_PACE:g}; above "
+                "1 is faster than it was recorded"
+            )
         self._images, self._frames = images, images.lower if camera == "lower" else images.upper
         self._clock, self._pace, self._once = clock, pace, once
         self._created_ns = time.monotonic_ns()
@@ -188,8 +197,9 @@ class LogMotion:
             yield from ((start_ns + at_ns, sample, 1) for at_ns, sample in self._images.motion)
             if self._once:
                 return
-            yield from ((start_ns + pass_ns + last_ns - at_ns, sample, -1)
-                        for at_ns, sample in reversed(self._images.motion))
+            yield from (
+                (start_ns + pass_ns + last_ns - at_ns, sample, -1) for at_ns, sample in reversed(self._images.motion)
+            )
 
 
 def _scaled(sample: MotionSample, stamp_ns: int, factor: float) -> MotionSample:

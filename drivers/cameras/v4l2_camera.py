@@ -91,8 +91,7 @@ class V4l2Camera:
             if self.state.exposure is not None:
                 stream.exposure.follow(self.state.exposure, stamp_ns)
             seq = self._counted()
-            yield Frame(seq, stamp_ns, self._camera, image.encoding, data, image.width_px, image.height_px,
-                        image.step)
+            yield Frame(seq, stamp_ns, self._camera, image.encoding, data, image.width_px, image.height_px, image.step)
 
     def _next(self, stream: V4l2Stream) -> tuple[int, bytes] | None:
         """Return stamp and bytes of the next valid image, None when closing; raise DriverError at the timeout."""
@@ -105,8 +104,10 @@ class V4l2Camera:
                 elif (stamp_ns := self._accepted(filled[0], stream)) is not None:
                     return stamp_ns, filled[1]
             if time.monotonic() > deadline_s and not self._closing:
-                raise DriverError(f"camera {self._settings.device} sent no valid image for "
-                                  f"{self._settings.timeout_s:g} s; check its cable and power")
+                raise DriverError(
+                    f"camera {self._settings.device} sent no valid image for "
+                    f"{self._settings.timeout_s:g} s; check its cable and power"
+                )
         return None
 
     def _accepted(self, buffer: v4l2.V4l2Buffer, stream: V4l2Stream) -> int | None:
@@ -140,8 +141,10 @@ class V4l2Camera:
         self._streams.append(stream)
         self.state.reopens += 1
         if self._bus_info and stream.bus_info != self._bus_info:
-            raise DriverError(f"camera {self._settings.device} was at {self._bus_info}, and is another one at "
-                              f"{stream.bus_info} now; use a persistent name, see `omnid cameras`")
+            raise DriverError(
+                f"camera {self._settings.device} was at {self._bus_info}, and is another one at "
+                f"{stream.bus_info} now; use a persistent name, see `omnid cameras`"
+            )
         self.state.mode = str(stream.image)
         if self.state.exposure is not None:
             self.state.exposure.problem = ""

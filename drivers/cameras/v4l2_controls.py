@@ -31,9 +31,16 @@ MANUAL_EXPOSURE: Final = 1  # enum v4l2_exposure_auto_type, with the next two
 _APERTURE_PRIORITY, _AUTO = 3, 0
 _POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
 _MENU_VALUE: Final = slice(8, 16)  # of struct v4l2_querymenu: the 64-bit integer in the place of the name
-_NAMES: Final = {GAIN: "gain", AUTO_GAIN: "automatic gain", AUTO_WHITE_BALANCE: "automatic white balance",
-                 POWER_LINE_FREQUENCY: "power line frequency", AUTO_EXPOSURE: "automatic exposure",
-                 EXPOSURE: "exposure time", FOCUS: "focus", AUTO_FOCUS: "automatic focus"}
+_NAMES: Final = {
+    GAIN: "gain",
+    AUTO_GAIN: "automatic gain",
+    AUTO_WHITE_BALANCE: "automatic white balance",
+    POWER_LINE_FREQUENCY: "power line frequency",
+    AUTO_EXPOSURE: "automatic exposure",
+    EXPOSURE: "exposure time",
+    FOCUS: "focus",
+    AUTO_FOCUS: "automatic focus",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +74,9 @@ def list_controls(fd: int) -> dict[int, CameraControl]:
     found = {}
     for entry in _queried(fd):
         if entry.type in _KINDS and not entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
-            found[entry.id] = CameraControl(entry.id, _plain(entry.name), entry.type, entry.minimum, entry.maximum,
-                                            entry.step, _menu(fd, entry))
+            found[entry.id] = CameraControl(
+                entry.id, _plain(entry.name), entry.type, entry.minimum, entry.maximum, entry.step, _menu(fd, entry)
+            )
     return found
 
 
@@ -94,13 +102,17 @@ def apply_controls(fd: int, plan: list[tuple[CameraControl, int]]) -> None:
         except OSError as error:
             if error.errno in (errno.ENODEV, errno.EBUSY):
                 raise
-            raise DriverError(f"control {control.name}: the device refused {value} ({error.strerror}); "
-                              f"it accepts {control.range}, and some only while their automatic mode is off") from error
+            raise DriverError(
+                f"control {control.name}: the device refused {value} ({error.strerror}); "
+                f"it accepts {control.range}, and some only while their automatic mode is off"
+            ) from error
     for control, value in plan:
         found = read_control(fd, control.id)
         if found != value:
-            raise DriverError(f"control {control.name}: {value} was set, the device stays at {found}; "
-                              "set a value that it keeps, or leave it as it is")
+            raise DriverError(
+                f"control {control.name}: {value} was set, the device stays at {found}; "
+                "set a value that it keeps, or leave it as it is"
+            )
 
 
 def read_control(fd: int, control_id: int) -> int:
@@ -118,9 +130,11 @@ def _automatic_modes(settings: V4l2Settings, offered: Mapping[int, CameraControl
             yield AUTO_EXPOSURE, _automatic_exposure(offered) if automatic else MANUAL_EXPOSURE
         if EXPOSURE_MAY_SLOW in offered:
             yield EXPOSURE_MAY_SLOW, 0
-    for control_id, switch, fixed in ((AUTO_GAIN, settings.auto_gain, settings.gain >= 0),
-                                      (AUTO_WHITE_BALANCE, settings.auto_white_balance, False),
-                                      (AUTO_FOCUS, settings.auto_focus, settings.focus >= 0)):
+    for control_id, switch, fixed in (
+        (AUTO_GAIN, settings.auto_gain, settings.gain >= 0),
+        (AUTO_WHITE_BALANCE, settings.auto_white_balance, False),
+        (AUTO_FOCUS, settings.auto_focus, settings.focus >= 0),
+    ):
         if switch != "keep" or (fixed and control_id in offered):
             yield control_id, int(switch == "on")
 
@@ -187,6 +201,9 @@ def _menu(fd: int, entry: v4l2.QueryControl) -> dict[int, str]:
                 v4l2.call(fd, v4l2.QUERYMENU, item)
             except OSError:
                 continue
-            items[index] = (item.name.decode("utf-8", "replace") if entry.type == v4l2.CONTROL_MENU
-                            else str(int.from_bytes(bytes(item)[_MENU_VALUE], "little", signed=True)))
+            items[index] = (
+                item.name.decode("utf-8", "replace")
+                if entry.type == v4l2.CONTROL_MENU
+                else str(int.from_bytes(bytes(item)[_MENU_VALUE], "little", signed=True))
+            )
     return items

@@ -58,8 +58,10 @@ def udev_rules(devices: Iterable[CaptureDevice]) -> Iterator[str]:
     for device, camera in zip(known, ("lower", "upper"), strict=False):
         shared = sum(other.id_path == device.id_path for other in known) > 1
         name = f'ATTR{{name}}=="{device.name}", ' if shared else ""
-        yield (f'SUBSYSTEM=="video4linux", ATTR{{index}}=="0", ENV{{ID_PATH}}=="{device.id_path}", {name}'
-               f'SYMLINK+="omnid/{camera}"')
+        yield (
+            f'SUBSYSTEM=="video4linux", ATTR{{index}}=="0", ENV{{ID_PATH}}=="{device.id_path}", {name}'
+            f'SYMLINK+="omnid/{camera}"'
+        )
 
 
 def describe_device(device: CaptureDevice) -> Iterator[str]:
@@ -88,8 +90,18 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
     except DriverError as error:
         found, problem = (_linked_name(entry / "device/driver"), "", (), ""), str(error)
     driver, bus, offered, exposure = found
-    return CaptureDevice(_in(root, node), _read(entry / "name"), driver, bus, by_path, by_id,
-                         _id_path(by_path or _sibling_link(root, entry)), offered, problem, exposure)
+    return CaptureDevice(
+        _in(root, node),
+        _read(entry / "name"),
+        driver,
+        bus,
+        by_path,
+        by_id,
+        _id_path(by_path or _sibling_link(root, entry)),
+        offered,
+        problem,
+        exposure,
+    )
 
 
 def _query(node: Path) -> tuple[str, str, tuple[Mode, ...], str] | None:

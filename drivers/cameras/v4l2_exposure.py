@@ -95,8 +95,11 @@ class ExposureControls:
     def _take_over(self) -> None:
         """Switch the automatic modes off, and keep what `release` restores: values first, then modes."""
         modes = ((AUTO_EXPOSURE, MANUAL_EXPOSURE), (AUTO_GAIN, 0))
-        changed = [(control, value) for control, value in modes
-                   if control in self._offered and (control != AUTO_GAIN or self._with_gain)]
+        changed = [
+            (control, value)
+            for control, value in modes
+            if control in self._offered and (control != AUTO_GAIN or self._with_gain)
+        ]
         kept = [(control, read_control(self._fd, control)) for control, _ in changed]
         if self._with_gain and GAIN in self._offered:
             kept.append((GAIN, read_control(self._fd, GAIN)))

@@ -37,15 +37,29 @@ _u8, _u32, _i32 = ctypes.c_uint8, ctypes.c_uint32, ctypes.c_int32
 class Capability(ctypes.Structure):
     """struct v4l2_capability."""
 
-    _fields_ = (("driver", ctypes.c_char * 16), ("card", ctypes.c_char * 32), ("bus_info", ctypes.c_char * 32),
-                ("version", _u32), ("capabilities", _u32), ("device_caps", _u32), ("reserved", _u32 * 3))
+    _fields_ = (
+        ("driver", ctypes.c_char * 16),
+        ("card", ctypes.c_char * 32),
+        ("bus_info", ctypes.c_char * 32),
+        ("version", _u32),
+        ("capabilities", _u32),
+        ("device_caps", _u32),
+        ("reserved", _u32 * 3),
+    )
 
 
 class FormatDescription(ctypes.Structure):
     """struct v4l2_fmtdesc."""
 
-    _fields_ = (("index", _u32), ("type", _u32), ("flags", _u32), ("description", ctypes.c_char * 32),
-                ("pixelformat", _u32), ("mbus_code", _u32), ("reserved", _u32 * 3))
+    _fields_ = (
+        ("index", _u32),
+        ("type", _u32),
+        ("flags", _u32),
+        ("description", ctypes.c_char * 32),
+        ("pixelformat", _u32),
+        ("mbus_code", _u32),
+        ("reserved", _u32 * 3),
+    )
 
 
 class FrameSize(ctypes.Structure):
@@ -63,16 +77,34 @@ class Fraction(ctypes.Structure):
 class FrameInterval(ctypes.Structure):
     """struct v4l2_frmivalenum; interval [s]: one discrete value, or min, max, step."""
 
-    _fields_ = (("index", _u32), ("pixel_format", _u32), ("width", _u32), ("height", _u32), ("type", _u32),
-                ("interval", Fraction * 3), ("reserved", _u32 * 2))
+    _fields_ = (
+        ("index", _u32),
+        ("pixel_format", _u32),
+        ("width", _u32),
+        ("height", _u32),
+        ("type", _u32),
+        ("interval", Fraction * 3),
+        ("reserved", _u32 * 2),
+    )
 
 
 class PixelFormat(ctypes.Structure):
     """struct v4l2_pix_format."""
 
-    _fields_ = (("width", _u32), ("height", _u32), ("pixelformat", _u32), ("field", _u32), ("bytesperline", _u32),
-                ("sizeimage", _u32), ("colorspace", _u32), ("priv", _u32), ("flags", _u32), ("ycbcr_enc", _u32),
-                ("quantization", _u32), ("xfer_func", _u32))
+    _fields_ = (
+        ("width", _u32),
+        ("height", _u32),
+        ("pixelformat", _u32),
+        ("field", _u32),
+        ("bytesperline", _u32),
+        ("sizeimage", _u32),
+        ("colorspace", _u32),
+        ("priv", _u32),
+        ("flags", _u32),
+        ("ycbcr_enc", _u32),
+        ("quantization", _u32),
+        ("xfer_func", _u32),
+    )
 
 
 class _AnyFormat(ctypes.Union):
@@ -88,8 +120,15 @@ class Format(ctypes.Structure):
 class StreamParameters(ctypes.Structure):
     """struct v4l2_streamparm with the capture branch of its union, struct v4l2_captureparm."""
 
-    _fields_ = (("type", _u32), ("capability", _u32), ("capturemode", _u32), ("timeperframe", Fraction),
-                ("extendedmode", _u32), ("readbuffers", _u32), ("reserved", _u8 * (200 - 6 * 4)))
+    _fields_ = (
+        ("type", _u32),
+        ("capability", _u32),
+        ("capturemode", _u32),
+        ("timeperframe", Fraction),
+        ("extendedmode", _u32),
+        ("readbuffers", _u32),
+        ("reserved", _u8 * (200 - 6 * 4)),
+    )
 
 
 class BufferRequest(ctypes.Structure):
@@ -109,9 +148,21 @@ class _BufferMemory(ctypes.Union):
 class V4l2Buffer(ctypes.Structure):
     """struct v4l2_buffer."""
 
-    _fields_ = (("index", _u32), ("type", _u32), ("bytesused", _u32), ("flags", _u32), ("field", _u32),
-                ("timestamp", _Timeval), ("timecode", _u32 * 4), ("sequence", _u32), ("memory", _u32),
-                ("m", _BufferMemory), ("length", _u32), ("reserved2", _u32), ("request_fd", _u32))
+    _fields_ = (
+        ("index", _u32),
+        ("type", _u32),
+        ("bytesused", _u32),
+        ("flags", _u32),
+        ("field", _u32),
+        ("timestamp", _Timeval),
+        ("timecode", _u32 * 4),
+        ("sequence", _u32),
+        ("memory", _u32),
+        ("m", _BufferMemory),
+        ("length", _u32),
+        ("reserved2", _u32),
+        ("request_fd", _u32),
+    )
 
     @property
     def stamp_ns(self) -> int:
@@ -122,8 +173,17 @@ class V4l2Buffer(ctypes.Structure):
 class QueryControl(ctypes.Structure):
     """struct v4l2_queryctrl."""
 
-    _fields_ = (("id", _u32), ("type", _u32), ("name", ctypes.c_char * 32), ("minimum", _i32), ("maximum", _i32),
-                ("step", _i32), ("default_value", _i32), ("flags", _u32), ("reserved", _u32 * 2))
+    _fields_ = (
+        ("id", _u32),
+        ("type", _u32),
+        ("name", ctypes.c_char * 32),
+        ("minimum", _i32),
+        ("maximum", _i32),
+        ("step", _i32),
+        ("default_value", _i32),
+        ("flags", _u32),
+        ("reserved", _u32 * 2),
+    )
 
 
 class QueryMenu(ctypes.Structure):

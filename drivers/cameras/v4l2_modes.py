@@ -77,8 +77,11 @@ def choose_format(modes: Iterable[Mode], pixel_format: str, size_px: tuple[int, 
 
 def list_modes(fd: int) -> list[Mode]:
     """Return all modes of an open device in the driver's order."""
-    return [Mode(v4l2.fourcc(code), widths, heights, tuple(_rates(fd, code, widths.low, heights.low)))
-            for code in _formats(fd) for widths, heights in list(_sizes(fd, code)) or [_ANY_SIZE]]
+    return [
+        Mode(v4l2.fourcc(code), widths, heights, tuple(_rates(fd, code, widths.low, heights.low)))
+        for code in _formats(fd)
+        for widths, heights in list(_sizes(fd, code)) or [_ANY_SIZE]
+    ]
 
 
 def _formats(fd: int) -> Iterator[int]:

@@ -39,21 +39,37 @@ class V4l2Settings:
     retry_s: float = 2.0  # longest wait between two tries to open a lost device
 
     def __post_init__(self) -> None:
-        for name, allowed in (("pixel_format", PIXEL_FORMATS), ("power_line", POWER_LINE),
-                              ("auto_exposure", EXPOSURE_MODES), ("auto_gain", SWITCH), ("auto_white_balance", SWITCH),
-                              ("auto_focus", SWITCH)):
+        for name, allowed in (
+            ("pixel_format", PIXEL_FORMATS),
+            ("power_line", POWER_LINE),
+            ("auto_exposure", EXPOSURE_MODES),
+            ("auto_gain", SWITCH),
+            ("auto_white_balance", SWITCH),
+            ("auto_focus", SWITCH),
+        ):
             self._require(name, getattr(self, name) in allowed, f"one of {', '.join(allowed)}")
-        for name, low, high in (("width_px", 16, MAX_SIZE_PX), ("height_px", 16, MAX_SIZE_PX), ("rate_hz", 0, 1000),
-                                ("buffers", 2, 32), ("timeout_s", 0.05, 60), ("retry_s", 0.05, 60),
-                                ("exposure_us", 0, 10**7), ("gain", -1, _MAX_CONTROL), ("focus", -1, _MAX_CONTROL)):
+        for name, low, high in (
+            ("width_px", 16, MAX_SIZE_PX),
+            ("height_px", 16, MAX_SIZE_PX),
+            ("rate_hz", 0, 1000),
+            ("buffers", 2, 32),
+            ("timeout_s", 0.05, 60),
+            ("retry_s", 0.05, 60),
+            ("exposure_us", 0, 10**7),
+            ("gain", -1, _MAX_CONTROL),
+            ("focus", -1, _MAX_CONTROL),
+        ):
             value = getattr(self, name)
             self._require(name, low <= value <= high, f"{low} to {high}")
         self._require("device", self.device.startswith("/"), "a path such as /dev/v4l/by-path/..., see `omnid cameras`")
         for text in self.controls:
             self._require("controls", re.fullmatch(r"\w+ *= *-?\d{1,10}", text) is not None, "entries such as 'gain=3'")
         for name, fixed in (("exposure", self.exposure_us > 0), ("gain", self.gain >= 0), ("focus", self.focus >= 0)):
-            self._require(f"auto_{name}", not (fixed and getattr(self, f"auto_{name}") == "on"),
-                          f"off where a fixed {name} is set")
+            self._require(
+                f"auto_{name}",
+                not (fixed and getattr(self, f"auto_{name}") == "on"),
+                f"off where a fixed {name} is set",
+            )
 
     @property
     def is_regulated(self) -> bool:

@@ -35,8 +35,11 @@ class StampValidator:
         stamp_ns = buffer.stamp_ns
         if not max(self._last_stamp_ns, arrival_ns - _MAX_AGE_NS) < stamp_ns <= arrival_ns:
             self._state.restamped += 1
-            self._report_once("stamp", f"a stamp is {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not "
-                              "after the stamp before; the time of arrival is used for such images, which are counted")
+            self._report_once(
+                "stamp",
+                f"a stamp is {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not "
+                "after the stamp before; the time of arrival is used for such images, which are counted",
+            )
             stamp_ns = max(arrival_ns, self._last_stamp_ns + 1)
         self._last_stamp_ns = stamp_ns
         return stamp_ns

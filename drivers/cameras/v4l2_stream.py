@@ -133,8 +133,10 @@ def _require_capture(fd: int) -> str:
     found = query_capability(fd)
     needed = v4l2.CAP_VIDEO_CAPTURE | v4l2.CAP_STREAMING
     if found.device_caps & needed != needed:
-        raise DriverError("is no capture device now; `omnid cameras` lists those that are (a loopback device is one "
-                          "only while a program writes to it)")
+        raise DriverError(
+            "is no capture device now; `omnid cameras` lists those that are (a loopback device is one "
+            "only while a program writes to it)"
+        )
     return str(found.bus_info.decode("utf-8", "replace"))
 
 
@@ -151,8 +153,10 @@ def _set_image(fd: int, settings: V4l2Settings) -> StreamFormat:
     pix = in_force.fmt.pix
     found_name = v4l2.fourcc(pix.pixelformat)
     if (found_name, pix.width, pix.height) != (name, *size):
-        raise DriverError(f"{name} {size[0]}x{size[1]} was requested, the device set {found_name} "
-                          f"{pix.width}x{pix.height}; choose a mode that `omnid cameras` lists")
+        raise DriverError(
+            f"{name} {size[0]}x{size[1]} was requested, the device set {found_name} "
+            f"{pix.width}x{pix.height}; choose a mode that `omnid cameras` lists"
+        )
     row_bytes = BYTES_PER_PIXEL.get(name, 0) * pix.width
     step = max(row_bytes, pix.bytesperline) if row_bytes else 0
     return StreamFormat(name, pix.width, pix.height, step, _set_rate(fd, settings))
@@ -168,8 +172,10 @@ def _set_rate(fd: int, settings: V4l2Settings) -> float:
     found_hz = _rate(fd)
     if settings.rate_hz and abs(found_hz - settings.rate_hz) > RATE_TOLERANCE * settings.rate_hz:
         found = f"set {found_hz:.4g} Hz" if found_hz else "has no rate to set"
-        raise DriverError(f"{settings.rate_hz:g} Hz was requested, the device {found}; "
-                          "choose a rate that `omnid cameras` lists, or 0 for the device's own")
+        raise DriverError(
+            f"{settings.rate_hz:g} Hz was requested, the device {found}; "
+            "choose a rate that `omnid cameras` lists, or 0 for the device's own"
+        )
     return found_hz
 
 
@@ -191,8 +197,9 @@ def _request_buffers(fd: int, count: int) -> int:
     request = v4l2.BufferRequest(count=count, type=v4l2.CAPTURE, memory=v4l2.MMAP)
     v4l2.call(fd, v4l2.REQBUFS, request)
     if request.count < _MIN_BUFFERS:
-        raise DriverError(f"{count} buffers were requested, the device gave {request.count}; "
-                          f"streaming needs {_MIN_BUFFERS}")
+        raise DriverError(
+            f"{count} buffers were requested, the device gave {request.count}; streaming needs {_MIN_BUFFERS}"
+        )
     return int(request.count)
 
 

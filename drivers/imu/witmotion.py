@@ -44,12 +44,12 @@ class PacketReader:
         """Yield the angular velocities [rad/s] in the bytes."""
         self._bytes += data
         while (start := self._bytes.find(START)) >= 0 and len(self._bytes) - start >= PACKET.size:
-            packet = bytes(self._bytes[start:start + PACKET.size])
+            packet = bytes(self._bytes[start : start + PACKET.size])
             if sum(packet[:-1]) & 0xFF != packet[-1]:
                 self.broken += 1
-                del self._bytes[:start + 1]  # the start may have been a byte of a packet
+                del self._bytes[: start + 1]  # the start may have been a byte of a packet
                 continue
-            del self._bytes[:start + PACKET.size]
+            del self._bytes[: start + PACKET.size]
             _, kind, x, y, z, _, _ = PACKET.unpack(packet)
             if kind == GYRO:
                 yield x * RADPS_PER_UNIT, y * RADPS_PER_UNIT, z * RADPS_PER_UNIT

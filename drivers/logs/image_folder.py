@@ -119,15 +119,19 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
     _require_own_files(top, paths)
     lines = _stamp_lines(folder)
     if lines is not None and len(lines) != len(paths):
-        raise DriverError(f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
-                          "they must be as many")
+        raise DriverError(
+            f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
+            "they must be as many"
+        )
     for index, path in enumerate(paths):
         text = path.stem if lines is None else lines[index]
         stamp_ns = parse_stamp(text)
         if stamp_ns is None:
             where = "is named" if lines is None else "has the stamp"
-            raise DriverError(f"{str(path)!r} {where} {text[:40]!r}; expected a stamp: nanoseconds of 16 digits or "
-                              f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}")
+            raise DriverError(
+                f"{str(path)!r} {where} {text[:40]!r}; expected a stamp: nanoseconds of 16 digits or "
+                f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}"
+            )
         yield _StampedFile(stamp_ns, topic, path)
 
 
@@ -136,16 +140,23 @@ def _require_no_gap(files: Sequence[_StampedFile]) -> None:
     for before, after in pairwise(files):
         gap_ns = after.stamp_ns - before.stamp_ns
         if gap_ns > _LONGEST_GAP_NS:
-            raise DriverError(f"{str(before.path)!r} and {after.path.name!r} are {_in_words(gap_ns)} apart by their "
-                              "stamps; whole numbers of fewer than 16 digits are seconds: give the stamps in seconds "
-                              f"or in nanoseconds since 1970 in {STAMP_FILES[0]}, or split the log at the gap")
+            raise DriverError(
+                f"{str(before.path)!r} and {after.path.name!r} are {_in_words(gap_ns)} apart by their "
+                "stamps; whole numbers of fewer than 16 digits are seconds: give the stamps in seconds "
+                f"or in nanoseconds since 1970 in {STAMP_FILES[0]}, or split the log at the gap"
+            )
 
 
 def _in_words(gap_ns: int) -> str:
     """Return a time of hours, days or years."""
     hours = gap_ns / 3600e9
-    return f"{hours:.1f} hours" if hours < 48 else f"{hours / 24:.0f} days" if hours < 9000 else (
-        f"{hours / 8766:.1f} years")
+    return (
+        f"{hours:.1f} hours"
+        if hours < 48
+        else f"{hours / 24:.0f} days"
+        if hours < 9000
+        else (f"{hours / 8766:.1f} years")
+    )
 
 
 def _require_own_files(top: Path, paths: Sequence[Path]) -> None:
@@ -154,12 +165,17 @@ def _require_own_files(top: Path, paths: Sequence[Path]) -> None:
     A pipe or a device would be waited for without an end, and a link could lead to any file of the machine.
     """
     real_top = os.path.realpath(top)
-    others = [path for path in paths if not path.is_file()
-              or os.path.commonpath([real_top, os.path.realpath(path)]) != real_top]
+    others = [
+        path
+        for path in paths
+        if not path.is_file() or os.path.commonpath([real_top, os.path.realpath(path)]) != real_top
+    ]
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise DriverError(f"{str(others[0])!r}{more}: no regular file of the folder {str(top)!r}, but a pipe, a "
-                          "device, a folder, or a link out of it: remove it, or copy what it leads to")
+        raise DriverError(
+            f"{str(others[0])!r}{more}: no regular file of the folder {str(top)!r}, but a pipe, a "
+            "device, a folder, or a link out of it: remove it, or copy what it leads to"
+        )
 
 
 def _read_regular(path: Path, most_bytes: int) -> bytes:

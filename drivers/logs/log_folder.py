@@ -94,8 +94,10 @@ class LogFolder:
             raise DriverError(f"cannot record to {str(self.path)!r}: {error.strerror}; name another folder") from error
         free = disk.f_bavail * disk.f_frsize
         if free < wanted_bytes:
-            raise DriverError(f"cannot record to {str(self.path)!r}: {free // _MB} MB are free and "
-                              f"{-(-wanted_bytes // _MB)} needed; make room, or keep fewer or smaller files")
+            raise DriverError(
+                f"cannot record to {str(self.path)!r}: {free // _MB} MB are free and "
+                f"{-(-wanted_bytes // _MB)} needed; make room, or keep fewer or smaller files"
+            )
 
     def _recordings(self) -> Iterator[RecordingFile]:
         with suppress(OSError), os.scandir(self.path) as entries:

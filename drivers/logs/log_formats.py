@@ -87,8 +87,10 @@ def _open_folder(path: Path) -> ImageLog:
     if not logs and (folders := image_folders(path)):
         return ImageFolder(path, folders)
     names = ", ".join(log.name for log in logs[:_MAX_LISTED]) or "none"
-    raise DriverError(f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}), the numbered parts of one, or a "
-                      f"folder of images for each camera; found: {names}; give one file")
+    raise DriverError(
+        f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}), the numbered parts of one, or a "
+        f"folder of images for each camera; found: {names}; give one file"
+    )
 
 
 def parts_in_order(logs: list[Path]) -> list[Path]:

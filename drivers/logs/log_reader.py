@@ -50,7 +50,12 @@ class LogReader:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], lower: str | None = None, upper: str | None = None, *, window: int = 32,
+        self,
+        path: str | os.PathLike[str],
+        lower: str | None = None,
+        upper: str | None = None,
+        *,
+        window: int = 32,
         span_s: tuple[float, float] = WHOLE,
         motion: MotionTopics | None = None,
     ) -> None:
@@ -62,8 +67,11 @@ class LogReader:
             wanted: dict[Camera, str | None] = {"lower": lower, "upper": upper}
             topics = self._log.topics()
             self._cameras = choose_topics(repr(self._log.name), topics, wanted)
-            self._motion = MotionChoice(frozenset()) if motion is None else choose_motion_topics(
-                repr(self._log.name), topics, motion)
+            self._motion = (
+                MotionChoice(frozenset())
+                if motion is None
+                else choose_motion_topics(repr(self._log.name), topics, motion)
+            )
             self._reset()
         except DriverError:
             self.close()
@@ -120,8 +128,10 @@ class LogReader:
             if at_s > end_s:
                 return
         if first_ns is not None and at_s < begin_s:
-            raise DriverError(f"{self._log.name!r} ends {at_s:.1f} s after its first image: a start before that was "
-                              f"expected, {begin_s:g} s found")
+            raise DriverError(
+                f"{self._log.name!r} ends {at_s:.1f} s after its first image: a start before that was "
+                f"expected, {begin_s:g} s found"
+            )
 
     def close(self) -> None:
         """End frames() and close the log."""
@@ -188,7 +198,6 @@ class LogReader:
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
         faults = {"fault": self._fault, "motion_fault": self._motion_fault}
         self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]
-
 
 
 class _Samples:

@@ -36,8 +36,9 @@ class Catalog:
     def add(self, opcode: int, body: memoryview) -> None:
         """Add a schema or channel record; raise RecordError where it is malformed or exceeds the limits."""
         if len(body) > _MAX_DEFINITION_BYTES or max(len(self._types), len(self._channels)) >= _MAX_CHANNELS:
-            raise RecordError(f"more than {_MAX_CHANNELS} channels or schemas, or one of more than "
-                              f"{_MAX_DEFINITION_BYTES} bytes")
+            raise RecordError(
+                f"more than {_MAX_CHANNELS} channels or schemas, or one of more than {_MAX_DEFINITION_BYTES} bytes"
+            )
         try:
             if opcode == Opcode.SCHEMA:
                 schema = Schema.read(parser(body))

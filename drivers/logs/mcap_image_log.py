@@ -50,17 +50,21 @@ class McapImageLog:
         for message in section.messages():
             topic = self._catalog.topic(message.channel_id)
             if topic is not None and topic.type in IMAGE_TYPES:
-                yield LoggedImage(topic.name, message.log_time_ns,
-                                  partial(_read, topic.type, message, topic.aligned))
+                yield LoggedImage(topic.name, message.log_time_ns, partial(_read, topic.type, message, topic.aligned))
             elif topic is not None and topic.type in MOTION_TYPES:
-                yield LoggedMotion(topic.name, message.log_time_ns,
-                                   partial(_read_motion, topic.type, message, topic.aligned))
+                yield LoggedMotion(
+                    topic.name, message.log_time_ns, partial(_read_motion, topic.type, message, topic.aligned)
+                )
             if self._file.closed:
                 return
         complete = section.ended and has_footer(self._file)
-        self._damage = LogDamage(section.broken, "" if complete else
-                                 f"the log {self.name!r} is cut or corrupt after byte {section.position} of "
-                                 f"{self._file.size}: used the data before")
+        self._damage = LogDamage(
+            section.broken,
+            ""
+            if complete
+            else f"the log {self.name!r} is cut or corrupt after byte {section.position} of "
+            f"{self._file.size}: used the data before",
+        )
 
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments."""

@@ -48,8 +48,7 @@ class LogInfo:
 
 
 def read_log_info(path: str | os.PathLike[str]) -> LogInfo:
-    """Return the contents of a log; a log without an index is read to its end. Raise DriverError where there is no log.
-    """
+    """Return the contents of a log; a log without an index is read to its end. Raise DriverError without a log."""
     locked = is_locked(path)  # before it is read: the writer may end in the meantime
     file = LogFile(path)
     try:
@@ -104,5 +103,7 @@ def _from_messages(file: LogFile, locked: bool) -> LogInfo:
 
 def _by_topic(catalog: Catalog, counts: Counter[int]) -> dict[str, tuple[str, int]]:
     """Return topic -> type and number of messages; messages of undefined channels are left out."""
-    return {name: (kind, sum(counts[channel] for channel in catalog.ids(name)))
-            for name, kind in sorted(catalog.topics().items())}
+    return {
+        name: (kind, sum(counts[channel] for channel in catalog.ids(name)))
+        for name, kind in sorted(catalog.topics().items())
+    }

@@ -70,8 +70,9 @@ def _created(out: Path) -> IO[bytes]:
     try:
         return out.open("xb")
     except FileExistsError as error:
-        raise DriverError(f"cannot write {str(out)!r}: it exists and is not overwritten; name another file by -o"
-                          ) from error
+        raise DriverError(
+            f"cannot write {str(out)!r}: it exists and is not overwritten; name another file by -o"
+        ) from error
     except OSError as error:
         raise DriverError(f"cannot write {str(out)!r}: {error.strerror}; name another file by -o") from error
 
@@ -110,8 +111,9 @@ def _copied(file: LogFile, target: IO[bytes]) -> Recovery:
     known = sum(summary.message_counts.values()) if summary else 0
     lost = max(0, known - copier.messages) if known else None
     whole = source.ended and not (source.skips or copier.broken or lost) and summary is not None and has_footer(file)
-    return Recovery(copier.messages, copier.attachments, 0 if whole else lost, copier.broken + source.skips,
-                    source.end, whole)
+    return Recovery(
+        copier.messages, copier.attachments, 0 if whole else lost, copier.broken + source.skips, source.end, whole
+    )
 
 
 def _header(file: LogFile) -> Header:

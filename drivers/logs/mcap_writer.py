@@ -22,11 +22,14 @@ _COMPRESSIONS = {"lz4": CompressionType.LZ4, "none": CompressionType.NONE}
 _MEDIA_TYPES = {".toml": "application/toml", ".yaml": "application/yaml", ".txt": "text/plain", ".png": "image/png"}
 _MAX_CHANNELS = 4096
 _KEPT_TOPICS = ("/tf_static",)  # ROS 2 keeps their newest message for late subscribers, also of `ros2 bag play`
-_TRANSIENT_LOCAL = "".join((  # rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
-    "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n", *(
-        f"  {name}:\n    sec: 9223372036\n    nsec: 854775807\n" for name in ("deadline", "lifespan")),
-    "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
-    "  avoid_ros_namespace_conventions: false\n"))
+_TRANSIENT_LOCAL = "".join(
+    (  # rosbag2's YAML: keep last, reliable, transient local, automatic liveliness
+        "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n",
+        *(f"  {name}:\n    sec: 9223372036\n    nsec: 854775807\n" for name in ("deadline", "lifespan")),
+        "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  avoid_ros_namespace_conventions: false\n",
+    )
+)
 _FLUSH_NS = 5 * 10**8  # of stamps, after which a chunk is ended
 _END_NS = 2**63  # of valid stamps
 

@@ -132,9 +132,13 @@ class Ros1Bag:
             if self._file.closed:
                 return
         complete = self._counts is not None and end == self._source.size
-        self._damage = LogDamage(broken, "" if complete else
-                                 f"the bag {self.name!r} is cut or was not closed: used the first {end} of its "
-                                 f"{self._source.size} bytes")
+        self._damage = LogDamage(
+            broken,
+            ""
+            if complete
+            else f"the bag {self.name!r} is cut or was not closed: used the first {end} of its "
+            f"{self._source.size} bytes",
+        )
 
     def attachments(self) -> dict[str, bytes]:
         """Return none: a bag has no attachments."""

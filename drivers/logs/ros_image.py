@@ -18,8 +18,14 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMAGE_TYPES = (IMAGE, COMPRESSED_IMAGE)
 
 # cv_bridge's names for images without declared colours, in OpenCV's order bgr, and image_encodings.hpp's names of YUV
-_SYNONYMS = {"8UC1": "mono8", "8UC3": "bgr8", "8UC4": "bgra8", "16UC1": "mono16",
-            "yuv422_yuy2": "yuyv", "yuv422": "uyvy"}
+_SYNONYMS = {
+    "8UC1": "mono8",
+    "8UC3": "bgr8",
+    "8UC4": "bgra8",
+    "16UC1": "mono16",
+    "yuv422_yuy2": "yuyv",
+    "yuv422": "uyvy",
+}
 _MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
 _MAGIC_BYTES = 3
 _CDR_HEADER_BYTES = 4

@@ -32,8 +32,9 @@ class MotionReading(NamedTuple):
         return WheelSample(stamp_ns, *self.rates) if len(self.rates) == 2 else GyroSample(stamp_ns, *self.rates)
 
 
-def parse_motion(schema_name: str, message: memoryview, *, aligned: bool = True, joints: JointWheels | None = None
-                 ) -> MotionReading:
+def parse_motion(
+    schema_name: str, message: memoryview, *, aligned: bool = True, joints: JointWheels | None = None
+) -> MotionReading:
     """Return the rates in a message of type ODOMETRY, IMU or JOINT_STATE; raise FrameDecodeError where it is invalid.
 
     aligned: True for CDR (ROS 2), False for the serialisation of ROS 1. joints: the wheels in a JOINT_STATE.

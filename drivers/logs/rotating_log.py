@@ -182,8 +182,9 @@ class RotatingLog:
         try:
             self._path.rename(complete_path(self._path))
         except OSError as error:
-            raise DriverError(f"cannot rename the log {str(self._path)!r}: {error.strerror}; is its folder gone?"
-                              ) from error
+            raise DriverError(
+                f"cannot rename the log {str(self._path)!r}: {error.strerror}; is its folder gone?"
+            ) from error
 
 
 def _drop(writer: LogWriter) -> None:

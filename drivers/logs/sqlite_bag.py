@@ -32,19 +32,24 @@ _MAX_TOPICS: Final = 4096
 _MAX_REASON: Final = 120  # characters
 _LEAST_LIMIT: Final = 2**16  # bytes of a value or a query
 _ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame, RFC 8878
-_TABLES: Final = "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') " \
+_TABLES: Final = (
+    "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') "
     "AND sql LIKE 'CREATE TABLE%'"
+)
 # Columns that are computed are not in this list. The small ones come first, so that no row is read to its end for them.
 _COLUMNS: Final = "SELECT name FROM pragma_table_info('messages') LIMIT 4"
 _EXPECTED: Final = ["id", "topic_id", "timestamp", "data"]
 _LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
 _ROW_INSTRUCTIONS: Final = 100  # of SQLite for a row; it needs 10 to 20
 _FEWEST_INSTRUCTIONS: Final = 1_000_000
-_TOPICS: Final = f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics " \
-    f"LIMIT {_MAX_TOPICS}"
+_TOPICS: Final = (
+    f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {_MAX_TOPICS}"
+)
 # In the order of writing, which needs neither index nor sorting: that of the time is by the stamps of the images.
-_MESSAGES: Final = "SELECT topic_id, timestamp, data FROM messages WHERE typeof(topic_id) = 'integer' " \
+_MESSAGES: Final = (
+    "SELECT topic_id, timestamp, data FROM messages WHERE typeof(topic_id) = 'integer' "
     "AND topic_id IN ({}) ORDER BY rowid"
+)
 _TOPIC_OF_EACH: Final = "SELECT topic_id FROM messages WHERE typeof(topic_id) = 'integer' ORDER BY rowid"
 _TOO_MANY: Final = "it has more rows than its size allows"
 
@@ -61,18 +66,29 @@ class SqliteBag:
             self._bag = open_bounded(path, max(_LEAST_LIMIT, min(MAX_RECORD_BYTES, self._bytes)))
             self._bag.text_factory = _text
             self._bound_work()
-            is_bag = self._bag.execute(_TABLES).fetchone()[0] == 2 and [
-                name for name, in self._bag.execute(_COLUMNS)] == _EXPECTED
-            self._topics = {} if not is_bag else {
-                _integer(key): (str(name), str(kind) if encoding == "cdr" else "")
-                for key, name, kind, encoding in self._bag.execute(_TOPICS)}
+            is_bag = (
+                self._bag.execute(_TABLES).fetchone()[0] == 2
+                and [name for (name,) in self._bag.execute(_COLUMNS)] == _EXPECTED
+            )
+            self._topics = (
+                {}
+                if not is_bag
+                else {
+                    _integer(key): (str(name), str(kind) if encoding == "cdr" else "")
+                    for key, name, kind, encoding in self._bag.execute(_TOPICS)
+                }
+            )
         except (sqlite3.Error, OSError, OverflowError, ValueError) as error:
-            raise DriverError(f"cannot read the bag {self.name!r}: {_line(error)}; if the recording was cut, try "
-                              "`sqlite3 FILE .recover`") from error
+            raise DriverError(
+                f"cannot read the bag {self.name!r}: {_line(error)}; if the recording was cut, try "
+                "`sqlite3 FILE .recover`"
+            ) from error
         if not is_bag:
             self.close()
-            raise DriverError(f"{self.name!r} is an SQLite file, but no bag of ROS 2: it has no tables topics and "
-                              "messages as one has; give the .db3 file that `ros2 bag record` wrote")
+            raise DriverError(
+                f"{self.name!r} is an SQLite file, but no bag of ROS 2: it has no tables topics and "
+                "messages as one has; give the .db3 file that `ros2 bag record` wrote"
+            )
 
     def topics(self) -> Mapping[str, str]:
         """Return name -> type of all topics."""
@@ -82,7 +98,7 @@ class SqliteBag:
         """Return the number of messages of each topic; None where the file is damaged."""
         try:
             with closing(self._rows(_TOPIC_OF_EACH)) as rows:
-                found = Counter(key for key, in rows)
+                found = Counter(key for (key,) in rows)
         except sqlite3.Error:
             return None
         return {name: found[key] for key, (name, _) in self._topics.items()}
@@ -101,8 +117,11 @@ class SqliteBag:
                     count += 1
                     if isinstance(data, bytes) and isinstance(time_ns, int):
                         name, kind = wanted[key]
-                        yield (LoggedImage(name, time_ns, partial(_read, kind, data)) if kind in IMAGE_TYPES
-                               else LoggedMotion(name, time_ns, partial(_read_motion, kind, data)))
+                        yield (
+                            LoggedImage(name, time_ns, partial(_read, kind, data))
+                            if kind in IMAGE_TYPES
+                            else LoggedMotion(name, time_ns, partial(_read_motion, kind, data))
+                        )
                     else:
                         broken += 1
                     if self._closed:
@@ -110,8 +129,11 @@ class SqliteBag:
             self._damage = LogDamage(broken)
         except sqlite3.Error as error:
             if not self._closed:
-                self._damage = LogDamage(broken, f"the bag {self.name!r} is cut or corrupt after {count} messages "
-                                                 f"({_line(error)}): used those before")
+                self._damage = LogDamage(
+                    broken,
+                    f"the bag {self.name!r} is cut or corrupt after {count} messages "
+                    f"({_line(error)}): used those before",
+                )
 
     def _rows(self, query: str) -> Generator[tuple[Any, ...], None, None]:
         """Yield the rows of a query, as many and as large as the file can hold; then raise sqlite3.DatabaseError."""

@@ -34,8 +34,10 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
     """
     images = {name: kind for name, kind in topics.items() if _is_image(name, kind)}
     if not topics:
-        raise DriverError(f"no messages can be read in {log}: `omnid log info` says whether it was cut, and "
-                          "`omnid log recover` saves what is left of it")
+        raise DriverError(
+            f"no messages can be read in {log}: `omnid log info` says whether it was cut, and "
+            "`omnid log recover` saves what is left of it"
+        )
     if not images:
         raise DriverError(
             f"no image topics in {log}: found {_listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"
@@ -78,8 +80,11 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
                 raise DriverError(f"topic {name!r} {found} in {log}; {knob} must be one of {kind}: {_listed(topics)}")
             chosen.append(name)
         elif name is None:
-            found_names = [topic for topic, found in topics.items()
-                           if found == kind and (kind != ODOMETRY or "wheel" in topic.lower())]
+            found_names = [
+                topic
+                for topic, found in topics.items()
+                if found == kind and (kind != ODOMETRY or "wheel" in topic.lower())
+            ]
             if len(found_names) > 1:
                 warnings.append(f"{log} has several topics of {kind}: {_listed(found_names)}; none is used: set {knob}")
             else:

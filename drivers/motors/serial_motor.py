@@ -234,8 +234,7 @@ class SerialMotor:
             self._port.reset_input_buffer()
 
     def _write(self, data: bytes) -> None:
-        """Write all data at once; raise NoReplyError where the output buffer is full, as the other end does not read.
-        """
+        """Write all data at once; raise NoReplyError if the output buffer is full, as the other end does not read."""
         if data and self._port is not None:
             try:
                 if os.write(self._port.fileno(), data) < len(data):

@@ -76,8 +76,9 @@ def run_job(job: Job) -> JobResult:
     attempt = Path(tempfile.mkdtemp(prefix=f"{_ATTEMPT}{job.folder.name}-", dir=job.folder.parent))
     try:
         values = _attempt(job, attempt)
-        result = JobResult(name=job.name, log=job.log, seconds=round(time.monotonic() - started_s, 3), key=job.key(),
-                           **values)
+        result = JobResult(
+            name=job.name, log=job.log, seconds=round(time.monotonic() - started_s, 3), key=job.key(), **values
+        )
         (attempt / RESULT_FILE).write_text(json.dumps(row_values(result), indent=1) + "\n")
         _replace(attempt, job.folder)
         return result
@@ -111,8 +112,11 @@ def _attempt(job: Job, folder: Path) -> dict[str, Any]:
     outputs = ["--tum", "est.txt", "--map-tum", "map_est.txt", "--cloud", "cloud.ply", "--plan", "plan.png"]
     if job.options.record:
         outputs += ["--record", "recording.mcap"]
-    code, text = _omnid(["replay", str(log), *job.options.arguments, *outputs, "--inline", "--quiet", "--json"], folder,
-                        job.options.timeout_s)
+    code, text = _omnid(
+        ["replay", str(log), *job.options.arguments, *outputs, "--inline", "--quiet", "--json"],
+        folder,
+        job.options.timeout_s,
+    )
     values = _failure(code, folder) | _counters(text)
     if code == 0 and (truth := _truth(job, log)) is not None:
         values |= _compared(folder, truth, job.options.timeout_s)
@@ -139,8 +143,15 @@ def _local(log: str, folder: Path) -> Path:
 def _omnid(words: list[str], folder: Path, timeout_s: float) -> tuple[int | None, str]:
     """Run omnid in a folder; return its exit code, None after the time, and what it printed."""
     with (folder / LOG_FILE).open("ab") as messages:
-        process = subprocess.Popen(python("-m", "omnid", *words), cwd=folder, env=python_environment(**_ENVIRONMENT),
-                                   stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=messages, text=True)
+        process = subprocess.Popen(
+            python("-m", "omnid", *words),
+            cwd=folder,
+            env=python_environment(**_ENVIRONMENT),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=messages,
+            text=True,
+        )
         _RUNNING.add(process)
         try:
             text, _ = process.communicate(timeout=timeout_s)
@@ -190,8 +201,14 @@ def _counters(text: str) -> dict[str, Any]:
     """Return the values of the summary that a replay prints as JSON; none of one that printed no summary."""
     try:
         counters = json.loads(text)["counters"]
-        return {"pairs": counters["pairs"], "poses": counters["poses"], "length_m": _number(counters["length_m"]),
-                **counters["states"], "resets": counters["resets"], "dropped": sum(counters["drops"].values())}
+        return {
+            "pairs": counters["pairs"],
+            "poses": counters["poses"],
+            "length_m": _number(counters["length_m"]),
+            **counters["states"],
+            "resets": counters["resets"],
+            "dropped": sum(counters["drops"].values()),
+        }
     except (ValueError, KeyError, TypeError):
         return {}
 
@@ -207,8 +224,10 @@ def _compared(folder: Path, truth: Path, timeout_s: float) -> dict[str, Any]:
     _, text = _omnid(["eval", "est.txt", str(truth), "--json"], folder, timeout_s)
     with suppress(ValueError, KeyError, TypeError):
         found = json.loads(text)
-        return {name: _number(found[name])
-                for name in ("length_error_ratio", "ate_rmse_m", "end_error_m", "heading_max_rad")}
+        return {
+            name: _number(found[name])
+            for name in ("length_error_ratio", "ate_rmse_m", "end_error_m", "heading_max_rad")
+        }
     return {}
 
 

@@ -43,8 +43,7 @@ class Job:
     options: BatchOptions
 
     def key(self) -> str:
-        """Return a number that changes with the log, the options or the version of omnid: results of another are old.
-        """
+        """Return a number that changes with the log, the options or the version of omnid: results of others are old."""
         state: list[Any] = [__version__, asdict(self.options), self.log]
         if not is_url(self.log):
             state += [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in _files(Path(self.log))]
@@ -69,12 +68,15 @@ def find_logs(names: Sequence[str]) -> list[str]:
 
 def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
     """Return the jobs of logs; their folders have the names of the logs below their common folder."""
-    paths = [PurePosixPath("/", _URL.sub("", log).lstrip("/")) if is_url(log) else PurePosixPath(Path(log).absolute())
-             for log in logs]
+    paths = [
+        PurePosixPath("/", _URL.sub("", log).lstrip("/")) if is_url(log) else PurePosixPath(Path(log).absolute())
+        for log in logs
+    ]
     common = Path(os.path.commonpath([path.parent for path in paths])) if paths else Path("/")
     # Without a dot at the beginning: names such as ".." and those of this program's own files are no folders of logs.
-    names = _distinct(_UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log"
-                      for path in paths)
+    names = _distinct(
+        _UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log" for path in paths
+    )
     return [Job(name, log, out / name, options) for name, log in zip(names, logs, strict=True)]
 
 
@@ -134,8 +136,9 @@ def file_system(name: str) -> Any:
     try:
         import fsspec
     except ImportError as error:
-        raise OmnidError(f"batch: {name!r} needs fsspec, and for s3:// s3fs: install the extra `fleet` of omnid") \
-            from error
+        raise OmnidError(
+            f"batch: {name!r} needs fsspec, and for s3:// s3fs: install the extra `fleet` of omnid"
+        ) from error
     try:
         return fsspec.core.url_to_fs(name)[0]
     except (ValueError, ImportError) as error:

@@ -21,8 +21,20 @@ PARQUET_FILE: Final = "results.parquet"
 INDEX_FILE: Final = "index.html"
 COLUMNS: Final = tuple(name for name in JobResult.__slots__ if name != "key")
 _STYLE: Final = "body{max-width:none}.bad{color:#a40}"
-_HEAD: Final = ("log", "", "status", "pairs", "length", "tracking", "degraded", "lost", "resets", "ATE", "length error",
-                "time")
+_HEAD: Final = (
+    "log",
+    "",
+    "status",
+    "pairs",
+    "length",
+    "tracking",
+    "degraded",
+    "lost",
+    "resets",
+    "ATE",
+    "length error",
+    "time",
+)
 _FORMULA: Final = ("=", "+", "-", "@")  # first characters that spreadsheets execute
 MOST_CHARACTERS: Final = 5000  # of a cell, which may contain the path of a log
 
@@ -57,8 +69,9 @@ def _csv(results: Sequence[JobResult]) -> str:
 def _cells(result: JobResult) -> dict[str, object]:
     """Return the cells of a row by their columns: names of logs may come from anywhere, and be no text."""
     values = row_values(result)
-    return {name: plain(value, MOST_CHARACTERS) if isinstance(value := values[name], str) else value
-            for name in COLUMNS}
+    return {
+        name: plain(value, MOST_CHARACTERS) if isinstance(value := values[name], str) else value for name in COLUMNS
+    }
 
 
 def _no_formula(cell: object) -> object:
@@ -77,18 +90,35 @@ def _index(results: Sequence[JobResult], out: Path) -> list[str]:
 def _row(result: JobResult, out: Path) -> tuple[str, ...]:
     folder = quote(result.name)
     name = escape(result.name)
-    links = " ".join(f"<a href='{folder}/{file}'>{label}</a>" for file, label in _FILES
-                     if (out / result.name / file).is_file())
+    links = " ".join(
+        f"<a href='{folder}/{file}'>{label}</a>" for file, label in _FILES if (out / result.name / file).is_file()
+    )
     outcome = escape(plain(f"{result.status}: {result.error}" if result.error else result.status))
     status = outcome if result.status == OK else f"<span class='bad'>{outcome}</span>"
-    return (name, links, status, str(result.pairs), _metres(result.length_m), str(result.tracking),
-            str(result.degraded), str(result.lost), str(result.resets), _metres(result.ate_rmse_m, 4),
-            "" if math.isnan(result.length_error_ratio) else f"{result.length_error_ratio:+.3%}",
-            f"{result.seconds:.1f} s")
+    return (
+        name,
+        links,
+        status,
+        str(result.pairs),
+        _metres(result.length_m),
+        str(result.tracking),
+        str(result.degraded),
+        str(result.lost),
+        str(result.resets),
+        _metres(result.ate_rmse_m, 4),
+        "" if math.isnan(result.length_error_ratio) else f"{result.length_error_ratio:+.3%}",
+        f"{result.seconds:.1f} s",
+    )
 
 
-_FILES: Final = (("report.html", "report"), ("plan.png", "plan"), ("est.txt", "path"),
-                 ("map_est.txt", "path in the map"), ("cloud.ply", "cloud"), ("messages.txt", "messages"))
+_FILES: Final = (
+    ("report.html", "report"),
+    ("plan.png", "plan"),
+    ("est.txt", "path"),
+    ("map_est.txt", "path in the map"),
+    ("cloud.ply", "cloud"),
+    ("messages.txt", "messages"),
+)
 
 
 def _metres(value: float, digits: int = 2) -> str:

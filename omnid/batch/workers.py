@@ -58,13 +58,16 @@ def dask_workers(address: str) -> Workers:
     try:
         distributed: Any = import_module("distributed")
     except ImportError as error:
-        raise OmnidError("batch --dask needs dask.distributed: install the extra `fleet` of omnid into "
-                         f"{sys.prefix}") from error
+        raise OmnidError(
+            f"batch --dask needs dask.distributed: install the extra `fleet` of omnid into {sys.prefix}"
+        ) from error
     try:
         client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
-        raise OmnidError(f"batch: no dask scheduler answers at {address!r}: {one_line(error)}; start one with "
-                         "`dask scheduler`, and give its address such as tcp://HOST:8786") from error
+        raise OmnidError(
+            f"batch: no dask scheduler answers at {address!r}: {one_line(error)}; start one with "
+            "`dask scheduler`, and give its address such as tcp://HOST:8786"
+        ) from error
 
     def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
         with client:

@@ -67,7 +67,7 @@ def _grid_hint(other_grids: Counter[tuple[int, int]]) -> str:
 
 
 def _marker_hint(images: Images, board: CharucoBoard | AprilGrid) -> str:
-    layout, sample = board.markers, list(images.values())[::-(-len(images) // HINT_IMAGES)]
+    layout, sample = board.markers, list(images.values())[:: -(-len(images) // HINT_IMAGES)]
     names = [name for image in sample if (name := seen_dictionary(image, layout.border_bits))]
     if not names:
         return "take images with the board nearer (six pixels a bit of its markers), sharp and well lit"

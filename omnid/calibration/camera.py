@@ -54,16 +54,21 @@ class CameraResult:
     def warnings(self) -> list[str]:
         """Limits of the result, one line each."""
         found = self.calibration
-        return [*misfit_warning("camera", camera_structure(found)), *found.warnings,
-                *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected)]
+        return [
+            *misfit_warning("camera", camera_structure(found)),
+            *found.warnings,
+            *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
+        ]
 
     def __str__(self) -> str:
         found = self.calibration
         (width, height), (u, v) = found.camera.size, found.camera.center
         corners = int(np.isfinite(found.fit.errors_px).sum())
-        return (f"{'MISFIT: ' if self.is_misfit else ''}model {self.selected.model}, {width}x{height}, centre {u:.2f} "
-                f"{v:.2f}, mean reprojection error {found.fit.mean_px:.3f} px over {corners} corners of "
-                f"{len(found.views)} views")
+        return (
+            f"{'MISFIT: ' if self.is_misfit else ''}model {self.selected.model}, {width}x{height}, centre {u:.2f} "
+            f"{v:.2f}, mean reprojection error {found.fit.mean_px:.3f} px over {corners} corners of "
+            f"{len(found.views)} views"
+        )
 
     def save(self, path: Path, mask_path: Path | None = None) -> None:
         """Write the camera.toml, and the mask to a PNG in the same folder, which the camera.toml names."""
@@ -81,8 +86,16 @@ class CameraResult:
         write_file(path, camera_report_html(self.calibration, self.images, missing, self.mask).encode())
 
 
-def calibrate_camera(sources: Sequence[str], board: AnyBoard, *, topic: str | None = None, model: ModelChoice = "auto",
-                     view: View = "mirror", with_mask: bool = False, progress: Progress = silent) -> CameraResult:
+def calibrate_camera(
+    sources: Sequence[str],
+    board: AnyBoard,
+    *,
+    topic: str | None = None,
+    model: ModelChoice = "auto",
+    view: View = "mirror",
+    with_mask: bool = False,
+    progress: Progress = silent,
+) -> CameraResult:
     """Calibrate a camera by images of a board that it saw at several places.
 
     sources: files, folders and patterns of images, or one log, with the topic of the camera in it. model: "auto" fits

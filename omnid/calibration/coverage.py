@@ -79,5 +79,4 @@ def _listed(hours: Sequence[int]) -> str:
             groups[-1].append(hour)
         else:
             groups.append([hour])
-    return ", ".join(f"{group[0]} to {group[-1]}" if len(group) > 2 else ", ".join(map(str, group))
-                     for group in groups)
+    return ", ".join(f"{group[0]} to {group[-1]}" if len(group) > 2 else ", ".join(map(str, group)) for group in groups)

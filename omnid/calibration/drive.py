@@ -67,10 +67,12 @@ class DriveCalibration:
 
     def __str__(self) -> str:
         uncertainty = drive_uncertainty(self.rig)
-        return (f"{'MISFIT: ' if self.is_misfit else ''}error {self.first_sigma_px:.3f} px before, "
-                f"{self.adjustment.sigma_px:.3f} px after, {self.drives.keyframes} keyframes, "
-                f"{len(self.adjustment.state.points)} landmarks, lengths change by {100 * self.scale_change:+.3f} %"
-                + (f"; drives: {uncertainty}" if uncertainty else ""))
+        return (
+            f"{'MISFIT: ' if self.is_misfit else ''}error {self.first_sigma_px:.3f} px before, "
+            f"{self.adjustment.sigma_px:.3f} px after, {self.drives.keyframes} keyframes, "
+            f"{len(self.adjustment.state.points)} landmarks, lengths change by {100 * self.scale_change:+.3f} %"
+            + (f"; drives: {uncertainty}" if uncertainty else "")
+        )
 
     @property
     def is_misfit(self) -> bool:
@@ -91,21 +93,25 @@ class DriveCalibration:
         return float(np.linalg.norm(T_first_last[:3, 3])) * self.rig.baseline_m / self.before.baseline_m
 
     def at_distance(self, distance_m: float) -> Rig:
-        """Return the rig with the baseline by a known distance from the first to the last pair; OmnidError if absurd.
-        """
+        """Return the rig with the baseline by a known distance from the first to the last pair; OmnidError if odd."""
         if self.distance_m < MIN_DISTANCE_M:
-            raise OmnidError(f"--distance-m: the log ends {self.distance_m:.2f} m from its beginning, expected "
-                             f"{MIN_DISTANCE_M:.0f} m at least; measure the distance between two stops farther apart")
+            raise OmnidError(
+                f"--distance-m: the log ends {self.distance_m:.2f} m from its beginning, expected "
+                f"{MIN_DISTANCE_M:.0f} m at least; measure the distance between two stops farther apart"
+            )
         ratio = distance_m / self.distance_m
         if abs(ratio - 1) > MAX_SCALE_CHANGE:
-            raise OmnidError(f"--distance-m {distance_m:g}: the log ends {self.distance_m:.3f} m from its beginning by "
-                             f"the baseline of {1e3 * self.rig.baseline_m:.1f} mm; which of the two is wrong?")
+            raise OmnidError(
+                f"--distance-m {distance_m:g}: the log ends {self.distance_m:.3f} m from its beginning by "
+                f"the baseline of {1e3 * self.rig.baseline_m:.1f} mm; which of the two is wrong?"
+            )
         rig, covariance = rescaled(self.rig, ratio), self.rig.covariance
         return replace(rig, covariance=covariance and covariance.select(covariance.names[:-1]))
 
 
-def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None), progress: Progress = silent
-                    ) -> DriveCalibration:
+def calibrate_drive(
+    logs: Sequence[Path], rig: Rig, topics: Topics = (None, None), progress: Progress = silent
+) -> DriveCalibration:
     """Return the rig that fits drives best, near the one given; OmnidError or CalibError where they do not suffice.
 
     topics: of the lower and the upper camera. progress receives one line for each round.
@@ -135,12 +141,22 @@ def calibrate_drive(logs: Sequence[Path], rig: Rig, topics: Topics = (None, None
     require_same_rig(parameters, found.state.steps)
     # 6. The length of the baseline by the prior, the covariance, and a level frame of a nominal rig.
     adjusted, level_rad = _finished_rig(before, found, drives)
-    return DriveCalibration(before, adjusted, found, scores, observation_sigma(before, found, drives.fixed),
-                            _length_change(before, adjusted, found), drive_structure(found), level_rad, drives)
+    return DriveCalibration(
+        before,
+        adjusted,
+        found,
+        scores,
+        observation_sigma(before, found, drives.fixed),
+        _length_change(before, adjusted, found),
+        drive_structure(found),
+        level_rad,
+        drives,
+    )
 
 
-def _in_rounds(logs: Sequence[Path], start: tuple[RigParameters, Array], topics: Topics, config: Config,
-               progress: Progress) -> tuple[DriveAdjustment, Drives]:
+def _in_rounds(
+    logs: Sequence[Path], start: tuple[RigParameters, Array], topics: Topics, config: Config, progress: Progress
+) -> tuple[DriveAdjustment, Drives]:
     """Track and adjust until lengths change no more: each round tracks in panoramas of the rig of the one before."""
     parameters, steps = start
     rig = parameters.at(steps)
@@ -149,8 +165,10 @@ def _in_rounds(logs: Sequence[Path], start: tuple[RigParameters, Array], topics:
         found = _adjusted(parameters, steps, drives)
         moved = scale_change(found, rig)
         steps, rig = found.state.steps, _with_times(found.rig, significant_times(found))
-        progress(f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
-               f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %")
+        progress(
+            f"round {number}: {len(drives.observations)} observations from {drives.keyframes} keyframes, error "
+            f"{found.sigma_px:.3f} px, lengths {100 * moved:+.3f} %"
+        )
         if number >= ROUNDS and abs(moved) < SETTLED:
             break
     return found, drives
@@ -159,8 +177,9 @@ def _in_rounds(logs: Sequence[Path], start: tuple[RigParameters, Array], topics:
 def _adjusted(parameters: RigParameters, steps: Array, drives: Drives) -> DriveAdjustment:
     prior = prior_information(parameters, parameters.rig)
     alike = 1.0 if parameters.rig.covariance is None else OBSERVATIONS_ALIKE
-    return adjust_drive(parameters, replace(drives.state, steps=steps), drives.observations, prior, drives.fixed,
-                        alike=alike)
+    return adjust_drive(
+        parameters, replace(drives.state, steps=steps), drives.observations, prior, drives.fixed, alike=alike
+    )
 
 
 def _named_steps(parameters: RigParameters, found: DriveAdjustment) -> Array:
@@ -178,15 +197,15 @@ def _score(found: DriveAdjustment, drives: Drives, terms: tuple[str, ...], waves
 def _finished_rig(before: Rig, found: DriveAdjustment, drives: Drives) -> tuple[Rig, float]:
     """Return the rig with baseline and covariance, and the angle [rad] by which a nominal rig's frame was levelled."""
     parameters = found.parameters
-    names, units = parameters.rig_names, parameters.units[:len(parameters.rig_names)]
-    change = found.state.steps[:len(names)] * units
-    covariance = found.covariance[:len(names), :len(names)] * np.outer(units, units)
+    names, units = parameters.rig_names, parameters.units[: len(parameters.rig_names)]
+    change = found.state.steps[: len(names)] * units
+    covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
     baseline_m, matrix = baseline_by_prior(before, names, change, covariance)
     rig, level_rad = rescaled(found.rig, baseline_m / before.baseline_m), 0.0
     if before.covariance is None:
         ends = (*drives.fixed, drives.keyframes)
         longest = int(np.argmax(np.diff(ends)))
-        turn = level_turn(rig, found.state.T_rig_odom[ends[longest]:ends[longest + 1]])
+        turn = level_turn(rig, found.state.T_rig_odom[ends[longest] : ends[longest + 1]])
         if turn is not None:
             rig, level_rad = turned_about_lower(rig, turn), float(np.linalg.norm(se3.rotation_log(turn)))
     return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix)), level_rad
@@ -199,8 +218,9 @@ def _length_change(before: Rig, rig: Rig, found: DriveAdjustment) -> float:
 
 def _with_times(rig: Rig, kept: tuple[str, ...]) -> Rig:
     """Return the rig without the times of exposure that are not kept."""
-    times = ShutterTimes(rig.times.upper_delay_s if UPPER_DELAY in kept else 0.0,
-                         rig.times.line_time_s if LINE_TIME in kept else 0.0)
+    times = ShutterTimes(
+        rig.times.upper_delay_s if UPPER_DELAY in kept else 0.0, rig.times.line_time_s if LINE_TIME in kept else 0.0
+    )
     return replace(rig, times=times)
 
 
@@ -208,5 +228,8 @@ def significant_times(found: DriveAdjustment) -> tuple[str, ...]:
     """Return the names of the times of exposure that differ from none."""
     names, values = found.parameters.names, found.parameters.values + found.state.steps * found.parameters.units
     sigmas = found.sigmas * found.parameters.units
-    return tuple(name for name, value, sigma in zip(names, values, sigmas, strict=True)
-                 if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma))
+    return tuple(
+        name
+        for name, value, sigma in zip(names, values, sigmas, strict=True)
+        if name in TIMES and abs(value) > max(MIN_TIME[name], TIME_SIGMAS * sigma)
+    )

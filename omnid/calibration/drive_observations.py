@@ -69,9 +69,13 @@ def collect(logs: Sequence[Path], rig: Rig, topics: Topics, config: Config) -> D
     observations = DriveObservations(
         np.concatenate([part.keyframe + first for part, first in zip(seen, keyframes, strict=False)]),
         np.concatenate([part.landmark + first for part, first in zip(seen, landmarks, strict=False)]),
-        np.concatenate([part.camera for part in seen]), np.concatenate([part.pixels for part in seen]))
-    motion = KeyframeMotion(np.concatenate([state.motion.twist for state in states]),
-                            np.concatenate([state.motion.upper_delay_s for state in states]))
+        np.concatenate([part.camera for part in seen]),
+        np.concatenate([part.pixels for part in seen]),
+    )
+    motion = KeyframeMotion(
+        np.concatenate([state.motion.twist for state in states]),
+        np.concatenate([state.motion.upper_delay_s for state in states]),
+    )
     state = DriveState(T_rig_odom, np.concatenate([state.points for state in states]), np.zeros(0), motion)
     return Drives(state, observations, tuple(keyframes[:-1].tolist()), parts[-1].T_last)
 
@@ -86,11 +90,13 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
         matches = match(panoramas.lower, panoramas.upper, panoramas.visible)
         found.append((np.full(len(matches.lower), number), matches.lower, matches.upper))
     keyframe, lower, upper = (np.concatenate([part[k] for part in found]) for k in range(3))
-    points = se3.apply(place.T_rig_rect, triangulate(np.column_stack([lower, upper[:, 1]]), model.cylinder,
-                                                     model.baseline_m))
+    points = se3.apply(
+        place.T_rig_rect, triangulate(np.column_stack([lower, upper[:, 1]]), model.cylinder, model.baseline_m)
+    )
     count, landmark = len(points), np.arange(len(points))
-    seen = PanoramaObservations(np.tile(keyframe, 2), np.tile(landmark, 2), np.repeat([0, 1], count),
-                                np.concatenate([lower, upper]), points)
+    seen = PanoramaObservations(
+        np.tile(keyframe, 2), np.tile(landmark, 2), np.repeat([0, 1], count), np.concatenate([lower, upper]), points
+    )
     pixels = image_pixels(seen, rig, place.cylinder)
     known = np.isfinite(pixels).all(axis=1) & np.tile(np.isfinite(points).all(axis=1), 2)
     observations = DriveObservations(seen.keyframe, seen.landmark, seen.camera, pixels)
@@ -211,22 +217,30 @@ def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log:
             raise OmnidError(f"{log}: {health.warning}")
         yield update
     if not states or states[TrackingState.LOST] > MAX_LOST * states.total():
-        raise OmnidError(f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "
-                         "rig; start from one that is nearer to the truth, or take a drive where there is more to see")
+        raise OmnidError(
+            f"{log}: the pose is lost in {states[TrackingState.LOST]} of {states.total()} pairs with this "
+            "rig; start from one that is nearer to the truth, or take a drive where there is more to see"
+        )
 
 
 def require_motion(T_rig_odom: Array, drives: int) -> None:
     """Raise OmnidError where the drives are too short or too straight to tell."""
     if len(T_rig_odom) < MIN_KEYFRAMES:
-        raise OmnidError(f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "
-                         f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive")
+        raise OmnidError(
+            f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "
+            f"{np.rad2deg(KEYFRAME_RAD):.0f} deg apart, {MIN_KEYFRAMES} are needed; take a longer drive"
+        )
     T_odom_rig = se3.inverse(T_rig_odom)
     path_m = float(np.linalg.norm(np.diff(T_odom_rig[:, :3, 3], axis=0), axis=1).sum())
     if path_m < MIN_PATH_M:
-        raise OmnidError(f"calibrate drive: the path is {path_m:.1f} m long, {MIN_PATH_M:.0f} m are needed: turns on "
-                         "the spot show nothing from near and from far; take a longer drive")
+        raise OmnidError(
+            f"calibrate drive: the path is {path_m:.1f} m long, {MIN_PATH_M:.0f} m are needed: turns on "
+            "the spot show nothing from near and from far; take a longer drive"
+        )
     heading = se3.yaw(T_odom_rig)
     change = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
     if np.ptp(np.concatenate([[0.0], np.cumsum(change)])) < MIN_TURN_RAD:
-        raise OmnidError(f"calibrate drive: {drives} drive(s) turn by less than {np.rad2deg(MIN_TURN_RAD):.0f} deg; on "
-                         "a straight line some errors of the rig look like motion: take a drive with turns")
+        raise OmnidError(
+            f"calibrate drive: {drives} drive(s) turn by less than {np.rad2deg(MIN_TURN_RAD):.0f} deg; on "
+            "a straight line some errors of the rig look like motion: take a drive with turns"
+        )

@@ -49,8 +49,10 @@ def straightened(log: Path, parameters: RigParameters, topics: Topics, config: C
     finding = check_rig(pairs, rig, config.panorama).finding
     progress(finding.summary)
     if finding.drift is None:
-        raise OmnidError(f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
-                         "and is there enough to see?")
+        raise OmnidError(
+            f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
+            "and is there enough to see?"
+        )
     # Errors of a centre look like a shifted viewpoint, which is none: only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
     prior = prior_information(parameters, rig)

@@ -34,21 +34,21 @@ def residual_image(image: Image, pixels: Array, residuals: Array, side: int = 32
     edge = int(min(np.ceil(np.ptp(known, axis=0).max()) + 2 * MARGIN_PX, *image.shape))
     middle = (known.min(axis=0) + known.max(axis=0)) / 2
     low = np.clip(np.round(middle - edge / 2).astype(int), 0, np.array(image.shape[::-1]) - edge)
-    part, scale = image[low[1]:low[1] + edge, low[0]:low[0] + edge], side / edge
+    part, scale = image[low[1] : low[1] + edge, low[0] : low[0] + edge], side / edge
     canvas = _color(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC))
     _arrows(canvas, (pixels - low + 0.5) * scale - 0.5, residuals * scale)
     return canvas
 
 
-def coverage_image(image: Image, views: Sequence[tuple[Array, Array]], center: tuple[float, float],
-                   width: int = 700) -> Image:
+def coverage_image(
+    image: Image, views: Sequence[tuple[Array, Array]], center: tuple[float, float], width: int = 700
+) -> Image:
     """Return one image with the corners of all views (pixels, residuals) and ARROW times their residuals."""
     scale = width / image.shape[1]
     canvas = _color(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) // 2)
     for pixels, residuals in views:
         _arrows(canvas, (pixels + 0.5) * scale - 0.5, residuals * scale)
-    cv2.drawMarker(canvas, tuple(round(value * scale) for value in center), CENTER,
-                   cv2.MARKER_CROSS, CROSS_PX, 1)
+    cv2.drawMarker(canvas, tuple(round(value * scale) for value in center), CENTER, cv2.MARKER_CROSS, CROSS_PX, 1)
     return canvas
 
 
@@ -78,8 +78,11 @@ def error_by_radius(fit: BundleResult, pixels: Array, center: tuple[float, float
     errors = fit.errors_px.ravel()
     order = np.argsort(radius)
     order = order[np.isfinite(errors[order])]
-    return [(float(radius[part].mean()), float(errors[part].mean()), len(part))
-            for part in np.array_split(order, RINGS) if len(part)]
+    return [
+        (float(radius[part].mean()), float(errors[part].mean()), len(part))
+        for part in np.array_split(order, RINGS)
+        if len(part)
+    ]
 
 
 def _color(image: NDArray[np.generic]) -> Image:

@@ -36,9 +36,11 @@ class HeightCalibration:
 
     def __str__(self) -> str:
         floor = self.floor
-        return (f"height of the lower viewpoint {floor.height_m:.3f} m (sigma {floor.sigma_m:.3f}), tilt "
-                f"{math.degrees(floor.tilt_rad):.2f} deg (sigma {math.degrees(floor.sigma_rad):.2f}), by the floor in "
-                f"{self.pairs} pairs")
+        return (
+            f"height of the lower viewpoint {floor.height_m:.3f} m (sigma {floor.sigma_m:.3f}), tilt "
+            f"{math.degrees(floor.tilt_rad):.2f} deg (sigma {math.degrees(floor.sigma_rad):.2f}), by the floor in "
+            f"{self.pairs} pairs"
+        )
 
     def contradiction(self, ruler_m: float) -> str:
         """Return in words that a height by ruler is another one; empty where they agree."""
@@ -46,9 +48,11 @@ class HeightCalibration:
         if abs(ruler_m - self.floor.height_m) <= limit_m:
             return ""
         baseline_mm = 1e3 * self.rig.baseline_m * ruler_m / self.floor.height_m
-        return (f"{ruler_m:.3f} m by ruler, {self.floor.height_m:.3f} m by the floor: they differ by more than "
-                f"{limit_m:.3f} m; measure from the floor to the focus of the lower mirror; if that is right, the "
-                f"baseline is wrong: {1e3 * self.rig.baseline_m:.1f} mm in the rig, {baseline_mm:.1f} mm would fit")
+        return (
+            f"{ruler_m:.3f} m by ruler, {self.floor.height_m:.3f} m by the floor: they differ by more than "
+            f"{limit_m:.3f} m; measure from the floor to the focus of the lower mirror; if that is right, the "
+            f"baseline is wrong: {1e3 * self.rig.baseline_m:.1f} mm in the rig, {baseline_mm:.1f} mm would fit"
+        )
 
     def save(self, path: Path) -> None:
         """Write the rig.toml."""
@@ -74,9 +78,11 @@ def calibrate_height(log: Path, rig: Rig, topics: Topics = (None, None)) -> Heig
         estimator.add(se3.apply(rig.T_base_rig, depth.points) - view, depth.variance_m2)
     floor = estimator.floor
     if floor is None:
-        raise OmnidError(f"calibrate height: {log}: the floor is not seen in {len(chosen)} pairs: record a log where "
-                         "the floor has texture all around (tiles, a carpet, newspapers), or give the measured height "
-                         "as --height-m to the command that makes the rig")
+        raise OmnidError(
+            f"calibrate height: {log}: the floor is not seen in {len(chosen)} pairs: record a log where "
+            "the floor has texture all around (tiles, a carpet, newspapers), or give the measured height "
+            "as --height-m to the command that makes the rig"
+        )
     return HeightCalibration(rig, on_floor(rig, floor), floor, len(chosen))
 
 

@@ -41,8 +41,10 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     pairs = _of_log(source, lower, upper) if of_log else _of_folder(source)
     if not pairs.sides[0].keys() & pairs.sides[1].keys():
-        raise OmnidError(f"{source}: no pair of images: found {_counted(pairs)}; expected pairs like lower_001.png "
-                         "and upper_001.png in a folder, or images with nearly equal stamps in a log")
+        raise OmnidError(
+            f"{source}: no pair of images: found {_counted(pairs)}; expected pairs like lower_001.png "
+            "and upper_001.png in a folder, or images with nearly equal stamps in a log"
+        )
     return pairs
 
 
@@ -52,8 +54,10 @@ def _counted(pairs: PairedImages) -> str:
 
 def _of_folder(folder: Path) -> PairedImages:
     if not folder.is_dir():
-        raise OmnidError(f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
-                         f"found {'a file' if folder.exists() else 'nothing'}")
+        raise OmnidError(
+            f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
+            f"found {'a file' if folder.exists() else 'nothing'}"
+        )
     lower, upper = (_of_side(folder, side) for side in SIDES)
     return PairedImages((lower, upper))
 

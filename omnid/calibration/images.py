@@ -82,8 +82,9 @@ def _read(path: Path) -> Image:
     except cv2.error:
         image = None
     if image is None or image.size > MAX_PIXELS:
-        raise OmnidError(f"{path}: expected an image (PNG, JPEG, TIFF ...) of at most {MAX_PIXELS} pixels, found none; "
-                         "leave it out")
+        raise OmnidError(
+            f"{path}: expected an image (PNG, JPEG, TIFF ...) of at most {MAX_PIXELS} pixels, found none; leave it out"
+        )
     return np.ascontiguousarray(image, np.uint8)
 
 
@@ -126,7 +127,21 @@ def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image
             continue
         try:
             image = logged.read()
-            yield f"frame{number:06d}", gray(Frame(number, image.stamp_ns, "lower", image.encoding, image.data,
-                                                   image.width, image.height, image.step, image.bigendian))
+            yield (
+                f"frame{number:06d}",
+                gray(
+                    Frame(
+                        number,
+                        image.stamp_ns,
+                        "lower",
+                        image.encoding,
+                        image.data,
+                        image.width,
+                        image.height,
+                        image.step,
+                        image.bigendian,
+                    )
+                ),
+            )
         except (FrameDecodeError, RecordError):
             continue

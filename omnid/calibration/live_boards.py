@@ -96,8 +96,10 @@ class LiveBoards:
 
     def _near(self, a: Views, b: Views, part: float) -> bool:
         """True if both boards are nearly at the same places in both views, as parts of the rims' radii."""
-        return all(moved(one, other) <= part * coverage.rim.outer_px
-                   for one, other, coverage in zip(a, b, self._covered(), strict=True))
+        return all(
+            moved(one, other) <= part * coverage.rim.outer_px
+            for one, other, coverage in zip(a, b, self._covered(), strict=True)
+        )
 
     def _covered(self) -> tuple[CameraCoverage, CameraCoverage]:
         assert self.coverage is not None  # since the first images

@@ -15,8 +15,15 @@ from calib.boards.board import Board
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerLayout
 from omnid.errors import OmnidError
 
-PAPERS_MM: Final = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "a2": (420.0, 594.0), "a1": (594.0, 841.0),
-                    "a0": (841.0, 1189.0), "letter": (215.9, 279.4), "tabloid": (279.4, 431.8)}
+PAPERS_MM: Final = {
+    "a4": (210.0, 297.0),
+    "a3": (297.0, 420.0),
+    "a2": (420.0, 594.0),
+    "a1": (594.0, 841.0),
+    "a0": (841.0, 1189.0),
+    "letter": (215.9, 279.4),
+    "tabloid": (279.4, 431.8),
+}
 EDGE_MM: Final = 8.0  # that printers leave free
 FOOT_MM: Final = 22.0  # below the board, for ruler and text
 RULER_MM: Final = 100.0
@@ -46,11 +53,15 @@ def board_pdf(board: Board | CharucoBoard | AprilGrid, paper: str, options: str)
     left, top = (page[0] - width) / 2, EDGE_MM + (page[1] - 2 * EDGE_MM - FOOT_MM - height) / 2
     drawn = [_rectangle(page, left + black.x, top + black.y, black.width, black.height) for black in rectangles]
     foot = page[1] - EDGE_MM
-    lines = (f"{board}. Print it at 100 %, not fitted to the page, and glue it on a flat plate.",
-             f"The line above is {RULER_MM:g} mm long: measure it and the board; give the size that you measured.",
-             f"omnid calibrate rig LOG {options} -o rig.toml")
-    drawn += [*_ruler(page, EDGE_MM, foot - 14.0), *(_text(page, EDGE_MM, foot - 8.5 + 4.0 * line, text)
-                                                     for line, text in enumerate(lines))]
+    lines = (
+        f"{board}. Print it at 100 %, not fitted to the page, and glue it on a flat plate.",
+        f"The line above is {RULER_MM:g} mm long: measure it and the board; give the size that you measured.",
+        f"omnid calibrate rig LOG {options} -o rig.toml",
+    )
+    drawn += [
+        *_ruler(page, EDGE_MM, foot - 14.0),
+        *(_text(page, EDGE_MM, foot - 8.5 + 4.0 * line, text) for line, text in enumerate(lines)),
+    ]
     return _pdf(page, drawn)
 
 
@@ -80,8 +91,9 @@ def _april_grid(board: AprilGrid) -> Iterator[Black]:
             yield Black(column * (side + gap), row * (side + gap), gap, gap)
 
 
-def _markers(layout: MarkerLayout, origin_mm: np.ndarray[tuple[int], np.dtype[np.float64]], down: float
-             ) -> Iterator[Black]:
+def _markers(
+    layout: MarkerLayout, origin_mm: np.ndarray[tuple[int], np.dtype[np.float64]], down: float
+) -> Iterator[Black]:
     """Yield the black bits of markers, each row of equal bits as one rectangle; down: sign of the frame's y."""
     bits = layout.dictionary.markerSize + 2 * layout.border_bits
     for number, corners in zip(layout.ids, 1e3 * layout.corners, strict=True):
@@ -107,11 +119,17 @@ def _page(paper: str, width: float, height: float) -> tuple[float, float]:
     for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
         if width <= page[0] - 2 * EDGE_MM and height <= page[1] - 2 * EDGE_MM - FOOT_MM:
             return page
-    fitting = [name for name, sides in PAPERS_MM.items() for page in (sides, sides[::-1])
-               if width <= page[0] - 2 * EDGE_MM and height <= page[1] - 2 * EDGE_MM - FOOT_MM]
+    fitting = [
+        name
+        for name, sides in PAPERS_MM.items()
+        for page in (sides, sides[::-1])
+        if width <= page[0] - 2 * EDGE_MM and height <= page[1] - 2 * EDGE_MM - FOOT_MM
+    ]
     advice = f"give --paper {fitting[0]}, or" if fitting else "give"
-    raise OmnidError(f"the board is {width:.0f} x {height:.0f} mm and does not fit on {paper} with a margin of "
-                     f"{EDGE_MM:g} mm and the ruler; {advice} smaller squares, or fewer of them")
+    raise OmnidError(
+        f"the board is {width:.0f} x {height:.0f} mm and does not fit on {paper} with a margin of "
+        f"{EDGE_MM:g} mm and the ruler; {advice} smaller squares, or fewer of them"
+    )
 
 
 def _rectangle(page: tuple[float, float], x: float, y: float, width: float, height: float) -> str:
@@ -141,8 +159,10 @@ def _pdf(page: tuple[float, float], drawn: Sequence[str]) -> bytes:
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
         b"<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
-        (f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] /Contents 5 0 R "
-         "/Resources << /Font << /F1 4 0 R >> >> >>").encode(),
+        (
+            f"<< /Type /Page /Parent 2 0 R /MediaBox [0 0 {width:.4f} {height:.4f}] /Contents 5 0 R "
+            "/Resources << /Font << /F1 4 0 R >> >> >>"
+        ).encode(),
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
         b"<< /Length %d >>\nstream\n%b\nendstream" % (len(content), content),
     ]

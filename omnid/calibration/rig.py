@@ -59,8 +59,11 @@ class RigResult:
     @property
     def warnings(self) -> list[str]:
         """Limits of the result, one line each."""
-        misfit = [line for side, name in enumerate(SIDES)
-                  for line in misfit_warning(f"{name} camera", self.calibration.structure(side))]
+        misfit = [
+            line
+            for side, name in enumerate(SIDES)
+            for line in misfit_warning(f"{name} camera", self.calibration.structure(side))
+        ]
         return [*misfit, *self.notes, *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected)]
 
     def __str__(self) -> str:
@@ -69,11 +72,13 @@ class RigResult:
         sigma_deg = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
         single_views = len(found.views) - found.pairs
         uncertainty = drive_uncertainty(self.rig) if any(found.parameters) else None
-        return (f"{'MISFIT: ' if self.is_misfit else ''}baseline {found.baseline_m * 1e3:.2f} mm (sigma "
-                f"{found.baseline_sigma_m * 1e3:.2f}), upper rotated by {rotation_deg:.3f} deg (sigma {sigma_deg:.3f}),"
-                f" mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
-                + (f", {single_views} views of one camera alone" if single_views else "")
-                + (f"; drives: {uncertainty}" if uncertainty else ""))
+        return (
+            f"{'MISFIT: ' if self.is_misfit else ''}baseline {found.baseline_m * 1e3:.2f} mm (sigma "
+            f"{found.baseline_sigma_m * 1e3:.2f}), upper rotated by {rotation_deg:.3f} deg (sigma {sigma_deg:.3f}),"
+            f" mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
+            + (f", {single_views} views of one camera alone" if single_views else "")
+            + (f"; drives: {uncertainty}" if uncertainty else "")
+        )
 
     def save(self, path: Path) -> None:
         """Write the rig.toml, and masks with struts to PNGs in the same folder."""
@@ -84,10 +89,19 @@ class RigResult:
         write_file(path, rig_report_html(self.calibration, self.images, self.rig).encode())
 
 
-def calibrate_rig(source: Path, board: AnyBoard, *, topics: tuple[str | None, str | None] = (None, None),
-                  cameras: GivenCameras | None = None, refine_cameras: bool = False, model: ModelChoice = "auto",
-                  view: View = "mirror", with_struts: bool = False, expected_baseline_m: float | None = None,
-                  progress: Progress = silent) -> RigResult:
+def calibrate_rig(
+    source: Path,
+    board: AnyBoard,
+    *,
+    topics: tuple[str | None, str | None] = (None, None),
+    cameras: GivenCameras | None = None,
+    refine_cameras: bool = False,
+    model: ModelChoice = "auto",
+    view: View = "mirror",
+    with_struts: bool = False,
+    expected_baseline_m: float | None = None,
+    progress: Progress = silent,
+) -> RigResult:
     """Calibrate two cameras and the transform between them by images of a board.
 
     source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
@@ -101,8 +115,9 @@ def calibrate_rig(source: Path, board: AnyBoard, *, topics: tuple[str | None, st
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
-    single = _FittedCameras.known(cameras, views) if cameras else _fit_cameras(views, images, board, (model, view),
-                                                                              progress)
+    single = (
+        _FittedCameras.known(cameras, views) if cameras else _fit_cameras(views, images, board, (model, view), progress)
+    )
     # 4. Fit the transform between the cameras, and the cameras with it.
     refined = cameras is None or refine_cameras
     if refined:
@@ -142,13 +157,17 @@ def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
     if cameras is None:
         return
     if _is_mirror(cameras[0]) != _is_mirror(cameras[1]):
-        raise OmnidError("calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
-                         "calibrate both with the same --view")
+        raise OmnidError(
+            "calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
+            "calibrate both with the same --view"
+        )
     for name, side, file in zip(SIDES, images.sides, cameras, strict=True):
         height, width = next(iter(side.values())).shape
         if (width, height) != tuple(file.camera.size):
-            raise OmnidError(f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
-                             f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera")
+            raise OmnidError(
+                f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
+                f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera"
+            )
 
 
 def _is_mirror(file: CameraFile) -> bool:
@@ -161,8 +180,10 @@ def _is_mirror(file: CameraFile) -> bool:
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
     """Find the board in the images of both cameras; of a log's many pairs the most diverse ones are selected."""
     of_log = bool(images.topics[0])
-    found = [_find_side(side, board, name, progress, thorough=not of_log)
-             for name, side in zip(SIDES, images.sides, strict=True)]
+    found = [
+        _find_side(side, board, name, progress, thorough=not of_log)
+        for name, side in zip(SIDES, images.sides, strict=True)
+    ]
     both = [found[0][name] for name in images.names if name in found[0] and name in found[1]]
     selected = set(images.names)
     if of_log and both:
@@ -171,8 +192,9 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
     return [view for view in seen if any(view.seen)]
 
 
-def _find_side(images: Images, board: AnyBoard, name: str, progress: Progress, *, thorough: bool
-               ) -> dict[str, BoardView]:
+def _find_side(
+    images: Images, board: AnyBoard, name: str, progress: Progress, *, thorough: bool
+) -> dict[str, BoardView]:
     """Return the views of the board by the camera of that name, by the names of the images."""
     try:
         views = find_boards(images, board, thorough=thorough, progress=progress)
@@ -181,8 +203,9 @@ def _find_side(images: Images, board: AnyBoard, name: str, progress: Progress, *
     return {view.name: view for view in views}
 
 
-def _fit_cameras(views: list[PairView], images: PairedImages, board: AnyBoard, choice: tuple[ModelChoice, View],
-                 progress: Progress) -> _FittedCameras:
+def _fit_cameras(
+    views: list[PairView], images: PairedImages, board: AnyBoard, choice: tuple[ModelChoice, View], progress: Progress
+) -> _FittedCameras:
     """Fit each camera to all its views; views that do not fit their camera are rejected."""
     model, direction = choice
     cameras, polynomials, rejected = [], list[OcamCamera](), list[RejectedView]()
@@ -203,49 +226,71 @@ def _fit_cameras(views: list[PairView], images: PairedImages, board: AnyBoard, c
 
 def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView]:
     """Remove one camera's views of the named instants; the other camera's views are kept."""
-    kept = [view if view.name not in names else
-            replace(view, seen=(None, view.seen[1]) if side == 0 else (view.seen[0], None)) for view in views]
+    kept = [
+        view
+        if view.name not in names
+        else replace(view, seen=(None, view.seen[1]) if side == 0 else (view.seen[0], None))
+        for view in views
+    ]
     return [view for view in kept if any(view.seen)]
 
 
 def _views_of_one_camera(views: list[PairView]) -> list[RejectedView]:
     """Return the views that a fit of known cameras cannot use."""
-    return [RejectedView(view.name, f"only the {name} camera saw the board; with given cameras pairs are needed")
-            for view in views for name, other in zip(SIDES, view.seen[::-1], strict=True) if other is None]
+    return [
+        RejectedView(view.name, f"only the {name} camera saw the board; with given cameras pairs are needed")
+        for view in views
+        for name, other in zip(SIDES, view.seen[::-1], strict=True)
+        if other is None
+    ]
 
 
 def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | None) -> list[str]:
     """Return warnings about the baseline; raises OmnidError if it is far from the expected one."""
     baseline_mm, (low, high) = found.baseline_m * 1e3, BASELINE_RANGE_M
-    option, length_mm = ("--tag-mm", board.tag_m * 1e3) if isinstance(board, AprilGrid) else (
-        "--square-mm", board.square_m * 1e3)
+    option, length_mm = (
+        ("--tag-mm", board.tag_m * 1e3) if isinstance(board, AprilGrid) else ("--square-mm", board.square_m * 1e3)
+    )
     if not low <= found.baseline_m <= high:
-        raise OmnidError(f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found "
-                         f"{baseline_mm:.4g} mm; it is proportional to {option}, which is {length_mm:g}: "
-                         "measure the board")
+        raise OmnidError(
+            f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found "
+            f"{baseline_mm:.4g} mm; it is proportional to {option}, which is {length_mm:g}: "
+            "measure the board"
+        )
     if expected_m is None:
         return []
     expected_mm = expected_m * 1e3
     off = baseline_mm / expected_mm - 1
     if abs(off) > REFUSED_PART:
-        raise OmnidError(f"calibrate rig: expected a baseline of {expected_mm:g} mm, found {baseline_mm:.1f} mm; "
-                         f"{option} {length_mm * expected_mm / baseline_mm:.2f} would explain it: measure the board "
-                         f"({option} is {length_mm:g}) and the distance of the mirrors")
+        raise OmnidError(
+            f"calibrate rig: expected a baseline of {expected_mm:g} mm, found {baseline_mm:.1f} mm; "
+            f"{option} {length_mm * expected_mm / baseline_mm:.2f} would explain it: measure the board "
+            f"({option} is {length_mm:g}) and the distance of the mirrors"
+        )
     if abs(off) > WARNING_PART:
         return [f"the baseline of {baseline_mm:.2f} mm is {abs(off):.1%} off the expected {expected_mm:g} mm"]
     return []
 
 
-def _masked_rig(found: RigCalibration, images: PairedImages, cameras: GivenCameras | None, *, with_struts: bool
-                ) -> tuple[Rig, list[str]]:
+def _masked_rig(
+    found: RigCalibration, images: PairedImages, cameras: GivenCameras | None, *, with_struts: bool
+) -> tuple[Rig, list[str]]:
     """Return the rig with its masks, and warnings about mirrors without a rim in the images."""
     rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
-    masks = [_mask(camera.center, side, file, with_struts=with_struts) for camera, side, file in zip(
-        (found.lower, found.upper), images.sides, cameras or (None, None), strict=True)]
-    mirrors = [name for name, camera, mask in zip(SIDES, (found.lower, found.upper), masks, strict=True)
-               if mask is None and not sees_directly(camera)]
-    warnings = [f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
-                f"add [{name}.mask] by hand" for name in mirrors]
+    masks = [
+        _mask(camera.center, side, file, with_struts=with_struts)
+        for camera, side, file in zip((found.lower, found.upper), images.sides, cameras or (None, None), strict=True)
+    ]
+    mirrors = [
+        name
+        for name, camera, mask in zip(SIDES, (found.lower, found.upper), masks, strict=True)
+        if mask is None and not sees_directly(camera)
+    ]
+    warnings = [
+        f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
+        f"add [{name}.mask] by hand"
+        for name in mirrors
+    ]
     return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), warnings
 
 

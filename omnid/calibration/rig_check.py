@@ -63,8 +63,10 @@ def read_rig_pairs(reader: LogReader, rig: Rig) -> list[FramePair]:
         if images[0] is not None and images[1] is not None:
             found.append(FramePair(number, lower.stamp_ns, images[0], images[1], skew_s))
     if not found:
-        raise OmnidError("calibrate check: no pair of images in the log; "
-                         f"{decode.fault or 'expected nearly equal stamps of both cameras'}")
+        raise OmnidError(
+            "calibrate check: no pair of images in the log; "
+            f"{decode.fault or 'expected nearly equal stamps of both cameras'}"
+        )
     return found
 
 
@@ -74,8 +76,10 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     dewarp = Dewarp(rectification, config)
     seen = map(dewarp.process, pairs)
     found = [match(panoramas.lower, panoramas.upper, panoramas.visible) for panoramas in seen]
-    rims = tuple(rim_shift(_brightest([getattr(pair, side) for pair in pairs]), mounted.mask)
-                 for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True))
+    rims = tuple(
+        rim_shift(_brightest([getattr(pair, side) for pair in pairs]), mounted.mask)
+        for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)
+    )
     return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]))
 
 

@@ -24,8 +24,10 @@ def require_same_rig(parameters: RigParameters, steps: Array, *, tracked: bool =
     """Raise OmnidError where the drive asks for another rig than the one given; tracked: as of `different_rig`."""
     reason = different_rig(parameters, steps, tracked=tracked)
     if reason:
-        raise OmnidError(f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
-                         "one: start from its own or nominal rig")
+        raise OmnidError(
+            f"calibrate drive: {reason}; is the rig that of these cameras? Nothing is written for another "
+            "one: start from its own or nominal rig"
+        )
 
 
 def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = True) -> str:
@@ -34,19 +36,23 @@ def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = Tr
     tracked: False before the motion is known: an upper camera that is exposed late then appears shifted.
     """
     first = len(parameters.rig_names) - len(TRANSFORM_NAMES)
-    change = (steps * parameters.units)[first:len(parameters.rig_names)]
+    change = (steps * parameters.units)[first : len(parameters.rig_names)]
     turn, lean = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:])) if tracked else 0.0
     limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
     if max(turn, lean) > limit:
-        return (f"the upper camera stands {np.rad2deg(turn):.1f} deg turned and {np.rad2deg(lean):.1f} deg aside of "
-                f"the rig's file, expected {np.rad2deg(limit):.1f} deg at most")
+        return (
+            f"the upper camera stands {np.rad2deg(turn):.1f} deg turned and {np.rad2deg(lean):.1f} deg aside of "
+            f"the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
+        )
     away = np.abs(steps / nominal_sigmas(parameters))[:first]
     worst = int(np.argmax(away))
     if away[worst] <= MAX_CHANGE_SIGMAS:
         return ""
     old, new = parameters.values[worst], (parameters.values + steps * parameters.units)[worst]
-    return (f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "
-            "same camera and mirror")
+    return (
+        f"{parameters.names[worst]} would change from {old:.5g} to {new:.5g}, more than another calibration of the "
+        "same camera and mirror"
+    )
 
 
 def is_nominal(rig: Rig) -> bool:

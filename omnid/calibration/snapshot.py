@@ -46,8 +46,13 @@ def view_of(images: Sequence[Image]) -> CameraView:
     laplacian = cv2.Laplacian(smooth, cv2.CV_32F)
     grey = newest[world]
     focus = float(laplacian[world].var() / (grey.var() + NOISE_GREY2)) if grey.size else math.nan
-    return CameraView(newest, rim, focus, float(grey.mean()) if grey.size else math.nan,
-                      float((grey >= SATURATED).mean()) if grey.size else math.nan)
+    return CameraView(
+        newest,
+        rim,
+        focus,
+        float(grey.mean()) if grey.size else math.nan,
+        float((grey >= SATURATED).mean()) if grey.size else math.nan,
+    )
 
 
 def _world(image: Image, rim: Mask | None) -> NDArray[np.bool_]:
@@ -66,18 +71,24 @@ def described(view: CameraView) -> str:
         rim = "no rim found"
     else:
         (u, v), radius = view.rim.center, view.rim.outer_px
-        rim = (f"rim: centre ({u:.0f}, {v:.0f}) px, {u - (width - 1) / 2:+.0f} and {v - (height - 1) / 2:+.0f} px from "
-               f"the middle, radius {radius:.0f} px")
-    return (f"{width}x{height}, {rim}; focus {1e3 * view.focus:.1f}; brightness {view.level_grey:.0f}, "
-            f"{100 * view.saturated:.1f} % too bright")
+        rim = (
+            f"rim: centre ({u:.0f}, {v:.0f}) px, {u - (width - 1) / 2:+.0f} and {v - (height - 1) / 2:+.0f} px from "
+            f"the middle, radius {radius:.0f} px"
+        )
+    return (
+        f"{width}x{height}, {rim}; focus {1e3 * view.focus:.1f}; brightness {view.level_grey:.0f}, "
+        f"{100 * view.saturated:.1f} % too bright"
+    )
 
 
 def warnings(views: Mapping[str, CameraView]) -> Iterator[str]:
     """Yield what should be corrected before the cameras are calibrated."""
     for name, view in views.items():
         if view.rim is None:
-            yield (f"{name}: the mirror's rim was not found: light all around, and the whole circle in the image; "
-                   "without a rim the mask must be given in the rig")
+            yield (
+                f"{name}: the mirror's rim was not found: light all around, and the whole circle in the image; "
+                "without a rim the mask must be given in the rig"
+            )
         elif _reach_px(view) < NEAR_BORDER_PX:
             yield f"{name}: the rim leaves the image: move the camera towards the middle of the mirror, or farther away"
         if view.level_grey < DARK_GREY:
@@ -87,8 +98,10 @@ def warnings(views: Mapping[str, CameraView]) -> Iterator[str]:
     sharpest = max(views, key=lambda name: views[name].focus)
     for name, view in views.items():
         if view.focus < LESS_SHARP * views[sharpest].focus:
-            yield (f"{name}: less sharp than the {sharpest} camera: turn its lens until `focus` is highest; both see "
-                   "the same world")
+            yield (
+                f"{name}: less sharp than the {sharpest} camera: turn its lens until `focus` is highest; both see "
+                "the same world"
+            )
 
 
 def _reach_px(view: CameraView) -> float:
@@ -112,6 +125,7 @@ def annotated(name: str, view: CameraView) -> Image:
     cv2.drawMarker(image, (width // 2, height // 2), _RED, cv2.MARKER_TILTED_CROSS, 15)
     strip = np.zeros((24, width, 3), np.uint8)
     text = f"{name}: focus {1e3 * view.focus:.1f}, brightness {view.level_grey:.0f}, " + (
-        "no rim" if view.rim is None else f"radius {view.rim.outer_px:.0f} px")
+        "no rim" if view.rim is None else f"radius {view.rim.outer_px:.0f} px"
+    )
     cv2.putText(strip, text, (6, 17), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (255, 255, 255), 1, cv2.LINE_AA)
     return np.vstack((image, strip))

@@ -27,23 +27,51 @@ TABLES_S = 5.0  # shortest time from one writing of the tables to the next, befo
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `batch` to the command line."""
     parser = subparsers.add_parser("batch", help="replay many logs into one table; goes on where it was interrupted")
-    parser.add_argument("logs", nargs="+", metavar="LOG", help="files, folders, patterns in quotes, or addresses such "
-                        "as s3://bucket/*.mcap (extra `fleet`)")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a folder for each log, results.csv, "
-                        "index.html, and results.parquet where pyarrow is installed")
+    parser.add_argument(
+        "logs",
+        nargs="+",
+        metavar="LOG",
+        help="files, folders, patterns in quotes, or addresses such as s3://bucket/*.mcap (extra `fleet`)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="a folder for each log, results.csv, index.html, and results.parquet where pyarrow is installed",
+    )
     parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
     parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
     parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
     parser.add_argument("--config", type=Path, metavar="FILE", help="configuration (TOML) of all replays")
-    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="SECTION.KEY=VALUE",
-                        help="change one setting; may be repeated")
-    parser.add_argument("--truth", default="truth.txt", metavar="NAME", help="trajectory beside each log, which is "
-                        "compared where it exists; default %(default)s")
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="change one setting; may be repeated",
+    )
+    parser.add_argument(
+        "--truth",
+        default="truth.txt",
+        metavar="NAME",
+        help="trajectory beside each log, which is compared where it exists; default %(default)s",
+    )
     parser.add_argument("--record", action="store_true", help="keep a recording and a report of each log")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N",
-                        help="logs at a time on this machine; default: the number of cores, %(default)s")
-    parser.add_argument("--dask", metavar="ADDRESS", help="run on the workers of this dask scheduler, such as "
-                        "tcp://HOST:8786; they need the same paths (extra `fleet`)")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="logs at a time on this machine; default: the number of cores, %(default)s",
+    )
+    parser.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        help="run on the workers of this dask scheduler, such as "
+        "tcp://HOST:8786; they need the same paths (extra `fleet`)",
+    )
     parser.add_argument("--timeout-s", type=float, default=3600.0, metavar="S", help="for one log; default %(default)g")
     parser.set_defaults(run=run)
 
@@ -57,8 +85,10 @@ def run(args: argparse.Namespace) -> int:
     from omnid.plain_text import plain
 
     if not 1 <= args.jobs <= MAX_JOBS or not args.timeout_s > 0:
-        raise OmnidError(f"batch: --jobs {args.jobs} --timeout-s {args.timeout_s:g}: expected 1 to {MAX_JOBS} jobs and "
-                         "a time above 0")
+        raise OmnidError(
+            f"batch: --jobs {args.jobs} --timeout-s {args.timeout_s:g}: expected 1 to {MAX_JOBS} jobs and "
+            "a time above 0"
+        )
     all_jobs = jobs(find_logs(args.logs), args.out.absolute(), _options(args))
     workers = _workers(args)
     signal.signal(signal.SIGTERM, _interrupt)
@@ -71,8 +101,10 @@ def run(args: argparse.Namespace) -> int:
         for result in workers([job for job in all_jobs if job.name not in stored]):
             results[result.name] = result
             outcome = result.error if result.status != OK else f"{result.length_m:.3f} m"
-            print(f"{len(results)}/{len(all_jobs)}  {result.name}: {result.status}, {outcome}, {result.seconds:.1f} s",
-                  file=sys.stderr)
+            print(
+                f"{len(results)}/{len(all_jobs)}  {result.name}: {result.status}, {outcome}, {result.seconds:.1f} s",
+                file=sys.stderr,
+            )
             if time.monotonic() > next_s:
                 write_tables(list(results.values()), args.out)
                 next_s = time.monotonic() + TABLES_S
@@ -120,6 +152,7 @@ def _locked(out: Path) -> Iterator[None]:
         try:
             fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise OmnidError(f"batch: another batch writes into {str(out)!r}; wait for it, or give another --out") \
-                from error
+            raise OmnidError(
+                f"batch: another batch writes into {str(out)!r}; wait for it, or give another --out"
+            ) from error
         yield

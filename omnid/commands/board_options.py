@@ -11,9 +11,11 @@ from omnid.calibration.board_search import AnyBoard
 from omnid.errors import OmnidError
 
 # Options (attribute, name) that each kind of board needs, and those that it may have besides.
-NEEDED = {"checkerboard": ("corners", "square_mm"),
-          "charuco": ("corners", "square_mm", "marker_mm", "dictionary"),
-          "aprilgrid": ("tags", "tag_mm", "tag_spacing")}
+NEEDED = {
+    "checkerboard": ("corners", "square_mm"),
+    "charuco": ("corners", "square_mm", "marker_mm", "dictionary"),
+    "aprilgrid": ("tags", "tag_mm", "tag_spacing"),
+}
 OPTIONAL = {"charuco": ("legacy_charuco",)}
 ALL = ("corners", "square_mm", "marker_mm", "dictionary", "legacy_charuco", "tags", "tag_mm", "tag_spacing")
 
@@ -21,21 +23,38 @@ ALL = ("corners", "square_mm", "marker_mm", "dictionary", "legacy_charuco", "tag
 def add_board_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the board."""
     board = parser.add_argument_group("board")
-    board.add_argument("--board", choices=sorted(NEEDED), default="checkerboard", help="checkerboard (default); "
-                       "charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. Boards with "
-                       "markers may be half hidden")
-    board.add_argument("--corners", type=two_sides, metavar="6x7", help="inner corners (points where four squares "
-                       "meet) along both sides; for charuco along its columns and rows")
+    board.add_argument(
+        "--board",
+        choices=sorted(NEEDED),
+        default="checkerboard",
+        help="checkerboard (default); "
+        "charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. Boards with "
+        "markers may be half hidden",
+    )
+    board.add_argument(
+        "--corners",
+        type=two_sides,
+        metavar="6x7",
+        help="inner corners (points where four squares meet) along both sides; for charuco along its columns and rows",
+    )
     board.add_argument("--square-mm", type=float, metavar="MM", help="side of one square")
     board.add_argument("--marker-mm", type=float, metavar="MM", help="charuco: side of one marker")
     board.add_argument("--dictionary", metavar="NAME", help="charuco: the markers' dictionary, like 5X5_100")
-    board.add_argument("--legacy-charuco", action="store_true", help="charuco: printed by OpenCV before 4.6 with "
-                       "an even number of rows of squares, a light square first")
-    board.add_argument("--tags", type=two_sides, metavar="6x6", help="aprilgrid: tags along x and y (Kalibr's "
-                       "tagCols x tagRows)")
+    board.add_argument(
+        "--legacy-charuco",
+        action="store_true",
+        help="charuco: printed by OpenCV before 4.6 with an even number of rows of squares, a light square first",
+    )
+    board.add_argument(
+        "--tags", type=two_sides, metavar="6x6", help="aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)"
+    )
     board.add_argument("--tag-mm", type=float, metavar="MM", help="aprilgrid: side of one tag (tagSize)")
-    board.add_argument("--tag-spacing", type=float, metavar="RATIO", help="aprilgrid: space between tags in parts of a "
-                       "tag's side, like 0.3 (tagSpacing)")
+    board.add_argument(
+        "--tag-spacing",
+        type=float,
+        metavar="RATIO",
+        help="aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)",
+    )
 
 
 def two_sides(text: str) -> tuple[int, int]:
@@ -47,8 +66,7 @@ def two_sides(text: str) -> tuple[int, int]:
 
 
 def board_of(args: argparse.Namespace) -> AnyBoard:
-    """Return the board that the options describe; OmnidError for missing or unused options, CalibError for wrong sizes.
-    """
+    """Return the board that the options describe; OmnidError for missing or unused ones, CalibError for wrong sizes."""
     given = [name for name in ALL if getattr(args, name) not in (None, False)]
     needed = NEEDED[args.board]
     missing = [name for name in needed if name not in given]
@@ -56,8 +74,10 @@ def board_of(args: argparse.Namespace) -> AnyBoard:
         raise OmnidError(f"--board {args.board}: expected {_options(needed)}, found no {_options(missing)}")
     unused = [name for name in given if name not in (*needed, *OPTIONAL.get(args.board, ()))]
     if unused:
-        raise OmnidError(f"--board {args.board}: {_options(unused)} belongs to another kind of board; leave it out, or "
-                         "choose the --board that was printed")
+        raise OmnidError(
+            f"--board {args.board}: {_options(unused)} belongs to another kind of board; leave it out, or "
+            "choose the --board that was printed"
+        )
     if args.board == "aprilgrid":
         columns, rows = args.tags
         return AprilGrid(columns, rows, args.tag_mm / 1e3, args.tag_spacing)

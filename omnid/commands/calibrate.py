@@ -11,8 +11,9 @@ ACTIONS: Final = ("board", "camera", "live", "rig", "check", "drive", "height", 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `calibrate` with its actions to the command line."""
-    actions = add_listed(subparsers).add_subparsers(dest="action", required=True,
-                                                    metavar="board|live|camera|rig|check|drive|height|import|export")
+    actions = add_listed(subparsers).add_subparsers(
+        dest="action", required=True, metavar="board|live|camera|rig|check|drive|height|import|export"
+    )
     for name in ACTIONS:
         import_module(f"omnid.commands.calibrate_{name}").add_parser(actions)
 

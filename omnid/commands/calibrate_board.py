@@ -15,8 +15,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
     parser = subparsers.add_parser("board", help="a board to print, true to scale, with a ruler to check the print")
     add_board_options(parser)
-    parser.add_argument("--paper", choices=sorted(PAPERS_MM), default="a4",
-                        help="default %(default)s, either way round")
+    parser.add_argument(
+        "--paper", choices=sorted(PAPERS_MM), default="a4", help="default %(default)s, either way round"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.pdf")
     parser.set_defaults(run=run)
 
@@ -30,9 +31,13 @@ def run(args: argparse.Namespace) -> int:
     board, options = board_of(args), shlex.join(options_of(args))
     if len(ambiguous_orders(board)) > 1:
         columns, rows = args.corners
-        raise OmnidError(f"--corners {columns}x{rows}: such a board looks the same when it is turned: give one even "
-                         f"and one odd number, such as {columns}x{rows + 1}")
+        raise OmnidError(
+            f"--corners {columns}x{rows}: such a board looks the same when it is turned: give one even "
+            f"and one odd number, such as {columns}x{rows + 1}"
+        )
     args.output.write_bytes(board_pdf(board, args.paper, options))
-    print(f"{args.output}: {board}; print it at 100 % on {args.paper}, measure the line of 100 mm, then: "
-          f"omnid calibrate rig LOG {options} -o rig.toml")
+    print(
+        f"{args.output}: {board}; print it at 100 % on {args.paper}, measure the line of 100 mm, then: "
+        f"omnid calibrate rig LOG {options} -o rig.toml"
+    )
     return 0

@@ -18,8 +18,10 @@ from omnid.sinks.files import check_outputs
 if TYPE_CHECKING:
     from omnid.calibration.rig import RigResult
 
-MODEL_HELP = ("auto (default): fit all models and select by cross-validation; omni: unified model; ocam: polynomial; "
-              "ocam_tangential: polynomial with tangential terms")
+MODEL_HELP = (
+    "auto (default): fit all models and select by cross-validation; omni: unified model; ocam: polynomial; "
+    "ocam_tangential: polynomial with tangential terms"
+)
 
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -29,11 +31,21 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     add_board_options(parser)
     parser.add_argument("--topic", help="the camera's topic in a log")
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
-    parser.add_argument("--view", choices=VIEWS, default="mirror", help="the world is seen in a mirror (default) or "
-                        "directly through a lens: images of a flat board do not distinguish the two")
+    parser.add_argument(
+        "--view",
+        choices=VIEWS,
+        default="mirror",
+        help="the world is seen in a mirror (default) or "
+        "directly through a lens: images of a flat board do not distinguish the two",
+    )
     parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and coverage")
-    parser.add_argument("--mask", type=Path, metavar="FILE", help="also find rim, hub and struts, and write them to "
-                        "this PNG in the folder of the camera's file; it may be edited")
+    parser.add_argument(
+        "--mask",
+        type=Path,
+        metavar="FILE",
+        help="also find rim, hub and struts, and write them to "
+        "this PNG in the folder of the camera's file; it may be edited",
+    )
     parser.add_argument("--quiet", action="store_true", help="no progress")
     parser.add_argument("-o", "--output", type=Path, required=True, help="the camera.toml to write")
     parser.set_defaults(run=run)
@@ -43,8 +55,15 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate the camera, write the files and print one line."""
     board = board_of(args)
     _check_outputs(args)
-    found = calibrate_camera(args.images, board, topic=args.topic, model=args.model, view=args.view,
-                             with_mask=args.mask is not None, progress=progress_of(args))
+    found = calibrate_camera(
+        args.images,
+        board,
+        topic=args.topic,
+        model=args.model,
+        view=args.view,
+        with_mask=args.mask is not None,
+        progress=progress_of(args),
+    )
     found.save(args.output, args.mask)
     if args.report:
         found.save_report(args.report)

@@ -29,9 +29,11 @@ REFINEMENTS: Final = 3
 MAX_SKEW_S: Final = 3e-3
 # No mirror moves this far to the side, deg of the baseline; a camera's centre that is some pixels off has this effect.
 NO_MIRROR_DEG: Final = 5.0
-RECALIBRATE = ("the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board")
-NOT_OBSERVABLE = ("not observable without a board: the length of the baseline (kept), the cameras' intrinsics, and the "
-                  "rig's pose on the robot")
+RECALIBRATE = "the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board"
+NOT_OBSERVABLE = (
+    "not observable without a board: the length of the baseline (kept), the cameras' intrinsics, and the "
+    "rig's pose on the robot"
+)
 
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -41,8 +43,9 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
     parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
     parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
-    parser.add_argument("--refine", action="store_true", help="also correct the upper camera's pose, and write that "
-                        "rig")
+    parser.add_argument(
+        "--refine", action="store_true", help="also correct the upper camera's pose, and write that rig"
+    )
     parser.add_argument("-o", "--output", type=Path, help="with --refine: the rig.toml to write")
     parser.set_defaults(run=run)
 
@@ -62,8 +65,10 @@ def run(args: argparse.Namespace) -> int:
         reader.close()
     skewed = _skewed(pairs)
     if skewed and args.refine:
-        raise OmnidError(f"calibrate check: --refine would take motion for a drift: {skewed}; `omnid calibrate drive` "
-                         "calibrates such a rig")
+        raise OmnidError(
+            f"calibrate check: --refine would take motion for a drift: {skewed}; `omnid calibrate drive` "
+            "calibrates such a rig"
+        )
     found = check_rig(pairs, rig, Config().panorama)
     if skewed:
         # The motion between the exposures would look like a drift.
@@ -87,18 +92,23 @@ def _skewed(pairs: list[FramePair]) -> str:
 
 def _require_matches(finding: RigFinding, pairs: int) -> None:
     if finding.state is RigState.UNCHECKED:
-        raise OmnidError(f"calibrate check: expected at least {MIN_MATCHES} points in both panoramas, found "
-                         f"{finding.matches} of {finding.tried} in {pairs} pairs; use a log with more texture")
+        raise OmnidError(
+            f"calibrate check: expected at least {MIN_MATCHES} points in both panoramas, found "
+            f"{finding.matches} of {finding.tried} in {pairs} pairs; use a log with more texture"
+        )
 
 
 def report(found: RigCheckResult, pairs: int) -> str:
     """Return the result as lines of text, the condition first."""
     finding = found.finding
-    lines = [f"{found.state}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
-             f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px; by azimuth, degrees to "
-             "the left of forward:"]
-    lines.append("  " + "  ".join(f"{azimuth:+.0f}: {median:+.2f}" for azimuth, median, count in finding.by_azimuth
-                                  if count))
+    lines = [
+        f"{found.state}: {pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
+        f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px; by azimuth, degrees to "
+        "the left of forward:",
+    ]
+    lines.append(
+        "  " + "  ".join(f"{azimuth:+.0f}: {median:+.2f}" for azimuth, median, count in finding.by_azimuth if count)
+    )
     if finding.drift is not None:
         lines += _drift(finding)
         lines += [RECALIBRATE] * _intrinsics_changed(finding)
@@ -112,13 +122,17 @@ def _drift(finding: RigFinding) -> list[str]:
     drift = finding.drift
     turn, turn_sigma = np.rad2deg(drift.turn), np.rad2deg(drift.turn_sigma)
     shift, shift_sigma = np.rad2deg(drift.shift), np.rad2deg(drift.shift_sigma)
-    rotation = ", ".join(f"{value:+.3f} ({sigma:.3f}) about {axis}"
-                         for value, sigma, axis in zip(turn, turn_sigma, "xyz", strict=True))
-    translation = ", ".join(f"{value:+.2f} ({sigma:.2f}) along {axis}"
-                            for value, sigma, axis in zip(shift, shift_sigma, "xy", strict=True))
-    return [f"upper camera: rotated by {finding.turn_deg:.3f} deg: {rotation}; z is along the baseline",
-            f"upper viewpoint: shifted by {translation} deg, as seen from the lower one",
-            f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions"]
+    rotation = ", ".join(
+        f"{value:+.3f} ({sigma:.3f}) about {axis}" for value, sigma, axis in zip(turn, turn_sigma, "xyz", strict=True)
+    )
+    translation = ", ".join(
+        f"{value:+.2f} ({sigma:.2f}) along {axis}" for value, sigma, axis in zip(shift, shift_sigma, "xy", strict=True)
+    )
+    return [
+        f"upper camera: rotated by {finding.turn_deg:.3f} deg: {rotation}; z is along the baseline",
+        f"upper viewpoint: shifted by {translation} deg, as seen from the lower one",
+        f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
+    ]
 
 
 def _intrinsics_changed(finding: RigFinding) -> bool:
@@ -133,8 +147,10 @@ def _rim(name: str, rim: RimShift | None) -> str:
     fits = "the mask fits"
     if not rim.fits:
         fits = "the mask reaches beyond the mirror: it was drawn so, or the camera has moved"
-    return (f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
-            f"{rim.wider_px:+.1f} px: {fits}")
+    return (
+        f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
+        f"{rim.wider_px:+.1f} px: {fits}"
+    )
 
 
 def _refine(rig: Rig, pairs: list[FramePair], found: RigCheckResult, path: Path) -> None:

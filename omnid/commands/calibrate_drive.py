@@ -30,13 +30,23 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     """Add `drive` to `omnid calibrate`."""
     parser = actions.add_parser("drive", help="a better rig.toml from ordinary drives with turns, without a board")
     parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="drives with turns; 100 to 350 pairs")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml to start from; a nominal one will do: "
-                        "mirror data sheet, centre of the images, baseline by ruler; default: the one attached to the "
-                        "first log")
+    parser.add_argument(
+        "--rig",
+        type=Path,
+        metavar="FILE",
+        help="the rig.toml to start from; a nominal one will do: "
+        "mirror data sheet, centre of the images, baseline by ruler; default: the one attached to the "
+        "first log",
+    )
     parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
     parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
-    parser.add_argument("--distance-m", type=float, metavar="M", help="straight distance from the first to the last "
-                        "image of a single log: sets the baseline's length, which is kept otherwise")
+    parser.add_argument(
+        "--distance-m",
+        type=float,
+        metavar="M",
+        help="straight distance from the first to the last "
+        "image of a single log: sets the baseline's length, which is kept otherwise",
+    )
     add_height(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the rig.toml to write")
     parser.set_defaults(run=run)
@@ -50,8 +60,9 @@ def run(args: argparse.Namespace) -> int:
 
     _check(args)
     prepare_kernels(log)
-    found = calibrate_drive(args.logs, _start(args), (args.lower, args.upper),
-                            lambda line: print(line, file=sys.stderr))
+    found = calibrate_drive(
+        args.logs, _start(args), (args.lower, args.upper), lambda line: print(line, file=sys.stderr)
+    )
     print("\n".join(describe(found)))
     if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px and not args.distance_m:
         print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig: nothing was written")
@@ -59,14 +70,19 @@ def run(args: argparse.Namespace) -> int:
     rig = found.rig
     if args.distance_m:
         rig = found.at_distance(args.distance_m)
-        print(f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance "
-              f"({found.distance_m:.3f} m before)")
+        print(
+            f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance "
+            f"({found.distance_m:.3f} m before)"
+        )
     rig = with_height(rig, args)
     write_rig(args.output, rig)
     print(f"{args.output}: written, {height_of(rig)}")
     if found.is_misfit:
-        print(f"{args.output}: warning: the model does not describe these cameras; calibrate with a board, and check "
-              "the mirrors", file=sys.stderr)
+        print(
+            f"{args.output}: warning: the model does not describe these cameras; calibrate with a board, and check "
+            "the mirrors",
+            file=sys.stderr,
+        )
     return 0
 
 
@@ -96,12 +112,14 @@ def describe(found: DriveCalibration) -> list[str]:
     adjustment, parameters = found.adjustment, found.adjustment.parameters
     misfit = "MISFIT: the residuals are not noise. " if found.is_misfit else ""
     uncertainty = drive_uncertainty(found.rig)
-    lines = [f"{misfit}{found.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
-             f"{len(adjustment.observations)} observations; error {found.first_sigma_px:.3f} px before, "
-             f"{adjustment.sigma_px:.3f} px after",
-             *(f"{side}: {structure}" for side, structure in zip(("lower", "upper"), found.structure, strict=True)),
-             f"lengths change by {100 * found.scale_change:+.3f} %" + (f"; {uncertainty}" if uncertainty else ""),
-             f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}"]
+    lines = [
+        f"{misfit}{found.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
+        f"{len(adjustment.observations)} observations; error {found.first_sigma_px:.3f} px before, "
+        f"{adjustment.sigma_px:.3f} px after",
+        *(f"{side}: {structure}" for side, structure in zip(("lower", "upper"), found.structure, strict=True)),
+        f"lengths change by {100 * found.scale_change:+.3f} %" + (f"; {uncertainty}" if uncertainty else ""),
+        f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}",
+    ]
     after = parameters.values + adjustment.state.steps * parameters.units
     sigmas = adjustment.sigmas * parameters.units
     rows = zip(parameters.names, parameters.values, after, sigmas, adjustment.seen.tolist(), strict=True)
@@ -114,6 +132,8 @@ def describe(found: DriveCalibration) -> list[str]:
         times = ", ".join(f"{name} {value:.3g}" for name, value in found.times)
         lines.append(f"times of exposure: {times}: in the table [times] of the file, where runs read them")
     if found.level_rad:
-        lines.append(f"the rig frame was turned by {np.rad2deg(found.level_rad):.2f} deg, so that the drive lies in "
-                     "the x-y plane of the base")
+        lines.append(
+            f"the rig frame was turned by {np.rad2deg(found.level_rad):.2f} deg, so that the drive lies in "
+            "the x-y plane of the base"
+        )
     return lines

@@ -26,8 +26,9 @@ from omnid.sinks.files import check_outputs
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `import` and `export` to the actions of `calibrate`."""
-    importing = actions.add_parser("import", help="a rig.toml from a Kalibr file, from two OCamCalib files, or of "
-                                   "two 360-degree cameras")
+    importing = actions.add_parser(
+        "import", help="a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras"
+    )
     exporting = actions.add_parser("export", help="Kalibr or OCamCalib files from a rig.toml")
     _add_import(importing)
     _add_export(exporting)
@@ -36,19 +37,31 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def _add_import(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml, or Helvipad's "
-                        "calibration.json")
-    parser.add_argument("--lower", default="", help="the lower camera: its name in the camchain (cam0), its "
-                        "calib_results.txt, or with a calibration.json a folder of its images")
+    parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml, or Helvipad's calibration.json")
+    parser.add_argument(
+        "--lower",
+        default="",
+        help="the lower camera: its name in the camchain (cam0), its "
+        "calib_results.txt, or with a calibration.json a folder of its images",
+    )
     parser.add_argument("--upper", default="", help="the same for the upper camera")
     between = parser.add_mutually_exclusive_group()
     between.add_argument("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers")
-    between.add_argument("--baseline", type=float, metavar="M", help="metres from the lower viewpoint straight up to "
-                         "the upper one; both cameras look up and are equally oriented")
-    parser.add_argument("--equirectangular", metavar="WIDTHxHEIGHT", help="two 360-degree cameras one above the other, "
-                        "with stitched images of this size; with --baseline")
-    parser.add_argument("--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly "
-                        "through a lens")
+    between.add_argument(
+        "--baseline",
+        type=float,
+        metavar="M",
+        help="metres from the lower viewpoint straight up to "
+        "the upper one; both cameras look up and are equally oriented",
+    )
+    parser.add_argument(
+        "--equirectangular",
+        metavar="WIDTHxHEIGHT",
+        help="two 360-degree cameras one above the other, with stitched images of this size; with --baseline",
+    )
+    parser.add_argument(
+        "--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly through a lens"
+    )
     add_height(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
 
@@ -56,8 +69,14 @@ def _add_import(parser: argparse.ArgumentParser) -> None:
 def _add_export(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("rig", type=Path, help="the rig.toml to read")
     parser.add_argument("--format", choices=("kalibr", "ocam"), required=True)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="kalibr: the file to write; ocam: a folder, "
-                        "or PATH for PATH.lower.txt, PATH.upper.txt and PATH.transform.toml")
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        required=True,
+        help="kalibr: the file to write; ocam: a folder, "
+        "or PATH for PATH.lower.txt, PATH.upper.txt and PATH.transform.toml",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -89,8 +108,10 @@ def _imported(args: argparse.Namespace) -> Rig:
     if args.camchain and args.camchain.suffix == ".json":
         check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
         if not args.lower:
-            raise OmnidError(f"{args.camchain}: it does not tell the size of the images: give --lower FOLDER, the "
-                             "folder of the lower camera's images")
+            raise OmnidError(
+                f"{args.camchain}: it does not tell the size of the images: give --lower FOLDER, the "
+                "folder of the lower camera's images"
+            )
         return import_helvipad(args.camchain, Path(args.lower))
     return _kalibr(args) if args.camchain else _ocam(args)
 
@@ -100,8 +121,10 @@ def _stitched(args: argparse.Namespace) -> Rig:
     if size is None:
         raise OmnidError(f"--equirectangular: expected WIDTHxHEIGHT as 3840x1920, found {args.equirectangular!r}")
     if args.baseline is None or args.camchain or args.transform or args.lower or args.upper or args.view:
-        raise OmnidError("--equirectangular goes with --baseline METRES, and with no file, because stitched images "
-                         "have no other numbers")
+        raise OmnidError(
+            "--equirectangular goes with --baseline METRES, and with no file, because stitched images "
+            "have no other numbers"
+        )
     return stacked_rig((int(size[1]), int(size[2])), args.baseline)
 
 
@@ -109,19 +132,24 @@ def _kalibr(args: argparse.Namespace) -> Rig:
     if args.camchain.suffix == ".toml":
         raise OmnidError(f"{args.camchain}: a rig.toml needs no import: use it as it is, --rig {args.camchain}")
     if args.transform or args.baseline is not None or args.view:
-        raise OmnidError(f"{args.camchain}: --transform, --baseline and --view go with OCamCalib files; a Kalibr file "
-                         "holds its transforms")
+        raise OmnidError(
+            f"{args.camchain}: --transform, --baseline and --view go with OCamCalib files; a Kalibr file "
+            "holds its transforms"
+        )
     check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
     return import_kalibr(args.camchain, args.lower, args.upper)
 
 
 def _ocam(args: argparse.Namespace) -> Rig:
     if not (args.lower and args.upper):
-        raise OmnidError("calibrate import: expected a Kalibr camchain.yaml, or two OCamCalib files as --lower and "
-                         "--upper")
+        raise OmnidError(
+            "calibrate import: expected a Kalibr camchain.yaml, or two OCamCalib files as --lower and --upper"
+        )
     if args.transform is None and args.baseline is None:
-        raise OmnidError("calibrate import: OCamCalib files do not contain the transform between the cameras: give "
-                         "--transform FILE or --baseline METRES")
+        raise OmnidError(
+            "calibrate import: OCamCalib files do not contain the transform between the cameras: give "
+            "--transform FILE or --baseline METRES"
+        )
     read = [Path(args.lower), Path(args.upper), *([args.transform] if args.transform else [])]
     check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
     T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
@@ -136,8 +164,11 @@ def _export_kalibr(rig: Rig, path: Path) -> list[Path]:
 def _export_ocam(rig: Rig, path: Path) -> list[Path]:
     base = path / "calib_results" if path.is_dir() else path
     T_lower_upper = rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig)
-    texts = {f"{base}.lower.txt": export_ocam(rig.lower.camera), f"{base}.upper.txt": export_ocam(rig.upper.camera),
-             f"{base}.transform.toml": transform_toml(T_lower_upper)}
+    texts = {
+        f"{base}.lower.txt": export_ocam(rig.lower.camera),
+        f"{base}.upper.txt": export_ocam(rig.upper.camera),
+        f"{base}.transform.toml": transform_toml(T_lower_upper),
+    }
     for name, text in texts.items():
         write_file(Path(name), text.encode())
     return [Path(name) for name in texts]
@@ -154,10 +185,13 @@ def describe(rig: Rig) -> str:
     """Return one line about a rig: cameras, topics, baseline, rotation between the cameras, height."""
     T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
     rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(T_upper_lower[:3, :3])))
-    lower, upper = (_describe(mounted, topic)
-                    for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True))
-    return (f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
-            f"{rotation_deg:.2f} deg, {height_of(rig)}")
+    lower, upper = (
+        _describe(mounted, topic) for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True)
+    )
+    return (
+        f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
+        f"{rotation_deg:.2f} deg, {height_of(rig)}"
+    )
 
 
 def _describe(mounted: MountedCamera, topic: str) -> str:

@@ -21,8 +21,9 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
     parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
     parser.add_argument("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the "
-                        "file of --rig")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the file of --rig"
+    )
     parser.set_defaults(run=run)
 
 

@@ -17,7 +17,6 @@ from omnid.commands.board_options import add_board_options, board_of, options_of
 from omnid.commands.config import add_settings
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-
     from omnid.calibration.images import Image
     from omnid.calibration.live_boards import LiveBoards, PairOutcome
     from omnid.config import Config
@@ -28,19 +27,33 @@ PUBLISH_S: Final = 0.5
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `live` to `omnid calibrate`."""
-    parser = actions.add_parser("live", help="images of a board, with its coverage so far and what is missing",
-                                description="Search the board in the images of both cameras as they come. Pairs in "
-                                "which it stands still at a new place are written to DIR; the terminal and the page "
-                                "(`omnid web`) show where it has been, what is missing, and when it is enough. Stop "
-                                "the daemon first: it holds the cameras. Exit code 1: not enough yet.")
-    parser.add_argument("images", type=Path, nargs="?", metavar="DIR", help="folder of the images, lower_*.png and "
-                        "upper_*.png; what is there counts, so that it goes on where it ended")
+    parser = actions.add_parser(
+        "live",
+        help="images of a board, with its coverage so far and what is missing",
+        description="Search the board in the images of both cameras as they come. Pairs in "
+        "which it stands still at a new place are written to DIR; the terminal and the page "
+        "(`omnid web`) show where it has been, what is missing, and when it is enough. Stop "
+        "the daemon first: it holds the cameras. Exit code 1: not enough yet.",
+    )
+    parser.add_argument(
+        "images",
+        type=Path,
+        nargs="?",
+        metavar="DIR",
+        help="folder of the images, lower_*.png and "
+        "upper_*.png; what is there counts, so that it goes on where it ended",
+    )
     add_board_options(parser)
-    parser.add_argument("--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are "
-                        "only judged")
+    parser.add_argument(
+        "--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are only judged"
+    )
     for camera in ("lower", "upper"):
-        parser.add_argument(f"--{camera}", metavar="DEVICE|TOPIC", help=f"device of the {camera} camera; default: "
-                            f"cameras.{camera} of the settings; of --log the topic, default: found by name")
+        parser.add_argument(
+            f"--{camera}",
+            metavar="DEVICE|TOPIC",
+            help=f"device of the {camera} camera; default: "
+            f"cameras.{camera} of the settings; of --log the topic, default: found by name",
+        )
     add_settings(parser)
     parser.set_defaults(run=run)
 

@@ -20,22 +20,40 @@ from omnid.sinks.files import check_outputs
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `rig` to `omnid calibrate`."""
     parser = actions.add_parser("rig", help="a rig.toml from images of a board that both cameras saw at once")
-    parser.add_argument("images", type=Path, metavar="LOG|DIR", help="a log of both cameras, or a folder with "
-                        "lower_*.png, upper_*.png of the same names")
+    parser.add_argument(
+        "images",
+        type=Path,
+        metavar="LOG|DIR",
+        help="a log of both cameras, or a folder with lower_*.png, upper_*.png of the same names",
+    )
     add_board_options(parser)
-    parser.add_argument("--expected-baseline-mm", type=float, metavar="MM", help="the measured distance of the "
-                        "mirrors: a result that differs by more than a tenth is refused")
-    parser.add_argument("--lower-camera", type=Path, metavar="FILE", help="camera.toml of the lower camera, which is "
-                        "not changed")
+    parser.add_argument(
+        "--expected-baseline-mm",
+        type=float,
+        metavar="MM",
+        help="the measured distance of the mirrors: a result that differs by more than a tenth is refused",
+    )
+    parser.add_argument(
+        "--lower-camera", type=Path, metavar="FILE", help="camera.toml of the lower camera, which is not changed"
+    )
     parser.add_argument("--upper-camera", type=Path, metavar="FILE", help="the same for the upper camera")
     parser.add_argument("--refine-cameras", action="store_true", help="adjust the given cameras as well")
     parser.add_argument("--lower", metavar="TOPIC", help="a log's topic of the lower camera")
     parser.add_argument("--upper", metavar="TOPIC", help="a log's topic of the upper camera")
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
-    parser.add_argument("--view", choices=VIEWS, default="mirror", help="the world is seen in mirrors (default) or "
-                        "directly through lenses: images of a flat board do not distinguish the two")
-    parser.add_argument("--mask", action="store_true", help="also find hub and struts, and write the masks to PNGs in "
-                        "the folder of the rig's file; they may be edited")
+    parser.add_argument(
+        "--view",
+        choices=VIEWS,
+        default="mirror",
+        help="the world is seen in mirrors (default) or "
+        "directly through lenses: images of a flat board do not distinguish the two",
+    )
+    parser.add_argument(
+        "--mask",
+        action="store_true",
+        help="also find hub and struts, and write the masks to PNGs in "
+        "the folder of the rig's file; they may be edited",
+    )
     parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and panoramas")
     add_height(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress")
@@ -49,9 +67,18 @@ def run(args: argparse.Namespace) -> int:
     given = _given(args)
     _check_outputs(args)
     expected_m = None if args.expected_baseline_mm is None else args.expected_baseline_mm / 1e3
-    found = calibrate_rig(args.images, board, topics=(args.lower, args.upper), cameras=given,
-                          refine_cameras=args.refine_cameras, model=args.model, view=args.view, with_struts=args.mask,
-                          expected_baseline_m=expected_m, progress=progress_of(args))
+    found = calibrate_rig(
+        args.images,
+        board,
+        topics=(args.lower, args.upper),
+        cameras=given,
+        refine_cameras=args.refine_cameras,
+        model=args.model,
+        view=args.view,
+        with_struts=args.mask,
+        expected_baseline_m=expected_m,
+        progress=progress_of(args),
+    )
     found = replace(found, rig=with_height(found.rig, args))
     found.save(args.output)
     if args.report:
@@ -75,8 +102,11 @@ def _given(args: argparse.Namespace) -> GivenCameras | None:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     named = [("--output", args.output), ("--report", args.report)]
-    read = [("a file that is read", path) for path in (args.images, args.lower_camera, args.upper_camera)
-            if path is not None and path.is_file()]
+    read = [
+        ("a file that is read", path)
+        for path in (args.images, args.lower_camera, args.upper_camera)
+        if path is not None and path.is_file()
+    ]
     check_outputs([(option, path) for option, path in named if path is not None], read)
     expected = args.expected_baseline_mm
     if expected is not None and not expected > 0:

@@ -27,10 +27,13 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `cameras` to the command line."""
-    parser = subparsers.add_parser("cameras", help="list cameras and the udev rule to copy, or show what they see",
-                                   description="List cameras, their modes and the udev rule to copy. With --snapshot "
-                                   "write an image of each configured camera with the mirror's rim, and print a "
-                                   "measure of its focus, which is highest where the lens is set best.")
+    parser = subparsers.add_parser(
+        "cameras",
+        help="list cameras and the udev rule to copy, or show what they see",
+        description="List cameras, their modes and the udev rule to copy. With --snapshot "
+        "write an image of each configured camera with the mirror's rim, and print a "
+        "measure of its focus, which is highest where the lens is set best.",
+    )
     parser.add_argument("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png")
     parser.add_argument("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log")
     parser.add_argument("--lower", metavar="TOPIC", help="of --log: images of the lower camera; default: by name")
@@ -56,8 +59,10 @@ def _list() -> int:
 
     devices = capture_devices(ROOT)
     if not devices:
-        print("omnid: no cameras: the kernel has no capture device; check the cables and the output of `dmesg`",
-              file=sys.stderr)
+        print(
+            "omnid: no cameras: the kernel has no capture device; check the cables and the output of `dmesg`",
+            file=sys.stderr,
+        )
         return 1
     print("\n\n".join("\n".join(describe_device(device)) for device in devices))
     if rules := list(udev_rules(devices)):

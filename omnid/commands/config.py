@@ -18,14 +18,21 @@ PROFILES: Final = {
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `config` to the command line."""
-    parser = subparsers.add_parser("config", help="print, check or migrate settings",
-                                   description="Print all settings with their defaults as TOML; check or migrate a "
-                                   "file.")
-    parser.add_argument("action", nargs="?", choices=("print", "check", "migrate"), default="print",
-                        help="default: print")
+    parser = subparsers.add_parser(
+        "config",
+        help="print, check or migrate settings",
+        description="Print all settings with their defaults as TOML; check or migrate a file.",
+    )
+    parser.add_argument(
+        "action", nargs="?", choices=("print", "check", "migrate"), default="print", help="default: print"
+    )
     parser.add_argument("file", nargs="?", type=Path, metavar="FILE", help="of check and migrate")
-    parser.add_argument("--minimal", action="store_true", help="print only what differs from the defaults, and what "
-                        "a new robot needs; all other defaults stay those of the installed version")
+    parser.add_argument(
+        "--minimal",
+        action="store_true",
+        help="print only what differs from the defaults, and what "
+        "a new robot needs; all other defaults stay those of the installed version",
+    )
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -33,21 +40,38 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 class ChooseProfile(argparse.Action):
     """Settings of a profile, as if --set came before all others."""
 
-    def __call__(self, parser: argparse.ArgumentParser, namespace: argparse.Namespace,
-                 values: str | Sequence[Any] | None, option_string: str | None = None) -> None:
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
         """Add the settings."""
         namespace.overrides = [*PROFILES[str(values)], *namespace.overrides]
 
 
 def add_settings(parser: argparse.ArgumentParser) -> None:
     """Add the options --config, --profile and --set."""
-    parser.add_argument("--config", type=Path, metavar="FILE",
-                        help="TOML file of settings; `omnid config` prints the defaults")
-    parser.add_argument("--profile", action=ChooseProfile, choices=tuple(PROFILES), default=argparse.SUPPRESS,
-                        help="settings that replace those of the file; small: half-size panoramas and half the "
-                        "landmarks, for a small computer")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides",
-                        help="a setting that replaces that of the file; may be repeated")
+    parser.add_argument(
+        "--config", type=Path, metavar="FILE", help="TOML file of settings; `omnid config` prints the defaults"
+    )
+    parser.add_argument(
+        "--profile",
+        action=ChooseProfile,
+        choices=tuple(PROFILES),
+        default=argparse.SUPPRESS,
+        help="settings that replace those of the file; small: half-size panoramas and half the "
+        "landmarks, for a small computer",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        dest="overrides",
+        help="a setting that replaces that of the file; may be repeated",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -57,8 +81,14 @@ def run(args: argparse.Namespace) -> int:
     from omnid.settings_dump import dump, dump_minimal
 
     if (args.action == "print") != (args.file is None):
-        raise OmnidError(f"omnid config {args.action}: " + ("name the file" if args.file is None else
-                         f"takes no file: `omnid config --config {args.file}` prints its settings"))
+        raise OmnidError(
+            f"omnid config {args.action}: "
+            + (
+                "name the file"
+                if args.file is None
+                else f"takes no file: `omnid config --config {args.file}` prints its settings"
+            )
+        )
     if args.action == "migrate":
         config, renamed = migrated_config(args.file)
         print(dump_minimal(config, ()), end="")

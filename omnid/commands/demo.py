@@ -15,12 +15,22 @@ DRIVE_S = 90.0  # of simulated time at most
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `demo` to the command line."""
     parser = subparsers.add_parser("demo", help="replay a sample in real time: files, bus and a simulated motor")
-    parser.add_argument("--output", type=Path, default=Path("omnid-demo"), metavar="FOLDER",
-                        help="folder of the output files; default %(default)s")
-    parser.add_argument("--drive", action="store_true", help="a simulated robot is taught a route of 6 m and repeats "
-                        "it; takes a minute or two, and writes drive.png with both true paths")
-    parser.add_argument("--seed", type=int, default=1, help="with --drive: of the world and its noise; default "
-                        "%(default)s")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("omnid-demo"),
+        metavar="FOLDER",
+        help="folder of the output files; default %(default)s",
+    )
+    parser.add_argument(
+        "--drive",
+        action="store_true",
+        help="a simulated robot is taught a route of 6 m and repeats "
+        "it; takes a minute or two, and writes drive.png with both true paths",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=1, help="with --drive: of the world and its noise; default %(default)s"
+    )
     parser.add_argument("--verbose", action="store_true", help="print all counters, and the times of all stages")
     parser.add_argument("--quiet", action="store_true", help="do not show the progress")
     add_settings(parser)
@@ -38,11 +48,17 @@ def run(args: argparse.Namespace) -> int:
 
     _make_folder(args.output)
     tum = args.output / "trajectory.tum"
-    options = ReplayOptions(tum=tum, cloud=args.output / "map.ply", plan=args.output / "plan.png",
-                            record=args.output / "log.mcap", publish=True, bus_optional=True, paced=True,
-                            settings=args.config)
-    config = load_config(args.config, ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3",
-                                       *args.overrides])
+    options = ReplayOptions(
+        tum=tum,
+        cloud=args.output / "map.ply",
+        plan=args.output / "plan.png",
+        record=args.output / "log.mcap",
+        publish=True,
+        bus_optional=True,
+        paced=True,
+        settings=args.config,
+    )
+    config = load_config(args.config, ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.overrides])
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
         code = replay_and_print(log, config, options, Output(args.quiet, args.verbose))
@@ -89,7 +105,9 @@ def _drive(args: argparse.Namespace) -> int:
     print(f"end: {end}; contacts with obstacles: {len(run.contacts)}; pose {100 * drift_m(run):.1f} cm off at the end")
     if len(second):
         off_cm = 100 * cross_track_m(first, second)
-        print(f"the repeated path is {np.percentile(off_cm, 95):.1f} cm off the taught one (95 % of it), at most "
-              f"{off_cm.max():.1f} cm, by the truth")
+        print(
+            f"the repeated path is {np.percentile(off_cm, 95):.1f} cm off the taught one (95 % of it), at most "
+            f"{off_cm.max():.1f} cm, by the truth"
+        )
     print(f"picture: {image}; map: {place_map}")
     return 0 if script.end == NavigationState.REACHED else 1

@@ -10,10 +10,13 @@ from omnid.commands.listen import add_robot, config_of
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `drive` to the command line."""
-    parser = subparsers.add_parser("drive", help="drive a robot by the keyboard",
-                                   description="Drive a robot by the arrow keys. A motion lasts as long as its key is "
-                                   "held: terminals repeat keys, and 0.6 s after the last one the wheels stop. Space "
-                                   "stops them until `a` arms the robot. Speeds are shares of the robot's own limits.")
+    parser = subparsers.add_parser(
+        "drive",
+        help="drive a robot by the keyboard",
+        description="Drive a robot by the arrow keys. A motion lasts as long as its key is "
+        "held: terminals repeat keys, and 0.6 s after the last one the wheels stop. Space "
+        "stops them until `a` arms the robot. Speeds are shares of the robot's own limits.",
+    )
     add_robot(parser)
     add_settings(parser)
     parser.set_defaults(run=run)

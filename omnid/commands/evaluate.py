@@ -19,17 +19,31 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `eval` to the command line."""
     parser = subparsers.add_parser("eval", help="compare a trajectory with the truth, both in the TUM format")
     parser.add_argument("estimate", type=Path, metavar="EST", help="t x y z qx qy qz qw, T_odom_rig")
-    parser.add_argument("truth", type=Path, metavar="TRUTH",
-                        help="the same format, of the same rig frame in any world frame")
-    parser.add_argument("--tolerance-ms", type=float, default=10.0, metavar="MS",
-                        help="largest difference between the stamps of two poses; default %(default)s")
-    parser.add_argument("--align", choices=("origin", "rigid", "scale"), help="the first pose "
-                        "(default), as evo's --align_origin; rigid: all positions, as its --align; scale: these and "
-                        "the estimate's scale, as its --align --correct_scale")
-    parser.add_argument("--score", choices=("hilti", "kitti"), help="a score by which others compare. hilti: 100 "
-                        "exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree cameras, 0 where more than 1 %% of "
-                        "the truth's poses are missing, with --align rigid unless another one is given; kitti: drift "
-                        "over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m")
+    parser.add_argument(
+        "truth", type=Path, metavar="TRUTH", help="the same format, of the same rig frame in any world frame"
+    )
+    parser.add_argument(
+        "--tolerance-ms",
+        type=float,
+        default=10.0,
+        metavar="MS",
+        help="largest difference between the stamps of two poses; default %(default)s",
+    )
+    parser.add_argument(
+        "--align",
+        choices=("origin", "rigid", "scale"),
+        help="the first pose "
+        "(default), as evo's --align_origin; rigid: all positions, as its --align; scale: these and "
+        "the estimate's scale, as its --align --correct_scale",
+    )
+    parser.add_argument(
+        "--score",
+        choices=("hilti", "kitti"),
+        help="a score by which others compare. hilti: 100 "
+        "exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree cameras, 0 where more than 1 %% of "
+        "the truth's poses are missing, with --align rigid unless another one is given; kitti: drift "
+        "over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m",
+    )
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -43,13 +57,17 @@ def run(args: argparse.Namespace) -> int:
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     metrics = evaluate(estimate, truth, tolerance_s, args.align or ("rigid" if args.score == "hilti" else "origin"))
     if metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
-        print(f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
-              f"{metrics.length_truth_m:.2f} m: is this the truth of the same drive, in the same frame of the robot?",
-              file=sys.stderr)
+        print(
+            f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
+            f"{metrics.length_truth_m:.2f} m: is this the truth of the same drive, in the same frame of the robot?",
+            file=sys.stderr,
+        )
     drift = kitti_drift(*associated(estimate, truth, tolerance_s)) if args.score == "kitti" else []
     if args.json:
-        scores: dict[str, dict[str, object]] = {"hilti": {"hilti_score": hilti_score(metrics)},
-                                                "kitti": {"drift": drift}}
+        scores: dict[str, dict[str, object]] = {
+            "hilti": {"hilti_score": hilti_score(metrics)},
+            "kitti": {"drift": drift},
+        }
         print_json(asdict(metrics) | scores.get(args.score, {}))
         return 0
     print(metrics)

@@ -13,18 +13,35 @@ FARTHEST_M = 1e6
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `goto` to the command line."""
-    parser = subparsers.add_parser("goto", help="drive a robot to a pose, around obstacles",
-                                   description="Drive an armed robot to a pose of its base and wait for the end; "
-                                   "Ctrl-C cancels, and it stops. Exit code 0: reached, 1: not reached.")
-    parser.add_argument("pose", type=float, nargs="*", metavar="X Y [YAW]", help="m, m, and deg counter-clockwise; "
-                        "without YAW the heading stays as it comes")
-    parser.add_argument("--frame", choices=("odom", "map"), default="odom", help="frame of the pose: odom begins at "
-                        "the robot's start, map is that of its saved map; default %(default)s")
+    parser = subparsers.add_parser(
+        "goto",
+        help="drive a robot to a pose, around obstacles",
+        description="Drive an armed robot to a pose of its base and wait for the end; "
+        "Ctrl-C cancels, and it stops. Exit code 0: reached, 1: not reached.",
+    )
+    parser.add_argument(
+        "pose",
+        type=float,
+        nargs="*",
+        metavar="X Y [YAW]",
+        help="m, m, and deg counter-clockwise; without YAW the heading stays as it comes",
+    )
+    parser.add_argument(
+        "--frame",
+        choices=("odom", "map"),
+        default="odom",
+        help="frame of the pose: odom begins at the robot's start, map is that of its saved map; default %(default)s",
+    )
     verbs = parser.add_mutually_exclusive_group()
     verbs.add_argument("--cancel", action="store_const", dest="verb", const="cancel", help="end what is under way")
     verbs.add_argument("--pause", action="store_const", dest="verb", const="pause", help="halt")
-    verbs.add_argument("--resume", action="store_const", dest="verb", const="resume", help="go on after a halt or "
-                       "a fault; it arms the robot, too")
+    verbs.add_argument(
+        "--resume",
+        action="store_const",
+        dest="verb",
+        const="resume",
+        help="go on after a halt or a fault; it arms the robot, too",
+    )
     parser.add_argument("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
     add_robot(parser)
     add_settings(parser)

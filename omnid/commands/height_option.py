@@ -9,8 +9,13 @@ from calib.rig import LEAST_HEIGHT_M, MAX_HEIGHT_M, Rig
 
 def add_height(parser: argparse.ArgumentParser) -> None:
     """Add --height-m."""
-    parser.add_argument("--height-m", type=height, metavar="M", help="height of the lower viewpoint (the focus of the "
-                        "lower mirror) above the floor; without it `omnid calibrate height` finds it by the floor")
+    parser.add_argument(
+        "--height-m",
+        type=height,
+        metavar="M",
+        help="height of the lower viewpoint (the focus of the "
+        "lower mirror) above the floor; without it `omnid calibrate height` finds it by the floor",
+    )
 
 
 def height(text: str) -> float:
@@ -32,5 +37,8 @@ def with_height(rig: Rig, args: argparse.Namespace) -> Rig:
 def height_of(rig: Rig) -> str:
     """Return the height that a rig states, in words."""
     height_m = rig.height_m()
-    return ("no height of the cameras (--height-m, or `omnid calibrate height LOG`)" if height_m is None
-            else f"cameras {height_m:.3f} m above the floor")
+    return (
+        "no height of the cameras (--height-m, or `omnid calibrate height LOG`)"
+        if height_m is None
+        else f"cameras {height_m:.3f} m above the floor"
+    )

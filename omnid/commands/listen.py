@@ -28,8 +28,13 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def add_robot(parser: argparse.ArgumentParser) -> None:
     """Add the options --robot and --connect."""
     parser.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
-                        "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
+    parser.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="the robot or a router, such as "
+        "tcp/robot:7447; default: bus.connect of the settings, without them this machine",
+    )
 
 
 def config_of(args: argparse.Namespace) -> Config:

@@ -24,14 +24,24 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("log", help="show the content of logs, and recover broken ones")
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
     info = actions.add_parser("info", help="topics, types, counts, times, attachments, and whether the log is whole")
-    info.add_argument("logs", type=Path, nargs="+", metavar="LOG",
-                      help=".mcap, .mcap.part, .db3, .bag, or a folder of these or of images")
+    info.add_argument(
+        "logs",
+        type=Path,
+        nargs="+",
+        metavar="LOG",
+        help=".mcap, .mcap.part, .db3, .bag, or a folder of these or of images",
+    )
     add_json(info)
     info.set_defaults(run=run_info)
     recover = actions.add_parser("recover", help="write all readable messages of a cut or corrupt log to a new one")
     recover.add_argument("log", type=Path, metavar="FILE", help=".mcap or .mcap.part, of any program")
-    recover.add_argument("-o", "--output", type=Path, metavar="OUT", help="default: FILE without .part, or "
-                      "FILE.recovered.mcap; nothing is overwritten")
+    recover.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="OUT",
+        help="default: FILE without .part, or FILE.recovered.mcap; nothing is overwritten",
+    )
     recover.set_defaults(run=run_recover)
 
 

@@ -36,8 +36,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     show.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
     show.set_defaults(run=run_show)
     merge = actions.add_parser("merge", help="join maps of one building, made by the same rig")
-    merge.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first "
-                       "stays")
+    merge.add_argument(
+        "maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first stays"
+    )
     merge.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
     merge.set_defaults(run=run_merge)
     add_tags(actions)
@@ -66,8 +67,12 @@ def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     export.add_argument("map", type=Path, metavar="FILE.omap")
     export.add_argument("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age")
     export.add_argument("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths")
-    export.add_argument("--grid", type=Path, metavar="FILE.yaml", help="occupancy grid for nav2 and map_server; the "
-                        "image beside it is FILE.pgm")
+    export.add_argument(
+        "--grid",
+        type=Path,
+        metavar="FILE.yaml",
+        help="occupancy grid for nav2 and map_server; the image beside it is FILE.pgm",
+    )
     export.add_argument("--cell", type=float, default=CELL_M, metavar="M", help="edge of a cell; default %(default)s m")
     export.set_defaults(run=run_export)
 
@@ -91,8 +96,9 @@ def run_build(args: argparse.Namespace) -> int:
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
     built = RigPlaces(*read_places(args.output, new_places(config.places))) if args.extend else None
     for log in args.logs:
-        options = ReplayOptions(rig=args.rig, settings=args.config, build=True, rig_places=built,
-                                progress=None if args.quiet else Progress)
+        options = ReplayOptions(
+            rig=args.rig, settings=args.config, build=True, rig_places=built, progress=None if args.quiet else Progress
+        )
         result = run_log(log, config, options)
         for warning in (*warnings, *result.warnings):
             print(f"omnid: warning: {log}: {warning}", file=sys.stderr)
@@ -177,8 +183,10 @@ def run_merge(args: argparse.Namespace) -> int:
             raise OmnidError(f"{path}: this map was made with {difference}: build one with the rig of {args.maps[0]}")
         seen_by(other, other_rig, rig)
         if not merge(places, other, StereoModel(rig.cylinder, rig.baseline_m)):
-            raise OmnidError(f"{path}: it shares no place with the maps before that is recognised: drive where both "
-                             "have been, and add that log by `omnid map build LOG --extend`")
+            raise OmnidError(
+                f"{path}: it shares no place with the maps before that is recognised: drive where both "
+                "have been, and add that log by `omnid map build LOG --extend`"
+            )
     write_places(args.output, places, rig)
     print(*_described(args.output, summary(places, rig), rig), sep="\n")
     return 0
@@ -207,9 +215,11 @@ def run_export(args: argparse.Namespace) -> int:
     places, rig = read_places(args.map)
     if args.grid:
         if not any(np.isfinite(keyframe.scan).any() for keyframe in places.keyframes.values()):
-            print(f"omnid: warning: {args.grid}: all cells are unknown: the map is of an earlier version, or was built "
-                  f"without the height of the cameras above the floor: {ADVICE}, and build the map again",
-                  file=sys.stderr)
+            print(
+                f"omnid: warning: {args.grid}: all cells are unknown: the map is of an earlier version, or was built "
+                f"without the height of the cameras above the floor: {ADVICE}, and build the map again",
+                file=sys.stderr,
+            )
         write_grid(args.grid, place_views.grid(places, rig, args.cell))
     if args.ply or args.plan:
         points = place_views.landmarks(places, rig)
@@ -239,5 +249,7 @@ def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
     yield f"path         {sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m"
     if sizes.parts > 1:
         yield f"parts        {sizes.parts}, between which no pose is known"
-    yield (f"rig          {rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of "
-           f"{rig.cylinder.width} x {rig.cylinder.height} px")
+    yield (
+        f"rig          {rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of "
+        f"{rig.cylinder.width} x {rig.cylinder.height} px"
+    )

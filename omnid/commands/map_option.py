@@ -9,17 +9,26 @@ from pathlib import Path
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add --map, --localize-only and --tags."""
     group = parser.add_argument_group("map of places")
-    group.add_argument("--map", type=Path, metavar="FILE.omap", help="localise in a map of places and extend it at "
-                       "the end; a file that does not exist is made; the points of the 3-D map are written by "
-                       "`omnid replay --cloud FILE.ply`")
+    group.add_argument(
+        "--map",
+        type=Path,
+        metavar="FILE.omap",
+        help="localise in a map of places and extend it at "
+        "the end; a file that does not exist is made; the points of the 3-D map are written by "
+        "`omnid replay --cloud FILE.ply`",
+    )
     group.add_argument("--localize-only", action="store_true", help="leave the map as it is")
     add_tags_option(group)
 
 
 def add_tags_option(parser: argparse._ActionsContainer) -> None:
     """Add --tags."""
-    parser.add_argument("--tags", type=Path, metavar="TAGS.toml", help="AprilTags (36h11) that are to be landmarks of "
-                        "the map, with names, numbers and sizes; the map keeps them")
+    parser.add_argument(
+        "--tags",
+        type=Path,
+        metavar="TAGS.toml",
+        help="AprilTags (36h11) that are to be landmarks of the map, with names, numbers and sizes; the map keeps them",
+    )
 
 
 def tag_settings(args: argparse.Namespace) -> list[str]:
@@ -32,7 +41,9 @@ def map_settings(args: argparse.Namespace) -> list[str]:
     from omnid.errors import OmnidError
 
     if args.map is not None and args.map.suffix == ".ply":
-        raise OmnidError(f"--map {args.map}: expected a map of places (.omap) to localise in; the points of the 3-D "
-                         "map are written by --cloud FILE.ply")
+        raise OmnidError(
+            f"--map {args.map}: expected a map of places (.omap) to localise in; the points of the 3-D "
+            "map are written by --cloud FILE.ply"
+        )
     settings = [] if args.map is None else [f"places.map={args.map}"]
     return [*settings, *tag_settings(args), *(["places.localize_only=true"] if args.localize_only else [])]

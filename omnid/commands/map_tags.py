@@ -29,11 +29,17 @@ LARGEST_M = 0.3  # that may be left at a landmark: beyond it, a number was mista
 
 def add_tags(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `map tags`."""
-    tags = actions.add_parser("tags", help="AprilTags (36h11) as landmarks with names: those of a map, or those that a "
-                              "log shows")
+    tags = actions.add_parser(
+        "tags", help="AprilTags (36h11) as landmarks with names: those of a map, or those that a log shows"
+    )
     tags.add_argument("source", type=Path, metavar="FILE.omap|LOG", help="a map, or a log as of `omnid replay`")
-    tags.add_argument("--tag", action="append", default=[], metavar="ID=SIZE", help="of a log: number of a tag and the "
-                      "edge of its black square, m; may be repeated")
+    tags.add_argument(
+        "--tag",
+        action="append",
+        default=[],
+        metavar="ID=SIZE",
+        help="of a log: number of a tag and the edge of its black square, m; may be repeated",
+    )
     tags.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     tags.add_argument("--write", type=Path, metavar="TAGS.toml", help="write them as landmarks, for `omnid map align`")
     add_map(tags)
@@ -46,10 +52,21 @@ def add_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     """Add `map align`."""
     parser = actions.add_parser("align", help="move a map into the axes of a plan of the building, by known AprilTags")
     parser.add_argument("map", type=Path, metavar="FILE.omap")
-    parser.add_argument("--seen", type=Path, metavar="TAGS.toml", help="the tags in the map, as written by `omnid map "
-                        "tags LOG --map FILE.omap --localize-only --write TAGS.toml`; default: those of the map")
-    parser.add_argument("--known", type=Path, required=True, metavar="PLAN.toml", help="the same tags on the plan: x, "
-                        "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one")
+    parser.add_argument(
+        "--seen",
+        type=Path,
+        metavar="TAGS.toml",
+        help="the tags in the map, as written by `omnid map "
+        "tags LOG --map FILE.omap --localize-only --write TAGS.toml`; default: those of the map",
+    )
+    parser.add_argument(
+        "--known",
+        type=Path,
+        required=True,
+        metavar="PLAN.toml",
+        help="the same tags on the plan: x, "
+        "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one",
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
     parser.set_defaults(run=run_align)
 
@@ -69,12 +86,15 @@ def run_tags(args: argparse.Namespace) -> int:
     else:
         print(*_tag_lines(rows), sep="\n")
     if args.write is not None:
-        write_landmarks(args.write, [replace(landmark(id, tags[id].size_m, tag.T), name=tags[id].name)
-                                     for id, tag in found.items()])
+        write_landmarks(
+            args.write, [replace(landmark(id, tags[id].size_m, tag.T), name=tags[id].name) for id, tag in found.items()]
+        )
     missing = tags.keys() - found.keys()
     if missing:
-        print(f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {refused} views were of another size",
-              file=sys.stderr)
+        print(
+            f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {refused} views were of another size",
+            file=sys.stderr,
+        )
     return int(bool(missing))
 
 
@@ -84,16 +104,17 @@ def _of_map(args: argparse.Namespace) -> Found:
     from omnid.formats.place_file import read_places
 
     if args.tag or args.tags or args.rig or args.map:
-        raise OmnidError(f"map tags {args.source}: --tag, --tags, --rig and --map belong to a log: leave them out, "
-                         "or name a log instead of the map")
+        raise OmnidError(
+            f"map tags {args.source}: --tag, --tags, --rig and --map belong to a log: leave them out, "
+            "or name a log instead of the map"
+        )
     places, rig = read_places(args.source)
     return places.tags.known, _tags_of(places, rig), 0
 
 
 def _tags_of(places: PlaceMap, rig: PlaceRig) -> dict[int, TagEstimate]:
     """Return the poses of the tags of a map, in the axes of the base at its start."""
-    return {id: replace(tag, T=rig.T_base_rect @ tag.T)
-            for id, tag in places.tags.all_located(places.poses).items()}
+    return {id: replace(tag, T=rig.T_base_rect @ tag.T) for id, tag in places.tags.all_located(places.poses).items()}
 
 
 def _of_log(args: argparse.Namespace) -> Found:
@@ -109,8 +130,10 @@ def _of_log(args: argparse.Namespace) -> Found:
     tags = {} if args.tags is None else read_tags(args.tags)
     tags |= {id: MapTag(id, str(id), size_m) for id, size_m in _sizes_m(args.tag).items()}
     if not tags:
-        raise OmnidError(f"map tags {args.source}: expected --tag ID=SIZE for each tag that a log shows, such as "
-                         "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap")
+        raise OmnidError(
+            f"map tags {args.source}: expected --tag ID=SIZE for each tag that a log shows, such as "
+            "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap"
+        )
     config = load_config(args.config, [*args.overrides, *map_settings(args)])
     collector: Slot[TagCollector] = Slot()
 
@@ -131,11 +154,17 @@ def _row(tag: MapTag, found: TagEstimate) -> dict[str, Any]:
 
     from calib import se3
 
-    return {"id": tag.id, "name": tag.name, "size_m": tag.size_m, "xyz_m": found.T[:3, 3].tolist(),
-            "quaternion_xyzw": se3.quaternion(found.T[:3, :3]).tolist(),
-            "sigma_m": float(np.sqrt(np.trace(found.covariance[:3, :3]) / 3)),
-            "sigma_deg": float(np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:]) / 3))),
-            "views": found.views, "rejected": found.rejected}
+    return {
+        "id": tag.id,
+        "name": tag.name,
+        "size_m": tag.size_m,
+        "xyz_m": found.T[:3, 3].tolist(),
+        "quaternion_xyzw": se3.quaternion(found.T[:3, :3]).tolist(),
+        "sigma_m": float(np.sqrt(np.trace(found.covariance[:3, :3]) / 3)),
+        "sigma_deg": float(np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:]) / 3))),
+        "views": found.views,
+        "rejected": found.rejected,
+    }
 
 
 def run_align(args: argparse.Namespace) -> int:
@@ -158,12 +187,15 @@ def run_align(args: argparse.Namespace) -> int:
     try:
         T_plan_map, left_m = fit(seen, known)
     except ValueError as error:
-        raise OmnidError(f"map align: {source} and {args.known} have {len(seen.keys() & known.keys())} tags in "
-                         f"common: {error}") from None
+        raise OmnidError(
+            f"map align: {source} and {args.known} have {len(seen.keys() & known.keys())} tags in common: {error}"
+        ) from None
     worst = max(left_m, key=lambda id: left_m[id])
     if left_m[worst] > LARGEST_M:
-        raise OmnidError(f"map align: tag {worst} ({known[worst].name}) is {left_m[worst]:.2f} m from its place on the "
-                         f"plan, expected at most {LARGEST_M} m: correct its place in {args.known}, or leave it out")
+        raise OmnidError(
+            f"map align: tag {worst} ({known[worst].name}) is {left_m[worst]:.2f} m from its place on the "
+            f"plan, expected at most {LARGEST_M} m: correct its place in {args.known}, or leave it out"
+        )
     align(places, rig, T_plan_map)
     write_places(args.output, places, rig)
     for id, metres in left_m.items():
@@ -184,15 +216,20 @@ def _sizes_m(words: list[str]) -> dict[int, float]:
         except ValueError:
             raise OmnidError(f"--tag {word}: expected ID=SIZE, such as 5=0.16") from None
         if not (0 <= int(id) <= MAX_TAG and SIZES_M[0] <= sizes[int(id)] <= SIZES_M[1]):
-            raise OmnidError(f"--tag {word}: expected a number of 0 to {MAX_TAG} and an edge of "
-                             f"{SIZES_M[0]:g} to {SIZES_M[1]:g} m")
+            raise OmnidError(
+                f"--tag {word}: expected a number of 0 to {MAX_TAG} and an edge of {SIZES_M[0]:g} to {SIZES_M[1]:g} m"
+            )
     return sizes
 
 
 def _tag_lines(rows: list[dict[str, Any]]) -> Iterator[str]:
-    yield (f"{'tag':>4}  {'name':<16}{'x, m':>10}{'y, m':>10}{'z, m':>10}{'sigma, mm':>11}{'deg':>7}{'views':>7}"
-           f"{'rejected':>10}")
+    yield (
+        f"{'tag':>4}  {'name':<16}{'x, m':>10}{'y, m':>10}{'z, m':>10}{'sigma, mm':>11}{'deg':>7}{'views':>7}"
+        f"{'rejected':>10}"
+    )
     for row in rows:
         x, y, z = row["xyz_m"]
-        yield (f"{row['id']:>4}  {row['name']:<16}{x:>10.3f}{y:>10.3f}{z:>10.3f}"
-               f"{1e3 * row['sigma_m']:>11.1f}{row['sigma_deg']:>7.2f}{row['views']:>7}{row['rejected']:>10}")
+        yield (
+            f"{row['id']:>4}  {row['name']:<16}{x:>10.3f}{y:>10.3f}{z:>10.3f}"
+            f"{1e3 * row['sigma_m']:>11.1f}{row['sigma_deg']:>7.2f}{row['views']:>7}{row['rejected']:>10}"
+        )

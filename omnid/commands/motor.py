@@ -21,17 +21,32 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `motor` to the command line."""
     parser = subparsers.add_parser("motor", help="test the wiring of the motors: sides, directions, scale")
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
-    test = actions.add_parser("test", help="turn each wheel, ask what moved, print the settings for that",
-                              description="Turn each motor forwards and back, ask which wheel moved and which way, "
-                              "then turn both wheels a number of times and ask for the true number. It prints the "
-                              "lines of the configuration that make the wheels turn as commanded.")
-    test.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'; default: "
-                      "motor.port of the settings")
+    test = actions.add_parser(
+        "test",
+        help="turn each wheel, ask what moved, print the settings for that",
+        description="Turn each motor forwards and back, ask which wheel moved and which way, "
+        "then turn both wheels a number of times and ask for the true number. It prints the "
+        "lines of the configuration that make the wheels turn as commanded.",
+    )
+    test.add_argument(
+        "--motor",
+        metavar="PORT",
+        help="serial port of the controller, or 'simulated'; default: motor.port of the settings",
+    )
     test.add_argument("--speed", type=float, default=0.1, metavar="MPS", help="of a wheel, m/s; default %(default)s")
-    test.add_argument("--turns", type=float, default=3.0, metavar="N", help="of the wheels for the scale, 0: do not "
-                      "test it; default %(default)s")
-    test.add_argument("--write", type=Path, metavar="FILE", help="set the lines in this configuration file; its other "
-                      "lines stay as they are")
+    test.add_argument(
+        "--turns",
+        type=float,
+        default=3.0,
+        metavar="N",
+        help="of the wheels for the scale, 0: do not test it; default %(default)s",
+    )
+    test.add_argument(
+        "--write",
+        type=Path,
+        metavar="FILE",
+        help="set the lines in this configuration file; its other lines stay as they are",
+    )
     add_settings(test)
     test.set_defaults(run=run)
 
@@ -74,8 +89,11 @@ def ask(question: str) -> str:
 def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
     """Return key and value in TOML of the wiring, and of the scale where it is another one."""
     wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
-    scale = {name: repr(getattr(drive, name)) for name in ("gear", "ticks_per_turn", "max_wheel_mps")
-             if getattr(drive, name) != getattr(before, name)}
+    scale = {
+        name: repr(getattr(drive, name))
+        for name in ("gear", "ticks_per_turn", "max_wheel_mps")
+        if getattr(drive, name) != getattr(before, name)
+    }
     return wiring | scale
 
 

@@ -17,13 +17,16 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `record` to the command line."""
     parser = subparsers.add_parser("record", help="record both cameras to MCAP files until Ctrl-C")
-    parser.add_argument("folder", type=Path, nargs="?",
-                        help="folder of the files; default: record.folder of the settings")
-    parser.add_argument("--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it "
-                        "exists")
+    parser.add_argument(
+        "folder", type=Path, nargs="?", help="folder of the files; default: record.folder of the settings"
+    )
+    parser.add_argument(
+        "--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it exists"
+    )
     for camera in ("lower", "upper"):
-        parser.add_argument(f"--{camera}", metavar="DEVICE", help=f"the {camera} camera; default: cameras.{camera} of "
-                            "the settings")
+        parser.add_argument(
+            f"--{camera}", metavar="DEVICE", help=f"the {camera} camera; default: cameras.{camera} of the settings"
+        )
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -35,8 +38,12 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config import load_config
     from omnid.runs.record import record
 
-    named = {"record.folder": args.folder, "cameras.rig": args.rig, "cameras.lower": args.lower,
-             "cameras.upper": args.upper}
+    named = {
+        "record.folder": args.folder,
+        "cameras.rig": args.rig,
+        "cameras.lower": args.lower,
+        "cameras.upper": args.upper,
+    }
     config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, Camera] = ("lower", "upper")

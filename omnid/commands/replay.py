@@ -21,8 +21,13 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `replay` to the command line."""
     parser = subparsers.add_parser("replay", help="run a recorded log through the stages of the daemon")
-    parser.add_argument("log", type=Path, metavar="LOG", help="an .mcap, .db3 or .bag file, a folder with "
-                        "one or with its parts, or a folder with a folder of stamped images for each camera")
+    parser.add_argument(
+        "log",
+        type=Path,
+        metavar="LOG",
+        help="an .mcap, .db3 or .bag file, a folder with "
+        "one or with its parts, or a folder with a folder of stamped images for each camera",
+    )
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
     parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
@@ -39,25 +44,39 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 def _add_outputs(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("outputs")
     group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
-    group.add_argument("--map-tum", type=Path, metavar="FILE", help="trajectory in the map, T_map_rig: places that are "
-                       "recognised correct all poses before them")
+    group.add_argument(
+        "--map-tum",
+        type=Path,
+        metavar="FILE",
+        help="trajectory in the map, T_map_rig: places that are recognised correct all poses before them",
+    )
     group.add_argument("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
     group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
     group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
-    group.add_argument("--publish", action="store_true", help="publish on the bus as `<robot>/odom` and so on; off by "
-                       "default, because a robot's daemon publishes there")
-    group.add_argument("--motor", metavar="PORT", help="send commands to the motor controller on a serial port (the "
-                       "wheels will turn!), or to a 'simulated' one")
+    group.add_argument(
+        "--publish",
+        action="store_true",
+        help="publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon publishes there",
+    )
+    group.add_argument(
+        "--motor",
+        metavar="PORT",
+        help="send commands to the motor controller on a serial port (the wheels will turn!), or to a 'simulated' one",
+    )
 
 
 def _add_computation(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("computation")
-    group.add_argument("--method", choices=("default", "paper"), help="paper: the odometry of the paper on its "
-                       "enhanced SAD, for comparison")
+    group.add_argument(
+        "--method",
+        choices=("default", "paper"),
+        help="paper: the odometry of the paper on its enhanced SAD, for comparison",
+    )
     group.add_argument("--tracker", choices=("improved", "klt"), help="feature tracker of the paper's method")
     group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same results")
-    group.add_argument("--realtime", action="store_true",
-                       help="at the speed of the recording; late messages are dropped")
+    group.add_argument(
+        "--realtime", action="store_true", help="at the speed of the recording; late messages are dropped"
+    )
     group.add_argument("--verbose", action="store_true", help="print all counters, and the times of all stages")
     group.add_argument("--quiet", action="store_true", help="do not show the progress")
 
@@ -68,10 +87,21 @@ def run(args: argparse.Namespace) -> int:
     from omnid.config_use import unused_settings
     from omnid.runs.replay import ReplayOptions
 
-    options = ReplayOptions(rig=args.rig, topics=(args.lower, args.upper), span_s=_span_of(args), tum=args.tum,
-                            map_tum=args.map_tum, cloud=args.cloud, plan=args.plan, record=args.record,
-                            publish=args.publish, inline=args.inline, paced=args.realtime, drops=args.realtime,
-                            settings=args.config)
+    options = ReplayOptions(
+        rig=args.rig,
+        topics=(args.lower, args.upper),
+        span_s=_span_of(args),
+        tum=args.tum,
+        map_tum=args.map_tum,
+        cloud=args.cloud,
+        plan=args.plan,
+        record=args.record,
+        publish=args.publish,
+        inline=args.inline,
+        paced=args.realtime,
+        drops=args.realtime,
+        settings=args.config,
+    )
     config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
@@ -112,8 +142,15 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output) -> 
         print(f"omnid: warning: {warning}", file=sys.stderr)
     stream = sys.stderr if on_stdout(options.files) else sys.stdout
     if output.as_json:
-        print_json({"counters": result.counters, "timings": dict(result.timings), "warnings": result.warnings,
-                    "signal": result.signal}, stream)
+        print_json(
+            {
+                "counters": result.counters,
+                "timings": dict(result.timings),
+                "warnings": result.warnings,
+                "signal": result.signal,
+            },
+            stream,
+        )
         return
     columns = get_terminal_size().columns if stream.isatty() else 0
     print(run_summary(result.counters, result.timings.values(), columns, verbose=output.verbose), file=stream)

@@ -19,23 +19,42 @@ if TYPE_CHECKING:
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `route` to the command line."""
-    parser = subparsers.add_parser("route", help="teach a route by driving it, and repeat it",
-                                   description="Routes are tied to the saved map that the robot runs with (`omnid run "
-                                   "--map FILE.omap`). They lie on the robot, in navigation.routes.")
+    parser = subparsers.add_parser(
+        "route",
+        help="teach a route by driving it, and repeat it",
+        description="Routes are tied to the saved map that the robot runs with (`omnid run "
+        "--map FILE.omap`). They lie on the robot, in navigation.routes.",
+    )
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
-    teach = _add(actions, "teach", run_teach, "record a route while somebody drives (`omnid drive`, a joystick)",
-                 on_robot=False)
-    teach.add_argument("--replace", action="store_true", help="in the place of a route of that name, which stays until "
-                       "the new one is written; without it an existing name is refused")
+    teach = _add(
+        actions, "teach", run_teach, "record a route while somebody drives (`omnid drive`, a joystick)", on_robot=False
+    )
+    teach.add_argument(
+        "--replace",
+        action="store_true",
+        help="in the place of a route of that name, which stays until "
+        "the new one is written; without it an existing name is refused",
+    )
     teach.add_argument("--no-wait", action="store_true", help="end at once: `omnid route finish` writes it")
     _add(actions, "finish", run_text, "end the recording and write the route and the map", on_robot=False, named=False)
     repeat = _add(actions, "repeat", run_repeat, "drive a route, from where the robot is on it", on_robot=False)
     repeat.add_argument("--reverse", action="store_true", help="from its end to its start")
-    repeat.add_argument("--loops", type=int, default=1, metavar="N", help="a closed route is driven in rounds, another "
-                        "there and back, N times in all; default %(default)s")
-    repeat.add_argument("--from", choices=("here", "start"), default="here", dest="begin", help="here: from where the "
-                        "robot is on the route, anywhere within 1.5 m of it; start: the whole route, refused "
-                        "elsewhere; default %(default)s")
+    repeat.add_argument(
+        "--loops",
+        type=int,
+        default=1,
+        metavar="N",
+        help="a closed route is driven in rounds, another there and back, N times in all; default %(default)s",
+    )
+    repeat.add_argument(
+        "--from",
+        choices=("here", "start"),
+        default="here",
+        dest="begin",
+        help="here: from where the "
+        "robot is on the route, anywhere within 1.5 m of it; start: the whole route, refused "
+        "elsewhere; default %(default)s",
+    )
     repeat.add_argument("--no-wait", action="store_true", help="end as soon as the robot has accepted it")
     _add(actions, "stop", run_text, "end the repetition, or the recording without a file", on_robot=False, named=False)
     add_json(_add(actions, "list", run_list, "the routes in navigation.routes, here", named=False))
@@ -45,8 +64,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add(actions, "delete", run_delete, "delete a route")
 
 
-def _add(actions: argparse._SubParsersAction[argparse.ArgumentParser], name: str, run: object, help: str, *,
-         on_robot: bool = True, named: bool = True) -> argparse.ArgumentParser:
+def _add(
+    actions: argparse._SubParsersAction[argparse.ArgumentParser],
+    name: str,
+    run: object,
+    help: str,
+    *,
+    on_robot: bool = True,
+    named: bool = True,
+) -> argparse.ArgumentParser:
     """Add an action; on_robot: it works on files of this machine, and needs no connection."""
     parser = actions.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
     if named:
@@ -132,11 +158,18 @@ def run_show(args: argparse.Namespace) -> int:
         check_outputs([("--tum", args.tum)], [("the route that is read", folder.path(args.name))])
         steps_m = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
         times_s = np.concatenate([[0.0], np.cumsum(steps_m / np.maximum(np.abs(route.speeds[1:]), 0.1))])
-        write_trajectory(args.tum, np.round(times_s * 1e9).astype(np.int64),
-                         np.array([transform(pose) for pose in route.poses]))
+        write_trajectory(
+            args.tum, np.round(times_s * 1e9).astype(np.int64), np.array([transform(pose) for pose in route.poses])
+        )
     if args.json:
-        print_json({**_summary(route), "points": [[*pose, speed] for pose, speed in
-                                                  zip(route.poses.tolist(), route.speeds.tolist(), strict=True)]})
+        print_json(
+            {
+                **_summary(route),
+                "points": [
+                    [*pose, speed] for pose, speed in zip(route.poses.tolist(), route.speeds.tolist(), strict=True)
+                ],
+            }
+        )
         return 0
     summary = _summary(route)
     for key in ("name", "map", "length_m", "points", "keyframes", "closed"):
@@ -162,8 +195,15 @@ def _folder(args: argparse.Namespace) -> RouteFolder:
 
 
 def _summary(route: Route) -> dict[str, object]:
-    return {"name": route.name, "map": route.map_name, "created_s": route.created_s, "length_m": route.length_m,
-            "points": len(route.poses), "keyframes": len(route.stamps_ns), "closed": route.is_closed}
+    return {
+        "name": route.name,
+        "map": route.map_name,
+        "created_s": route.created_s,
+        "length_m": route.length_m,
+        "points": len(route.poses),
+        "keyframes": len(route.stamps_ns),
+        "closed": route.is_closed,
+    }
 
 
 def _time(route: Route) -> str:

@@ -27,17 +27,31 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `run` to the command line."""
     parser = subparsers.add_parser("run", help="the daemon: live cameras in, poses on the bus, commands to the wheels")
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log, or "
-                        "without --log cameras.rig of the settings")
+    parser.add_argument(
+        "--rig",
+        type=Path,
+        help="the rig.toml of the cameras; default: that attached to the log, or "
+        "without --log cameras.rig of the settings",
+    )
     parser.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'")
-    parser.add_argument("--log", type=Path, metavar="LOG", help="use the images of a log instead of cameras, for a "
-                        "trial: in real time, forwards and backwards until it is stopped")
+    parser.add_argument(
+        "--log",
+        type=Path,
+        metavar="LOG",
+        help="use the images of a log instead of cameras, for a "
+        "trial: in real time, forwards and backwards until it is stopped",
+    )
     for camera in ("lower", "upper"):
-        parser.add_argument(f"--{camera}", metavar="DEVICE|TOPIC", help=f"device of the {camera} camera; default: "
-                            f"cameras.{camera} of the settings; with --log the topic of its images, default: found by "
-                            "name")
-    parser.add_argument("--pace", type=float, default=1.0,
-                        help="speed of the log relative to its recording; default %(default)s")
+        parser.add_argument(
+            f"--{camera}",
+            metavar="DEVICE|TOPIC",
+            help=f"device of the {camera} camera; default: "
+            f"cameras.{camera} of the settings; with --log the topic of its images, default: found by "
+            "name",
+        )
+    parser.add_argument(
+        "--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"
+    )
     parser.add_argument("--once", action="store_true", help="stop at the end of the log")
     add_map(parser)
     add_settings(parser)

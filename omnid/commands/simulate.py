@@ -29,24 +29,38 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `simulate` to the command line."""
     parser = subparsers.add_parser(
-        "simulate", help="the daemon with a simulated robot in a simulated world",
+        "simulate",
+        help="the daemon with a simulated robot in a simulated world",
         description="Run the daemon with a simulated robot: cameras, motor controller and gyro (motion.imu=off: none) "
         "are simulated. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid "
-        "web`. Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.")
+        "web`. Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.",
+    )
     parser.add_argument("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)")
-    parser.add_argument("--speed", choices=(AUTO, REAL_TIME), default=AUTO, help="auto: simulated time waits for the "
-                        "daemon, and is never faster than real time; 1.0: real time, as on a robot: what the computer "
-                        "cannot do in time is dropped; default %(default)s")
+    parser.add_argument(
+        "--speed",
+        choices=(AUTO, REAL_TIME),
+        default=AUTO,
+        help="auto: simulated time waits for the "
+        "daemon, and is never faster than real time; 1.0: real time, as on a robot: what the computer "
+        "cannot do in time is dropped; default %(default)s",
+    )
     parser.add_argument("--seed", type=int, default=1, help="of textures and noise; default %(default)s")
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig")
-    parser.add_argument("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default "
-                        "%(default)s")
+    parser.add_argument(
+        "--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"
+    )
     parser.add_argument("--no-people", action="store_true", help="leave the people of the world out")
     parser.add_argument("--light", type=float, default=1.0, help="factor on the light; default %(default)s")
-    parser.add_argument("--other-posters", type=float, default=0.0, metavar="SHARE", help="share of the posters that "
-                        "is exchanged, 0 to 1; default %(default)s")
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, "
-                        "at the end")
+    parser.add_argument(
+        "--other-posters",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the posters that is exchanged, 0 to 1; default %(default)s",
+    )
+    parser.add_argument(
+        "--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, at the end"
+    )
     add_map(parser)
     add_settings(parser)
     parser.set_defaults(run=run)

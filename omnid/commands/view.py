@@ -17,14 +17,30 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `view` to the command line."""
     parser = subparsers.add_parser("view", help="show a log or a robot: path, map, depth, plots (needs rerun)")
-    parser.add_argument("log", type=Path, nargs="?", metavar="LOG", help="a recording, which is shown as it stands, or "
-                        "a log of images, which goes through the stages; without one, a robot is listened to")
+    parser.add_argument(
+        "log",
+        type=Path,
+        nargs="?",
+        metavar="LOG",
+        help="a recording, which is shown as it stands, or "
+        "a log of images, which goes through the stages; without one, a robot is listened to",
+    )
     where = parser.add_argument_group("output; default: a window")
-    where.add_argument("-o", "--output", type=Path, metavar="FILE.rrd", help="a file that `rerun FILE.rrd` opens, here "
-                       "or elsewhere; needs no display")
+    where.add_argument(
+        "-o",
+        "--output",
+        type=Path,
+        metavar="FILE.rrd",
+        help="a file that `rerun FILE.rrd` opens, here or elsewhere; needs no display",
+    )
     where.add_argument("--web", action="store_true", help="a browser of this machine")
-    where.add_argument("--port", type=int, default=0, metavar="N", help="of --web: serve the page at port N and its "
-                       "data at N + 1, for ssh -L; default: any free ones")
+    where.add_argument(
+        "--port",
+        type=int,
+        default=0,
+        metavar="N",
+        help="of --web: serve the page at port N and its data at N + 1, for ssh -L; default: any free ones",
+    )
     _add_log(parser)
     _add_robot(parser)
     add_settings(parser)
@@ -43,10 +59,16 @@ def _add_log(parser: argparse.ArgumentParser) -> None:
 
 def _add_robot(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a robot")
-    group.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings, in a recording "
-                       "the only one")
-    group.add_argument("--connect", action="append", metavar="ENDPOINT", help="the robot or a router, such as "
-                       "tcp/robot:7447; default: bus.connect of the settings, without them this machine")
+    group.add_argument(
+        "--robot", metavar="NAME", help="its name; default: bus.robot of the settings, in a recording the only one"
+    )
+    group.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="the robot or a router, such as "
+        "tcp/robot:7447; default: bus.connect of the settings, without them this machine",
+    )
     group.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
 
 
@@ -59,8 +81,12 @@ def run(args: argparse.Namespace) -> int:
     from omnid.viewer.view import check_file, target_for
 
     config = load_config(args.config, args.overrides)
-    check_file(args.output, ("the log that is read", args.log), ("the rig that is read", args.rig),
-               ("the configuration that is read", args.config))
+    check_file(
+        args.output,
+        ("the log that is read", args.log),
+        ("the rig that is read", args.rig),
+        ("the configuration that is read", args.config),
+    )
     place = target_for(args.output, args.web, args.port)
     return _robot(args, config, place) if args.log is None else _log(args, config, place)
 
@@ -70,8 +96,15 @@ def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
 
     from omnid.viewer.view import Log, show_log
 
-    log = Log(args.log, robot=args.robot, topic=args.topic, replay=args.replay, rig=args.rig,
-              topics=(args.lower, args.upper), settings=args.config)
+    log = Log(
+        args.log,
+        robot=args.robot,
+        topic=args.topic,
+        replay=args.replay,
+        rig=args.rig,
+        topics=(args.lower, args.upper),
+        settings=args.config,
+    )
     return show_log(log, config, place, partial(replay_and_print, output=Output(quiet=args.quiet)))
 
 
@@ -88,8 +121,13 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
     from omnid.errors import OmnidError
 
     live = {"--connect": args.connect, "--seconds": args.seconds}
-    of_log = {"--topic": args.topic, "--replay": args.replay, "--rig": args.rig, "--lower": args.lower,
-              "--upper": args.upper}
+    of_log = {
+        "--topic": args.topic,
+        "--replay": args.replay,
+        "--rig": args.rig,
+        "--lower": args.lower,
+        "--upper": args.upper,
+    }
     wrong = [name for name, value in (of_log if args.log is None else live).items() if value]
     if wrong:
         instead = "name a LOG as well" if args.log is None else "leave out the LOG to show a robot"
@@ -112,6 +150,7 @@ def _require_rerun() -> None:
     from omnid.errors import OmnidError
 
     if find_spec("rerun") is None:
-        raise OmnidError("omnid view draws with rerun, which is not installed: "
-                         f"{sys.executable} -m pip install 'rerun-sdk>=0.41'")
+        raise OmnidError(
+            f"omnid view draws with rerun, which is not installed: {sys.executable} -m pip install 'rerun-sdk>=0.41'"
+        )
     os.environ.setdefault("RUST_LOG", "off")  # omnid reports errors of rerun itself

@@ -13,21 +13,43 @@ PACKAGES = ("starlette", "uvicorn", "websockets")
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `web` to the command line."""
-    parser = subparsers.add_parser("web", help="a page with state, path, warnings, recordings, stop and arm",
-                                   description="Serve a page about a robot: state, path, map, warnings with their "
-                                   "remedy, recordings, a stop and an arm button; /metrics for Prometheus. It prints "
-                                   "the address with a token: who knows it may stop and arm the robot.")
+    parser = subparsers.add_parser(
+        "web",
+        help="a page with state, path, warnings, recordings, stop and arm",
+        description="Serve a page about a robot: state, path, map, warnings with their "
+        "remedy, recordings, a stop and an arm button; /metrics for Prometheus. It prints "
+        "the address with a token: who knows it may stop and arm the robot.",
+    )
     add_robot(parser)
-    parser.add_argument("--all", action="store_true", help="a page with all robots that the router or robot reaches, "
-                        "and one about each")
-    parser.add_argument("--listen", default="127.0.0.1:8447", metavar="HOST:PORT", help="where browsers connect; "
-                        "default %(default)s, this machine only; 0.0.0.0:8447 for its network")
-    parser.add_argument("--token-file", type=Path, metavar="FILE", help="the token; the file is made if it is missing; "
-                        "default: a new token at each start")
-    parser.add_argument("--stop-token-file", type=Path, metavar="FILE", help="a second token, which may see and stop, "
-                        "not arm; the file is made if it is missing; default: none")
-    parser.add_argument("--host", action="append", default=[], metavar="NAME", help="a further name of this machine, "
-                        "in addresses of browsers; without --listen on the network: localhost only")
+    parser.add_argument(
+        "--all", action="store_true", help="a page with all robots that the router or robot reaches, and one about each"
+    )
+    parser.add_argument(
+        "--listen",
+        default="127.0.0.1:8447",
+        metavar="HOST:PORT",
+        help="where browsers connect; default %(default)s, this machine only; 0.0.0.0:8447 for its network",
+    )
+    parser.add_argument(
+        "--token-file",
+        type=Path,
+        metavar="FILE",
+        help="the token; the file is made if it is missing; default: a new token at each start",
+    )
+    parser.add_argument(
+        "--stop-token-file",
+        type=Path,
+        metavar="FILE",
+        help="a second token, which may see and stop, not arm; the file is made if it is missing; default: none",
+    )
+    parser.add_argument(
+        "--host",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a further name of this machine, "
+        "in addresses of browsers; without --listen on the network: localhost only",
+    )
     parser.add_argument("--recordings", type=Path, metavar="DIR", help="default: record.folder of the settings")
     parser.add_argument("--tls-certificate", type=Path, metavar="FILE", help="serve over TLS; PEM")
     parser.add_argument("--tls-key", type=Path, metavar="FILE", help="the private key of the certificate, PEM")
@@ -50,8 +72,10 @@ def run(args: argparse.Namespace) -> int:
     config = config_of(args)
     tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
     folder = args.recordings or Path(config.record.folder)
-    serve(config.bus, WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), folder, tls,
-                                  args.all))
+    serve(
+        config.bus,
+        WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), folder, tls, args.all),
+    )
     return 0
 
 
@@ -64,5 +88,6 @@ def require_packages() -> None:
 
     missing = [name for name in PACKAGES if find_spec(name) is None]
     if missing:
-        raise OmnidError(f"omnid web needs {', '.join(missing)}, not installed: {sys.executable} -m pip install "
-                         f"{' '.join(missing)}")
+        raise OmnidError(
+            f"omnid web needs {', '.join(missing)}, not installed: {sys.executable} -m pip install {' '.join(missing)}"
+        )

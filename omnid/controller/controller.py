@@ -25,6 +25,7 @@ from omnid.engine.flow import nothing
 
 UNTIL_ARMED = "they stay stopped until cmd/arm (`omnid arm`)"
 
+
 class Controller:
     """Take poses and setpoints, of which the newest count; each call is one tick.
 
@@ -33,9 +34,16 @@ class Controller:
     Not thread-safe.
     """
 
-    def __init__(self, driver: MotorDriver, settings: ControllerSettings, period_s: float,
-                 report: Callable[[str], None] = nothing, *, clock_ns: Callable[[], int] = time.monotonic_ns,
-                 limited: Callable[[VelocityCommand], tuple[float, float]] | None = None) -> None:
+    def __init__(
+        self,
+        driver: MotorDriver,
+        settings: ControllerSettings,
+        period_s: float,
+        report: Callable[[str], None] = nothing,
+        *,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        limited: Callable[[VelocityCommand], tuple[float, float]] | None = None,
+    ) -> None:
         """report: takes lines for the log. clock_ns: the clock of the poses' stamps.
 
         limited: velocity [m/s] and yaw rate [rad/s] that the driver makes of a command; None: those of the command.
@@ -94,8 +102,9 @@ class Controller:
         """Step the law and send its motion."""
         now_ns = self._clock_ns()
         dt_s, late_s = self._keep_rhythm(now_ns)
-        output = self._law.step(now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed,
-                                motor_stopped=self._motor_stopped)
+        output = self._law.step(
+            now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed, motor_stopped=self._motor_stopped
+        )
         self._report_arming()
         self._report_slowing()
         self._report_obstacles()
@@ -108,8 +117,9 @@ class Controller:
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
         wheels = None if status is None else WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps)
-        return TickReport(None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s,
-                          self.state, wheels)
+        return TickReport(
+            None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s, self.state, wheels
+        )
 
     def close(self) -> None:
         """Stop the wheels at once and release the driver."""
@@ -202,8 +212,9 @@ class Controller:
         self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
         # One that holds a heading decides about its yaw rate itself.
         yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps
-        self._law.plausibility.add_report(now_ns, MotorReport(Motion(status.velocity_mps, yaw_rate_radps), status.fault,
-                                                        status.battery_v))
+        self._law.plausibility.add_report(
+            now_ns, MotorReport(Motion(status.velocity_mps, yaw_rate_radps), status.fault, status.battery_v)
+        )
 
     def _to_wheel_s(self, done_ns: int) -> float:
         """Return the age of the pose's images where this command is the first that follows from them, else NaN."""

@@ -188,11 +188,18 @@ class ControllerLink:
     def _unexpected_end(self) -> str:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(1.0)
-        return (f"the controller process has ended unexpectedly, with exit code {self._process.returncode}; the motor "
-                "controller's own watchdog stops the wheels: start omnid again")
+        return (
+            f"the controller process has ended unexpectedly, with exit code {self._process.returncode}; the motor "
+            "controller's own watchdog stops the wheels: start omnid again"
+        )
 
 
 def _started(descriptor: int) -> subprocess.Popen[bytes]:
     """Start the process in a session of its own, which Ctrl-C does not end."""
-    return subprocess.Popen(python("-m", PROCESS, str(descriptor)), pass_fds=(descriptor,), stdin=subprocess.DEVNULL,
-                            env=python_environment(), start_new_session=True)
+    return subprocess.Popen(
+        python("-m", PROCESS, str(descriptor)),
+        pass_fds=(descriptor,),
+        stdin=subprocess.DEVNULL,
+        env=python_environment(),
+        start_new_session=True,
+    )

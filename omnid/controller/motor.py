@@ -26,12 +26,18 @@ def open_motor(config: MotorSettings, closing: ExitStack) -> tuple[SerialMotor, 
     """
     least_ms = WATCHDOG_TICKS * 1000 / config.rate_hz
     if config.watchdog_ms < least_ms:
-        raise DriverError(f"motor.watchdog_ms is {config.watchdog_ms} at motor.rate_hz {config.rate_hz:g}; "
-                          f"give at least {least_ms:.0f}, {WATCHDOG_TICKS} ticks, or a higher rate")
+        raise DriverError(
+            f"motor.watchdog_ms is {config.watchdog_ms} at motor.rate_hz {config.rate_hz:g}; "
+            f"give at least {least_ms:.0f}, {WATCHDOG_TICKS} ticks, or a higher rate"
+        )
     simulated = _simulated(config, closing) if config.port == SIMULATED else None
-    driver = SerialMotor(simulated.port if simulated else config.port,
-                         PROTOCOLS[config.protocol](config.drive.geometry()), baud=config.baud,
-                         timeout_s=ANSWER_SHARE / config.rate_hz, watchdog_ms=config.watchdog_ms)
+    driver = SerialMotor(
+        simulated.port if simulated else config.port,
+        PROTOCOLS[config.protocol](config.drive.geometry()),
+        baud=config.baud,
+        timeout_s=ANSWER_SHARE / config.rate_hz,
+        watchdog_ms=config.watchdog_ms,
+    )
     closing.callback(driver.close)
     return driver, simulated
 

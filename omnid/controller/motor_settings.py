@@ -50,5 +50,3 @@ class MotorSettings:
         500, "the motor controller stops the wheels by itself after so long without a command, ms", low=50, high=10_000
     )
     drive: DriveSettings = field(default_factory=DriveSettings)
-
-

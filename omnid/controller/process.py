@@ -98,9 +98,13 @@ def run_controller(channel: Channel) -> int:
             channel.send(StartFailed(str(error)))
             return 2
         channel.send(LogRecord(prepare_process(start.realtime)))
-        controller = Controller(driver, start.controller, 1.0 / start.motor.rate_hz,
-                                lambda text: channel.send(LogRecord(text)),
-                                limited=start.motor.drive.geometry().limited)
+        controller = Controller(
+            driver,
+            start.controller,
+            1.0 / start.motor.rate_hz,
+            lambda text: channel.send(LogRecord(text)),
+            limited=start.motor.drive.geometry().limited,
+        )
         ControllerLoop(channel, controller).run()
     return 0
 

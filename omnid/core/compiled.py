@@ -68,7 +68,9 @@ class Kernel(Generic[P, R]):
         names = self.function.__code__.co_varnames
         return tuple(
             types.Array(kind.dtype, kind.ndim, kind.layout, readonly=name not in self.writes)
-            if isinstance(kind, types.Array) else kind for kind, name in zip(arguments, names, strict=False)
+            if isinstance(kind, types.Array)
+            else kind
+            for kind, name in zip(arguments, names, strict=False)
         )
 
 
@@ -127,7 +129,8 @@ class Inner(Generic[P, R]):
             # An argument such as 0 counts as an integer, not as a type of its own, which would be compiled once more.
             template_for = self._dispatcher.get_call_template
             self._dispatcher.get_call_template = lambda args, kws: template_for(
-                tuple(map(numba.types.unliteral, args)), kws)
+                tuple(map(numba.types.unliteral, args)), kws
+            )
         return self._dispatcher._numba_type_
 
 

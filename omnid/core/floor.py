@@ -98,8 +98,9 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
         return None
     # 2. The likeliest height of a level floor; its tilt is noise that grows with the range.
     across = np.hypot(seen.xyz[:, 0], seen.xyz[:, 1])
-    on, off = _densities(seen.xyz[:, 2] + HEIGHTS_M[:, None], np.hypot(seen.sigma_m, TILT_SIGMA_RAD * across),
-                         HEIGHTS_M[:, None])
+    on, off = _densities(
+        seen.xyz[:, 2] + HEIGHTS_M[:, None], np.hypot(seen.sigma_m, TILT_SIGMA_RAD * across), HEIGHTS_M[:, None]
+    )
     best = np.argmax(np.log(FIRST_PART * on + (1 - FIRST_PART) * off).sum(axis=1))
     # 3. Height, tilt, part on the floor and noise, by the points about the floor.
     A = np.column_stack([-np.ones(len(across)), seen.xyz[:, :2]])

@@ -21,8 +21,9 @@ LIVE = "all parts are live"
 class ImagesStatus:
     """The entry; a call makes it from the newest pair."""
 
-    def __init__(self, geometry: Geometry, statistics: RunStatistics, report: Callable[[str], object] = nothing
-                 ) -> None:
+    def __init__(
+        self, geometry: Geometry, statistics: RunStatistics, report: Callable[[str], object] = nothing
+    ) -> None:
         """report: takes a line for the log where the message changes."""
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._statistics, self._report, self._message = statistics, report, LIVE
@@ -44,8 +45,11 @@ class ImagesStatus:
     def _named(self, side: Side, tiles: TileStates) -> str:
         """Return what a camera does not show, such as "the upper camera is blind from 300 to 40 degrees"."""
         columns, is_dead = tiles.columns[side], tiles.dead[side].any(axis=0)
-        parts = [f"{word} {self._directions(found)}"
-                 for word, found in (("frozen", columns & is_dead), ("blind", columns & ~is_dead)) if found.any()]
+        parts = [
+            f"{word} {self._directions(found)}"
+            for word, found in (("frozen", columns & is_dead), ("blind", columns & ~is_dead))
+            if found.any()
+        ]
         return f"the {side} camera is {' and '.join(parts)}"
 
     def _directions(self, columns: NDArray[np.bool_]) -> str:

@@ -15,13 +15,13 @@ from omnid.tracking_state import TrackingState
 DARK_SHARE: Final = 0.1  # of the pairs
 LOST_PARTS_SHARE: Final = 0.1  # of the pairs
 LOST_SHARE: Final = 0.1  # of the pairs; fewer are a gap, whose first pose may imply any speed
-REPEATED: Final = {"drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
-                   "use": "they were used, as pair.repeated_images says"}
+REPEATED: Final = {
+    "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
+    "use": "they were used, as pair.repeated_images says",
+}
 
 
-def input_warnings(
-    pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config
-) -> Iterator[str]:
+def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
     """Return one line for each problem of the input."""
     counts = pairing.counts
     if pairing.fault:
@@ -30,33 +30,47 @@ def input_warnings(
         yield _no_pair(pairing.closest_miss_ms, pairing.tolerance_ms)
     elif min(counts["unpaired_lower"], counts["unpaired_upper"]) > counts["pairs"]:
         closest_ms = pairing.closest_miss_ms or 0.0
-        yield (f"most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
-               f"pair.tolerance_ms is {pairing.tolerance_ms:g}; if no images are missing, synchronise the cameras")
+        yield (
+            f"most images of both cameras found no partner: the closest ones are {closest_ms:.3f} ms apart, "
+            f"pair.tolerance_ms is {pairing.tolerance_ms:g}; if no images are missing, synchronise the cameras"
+        )
     for camera, images in pairing.repeated.items():
         if images.longest >= FROZEN_IMAGES:
-            yield (f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
-                   f"{images.longest} in a row; {REPEATED[config.pair.repeated_images]}")
+            yield (
+                f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
+                f"{images.longest} in a row; {REPEATED[config.pair.repeated_images]}"
+            )
     if rig.warning:
         yield rig.warning
     if statistics.dark > statistics.poses * DARK_SHARE:
-        yield (f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
-               "contrast; more light, a longer exposure (cameras.exposure_us) or less gain")
+        yield (
+            f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "
+            "contrast; more light, a longer exposure (cameras.exposure_us) or less gain"
+        )
     for camera, pairs in statistics.lost_parts.items():
         if pairs > statistics.poses * LOST_PARTS_SHARE:
-            yield (f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
-                   f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver")
+            yield (
+                f"a part of the {camera} camera's image was frozen, dark, saturated or blurred in {pairs} of "
+                f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver"
+            )
     lost = statistics.states[TrackingState.LOST]
     if statistics.too_fast and lost > statistics.poses * LOST_SHARE:
-        yield (f"the pose was lost in {lost} of {statistics.poses} pairs, and the images show up to "
-               f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
-               f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast")
+        yield (
+            f"the pose was lost in {lost} of {statistics.poses} pairs, and the images show up to "
+            f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
+            f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast"
+        )
     elif lost > statistics.poses / 2:
-        yield (f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "
-               "is --lower the lower one, are the images bright and sharp?")
+        yield (
+            f"the pose was lost in {lost} of {statistics.poses} pairs: is the rig that of these cameras, "
+            "is --lower the lower one, are the images bright and sharp?"
+        )
 
 
 def _no_pair(closest_ms: float | None, tolerance_ms: float) -> str:
     if closest_ms is None:
         return "no pair of images: one camera or both have none, see the drops below"
-    return (f"no pair of images: the stamps of the two cameras are at least {closest_ms:.3f} ms apart, "
-            f"pair.tolerance_ms is {tolerance_ms:g}: increase it, or correct the clocks of the cameras")
+    return (
+        f"no pair of images: the stamps of the two cameras are at least {closest_ms:.3f} ms apart, "
+        f"pair.tolerance_ms is {tolerance_ms:g}: increase it, or correct the clocks of the cameras"
+    )

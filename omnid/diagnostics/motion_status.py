@@ -16,14 +16,23 @@ WRONG_WHEELS = "wheels contradict the cameras: check motor.drive (radius, track,
 SLIP = "wheels slip"
 
 
-def motion_status(odometry: OdometryStage, inbox: MotionInbox, receiver: SensorReceiver | None = None,
-                  gyro: WitMotionGyro | None = None) -> Callable[[], DiagnosticStatus]:
+def motion_status(
+    odometry: OdometryStage,
+    inbox: MotionInbox,
+    receiver: SensorReceiver | None = None,
+    gyro: WitMotionGyro | None = None,
+) -> Callable[[], DiagnosticStatus]:
     """Return a function that returns the entry: what comes, what was estimated of its errors, and which one differs."""
     sensors = odometry.sensors
 
     def status() -> DiagnosticStatus:
-        values = {"wheel_samples": str(inbox.wheels), "gyro_samples": str(inbox.gyro), "dropped": str(inbox.dropped),
-                  "slips": str(sensors.slips), "refused_gyro": str(sensors.refused)}
+        values = {
+            "wheel_samples": str(inbox.wheels),
+            "gyro_samples": str(inbox.gyro),
+            "dropped": str(inbox.dropped),
+            "slips": str(sensors.slips),
+            "refused_gyro": str(sensors.refused),
+        }
         if sensors.steps:
             values |= _estimates(sensors, wheels=bool(inbox.wheels), gyro=bool(inbox.gyro))
         if receiver is not None:
@@ -41,9 +50,16 @@ def motion_status(odometry: OdometryStage, inbox: MotionInbox, receiver: SensorR
 
 def _estimates(sensors: MotionSensors, *, wheels: bool, gyro: bool) -> dict[str, str]:
     names = [("wheel_scale", DISTANCE, 1.0), ("turn_scale", TURN, 1.0), ("wheel_offset_ms", WHEEL_OFFSET, 1e3)]
-    of_gyro = [("gyro_offset_ms", GYRO_OFFSET, 1e3),
-               *((f"gyro_bias_{axis}_radps", BIAS.start + k, 1.0) for k, axis in enumerate("xyz"))]
+    of_gyro = [
+        ("gyro_offset_ms", GYRO_OFFSET, 1e3),
+        *((f"gyro_bias_{axis}_radps", BIAS.start + k, 1.0) for k, axis in enumerate("xyz")),
+    ]
     chosen = (names if wheels else []) + (of_gyro if gyro else [])
-    return {key: text for name, state, unit in chosen
-            for key, text in ((name, f"{unit * sensors.values[state]:.5f}"),
-                              (f"{name}_sigma", f"{unit * sensors.sigmas[state]:.5f}"))}
+    return {
+        key: text
+        for name, state, unit in chosen
+        for key, text in (
+            (name, f"{unit * sensors.values[state]:.5f}"),
+            (f"{name}_sigma", f"{unit * sensors.sigmas[state]:.5f}"),
+        )
+    }

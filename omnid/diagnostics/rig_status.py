@@ -11,17 +11,26 @@ from omnid.core.rig.rig_state import RigState
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.status_names import RIG, Key
 
-LEVELS: Final = MappingProxyType({RigState.UNCHECKED: OK, RigState.FITS: OK, RigState.DRIFTED: WARN,
-                                  RigState.EXCHANGED: ERROR, RigState.BROKEN: ERROR})
-ADVICE: Final = MappingProxyType({
-    RigState.UNCHECKED: "not checked yet: the robot must drive past different places",
-    RigState.FITS: "fits",
-    RigState.DRIFTED: "drifted: run omnid calibrate check on a recording; --refine corrects the upper camera's "
-                      "rotation",
-    RigState.EXCHANGED: "the cameras are exchanged: exchange them in the configuration",
-    RigState.BROKEN: "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: run "
-                     "omnid calibrate check on a recording",
-})
+LEVELS: Final = MappingProxyType(
+    {
+        RigState.UNCHECKED: OK,
+        RigState.FITS: OK,
+        RigState.DRIFTED: WARN,
+        RigState.EXCHANGED: ERROR,
+        RigState.BROKEN: ERROR,
+    }
+)
+ADVICE: Final = MappingProxyType(
+    {
+        RigState.UNCHECKED: "not checked yet: the robot must drive past different places",
+        RigState.FITS: "fits",
+        RigState.DRIFTED: "drifted: run omnid calibrate check on a recording; --refine corrects the upper camera's "
+        "rotation",
+        RigState.EXCHANGED: "the cameras are exchanged: exchange them in the configuration",
+        RigState.BROKEN: "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: "
+        "run omnid calibrate check on a recording",
+    }
+)
 
 
 class RefinementReport(NamedTuple):
@@ -46,8 +55,13 @@ def rig_status(health: RigHealth, refinement: RefinementReport | None, refined_i
         values["exchanged_matches"] = str(start.exchanged_matches)
     newest = finding or (start.straight if start is not None else None)
     if newest is not None:
-        values |= {"turn_deg": f"{newest.turn_deg:.3f}", "offset_px": f"{newest.offset_px:+.2f}",
-                   "left_px": f"{newest.left_px:.2f}", "matches": str(newest.matches), "tried": str(newest.tried)}
+        values |= {
+            "turn_deg": f"{newest.turn_deg:.3f}",
+            "offset_px": f"{newest.offset_px:+.2f}",
+            "left_px": f"{newest.left_px:.2f}",
+            "matches": str(newest.matches),
+            "tried": str(newest.tried),
+        }
     if finding is not None:
         values["age_s"] = f"{health.finding_age_s:.0f}"
     # 3. The refinement; the message is that of the graver one.

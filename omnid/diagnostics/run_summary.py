@@ -15,8 +15,14 @@ _NAME_COLUMNS: Final = 9
 def summary_entries(counters: RunCounters) -> dict[str, str]:
     """Return the counters as texts, by name."""
     states = ", ".join(f"{state} {_share(count, counters.poses)}" for state, count in counters.states.items())
-    entries = {"pairs": str(counters.pairs), "poses": str(counters.poses), "length": f"{counters.length_m:.4f} m",
-               "states": states, "resets": str(counters.resets), "drops": _listed(counters.drops)}
+    entries = {
+        "pairs": str(counters.pairs),
+        "poses": str(counters.poses),
+        "length": f"{counters.length_m:.4f} m",
+        "states": states,
+        "resets": str(counters.resets),
+        "drops": _listed(counters.drops),
+    }
     if counters.map:
         entries["map"] = _listed(counters.map)
     if counters.places:
@@ -44,8 +50,9 @@ def brief_entries(counters: RunCounters) -> dict[str, str]:
     return shown
 
 
-def run_summary(counters: RunCounters, timings: Iterable[SummaryRow], columns: int = 0, *, verbose: bool = False
-                ) -> str:
+def run_summary(
+    counters: RunCounters, timings: Iterable[SummaryRow], columns: int = 0, *, verbose: bool = False
+) -> str:
     """Return the counters, one a line.
 
     verbose: with a row for each stage that processed messages, and with all counters, zeros too. columns: of the
@@ -54,8 +61,9 @@ def run_summary(counters: RunCounters, timings: Iterable[SummaryRow], columns: i
     lines = []
     if verbose:
         lines = [f"{'stage':<11}{'n':>8}{'drops':>7}{'p50 ms':>9}{'p99 ms':>9}{'max ms':>9}"]
-        lines += [f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}"
-                  for r in timings if r.n]
+        lines += [
+            f"{r.stage:<11}{r.n:>8}{r.drops:>7}{r.p50_ms:>9.2f}{r.p99_ms:>9.2f}{r.max_ms:>9.2f}" for r in timings if r.n
+        ]
         lines.append("")
     entries = summary_entries(counters) if verbose else brief_entries(counters)
     lines += [line for name, text in entries.items() for line in folded_entry(name, text, columns)]

@@ -87,15 +87,22 @@ class StatusCollector:
         if newest is None:
             return DiagnosticStatus(status_names.ODOMETRY, STALE, "no pose yet", {})
         age_s = (self._sources.clock_ns() - newest.stamp_ns) * 1e-9
-        values = {Key.RATE_HZ: f"{self._rates('poses', statistics.poses):.1f}", Key.AGE_S: f"{age_s:.3f}",
-                  Key.INLIERS: str(newest.inliers), Key.TRACKED: str(newest.tracks),
-                  Key.RESETS: str(newest.reset_counter), Key.LENGTH_M: f"{statistics.length_m:.2f}",
-                  **_times(status_names.CAPTURE_TO_POSE, self._sources.to_pose)}
+        values = {
+            Key.RATE_HZ: f"{self._rates('poses', statistics.poses):.1f}",
+            Key.AGE_S: f"{age_s:.3f}",
+            Key.INLIERS: str(newest.inliers),
+            Key.TRACKED: str(newest.tracks),
+            Key.RESETS: str(newest.reset_counter),
+            Key.LENGTH_M: f"{statistics.length_m:.2f}",
+            **_times(status_names.CAPTURE_TO_POSE, self._sources.to_pose),
+        }
         if age_s > TIMEOUT_S:
             return DiagnosticStatus(status_names.ODOMETRY, STALE, "no new pose", values)
         if math.isfinite(newest.light.level_grey):
-            values |= {"level_grey": f"{newest.light.level_grey:.0f}",
-                       "contrast_to_noise": f"{newest.light.contrast_to_noise:.1f}"}
+            values |= {
+                "level_grey": f"{newest.light.level_grey:.0f}",
+                "contrast_to_noise": f"{newest.light.contrast_to_noise:.1f}",
+            }
         if newest.light.is_too_dark and newest.state != TrackingState.LOST:
             return DiagnosticStatus(status_names.ODOMETRY, WARN, f"{newest.state}: it is too dark", values)
         return DiagnosticStatus(status_names.ODOMETRY, LEVELS[newest.state], newest.state, values)
@@ -105,9 +112,12 @@ class StatusCollector:
         skew, counts = pair.skew, pair.counts
         fault = self._pairing_fault(pair)
         values = {name: str(count) for name, count in counts.items()} | {
-            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}", "max_skew_ms": f"{skew.max_ns * 1e-6:.3f}",
-            "skew_drift_ms": f"{skew.drift_ns * 1e-6:.3f}", "exposure_skew_ms": f"{skew.exposure_ns * 1e-6:.3f}",
-            "tolerance_ms": f"{pair.tolerance_ms:.3f}"}
+            "skew_ms": f"{skew.mean_ns * 1e-6:.3f}",
+            "max_skew_ms": f"{skew.max_ns * 1e-6:.3f}",
+            "skew_drift_ms": f"{skew.drift_ns * 1e-6:.3f}",
+            "exposure_skew_ms": f"{skew.exposure_ns * 1e-6:.3f}",
+            "tolerance_ms": f"{pair.tolerance_ms:.3f}",
+        }
         state = "synchronised"
         if skew.exposure_ns:
             state = "not synchronised: the motion between the exposures is corrected"
@@ -122,8 +132,10 @@ class StatusCollector:
         if broken_hz > 0:
             return f"images cannot be decoded; the first: {pair.fault}"
         if pair.frozen:
-            return f"the images of the {' and the '.join(pair.frozen)} camera are frozen: all pixels are as before; " \
-                   "check the camera and its driver"
+            return (
+                f"the images of the {' and the '.join(pair.frozen)} camera are frozen: all pixels are as before; "
+                "check the camera and its driver"
+            )
         if rate_hz == 0:
             return "the cameras' images are further apart in time than pair.tolerance_ms: synchronise them"
         if pair.has_fixed_tolerance and abs(pair.skew.drift_ns) > MAX_SKEW_DRIFT_NS:
@@ -190,27 +202,43 @@ def stage_status(stage: StageStats, lost: Key = Key.DROPPED, rate_hz: float | No
     lost: key of the counter of lost messages, or of missed deadlines.
     """
     values = {} if rate_hz is None else {str(Key.RATE_HZ): f"{rate_hz:.1f}"}
-    values |= {Key.PROCESSED: str(stage.processed), lost: str(stage.dropped), **_times(status_names.WORK, stage.wall),
-               **_times(status_names.CPU, stage.cpu)}
+    values |= {
+        Key.PROCESSED: str(stage.processed),
+        lost: str(stage.dropped),
+        **_times(status_names.WORK, stage.wall),
+        **_times(status_names.CPU, stage.cpu),
+    }
     return DiagnosticStatus(status_names.stage_name(stage.name), OK, "", values)
 
 
 def summary_status(counters: RunCounters) -> DiagnosticStatus:
     """Return the entry of a finished replay: its counters, one number per key."""
-    values = {"pairs": str(counters.pairs), "poses": str(counters.poses), str(Key.LENGTH_M): f"{counters.length_m:.4f}",
-              **{f"poses_{state}": str(count) for state, count in counters.states.items()},
-              Key.RESETS: str(counters.resets)}
-    for prefix, counts in (("dropped", counters.drops), ("map", counters.map), ("places", counters.places),
-                           ("motor", counters.motor)):
+    values = {
+        "pairs": str(counters.pairs),
+        "poses": str(counters.poses),
+        str(Key.LENGTH_M): f"{counters.length_m:.4f}",
+        **{f"poses_{state}": str(count) for state, count in counters.states.items()},
+        Key.RESETS: str(counters.resets),
+    }
+    for prefix, counts in (
+        ("dropped", counters.drops),
+        ("map", counters.map),
+        ("places", counters.places),
+        ("motor", counters.motor),
+    ):
         values |= {f"{prefix}_{name}": str(count) for name, count in counts.items()}
     return DiagnosticStatus(status_names.SUMMARY, OK, "the run has ended", values)
 
 
 def _arming(state: ControllerState) -> dict[str, str]:
     """Return the values about arming and about the source of the commands, without those that are empty."""
-    values = {Key.ARMED: str(int(state.armed)), Key.DISARMED_BY: state.disarmed_by,
-              Key.REMEDY: REMEDY if state.needs_request else "", Key.ARM_REFUSAL: state.arm_answer.refusal,
-              Key.SOURCE: state.source}
+    values = {
+        Key.ARMED: str(int(state.armed)),
+        Key.DISARMED_BY: state.disarmed_by,
+        Key.REMEDY: REMEDY if state.needs_request else "",
+        Key.ARM_REFUSAL: state.arm_answer.refusal,
+        Key.SOURCE: state.source,
+    }
     return {key: text for key, text in values.items() if text}
 
 

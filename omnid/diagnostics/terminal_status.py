@@ -15,8 +15,14 @@ class TerminalStatus:
 
     period_s = PERIOD_S
 
-    def __init__(self, show: Callable[[str], None], line: Callable[[], str], report: Callable[[str], None],
-                 statistics: RunStatistics, ready: str) -> None:
+    def __init__(
+        self,
+        show: Callable[[str], None],
+        line: Callable[[], str],
+        report: Callable[[str], None],
+        statistics: RunStatistics,
+        ready: str,
+    ) -> None:
         """show: rewrites the line. line: what it says. report: takes lines that stay. ready: of the start."""
         self._show, self._line, self._report = show, line, report
         self._statistics, self._ready = statistics, ready
@@ -33,5 +39,7 @@ class TerminalStatus:
         self._show("")
         statistics = self._statistics
         states = ", ".join(f"{state} {count / statistics.poses:.1%}" for state, count in statistics.states.items())
-        self._report(f"ended: {statistics.poses} poses, {statistics.length_m:.2f} m, {statistics.resets} resets"
-                     f"{f'; {states}' if states else ''}")
+        self._report(
+            f"ended: {statistics.poses} poses, {statistics.length_m:.2f} m, {statistics.resets} resets"
+            f"{f'; {states}' if states else ''}"
+        )

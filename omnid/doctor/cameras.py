@@ -54,8 +54,9 @@ def cameras(
             streams.append(stream)
     nodes = {_resolved(settings.device, root) for settings in wanted.values()}
     if len(nodes) < len(wanted):
-        yield Finding("error", "cameras", "both names lead to one device",
-                      "configure one device for each, see `omnid cameras`")
+        yield Finding(
+            "error", "cameras", "both names lead to one device", "configure one device for each, see `omnid cameras`"
+        )
     yield from buses(streams)
 
 
@@ -73,14 +74,27 @@ def _bus(subject: str, sharing: list[CameraStream]) -> Finding:
     needed_mbps = sum(stream.rate_mbps for stream in slow)
     for stream in slow:
         if stream.rate_mbps > STREAM_MBPS:
-            return Finding("error", subject, f"{stream.name} would send {stream.rate_mbps:.0f} Mbit/s, one camera can "
-                           f"send {STREAM_MBPS:.0f} over USB 2", "lower cameras.rate_hz or the size, or use MJPG")
+            return Finding(
+                "error",
+                subject,
+                f"{stream.name} would send {stream.rate_mbps:.0f} Mbit/s, one camera can "
+                f"send {STREAM_MBPS:.0f} over USB 2",
+                "lower cameras.rate_hz or the size, or use MJPG",
+            )
     if needed_mbps > BUS_MBPS:
-        return Finding("error", subject, f"{_names(slow)} would send {needed_mbps:.0f} Mbit/s over one USB 2 bus, "
-                       f"which carries {BUS_MBPS:.0f}", f"{_OTHER_PORT}, or lower cameras.rate_hz")
+        return Finding(
+            "error",
+            subject,
+            f"{_names(slow)} would send {needed_mbps:.0f} Mbit/s over one USB 2 bus, which carries {BUS_MBPS:.0f}",
+            f"{_OTHER_PORT}, or lower cameras.rate_hz",
+        )
     if len(slow) > 1 and not all(stream.rate_mbps for stream in slow):
-        return Finding("warning", subject, f"{_names(slow)} share a USB 2 bus, on which many cameras reserve more than "
-                       "their compressed images need", f"if one does not start (no space left): {_OTHER_PORT}")
+        return Finding(
+            "warning",
+            subject,
+            f"{_names(slow)} share a USB 2 bus, on which many cameras reserve more than their compressed images need",
+            f"if one does not start (no space left): {_OTHER_PORT}",
+        )
     sent = f"{needed_mbps:.0f} of {BUS_MBPS:.0f} Mbit/s" if needed_mbps else f"{sharing[0].bus_mbps:.0f} Mbit/s"
     return Finding("ok", subject, f"{_names(sharing)}: {sent}")
 
@@ -89,18 +103,28 @@ def _camera(name: str, settings: V4l2Settings, device: CaptureDevice | None, roo
     """Yield ok if a camera can be used as configured, else all reasons against it."""
     subject, path = f"camera {name}", root / settings.device.lstrip("/")
     if not path.exists():
-        yield Finding("error", subject, f"{settings.device} does not exist",
-                      "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name")
+        yield Finding(
+            "error",
+            subject,
+            f"{settings.device} does not exist",
+            "connect the camera; `omnid cameras` lists the cameras and the udev rule for this name",
+        )
     elif device is None:
         yield Finding("error", subject, f"{settings.device} is no camera", "choose a device that `omnid cameras` lists")
     else:
         problems = [*access(subject, path), *_problems(subject, settings, device)]
         others = [holder for holder in holders(path, root) if not is_ours(holder)]
         if others:
-            problems.append(Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}",
-                                    "end that program"))
-        yield from problems or [Finding("ok", subject, f"{device.name} at {device.node}, {_image(settings, device)}"
-                                            f"{_exposure(settings, device)}")]
+            problems.append(
+                Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}", "end that program")
+            )
+        yield from problems or [
+            Finding(
+                "ok",
+                subject,
+                f"{device.name} at {device.node}, {_image(settings, device)}{_exposure(settings, device)}",
+            )
+        ]
 
 
 def _problems(subject: str, settings: V4l2Settings, device: CaptureDevice) -> Iterator[Finding]:

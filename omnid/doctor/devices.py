@@ -21,11 +21,19 @@ def access(subject: str, device: Path) -> Iterator[Finding]:
     found = device.stat()
     group = _group(found.st_gid)
     if group not in GROUPS and found.st_mode & 0o006 != 0o006:
-        yield Finding("warning", subject, f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
-                      "set GROUP=\"video\" or GROUP=\"dialout\" in its udev rule, see 90-omnid.rules")
+        yield Finding(
+            "warning",
+            subject,
+            f"{device} is of group {group}, the service is in {' and '.join(GROUPS)}",
+            'set GROUP="video" or GROUP="dialout" in its udev rule, see 90-omnid.rules',
+        )
     elif not os.access(device, os.R_OK | os.W_OK):
-        yield Finding("error", subject, f"no permission for {device} of group {group}",
-                      f"`sudo usermod -aG {group} $USER`, then log in again")
+        yield Finding(
+            "error",
+            subject,
+            f"no permission for {device} of group {group}",
+            f"`sudo usermod -aG {group} $USER`, then log in again",
+        )
 
 
 def memberships(names: Sequence[str] = GROUPS) -> Finding:
@@ -34,8 +42,12 @@ def memberships(names: Sequence[str] = GROUPS) -> Finding:
     if os.geteuid() == 0:
         return Finding("ok", "groups", "root may open all devices")
     if missing:
-        return Finding("warning", "groups", f"you are not in group {' and '.join(missing)}; the service is",
-                       f"`sudo usermod -aG {','.join(missing)} $USER`, then log in again")
+        return Finding(
+            "warning",
+            "groups",
+            f"you are not in group {' and '.join(missing)}; the service is",
+            f"`sudo usermod -aG {','.join(missing)} $USER`, then log in again",
+        )
     return Finding("ok", "groups", f"you are in {' and '.join(names)}")
 
 

@@ -25,9 +25,14 @@ LEAST_COMMANDS: Final = 2  # of a motion: the driver may send a stop in place of
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 LARGEST_TURNS: Final = 1000.0
 # The setting that makes the number of turns right; controllers of other protocols take m/s, and know the rest.
-SCALES: Final[Mapping[str, str]] = {"roboteq": "gear", "odrive_ascii": "gear", "vesc": "gear",
-                                    "ros_arduino_bridge": "ticks_per_turn", "roboteq_power": "max_wheel_mps",
-                                    "roboteq_mixed": "max_wheel_mps"}
+SCALES: Final[Mapping[str, str]] = {
+    "roboteq": "gear",
+    "odrive_ascii": "gear",
+    "vesc": "gear",
+    "ros_arduino_bridge": "ticks_per_turn",
+    "roboteq_power": "max_wheel_mps",
+    "roboteq_mixed": "max_wheel_mps",
+}
 MIXES_ITSELF: Final = "line"
 _SIDES: Final = {"l": "left", "r": "right", "b": "both", "n": "none", "a": "again"}
 
@@ -44,18 +49,30 @@ class Seen(NamedTuple):
 class WiringTest:
     """A test of the wiring; its commands stop the wheels also where it is interrupted."""
 
-    def __init__(self, config: MotorSettings, ask: Ask, *, speed_mps: float, turns: float, move_s: float = MOVE_S,
-                 rest_s: float = REST_S) -> None:
+    def __init__(
+        self,
+        config: MotorSettings,
+        ask: Ask,
+        *,
+        speed_mps: float,
+        turns: float,
+        move_s: float = MOVE_S,
+        rest_s: float = REST_S,
+    ) -> None:
         """speed_mps: of a wheel, above 0. turns: of each wheel, for the scale; 0: leave that out.
 
         move_s: time for which a motor turns alone, in each direction. rest_s: after each motion.
         """
         if config.protocol == MIXES_ITSELF:
-            raise OmnidError("motor.protocol is 'line': its controller divides the speed between the wheels itself, so "
-                             "the wiring is set there; see whether it is right by `omnid drive`")
+            raise OmnidError(
+                "motor.protocol is 'line': its controller divides the speed between the wheels itself, so "
+                "the wiring is set there; see whether it is right by `omnid drive`"
+            )
         if not 0 < speed_mps <= config.drive.max_wheel_mps:
-            raise OmnidError(f"--speed {speed_mps:g}: expected a speed above 0, up to motor.drive.max_wheel_mps = "
-                             f"{config.drive.max_wheel_mps:g} m/s")
+            raise OmnidError(
+                f"--speed {speed_mps:g}: expected a speed above 0, up to motor.drive.max_wheel_mps = "
+                f"{config.drive.max_wheel_mps:g} m/s"
+            )
         if not 0 <= turns <= LARGEST_TURNS:
             raise OmnidError(f"--turns {turns:g}: expected 0 to {LARGEST_TURNS:g}")
         self._config, self._ask = config, ask
@@ -85,15 +102,21 @@ class WiringTest:
         while True:
             for sign in (1, -1):
                 self._move(motor, sign * velocity_mps, sign * yaw_rate_radps, self._move_s)
-            answer = self._ask(f"Motor {channel} turned one way and back. Name the wheel that moved (l left, r right, "
-                               "b both, n none, a again): ")
+            answer = self._ask(
+                f"Motor {channel} turned one way and back. Name the wheel that moved (l left, r right, "
+                "b both, n none, a again): "
+            )
             side = _SIDES.get(answer[:1].lower(), "again")
             if side == "none":
-                raise OmnidError(f"motor {channel} did not move: check power, cable, emergency stop and motor.protocol"
-                                 ", or try a higher --speed")
+                raise OmnidError(
+                    f"motor {channel} did not move: check power, cable, emergency stop and motor.protocol"
+                    ", or try a higher --speed"
+                )
             if side == "both":
-                raise OmnidError(f"motor {channel} moved both wheels: are they coupled, or do both controllers have "
-                                 "one address (motor.drive.can_id)?")
+                raise OmnidError(
+                    f"motor {channel} moved both wheels: are they coupled, or do both controllers have "
+                    "one address (motor.drive.can_id)?"
+                )
             if side != "again":
                 break
         return Seen(side, self._yes(f"Did the {side} wheel turn forwards first, as for driving forwards (y or n)? "))
@@ -162,8 +185,17 @@ def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:
     header = re.compile(rf"\s*\[\s*{re.escape(section)}\s*\]\s*(#.*)?")
     begin = next((number for number, line in enumerate(lines) if header.fullmatch(line)), None)
     if begin is None:
-        return "\n".join([*lines, *([""] if lines else []), f"[{section}]",
-                          *(f"{key} = {value}" for key, value in values.items())]) + "\n"
+        return (
+            "\n".join(
+                [
+                    *lines,
+                    *([""] if lines else []),
+                    f"[{section}]",
+                    *(f"{key} = {value}" for key, value in values.items()),
+                ]
+            )
+            + "\n"
+        )
     sections = (number for number in range(begin + 1, len(lines)) if lines[number].lstrip().startswith("["))
     end = next(sections, len(lines))
     missing = dict(values)
@@ -172,4 +204,4 @@ def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:
         if key in missing:
             lines[number] = f"{key} = {missing.pop(key)}"
     added = [f"{key} = {value}" for key, value in missing.items()]
-    return "\n".join([*lines[:begin + 1], *added, *lines[begin + 1:]]) + "\n"
+    return "\n".join([*lines[: begin + 1], *added, *lines[begin + 1 :]]) + "\n"

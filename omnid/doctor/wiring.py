@@ -31,14 +31,28 @@ def motor(port: str, root: Path = Path("/")) -> Iterator[Finding]:
     if port in ("", SIMULATED):
         yield Finding("ok", subject, "simulated" if port else "none is configured: motor.port is empty")
     elif not path.exists():
-        yield Finding("error", subject, f"{port} does not exist",
-                      "connect it; `ls -l /dev/serial/by-id` lists the ports, 90-omnid.rules gives it a name")
+        yield Finding(
+            "error",
+            subject,
+            f"{port} does not exist",
+            "connect it; `ls -l /dev/serial/by-id` lists the ports, 90-omnid.rules gives it a name",
+        )
     elif not stat.S_ISCHR(path.stat().st_mode):
         yield Finding("error", subject, f"{port} is no serial port", "set motor.port")
     else:
         others = [holder for holder in holders(path, root) if not is_ours(holder)]
-        busy = [Finding("error", subject, f"{port} is in use by {', '.join(others)}", "end that program; "
-                        "90-omnid.rules keeps ModemManager away from the port")] if others else []
+        busy = (
+            [
+                Finding(
+                    "error",
+                    subject,
+                    f"{port} is in use by {', '.join(others)}",
+                    "end that program; 90-omnid.rules keeps ModemManager away from the port",
+                )
+            ]
+            if others
+            else []
+        )
         yield from [*access(subject, path), *busy] or [Finding("ok", subject, port)]
 
 
@@ -56,19 +70,36 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
     for name, mounted in cameras.items():
         width, height = mounted.camera.size
         if (width, height) != size_px:
-            yield Finding("error", "rig", f"{path}: the {name} camera was calibrated with {width}x{height} px, "
-                          f"[cameras] asks for {size_px[0]}x{size_px[1]}", "set cameras.width_px and height_px")
+            yield Finding(
+                "error",
+                "rig",
+                f"{path}: the {name} camera was calibrated with {width}x{height} px, "
+                f"[cameras] asks for {size_px[0]}x{size_px[1]}",
+                "set cameras.width_px and height_px",
+            )
     height_m = found.height_m(floor_m)
     if height_m is None:
-        yield Finding("warning", "rig", f"{path} does not state the height of the cameras: nothing is free until the "
-                      "images show the floor", "state it by `omnid calibrate height LOG`, with --ruler-m as a check")
+        yield Finding(
+            "warning",
+            "rig",
+            f"{path} does not state the height of the cameras: nothing is free until the images show the floor",
+            "state it by `omnid calibrate height LOG`, with --ruler-m as a check",
+        )
     bare = [name for name, mounted in cameras.items() if mounted.mask is None]
     if bare:
-        yield Finding("warning", "rig", f"{path} has no mask for {' and '.join(bare)}, the rim is searched at "
-                      "each start", f"add [{bare[0]}.mask] with center, inner_px and outer_px")
+        yield Finding(
+            "warning",
+            "rig",
+            f"{path} has no mask for {' and '.join(bare)}, the rim is searched at each start",
+            f"add [{bare[0]}.mask] with center, inner_px and outer_px",
+        )
     else:
-        yield Finding("ok", "rig", f"{path}, {found.baseline_m:.3f} m between the viewpoints"
-                      + ("" if height_m is None else f", {height_m:.3f} m above the floor"))
+        yield Finding(
+            "ok",
+            "rig",
+            f"{path}, {found.baseline_m:.3f} m between the viewpoints"
+            + ("" if height_m is None else f", {height_m:.3f} m above the floor"),
+        )
 
 
 def bus(config: BusConfig) -> Iterator[Finding]:
@@ -91,8 +122,12 @@ def _remote_commands(config: BusConfig) -> Iterator[Finding]:
     if endpoints and accepted:
         yield Finding("ok", "bus", f"reachable at {endpoints}; commands are accepted from {accepted} only")
     elif endpoints:
-        yield Finding("warning", "bus", f"anyone who reaches {endpoints} can drive the robot",
-                      "set bus.command_names or bus.command_users, or listen on tcp/127.0.0.1:7447 only")
+        yield Finding(
+            "warning",
+            "bus",
+            f"anyone who reaches {endpoints} can drive the robot",
+            "set bus.command_names or bus.command_users, or listen on tcp/127.0.0.1:7447 only",
+        )
 
 
 def _router(endpoint: str) -> Finding:
@@ -103,8 +138,13 @@ def _router(endpoint: str) -> Finding:
         socket.create_connection((parts["host"], int(parts["port"])), _TIMEOUT_S).close()
     except (OSError, OverflowError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        return Finding("warning", "router", f"{endpoint} does not answer: {reason}", "start it, or correct "
-                       "bus.connect; the daemon runs without it; the unit needs IPAddressAllow for it, see lan.conf")
+        return Finding(
+            "warning",
+            "router",
+            f"{endpoint} does not answer: {reason}",
+            "start it, or correct "
+            "bus.connect; the daemon runs without it; the unit needs IPAddressAllow for it, see lan.conf",
+        )
     return Finding("ok", "router", f"{endpoint} answers")
 
 

@@ -132,9 +132,7 @@ class Direct:
     `succeeds(name, work, *args)` does the work and is True if no error was raised; `finish(node)` finishes the node.
     """
 
-    def __init__(
-        self, node: Node, writers: int, succeeds: Callable[..., bool], finish: Callable[[Node], None]
-    ) -> None:
+    def __init__(self, node: Node, writers: int, succeeds: Callable[..., bool], finish: Callable[[Node], None]) -> None:
         self._node, self._writers, self._succeeds, self._finish = node, writers, succeeds, finish
         self._alive = True
 

@@ -27,8 +27,10 @@ def prepare_kernels(report: Report) -> None:
     try:
         import numba  # noqa: F401 - it tries to make executable memory
     except OSError as error:
-        raise OmnidError("the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
-                         f"the service, or what else denies executable memory ({error})") from error
+        raise OmnidError(
+            "the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
+            f"the service, or what else denies executable memory ({error})"
+        ) from error
     read_kept_kernels()
     missing = _not_ready()
     if missing and not (reason := store.why_unusable(store.cache_folder())):
@@ -81,8 +83,11 @@ def kept_kernels(service: Path | None = None) -> KeptKernels:
 
 def _not_ready() -> dict[str, Path]:
     """Return the folders of the files, by the names of their modules, whose functions this program has not yet."""
-    return {name: store.folder_of_state(name, path) for name, path in store.kernel_files().items()
-            if not store.is_ready(name)}
+    return {
+        name: store.folder_of_state(name, path)
+        for name, path in store.kernel_files().items()
+        if not store.is_ready(name)
+    }
 
 
 def _compile_here(folders: dict[str, Path], reason: str, report: Report) -> None:
@@ -97,6 +102,9 @@ def _compile_here(folders: dict[str, Path], reason: str, report: Report) -> None
         if not store.is_ready(name):
             store.compile_into(name, None)
     if reason:
-        report(logging.WARNING, f"the compiled functions cannot be kept in {store.cache_folder()}: {reason}: every "
-               f"start takes {time.monotonic() - started_s:.0f} s longer; make that folder writable, or set "
-               "OMNID_CACHE_DIR to another one")
+        report(
+            logging.WARNING,
+            f"the compiled functions cannot be kept in {store.cache_folder()}: {reason}: every "
+            f"start takes {time.monotonic() - started_s:.0f} s longer; make that folder writable, or set "
+            "OMNID_CACHE_DIR to another one",
+        )

@@ -84,9 +84,16 @@ def _run_helpers(folders: Mapping[str, Path], lock: int, report: Report) -> None
         helpers: list[subprocess.Popen[bytes]] = []
         try:
             for _ in range(min(len(os.sched_getaffinity(0)), MAX_HELPERS, len(folders))):
-                helpers.append(subprocess.Popen(
-                    command, env=python_environment(), pass_fds=(lock,), stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+                helpers.append(
+                    subprocess.Popen(
+                        command,
+                        env=python_environment(),
+                        pass_fds=(lock,),
+                        stdin=subprocess.DEVNULL,
+                        stdout=subprocess.DEVNULL,
+                        stderr=subprocess.DEVNULL,
+                    )
+                )
             _wait(lambda: all(helper.poll() is not None for helper in helpers), folders, report)
         finally:
             for helper in helpers:

@@ -53,8 +53,10 @@ def cache_folder() -> Path:
 def kernel_files() -> dict[str, Path]:
     """Return the files with compiled functions by the names of their modules."""
     root = Path(omnid.core.__path__[0]).parent
-    return {f"omnid.{'.'.join(path.relative_to(root).with_suffix('').parts)}": path
-            for path in sorted(root.rglob(KERNEL_FILES))}
+    return {
+        f"omnid.{'.'.join(path.relative_to(root).with_suffix('').parts)}": path
+        for path in sorted(root.rglob(KERNEL_FILES))
+    }
 
 
 def functions_of(name: str) -> list[Kernel[..., Any]]:
@@ -146,15 +148,21 @@ def is_intact(folder: Path, owner: int | None = None) -> bool:
 
 def _digests(folder: Path) -> dict[str, str]:
     """Return the digests of all files in a folder."""
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-            for path in sorted(folder.rglob("*")) if path.is_file() and path.name != DIGESTS}
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != DIGESTS
+    }
 
 
 def remove_others(used: set[Path]) -> None:
     """Remove the folders of other states beyond MAX_FOLDERS, the oldest first, and what was left half made."""
     with suppress(OSError):
-        others = sorted((path for path in cache_folder().glob("kernels-*") if path not in used),
-                        key=lambda path: path.stat().st_mtime, reverse=True)
+        others = sorted(
+            (path for path in cache_folder().glob("kernels-*") if path not in used),
+            key=lambda path: path.stat().st_mtime,
+            reverse=True,
+        )
         for path in others[MAX_FOLDERS:]:
             shutil.rmtree(path, ignore_errors=True)
         day_ago_s = time.time() - _DAY_S

@@ -26,8 +26,10 @@ from omnid.settings import knob
 
 CAP_IPC_LOCK: Final = 14
 CAP_SYS_NICE: Final = 23
-LOCK_ADVICE: Final = ("set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
-                      "realtime.lock_memory = false")
+LOCK_ADVICE: Final = (
+    "set LimitMEMLOCK=infinity in the unit, or 'memlock unlimited' in /etc/security/limits.d, or "
+    "realtime.lock_memory = false"
+)
 FILES: Final = 4096  # open at once
 _PR_SET_NAME: Final = 15
 _NAME_BYTES: Final = 15
@@ -42,13 +44,19 @@ class RealtimeSettings:
 
     lock_memory: bool = knob(True, "lock all memory against swapping; needs LimitMEMLOCK=infinity")
     freeze_gc: bool = knob(True, "exclude what exists at the start from garbage collection")
-    switch_interval_ms: float = knob(1.0, "time after which Python switches threads, ms; 0: Python's default, 5 ms",
-                                     low=0, high=100)
-    motor_priority: int = knob(20, "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none", low=0,
-                               high=99)
+    switch_interval_ms: float = knob(
+        1.0, "time after which Python switches threads, ms; 0: Python's default, 5 ms", low=0, high=100
+    )
+    motor_priority: int = knob(
+        20, "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none", low=0, high=99
+    )
     capture_priority: int = knob(10, "SCHED_FIFO priority of the capture threads; 0: none", low=0, high=99)
-    longest_run_ms: int = knob(500, "longest run of a SCHED_FIFO thread without a wait, ms; beyond it the kernel "
-                               "ends the daemon; 0: no limit", low=0, high=10_000)
+    longest_run_ms: int = knob(
+        500,
+        "longest run of a SCHED_FIFO thread without a wait, ms; beyond it the kernel ends the daemon; 0: no limit",
+        low=0,
+        high=10_000,
+    )
 
 
 def prepare(config: RealtimeSettings) -> list[str]:
@@ -80,8 +88,11 @@ class ThreadStart:
         priority = self._priorities.get(name, 0)
         if priority and not set_realtime_priority(priority) and not self.refused:
             self.refused = True
-            self._report(logging.WARNING, f"thread '{name}' cannot have real-time priority {priority}, nor can others: "
-                         f"{priority_advice(max(self._priorities.values()))}")
+            self._report(
+                logging.WARNING,
+                f"thread '{name}' cannot have real-time priority {priority}, nor can others: "
+                f"{priority_advice(max(self._priorities.values()))}",
+            )
 
 
 def priorities(config: RealtimeSettings, *captures: str) -> dict[str, int]:
@@ -147,8 +158,10 @@ def has_capability(number: int) -> bool:
 
 def priority_advice(priority: int) -> str:
     """Return advice on how to allow a real-time priority."""
-    return (f"set LimitRTPRIO={priority} in the unit, or 'rtprio {priority}' in /etc/security/limits.d, or "
-            "realtime.motor_priority = 0 and realtime.capture_priority = 0")
+    return (
+        f"set LimitRTPRIO={priority} in the unit, or 'rtprio {priority}' in /etc/security/limits.d, or "
+        "realtime.motor_priority = 0 and realtime.capture_priority = 0"
+    )
 
 
 def raise_file_limit() -> None:

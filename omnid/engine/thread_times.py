@@ -41,8 +41,9 @@ def thread_times(pid: int = 0) -> dict[int, ThreadTime]:
             with suppress(FileNotFoundError):  # it has ended
                 times[int(task.name)] = _parsed((task / "stat").read_text())
         inherited = times[main].name
-        times = {tid: found._replace(name=LIBRARIES) if found.name == inherited else found
-                 for tid, found in times.items()}
+        times = {
+            tid: found._replace(name=LIBRARIES) if found.name == inherited else found for tid, found in times.items()
+        }
         times[main] = times[main]._replace(name=MAIN)
     return times
 

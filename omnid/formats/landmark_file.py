@@ -35,8 +35,13 @@ def write_landmarks(path: Path, landmarks: Iterable[Landmark]) -> None:
     """Write the file. Raises OmnidError if that is impossible."""
     lines = [f"schema = {SCHEMA}"]
     for mark in landmarks:
-        lines += ["", f"[tag.{json.dumps(mark.name)}]", f"id = {mark.id}", f"size_m = {mark.size_m!r}",
-                  f"xyz_m = [{', '.join(f'{value:.4f}' for value in mark.xyz_m)}]"]
+        lines += [
+            "",
+            f"[tag.{json.dumps(mark.name)}]",
+            f"id = {mark.id}",
+            f"size_m = {mark.size_m!r}",
+            f"xyz_m = [{', '.join(f'{value:.4f}' for value in mark.xyz_m)}]",
+        ]
         if mark.facing_rad is not None:
             lines.append(f"facing_deg = {math.degrees(mark.facing_rad):.2f}")
     write_whole(path, ("\n".join(lines) + "\n").encode())

@@ -41,19 +41,22 @@ MAX_TAG_VIEWS: Final = 100_000
 MAX_INSTRUCTIONS: Final = 50_000_000  # that SQLite may take to read a map
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
-                "missed INTEGER, T_map_rect BLOB, "
-                "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, descriptors BLOB, views BLOB, "
-                "crc32 INTEGER)",
+    "missed INTEGER, T_map_rect BLOB, "
+    "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, descriptors BLOB, views BLOB, "
+    "crc32 INTEGER)",
     "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
     "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, tags INTEGER, tag_views INTEGER, "
-           "width INTEGER, height INTEGER, "
-           "row0 REAL, baseline_m REAL, T_rig_rect BLOB, T_base_rig BLOB, rig_hash TEXT, crc32 INTEGER)",
+    "width INTEGER, height INTEGER, "
+    "row0 REAL, baseline_m REAL, T_rig_rect BLOB, T_base_rig BLOB, rig_hash TEXT, crc32 INTEGER)",
     "tag": "CREATE TABLE tag (id INTEGER PRIMARY KEY, name TEXT, size_m REAL, crc32 INTEGER)",
     "tag_view": "CREATE TABLE tag_view (keyframe INTEGER, tag INTEGER, T_rect_tag BLOB, covariance BLOB, "
-                "crc32 INTEGER)",
+    "crc32 INTEGER)",
 }
-SCHEMA_2: Final = {"keyframe": SCHEMA["keyframe"], "link": SCHEMA["link"],
-                   "map": SCHEMA["map"].replace("tags INTEGER, tag_views INTEGER, ", "")}
+SCHEMA_2: Final = {
+    "keyframe": SCHEMA["keyframe"],
+    "link": SCHEMA["link"],
+    "map": SCHEMA["map"].replace("tags INTEGER, tag_views INTEGER, ", ""),
+}
 
 
 def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
@@ -82,11 +85,14 @@ def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMa
         with closing(open_bounded(path, MAX_VALUE_BYTES, unchanging=True)) as database:
             return _read(_Reader(database, version), PlaceMap() if into is None else into)
     except BadRowError as error:
-        raise OmnidError(f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
-                         ) from error
+        raise OmnidError(
+            f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
+        ) from error
     except (sqlite3.Error, OverflowError, MemoryError, UnicodeDecodeError) as error:
-        raise OmnidError(f"{path}: the map is damaged: {' '.join(str(error).split())}; take a copy, or build it again "
-                         "with `omnid map build`") from error
+        raise OmnidError(
+            f"{path}: the map is damaged: {' '.join(str(error).split())}; take a copy, or build it again "
+            "with `omnid map build`"
+        ) from error
 
 
 def _version_of(path: Path) -> int:
@@ -101,8 +107,10 @@ def _version_of(path: Path) -> int:
         raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
     version = int.from_bytes(header[60:64])
     if version not in (WITHOUT_TAGS, WITHOUT_FLOOR, VERSION):
-        raise OmnidError(f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
-                         "`omnid map build`, or update omnid")
+        raise OmnidError(
+            f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
+            "`omnid map build`, or update omnid"
+        )
     if size > MAX_FILE_BYTES:
         raise OmnidError(f"{path}: expected a map of at most {MAX_FILE_BYTES >> 20} MB, found {size >> 20} MB")
     return version
@@ -112,15 +120,20 @@ def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
     """Write the database; the same map gives the same bytes."""
     with closing(sqlite3.connect(path, isolation_level=None)) as database:
         # Not synced here, and without a journal: the file has another name until it is whole.
-        for setting in ("journal_mode = OFF", "synchronous = OFF", f"application_id = {APPLICATION_ID}",
-                        f"user_version = {VERSION}"):
+        for setting in (
+            "journal_mode = OFF",
+            "synchronous = OFF",
+            f"application_id = {APPLICATION_ID}",
+            f"user_version = {VERSION}",
+        ):
             database.execute(f"PRAGMA {setting}")
         database.execute("BEGIN")
         for text in SCHEMA.values():
             database.execute(text)
         ids = sorted(places.keyframes)
-        keyframes = (place_rows.keyframe_row(places.keyframes[id], places.poses[id], places.uses.get(id, UNUSED))
-                     for id in ids)
+        keyframes = (
+            place_rows.keyframe_row(places.keyframes[id], places.poses[id], places.uses.get(id, UNUSED)) for id in ids
+        )
         _insert(database, "keyframe", keyframes)
         _insert(database, "link", (place_rows.link_row(link) for link in places.links))
         _insert(database, "tag", (place_rows.tag_row(places.tags.known[id]) for id in sorted(places.tags.known)))
@@ -166,8 +179,12 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
     links = [place_rows.read_link_row(row) for row in reader.rows("link", MAX_LINKS)]
     tags = [place_rows.read_tag_row(row) for row in reader.rows("tag", MAX_TAG + 1)] if has_tags else []
     views = [place_rows.read_tag_view_row(row) for row in reader.rows("tag_view", MAX_TAG_VIEWS)] if has_tags else []
-    for name, found, expected in (("keyframes", len(keyframes), head.keyframes), ("links", len(links), head.links),
-                                  ("tags", len(tags), head.tags), ("views of tags", len(views), head.tag_views)):
+    for name, found, expected in (
+        ("keyframes", len(keyframes), head.keyframes),
+        ("links", len(links), head.links),
+        ("tags", len(tags), head.tags),
+        ("views of tags", len(views), head.tag_views),
+    ):
         if found != expected:
             raise BadRowError(f"expected {expected} {name}, found {found}")
     _check([(keyframe, T_map_rect) for keyframe, T_map_rect, _ in keyframes], links)
@@ -200,8 +217,9 @@ def _check(keyframes: list[tuple[PlaceKeyframe, NDArray[np.float64]]], links: li
     if any(link.a not in ids or link.b not in ids or link.a == link.b for link in links):
         raise BadRowError("a link joins no two keyframes")
     of_keyframes: list[Any] = [keyframe for keyframe, _ in keyframes]
-    place_rows.require_rigid([T for _, T in keyframes] + [k.T_odom_rect for k in of_keyframes]
-                             + [link.T_a_b for link in links])
+    place_rows.require_rigid(
+        [T for _, T in keyframes] + [k.T_odom_rect for k in of_keyframes] + [link.T_a_b for link in links]
+    )
     of_odometry: list[Any] = [link for link in links if not link.is_loop]
     place_rows.require_covariances([one.covariance for one in of_keyframes + of_odometry], 0.0)
     place_rows.require_covariances([link.covariance for link in links if link.is_loop], place_rows.LEAST_VARIANCE)

@@ -59,10 +59,20 @@ def checksum(row: Row) -> int:
 def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse) -> Row:
     """Return the row of a keyframe."""
     features = keyframe.features
-    return (keyframe.id, keyframe.session, keyframe.stamp_ns, use.found, use.missed, _bytes(T_map_rect[:3], "<f8"),
-            _bytes(keyframe.T_odom_rect[:3], "<f8"), _bytes(keyframe.covariance, "<f8"),
-            _bytes(keyframe.thumbnail, "i1"), _bytes(keyframe.scan, "<f2"), _bytes(features.descriptors, "u1"),
-            _bytes(features.views, "<f4"))
+    return (
+        keyframe.id,
+        keyframe.session,
+        keyframe.stamp_ns,
+        use.found,
+        use.missed,
+        _bytes(T_map_rect[:3], "<f8"),
+        _bytes(keyframe.T_odom_rect[:3], "<f8"),
+        _bytes(keyframe.covariance, "<f8"),
+        _bytes(keyframe.thumbnail, "i1"),
+        _bytes(keyframe.scan, "<f2"),
+        _bytes(features.descriptors, "u1"),
+        _bytes(features.views, "<f4"),
+    )
 
 
 def link_row(link: Link) -> Row:
@@ -82,9 +92,20 @@ def tag_view_row(view: TagView) -> Row:
 
 def map_row(rig: PlaceRig, places: PlaceMap) -> Row:
     """Return the row of the table `map`."""
-    return (len(places.keyframes), len(places.links), places.dropped, len(places.tags.known),
-            len(places.tags.views), rig.cylinder.width, rig.cylinder.height, float(rig.cylinder.row0),
-            float(rig.baseline_m), _bytes(rig.T_rig_rect[:3], "<f8"), _bytes(rig.T_base_rig[:3], "<f8"), rig.rig_hash)
+    return (
+        len(places.keyframes),
+        len(places.links),
+        places.dropped,
+        len(places.tags.known),
+        len(places.tags.views),
+        rig.cylinder.width,
+        rig.cylinder.height,
+        float(rig.cylinder.row0),
+        float(rig.baseline_m),
+        _bytes(rig.T_rig_rect[:3], "<f8"),
+        _bytes(rig.T_base_rig[:3], "<f8"),
+        rig.rig_hash,
+    )
 
 
 def read_map_row(row: Row) -> Head:
@@ -93,8 +114,9 @@ def read_map_row(row: Row) -> Head:
     if not isinstance(rig_hash, str) or len(rig_hash) > MAX_HASH or not rig_hash.isalnum():
         raise BadRowError("the hash of the rig is none")
     cylinder = Cylinder(_integer(width, 1, MAX_PIXELS), _integer(height, 1, MAX_PIXELS), _number(row0, -1e6, 1e6))
-    rig = PlaceRig(cylinder, _number(baseline_m, *BASELINES_M), _transform(T_rig_rect), _transform(T_base_rig),
-                   rig_hash)
+    rig = PlaceRig(
+        cylinder, _number(baseline_m, *BASELINES_M), _transform(T_rig_rect), _transform(T_base_rig), rig_hash
+    )
     require_rigid([rig.T_rig_rect, rig.T_base_rig])
     return Head(rig, _integer(keyframes), _integer(links), _integer(dropped), _integer(tags), _integer(tag_views))
 
@@ -119,12 +141,20 @@ def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array, Ke
     column, lower, upper = features.views.T
     width, height = rig.cylinder.width, rig.cylinder.height
     # NaN fails too. The horizon of the upper camera may show a point beyond the lower one's panorama.
-    if not ((np.abs(column) <= 2 * width) & (np.abs(lower) <= 2 * height) & (upper > lower) & (upper <= 3 * height)
-            ).all():
+    if not (
+        (np.abs(column) <= 2 * width) & (np.abs(lower) <= 2 * height) & (upper > lower) & (upper <= 3 * height)
+    ).all():
         raise BadRowError("a view of a keyframe is outside the panorama")
-    keyframe = PlaceKeyframe(_integer(id), _integer(session), _integer(stamp_ns, -MAX_INTEGER),
-                             _transform(T_odom_rect), _array(covariance, "<f8", (6, 6)),
-                             _array(thumbnail, "i1", THUMBNAIL), ranges, features)
+    keyframe = PlaceKeyframe(
+        _integer(id),
+        _integer(session),
+        _integer(stamp_ns, -MAX_INTEGER),
+        _transform(T_odom_rect),
+        _array(covariance, "<f8", (6, 6)),
+        _array(thumbnail, "i1", THUMBNAIL),
+        ranges,
+        features,
+    )
     return keyframe, _transform(T_map_rect), KeyframeUse(_integer(found), _integer(missed))
 
 

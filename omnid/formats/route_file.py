@@ -21,8 +21,16 @@ SUFFIX: Final = ".route.json"
 MAX_BYTES: Final = 8 << 20
 MOST_KEYFRAMES: Final = 20_000
 FASTEST_MPS: Final = 20.0
-COLUMNS: Final = ("x_m", "y_m", "yaw_rad", "speed_mps", "keyframe", "in_keyframe_x_m", "in_keyframe_y_m",
-                  "in_keyframe_yaw_rad")
+COLUMNS: Final = (
+    "x_m",
+    "y_m",
+    "yaw_rad",
+    "speed_mps",
+    "keyframe",
+    "in_keyframe_x_m",
+    "in_keyframe_y_m",
+    "in_keyframe_yaw_rad",
+)
 _KEYS: Final = {"format", "version", "name", "created_s", "map", "columns", "points", "keyframes", "crc32"}
 
 
@@ -31,9 +39,17 @@ def route_bytes(route: Route) -> bytes:
     rows = np.column_stack([route.poses, route.speeds, route.keyframes, route.in_keyframe]).round(DECIMALS).tolist()
     points = [[int(v) if k == 4 else v for k, v in enumerate(row)] for row in rows]
     keyframes = [[int(id), int(stamp)] for id, stamp in sorted(route.stamps_ns.items())]
-    content = {"format": FORMAT, "version": VERSION, "name": route.name, "created_s": route.created_s,
-               "map": route.map_name, "columns": list(COLUMNS), "points": points, "keyframes": keyframes,
-               "crc32": _checksum(route.name, points, keyframes)}
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "name": route.name,
+        "created_s": route.created_s,
+        "map": route.map_name,
+        "columns": list(COLUMNS),
+        "points": points,
+        "keyframes": keyframes,
+        "crc32": _checksum(route.name, points, keyframes),
+    }
     return (json.dumps(content, separators=(",", ":"), allow_nan=False) + "\n").encode()
 
 
@@ -48,8 +64,10 @@ def parse_route(content: bytes, name: str) -> Route:
     if not isinstance(found, dict) or found.get("format") != FORMAT:
         raise OmnidError(f'{name}: this is no route file: expected "format": "{FORMAT}"')
     if found.get("version") != VERSION:
-        raise OmnidError(f"{name}: this is a route of version {ascii(found.get('version'))[:20]}, expected {VERSION}: "
-                         "teach it again, or update omnid")
+        raise OmnidError(
+            f"{name}: this is a route of version {ascii(found.get('version'))[:20]}, expected {VERSION}: "
+            "teach it again, or update omnid"
+        )
     try:
         return _route(found)
     except OmnidError as error:
@@ -68,20 +86,35 @@ def _route(found: dict[str, Any]) -> Route:
     _require(found["crc32"] == _checksum(title, points, keyframes), "the checksum is wrong")
     numbers = np.array(points, np.float64)
     _require(bool(np.isfinite(numbers).all()), "a number is not finite")
-    _require(float(np.abs(numbers[:, [0, 1, 5, 6]]).max()) <= FARTHEST_M
-             and float(np.abs(numbers[:, [2, 7]]).max()) <= 1e4
-             and float(np.abs(numbers[:, 3]).max()) <= FASTEST_MPS, "a number is out of range")
+    _require(
+        float(np.abs(numbers[:, [0, 1, 5, 6]]).max()) <= FARTHEST_M
+        and float(np.abs(numbers[:, [2, 7]]).max()) <= 1e4
+        and float(np.abs(numbers[:, 3]).max()) <= FASTEST_MPS,
+        "a number is out of range",
+    )
     created = found["created_s"]
     _require(type(created) is int and 0 <= created < 2**40, "its time is no number")
-    return Route(route_name(title), numbers[:, :3], numbers[:, 3], np.array([row[4] for row in points], np.int64),
-                 numbers[:, 5:], {id: stamp for id, stamp in keyframes}, created, map_name)
+    return Route(
+        route_name(title),
+        numbers[:, :3],
+        numbers[:, 3],
+        np.array([row[4] for row in points], np.int64),
+        numbers[:, 5:],
+        {id: stamp for id, stamp in keyframes},
+        created,
+        map_name,
+    )
 
 
 def _rows(value: Any, width: int, most: int) -> list[list[Any]]:
     _require(isinstance(value, list) and len(value) <= most, f"expected a list of at most {most} rows")
     for row in value:
-        _require(isinstance(row, list) and len(row) == width
-                 and all(type(v) in (int, float) and abs(v) < 2.0**63 for v in row), f"expected {width} numbers a row")
+        _require(
+            isinstance(row, list)
+            and len(row) == width
+            and all(type(v) in (int, float) and abs(v) < 2.0**63 for v in row),
+            f"expected {width} numbers a row",
+        )
     return list(value)
 
 
@@ -106,8 +139,9 @@ class RouteFolder:
 
     def names(self) -> list[str]:
         """Return the names of all routes, sorted."""
-        return sorted(path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"*{SUFFIX}")
-                      if not path.name.startswith("."))
+        return sorted(
+            path.name.removesuffix(SUFFIX) for path in self.folder.glob(f"*{SUFFIX}") if not path.name.startswith(".")
+        )
 
     def has(self, name: str) -> bool:
         """True if there is a file for a route of that name, readable or not."""
@@ -134,8 +168,10 @@ class RouteFolder:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise OmnidError(f"{self.folder}: cannot make the folder of the routes: {error.strerror or error}: change "
-                             "navigation.routes") from None
+            raise OmnidError(
+                f"{self.folder}: cannot make the folder of the routes: {error.strerror or error}: change "
+                "navigation.routes"
+            ) from None
         write_whole(self.path(route.name), route_bytes(route))
 
     def delete(self, name: str) -> None:

@@ -23,7 +23,7 @@ DARK_GREY, WHITE_GREY = 25.0, 230.0  # means beyond which images of cameras that
 ADVICE: Final[Mapping[str, str]] = {
     "too dark": "switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the mirrors",
     "too bright": "shade the mirrors, or put a filter before the lenses",
-    "no answer": "set cameras.auto_exposure = \"on\", or a fixed cameras.exposure_us",
+    "no answer": 'set cameras.auto_exposure = "on", or a fixed cameras.exposure_us',
 }
 _WORDS: Final[Mapping[str, str]] = {
     "too dark": "too dark: exposure time and gain are at their limits",
@@ -80,8 +80,9 @@ class ExposureControl:
         if levels is None:
             return DiagnosticStatus(EXPOSURE, OK, "no images yet", {})
         values = {f"{name}_grey": f"{level.mean:.0f}" for name, level in zip(("lower", "upper"), levels, strict=True)}
-        values |= {f"{name}_bright_grey": f"{level.bright:.0f}"
-                   for name, level in zip(("lower", "upper"), levels, strict=True)}
+        values |= {
+            f"{name}_bright_grey": f"{level.bright:.0f}" for name, level in zip(("lower", "upper"), levels, strict=True)
+        }
         if law is not None and not self._left_to_cameras:
             values |= {"exposure_ms": f"{law.setting.exposure_us * UNIT_MS:.1f}", "steps": str(law.steps)}
             values |= {} if law.setting.gain is None else {"gain": str(law.setting.gain)}
@@ -123,7 +124,7 @@ def _reason(config: CamerasConfig, cameras: Mapping[Camera, CameraState]) -> str
     if config.exposure_us:
         return "fixed by cameras.exposure_us"
     if config.auto_exposure != "rig":
-        return f"left to the cameras: cameras.auto_exposure = \"{config.auto_exposure}\""
+        return f'left to the cameras: cameras.auto_exposure = "{config.auto_exposure}"'
     without = [name for name, state in cameras.items() if state.exposure is None]
     if without:
         return f"left to the cameras: no exposure time to set in the {' and the '.join(without)} camera"

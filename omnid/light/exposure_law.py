@@ -47,8 +47,9 @@ def wanted_factor(lower: GreyLevels, upper: GreyLevels) -> float:
 class ExposureLaw:
     """Decides on steps by the levels of pairs; reads no clock."""
 
-    def __init__(self, ranges: ExposureRanges, start: ExposureSetting, limit_us: float, flicker_us: float = 0.0
-                 ) -> None:
+    def __init__(
+        self, ranges: ExposureRanges, start: ExposureSetting, limit_us: float, flicker_us: float = 0.0
+    ) -> None:
         """limit_us: of the exposure time. flicker_us: period of the lamps' light, 0: unknown.
 
         A longer exposure is a multiple of flicker_us, so that all images get the same light.

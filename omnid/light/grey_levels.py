@@ -37,8 +37,9 @@ class UsefulArea:
 
     def levels(self, pair: FramePair) -> tuple[GreyLevels, GreyLevels]:
         """Return the levels of the lower and of the upper image."""
-        lower, upper = (_levels(image.ravel()[pixels]) for image, pixels in
-                        zip((pair.lower, pair.upper), self._pixels, strict=True))
+        lower, upper = (
+            _levels(image.ravel()[pixels]) for image, pixels in zip((pair.lower, pair.upper), self._pixels, strict=True)
+        )
         return lower, upper
 
 

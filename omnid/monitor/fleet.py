@@ -111,8 +111,9 @@ def show(fleet: FleetState, stream: IO[str], dropped: int = 0) -> None:
     stream.flush()
 
 
-def fleet_table(robots: Mapping[str, RobotState], refused: int = 0, dropped: int = 0, *,
-                narrow: bool = False) -> Iterator[str]:
+def fleet_table(
+    robots: Mapping[str, RobotState], refused: int = 0, dropped: int = 0, *, narrow: bool = False
+) -> Iterator[str]:
     """Yield a head and a line for each robot: those that are gone or have the worst state first.
 
     narrow: without positions and ages.
@@ -152,8 +153,11 @@ def _line(name: str, state: RobotState, narrow: bool) -> str:
     shown = shown if len(shown) <= _NAME_COLUMNS else f"{shown[: _NAME_COLUMNS - 1]}\N{HORIZONTAL ELLIPSIS}"
     word = word_of(state)
     pose, age = state.pose, f"{1e3 * state.age.p(0.5):7.0f}" if state.age.count else f"{'':7}"
-    where = f"{'':9} {'':9} {'':8}" if pose is None else \
-        f"{pose.x_m:+9.2f} {pose.y_m:+9.2f} {math.degrees(pose.yaw_rad):+8.1f}"
+    where = (
+        f"{'':9} {'':9} {'':8}"
+        if pose is None
+        else f"{pose.x_m:+9.2f} {pose.y_m:+9.2f} {math.degrees(pose.yaw_rad):+8.1f}"
+    )
     worst = worst_part(state)
     problem = "" if worst is None else f"{short_name(worst.name)}: {worst.message}"
     details = "" if narrow else f" {where} {age}"

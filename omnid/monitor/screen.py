@@ -65,8 +65,10 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
         sigma = np.sqrt(np.maximum(0.0, state.pose.covariance.diagonal()))
         details = state.pose.attachment
         yield f"  {_position(state.pose)}"
-        yield (f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
-               f"inliers {details.inliers} of {details.tracked}; resets {details.resets}")
+        yield (
+            f"  1 sigma {1e3 * sigma[:3].max():.1f} mm, {math.degrees(sigma[3:].max()):.3f} deg; "
+            f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
+        )
         yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {dropped}"
     for status in sorted(state.statuses.values(), key=_importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
@@ -124,6 +126,7 @@ def _latencies(state: RobotState) -> str:
     """Return ages and network latencies in ms, median and 99th percentile; the pace of a simulation."""
     pace = [f"{plain(state.real_time_factor)} x real time"] if state.real_time_factor else []
     named = (("age", state.age), ("network", state.network))
-    times = [f"{name} {1e3 * times_s.p(0.5):.1f}/{1e3 * times_s.p(0.99):.1f} ms" for name, times_s in named
-             if times_s.count]
+    times = [
+        f"{name} {1e3 * times_s.p(0.5):.1f}/{1e3 * times_s.p(0.99):.1f} ms" for name, times_s in named if times_s.count
+    ]
     return "  ".join([*pace, *times])

@@ -26,8 +26,10 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
     with StopSender(bus.robot, bus.connect or (HERE,)) as datagrams:
         if datagrams.ask(_DATAGRAM_S):
             return datagrams.ask(deadline_s - time.monotonic()) == STOPPED
-        with (nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S)) as robot, \
-                robot.subscribe(Diagnostics) as statuses:
+        with (
+            nullcontext(connection) if connection else Robot(settings=bus, timeout_s=CONNECT_S) as robot,
+            robot.subscribe(Diagnostics) as statuses,
+        ):
             driver = robot.driver()
             driver.require_connected()
             while time.monotonic() < deadline_s:

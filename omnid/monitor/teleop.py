@@ -54,7 +54,7 @@ class Stick:
                 self._push(*ARROWS[arrow], now_s)
             else:
                 self._letter(data[:1])
-            data = data[len(arrow) or 1:]
+            data = data[len(arrow) or 1 :]
 
     def twist(self, now_s: float) -> tuple[float, float]:
         """Return forward speed [m/s] and yaw rate [rad/s]."""
@@ -92,8 +92,11 @@ def teleoperate(bus: BusConfig) -> int:
     """Drive the robot until `q`; return the exit code. OmnidError without a terminal, or where it cannot be reached."""
     if not sys.stdin.isatty():
         raise OmnidError("omnid drive needs a keyboard: run it in a terminal")
-    with raw_keys() as keys, Robot(settings=bus, timeout_s=CONNECT_S) as robot, \
-            robot.subscribe(Diagnostics) as statuses:
+    with (
+        raw_keys() as keys,
+        Robot(settings=bus, timeout_s=CONNECT_S) as robot,
+        robot.subscribe(Diagnostics) as statuses,
+    ):
         driver, stick = robot.driver(), Stick(limits_of(robot))
         driver.require_connected()
         print(HELP)
@@ -156,7 +159,7 @@ def _act(driver: Driver, stick: Stick, status: str) -> None:
     if stick.commands(now_s):
         driver.twist(velocity_mps, yaw_rate_radps)
     line = f"{velocity_mps:+.2f} m/s {yaw_rate_radps:+.2f} rad/s  {100 * stick.share:.0f} %  {status}"
-    sys.stdout.write(f"\r\x1b[K{plain(line)[:os.get_terminal_size().columns - 1]}")
+    sys.stdout.write(f"\r\x1b[K{plain(line)[: os.get_terminal_size().columns - 1]}")
     sys.stdout.flush()
 
 

@@ -30,8 +30,9 @@ def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:
     covariance = (truth - middle_true).T @ (estimate - middle_est) / len(truth)
     U, spread, Vt = np.linalg.svd(covariance)
     if len(truth) < 3 or spread[1] <= _LEAST_SPREAD**2 * spread[0]:
-        raise OmnidError(f"--align {alignment}: the associated positions lie on a line and determine no rotation; use "
-                         "--align origin")
+        raise OmnidError(
+            f"--align {alignment}: the associated positions lie on a line and determine no rotation; use --align origin"
+        )
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))])
     R = U * signs @ Vt
     variance = float(((estimate - middle_est) ** 2).sum() / len(truth))

@@ -68,8 +68,11 @@ class RunComparison:
     @property
     def differences(self) -> list[str]:
         """Subjects in which the runs differ by more than the tolerance."""
-        first_rows = {"poses": self._poses.first, "states": self._state_excess.first,
-                      "commands": self._drive_excess.first}
+        first_rows = {
+            "poses": self._poses.first,
+            "states": self._state_excess.first,
+            "commands": self._drive_excess.first,
+        }
         subjects = [name for name, row in first_rows.items() if row is not None]
         if self._share < self._tolerance.shared:
             subjects.append(f"less than {self._tolerance.shared:.0%} of the poses are in both")
@@ -91,9 +94,11 @@ class RunComparison:
 
     def _require_common(self, common: Series) -> None:
         if not common.stamps_ns.size:
-            raise OmnidError(f"no pose of {self._a.path} ({_span(self._a)}) and {self._b.path} ({_span(self._b)}) has "
-                             "the same stamp: the runs used different images; compare a recording with a replay of "
-                             f"it, `omnid replay {self._a.path} --record again.mcap`")
+            raise OmnidError(
+                f"no pose of {self._a.path} ({_span(self._a)}) and {self._b.path} ({_span(self._b)}) has "
+                "the same stamp: the runs used different images; compare a recording with a replay of "
+                f"it, `omnid replay {self._a.path} --record again.mcap`"
+            )
 
     def _rows(self) -> Rows:
         for name, run in (("A", self._a), ("B", self._b)):
@@ -111,8 +116,10 @@ class RunComparison:
     def _gaps_text(self, found: Gaps) -> str:
         if not found.missing:
             return "none"
-        return (f"{found.missing} poses in {found.stretches} gaps, the longest of {found.longest} from "
-                f"{self._at(found.longest_ns)} on")
+        return (
+            f"{found.missing} poses in {found.stretches} gaps, the longest of {found.longest} from "
+            f"{self._at(found.longest_ns)} on"
+        )
 
     def _pose_rows(self) -> Rows:
         poses = self._poses
@@ -126,8 +133,13 @@ class RunComparison:
         if poses.first is None:
             yield "", f"never more than {self._tolerance.text}"
             return
-        yield "", (f"more than {self._tolerance.text} first at {self._row(poses.first)}: "
-                   f"{_pose_text(poses.amounts[poses.first])}; at {poses.beyond} poses in all")
+        yield (
+            "",
+            (
+                f"more than {self._tolerance.text} first at {self._row(poses.first)}: "
+                f"{_pose_text(poses.amounts[poses.first])}; at {poses.beyond} poses in all"
+            ),
+        )
         if poses.first == 0 and not self._aligned:
             yield "", "the first poses differ: --align moves B so that they coincide"
 
@@ -136,8 +148,13 @@ class RunComparison:
         yield "states", f"A {_changes_text(self._a.states)}; B {_changes_text(self._b.states)}"
         if self._state_excess.first is not None:
             row = self._state_excess.first
-            yield "", (f"different at {self._state_excess.beyond} poses, first at {self._row(row)}: "
-                       f"A {_state(a, row)}, B {_state(b, row)}")
+            yield (
+                "",
+                (
+                    f"different at {self._state_excess.beyond} poses, first at {self._row(row)}: "
+                    f"A {_state(a, row)}, B {_state(b, row)}"
+                ),
+            )
 
     def _drive_rows(self) -> Rows:
         drive, counts = self._drive_excess, [run.drive.stamps_ns.size for run in (self._a, self._b)]
@@ -145,9 +162,14 @@ class RunComparison:
         if drive.stamps_ns.size:
             yield "", f"difference at most {_drive_text(drive.amounts.max(axis=0))}"
         if drive.first is not None:
-            yield "", (f"more than {self._tolerance.text} per second first at "
-                       f"{self._at(int(drive.stamps_ns[drive.first]))}: {_drive_text(drive.amounts[drive.first])}; "
-                       f"{drive.beyond} commands in all")
+            yield (
+                "",
+                (
+                    f"more than {self._tolerance.text} per second first at "
+                    f"{self._at(int(drive.stamps_ns[drive.first]))}: {_drive_text(drive.amounts[drive.first])}; "
+                    f"{drive.beyond} commands in all"
+                ),
+            )
 
     def _row(self, row: int) -> str:
         return self._at(int(self._common.stamps_ns[row]))

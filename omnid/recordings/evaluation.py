@@ -34,11 +34,13 @@ class Metrics:
 
     def __str__(self) -> str:
         """Return aligned lines for a terminal, in m, mm, per cent and degrees."""
-        length = (f"{self.length_estimate_m:.4f} m, truth {self.length_truth_m:.4f} m "
-                  f"({_percent(self.length_error_ratio)})")
+        length = (
+            f"{self.length_estimate_m:.4f} m, truth {self.length_truth_m:.4f} m ({_percent(self.length_error_ratio)})"
+        )
         position = f"rmse {_mm(self.ate_rmse_m)}, max {_mm(self.ate_max_m)}, end {_mm(self.end_error_m)}"
-        heading = (f"rmse {_deg(self.heading_rmse_rad)}, max {_deg(self.heading_max_rad)}, "
-                   f"end {_deg(self.heading_end_rad)}")
+        heading = (
+            f"rmse {_deg(self.heading_rmse_rad)}, max {_deg(self.heading_max_rad)}, end {_deg(self.heading_end_rad)}"
+        )
         rows = [
             ("associated poses", f"{self.pairs} ({self.coverage:.1%} of the truth)"),
             ("path length", length),
@@ -61,8 +63,9 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     return _metrics(aligned(T_estimate, T_true, alignment), T_true, len(T_true) / truth.stamps_ns.size)
 
 
-def associated(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01
-               ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def associated(
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the associated poses (N, 4, 4) of both, each in its world; OmnidError for fewer than two."""
     of_estimate, of_truth = _associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
     if of_estimate.size < 2:

@@ -36,8 +36,9 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
         topic = f"/{robot.strip('/')}{_OWN_NAME}"
     if topic is not None:
         if topic not in known:
-            raise OmnidError(f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}: found {_listed(known)}; name one of "
-                             "these topics")
+            raise OmnidError(
+                f"{found.path}: no {ODOMETRY_SCHEMA} on {topic!r}: found {_listed(known)}; name one of these topics"
+            )
         return topic
     if not known:
         raise OmnidError(_no_odometry(found))
@@ -50,8 +51,10 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
 def _no_odometry(found: LogInfo) -> str:
     if any(schema in (IMAGE, COMPRESSED_IMAGE) for schema, _ in found.topics.values()):
         rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
-        return (f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "
-                "out.mcap` and use out.mcap")
+        return (
+            f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "
+            "out.mcap` and use out.mcap"
+        )
     return f"{found.path}: no {ODOMETRY_SCHEMA}: found {_listed(found.topics)}; expected a recording of a run"
 
 

@@ -60,8 +60,10 @@ def read_run_series(path: Path, topic: str | None = None) -> RunSeries:
                 columns[DRIVE].add(stamp_ns, (velocity_mps, yaw_rate_radps))
     poses, states, drive = (columns[name].series() for name in (ODOMETRY, STATUS, DRIVE))
     if not poses.stamps_ns.size:
-        raise OmnidError(f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
-                         "the log is complete")
+        raise OmnidError(
+            f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
+            "the log is complete"
+        )
     warnings = _warnings(found, reader, {name: column.repeated for name, column in columns.items()})
     return RunSeries(found.path, reader.topic, poses, states, drive, reader.attachments, tuple(warnings))
 
@@ -77,8 +79,9 @@ class _Column:
     def add(self, stamp_ns: int, values: tuple[float, ...]) -> None:
         """Add a row. Raise OmnidError beyond MAX_ROWS."""
         if len(self._stamps) >= MAX_ROWS:
-            raise OmnidError(f"a recording with more than {MAX_ROWS} poses, states or commands: cut it into shorter "
-                             "ones")
+            raise OmnidError(
+                f"a recording with more than {MAX_ROWS} poses, states or commands: cut it into shorter ones"
+            )
         self._stamps.append(stamp_ns)
         self._values.extend(values)
 
@@ -104,8 +107,13 @@ def _warnings(found: LogInfo, reader: RecordingReader, repeated: Mapping[str, in
     lines = []
     if found.state in (LogState.BROKEN, LogState.WRITTEN):
         lines.append(f"{found.path}: {found.state.value}: the messages up to byte {found.readable_bytes} are compared")
-    lines += [f"{found.path}: {count} messages on {topic!r} cannot be read and are left out"
-              for topic, count in reader.unreadable.items()]
-    lines += [f"{found.path}: {count} messages on {reader.topic_name(name)!r} repeat a stamp and are left out"
-              for name, count in repeated.items() if count]
+    lines += [
+        f"{found.path}: {count} messages on {topic!r} cannot be read and are left out"
+        for topic, count in reader.unreadable.items()
+    ]
+    lines += [
+        f"{found.path}: {count} messages on {reader.topic_name(name)!r} repeat a stamp and are left out"
+        for name, count in repeated.items()
+        if count
+    ]
     return lines

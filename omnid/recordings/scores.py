@@ -57,15 +57,24 @@ def kitti_drift(T_estimate: Array, T_true: Array) -> list[Drift]:
             continue
         true = se3.inverse(T_true[first]) @ T_true[last]
         error = se3.inverse(true) @ se3.inverse(T_estimate[first]) @ T_estimate[last]
-        found.append(Drift(length_m, len(first), float(np.linalg.norm(error[:, :3, 3], axis=1).mean()) / length_m,
-                           float(np.linalg.norm(se3.rotation_log(error[:, :3, :3]), axis=1).mean()) / length_m))
+        found.append(
+            Drift(
+                length_m,
+                len(first),
+                float(np.linalg.norm(error[:, :3, 3], axis=1).mean()) / length_m,
+                float(np.linalg.norm(se3.rotation_log(error[:, :3, :3]), axis=1).mean()) / length_m,
+            )
+        )
     return found
 
 
 def drift_text(drift: list[Drift]) -> str:
     """Return a line for each length, and their mean as KITTI ranks by it."""
-    lines = [f"drift over {one.length_m:8.2f} m {100 * one.translation_ratio:7.3f} %, "
-             f"{math.degrees(one.rotation_radpm):.4f} deg/m ({one.segments} segments)" for one in drift]
+    lines = [
+        f"drift over {one.length_m:8.2f} m {100 * one.translation_ratio:7.3f} %, "
+        f"{math.degrees(one.rotation_radpm):.4f} deg/m ({one.segments} segments)"
+        for one in drift
+    ]
     count = sum(one.segments for one in drift)
     if not count:
         return "drift (KITTI)         undefined: the truth stands still"

@@ -20,8 +20,11 @@ class KeyDifference(NamedTuple):
 def table_differences(a: Mapping[str, object], b: Mapping[str, object]) -> list[KeyDifference]:
     """Return the keys of two TOML tables that differ, in the order of the first, then those only in the second."""
     of_a, of_b = dict(_leaves(a, "")), dict(_leaves(b, ""))
-    return [KeyDifference(path, _shown(of_a, path), _shown(of_b, path))
-            for path in {**of_a, **of_b} if not _same(of_a, of_b, path)]
+    return [
+        KeyDifference(path, _shown(of_a, path), _shown(of_b, path))
+        for path in {**of_a, **of_b}
+        if not _same(of_a, of_b, path)
+    ]
 
 
 def _leaves(value: object, path: str) -> Iterator[tuple[str, object]]:

@@ -90,17 +90,26 @@ def estimate(request: RefinementRequest) -> RigChange:
     """Return the rig that fits a window best; CalibError where the window does not determine it."""
     # 1. Bundle adjustment of cameras, transform, times, poses and landmarks, with the calibration as prior.
     rig, times = request.rig, (UPPER_DELAY,) if request.has_delay else ()
-    parameters = RigParameters.about(rig, times=times,
-                                     waves=any(has_wavefront(one.camera) for one in (rig.lower, rig.upper)))
+    parameters = RigParameters.about(
+        rig, times=times, waves=any(has_wavefront(one.camera) for one in (rig.lower, rig.upper))
+    )
     prior, none = prior_information(parameters, rig), np.zeros(len(parameters.names))
     found = adjust_drive(parameters, replace(request.state, steps=none), request.observations, prior)
     # 2. What it changes, and the change of lengths that follows.
     gradient = scale_gradient(found)
-    change = RigChange(rig, parameters.names, parameters.values,
-                       parameters.values + found.state.steps * parameters.units, found.sigmas * parameters.units,
-                       scale_change(found, rig), float(np.sqrt(gradient @ found.covariance @ gradient)),
-                       observation_sigma(rig, found), found.sigma_px, len(found.state.T_rig_odom),
-                       len(found.state.points))
+    change = RigChange(
+        rig,
+        parameters.names,
+        parameters.values,
+        parameters.values + found.state.steps * parameters.units,
+        found.sigmas * parameters.units,
+        scale_change(found, rig),
+        float(np.sqrt(gradient @ found.covariance @ gradient)),
+        observation_sigma(rig, found),
+        found.sigma_px,
+        len(found.state.T_rig_odom),
+        len(found.state.points),
+    )
     # 3. Only what has changed significantly is taken over.
     refined = _with_covariance(found, rig) if change.has_moved else rig
     return replace(change, rig=replace(refined, times=found.rig.times if change.has_delay else rig.times))
@@ -108,8 +117,8 @@ def estimate(request: RefinementRequest) -> RigChange:
 
 def _with_covariance(found: DriveAdjustment, before: Rig) -> Rig:
     """Return the adjusted rig with the covariance of its parameters and of its baseline, whose length stays."""
-    names, units = found.parameters.rig_names, found.parameters.units[:len(found.parameters.rig_names)]
-    change = found.state.steps[:len(names)] * units
-    covariance = found.covariance[:len(names), :len(names)] * np.outer(units, units)
+    names, units = found.parameters.rig_names, found.parameters.units[: len(found.parameters.rig_names)]
+    change = found.state.steps[: len(names)] * units
+    covariance = found.covariance[: len(names), : len(names)] * np.outer(units, units)
     _, matrix = baseline_by_prior(before, names, change, covariance)
     return replace(found.rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix))

@@ -100,9 +100,11 @@ def _untracked(start: _FirstPairs, finding: StartFinding | None) -> str:
     if finding is None or finding.state is not RigState.DRIFTED or start.lost < max(LEAST_LOST, MAX_LOST * start.pairs):
         return ""
     straight = finding.straight
-    return (f"no pose is found for {start.lost} of the first {start.pairs} pairs, and the columns of the panoramas do "
-            f"not match (off by {straight.offset_px:+.2f} px, spread {straight.spread_px:.2f} px, upper camera turned "
-            f"by {straight.turn_deg:.2f} deg)")
+    return (
+        f"no pose is found for {start.lost} of the first {start.pairs} pairs, and the columns of the panoramas do "
+        f"not match (off by {straight.offset_px:+.2f} px, spread {straight.spread_px:.2f} px, upper camera turned "
+        f"by {straight.turn_deg:.2f} deg)"
+    )
 
 
 def _first_keyframes(updates: Iterable[OdometryUpdate], start: _FirstPairs, front_end: FrontEnd) -> _FirstPairs:

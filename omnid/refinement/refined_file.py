@@ -62,8 +62,11 @@ class RefinedRigFile:
             report(logging.INFO, f"{self._path}: {refined.summary}: not used, as rig.refine is not 'use'")
             return self._calibration
         self.used = refined
-        report(logging.INFO, f"the rig of this run is {self._path}, {refined.summary}; delete the file to go back to "
-                             f"{self._calibration_path}")
+        report(
+            logging.INFO,
+            f"the rig of this run is {self._path}, {refined.summary}; delete the file to go back to "
+            f"{self._calibration_path}",
+        )
         return refined.applied_to(self._calibration)
 
     def write(self, change: RigChange) -> RefinedRig:
@@ -75,16 +78,26 @@ class RefinedRigFile:
         moved_rad = ANGLE_UNIT_RAD * float(np.abs(steps).max())
         if abs(lengths) > MAX_LENGTHS or moved_rad > MAX_RAD:
             self.withdraw()
-            raise OmnidError(f"the change is too large to be used unseen (lengths by {100 * lengths:+.2f} %, upper "
-                             f"camera by {np.rad2deg(moved_rad):.2f} deg against {self._calibration_path})")
+            raise OmnidError(
+                f"the change is too large to be used unseen (lengths by {100 * lengths:+.2f} %, upper "
+                f"camera by {np.rad2deg(moved_rad):.2f} deg against {self._calibration_path})"
+            )
         # 2. The calibration, and any file that is no refined rig, belong to the user.
         self._require_ours()
         if not self._is_written:
             self._before = self._path.read_bytes() if self._path.exists() else None
         # 3. Write it with its provenance.
-        refined = RefinedRig(change.rig, self._digest, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-                             change.keyframes, change.landmarks, change.error_px, change.refined_error_px, lengths,
-                             change.lengths_sigma)
+        refined = RefinedRig(
+            change.rig,
+            self._digest,
+            datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+            change.keyframes,
+            change.landmarks,
+            change.error_px,
+            change.refined_error_px,
+            lengths,
+            change.lengths_sigma,
+        )
         write_whole(self._path, refined.toml().encode())
         self._is_written = True
         return refined

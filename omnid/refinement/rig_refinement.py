@@ -36,10 +36,14 @@ KEYFRAME_M, KEYFRAME_RAD = 0.25, np.deg2rad(15)
 LANDMARKS: Final = 200
 # Longest time of an estimate, which takes some seconds of processor time, at the lowest priority.
 TIMEOUT_S: Final = 300.0
-ADVICE = ("the landmarks of this run do not fit the rig: a camera or a mirror has moved, or the calibration was not "
-          "good: run omnid calibrate drive on a recording")
-DELAY_ADVICE = ("the upper camera is exposed at other times than its stamps say: set camera.upper_delay_ms, or run "
-                "omnid calibrate drive on a recording")
+ADVICE = (
+    "the landmarks of this run do not fit the rig: a camera or a mirror has moved, or the calibration was not "
+    "good: run omnid calibrate drive on a recording"
+)
+DELAY_ADVICE = (
+    "the upper camera is exposed at other times than its stamps say: set camera.upper_delay_ms, or run "
+    "omnid calibrate drive on a recording"
+)
 
 
 def always() -> bool:
@@ -54,9 +58,16 @@ def ignore(_: str) -> None:
 class RigRefinement:
     """A sink of poses that estimates the rig's errors; its inbox drops the oldest (policy NEWEST)."""
 
-    def __init__(self, front_end: FrontEnd, settings: RigConfig, has_time: Callable[[], bool] = always,
-                 file: RefinedRigFile | None = None, report: Callable[[str], None] = ignore, *, has_delay: bool = True
-                 ) -> None:
+    def __init__(
+        self,
+        front_end: FrontEnd,
+        settings: RigConfig,
+        has_time: Callable[[], bool] = always,
+        file: RefinedRigFile | None = None,
+        report: Callable[[str], None] = ignore,
+        *,
+        has_delay: bool = True,
+    ) -> None:
         """front_end: of the poses. has_time: False under overload, when no keyframe is added.
 
         file: into which a change that counts is written; None: changes are only reported. report: takes a line for the
@@ -151,21 +162,32 @@ class RigRefinement:
 
     @property
     def _next_start(self) -> str:
-        return "the next start uses it" if self._settings.refine == "use" else "rig.refine = 'use' lets the next " \
-            "start use it"
+        return (
+            "the next start uses it"
+            if self._settings.refine == "use"
+            else "rig.refine = 'use' lets the next start use it"
+        )
 
     def report(self) -> RefinementReport:
         """Return the newest estimate for the status; refine_age_s is the time since then, by the stamps."""
         window, found = self._window, self._found
-        values = {"windows": str(self._windows), "windows_without_result": str(self._failed),
-                  "keyframes": str(window.keyframes if window else 0),
-                  "needed_keyframes": str(self._settings.refine_keyframes), "refined_file": self._outcome,
-                  "window_problem": self._reason.replace("calibrate drive: ", "")}
+        values = {
+            "windows": str(self._windows),
+            "windows_without_result": str(self._failed),
+            "keyframes": str(window.keyframes if window else 0),
+            "needed_keyframes": str(self._settings.refine_keyframes),
+            "refined_file": self._outcome,
+            "window_problem": self._reason.replace("calibrate drive: ", ""),
+        }
         if found is None:
             return RefinementReport(OK, "", values)
         change, stamp_ns = found
-        values |= {"error_px": f"{change.error_px:.3f}", "refined_error_px": f"{change.refined_error_px:.3f}",
-                   "landmarks": str(change.landmarks), "refine_age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}"}
+        values |= {
+            "error_px": f"{change.error_px:.3f}",
+            "refined_error_px": f"{change.refined_error_px:.3f}",
+            "landmarks": str(change.landmarks),
+            "refine_age_s": f"{(self._newest_ns - stamp_ns) * 1e-9:.0f}",
+        }
         if not change.is_significant:
             return RefinementReport(OK, "", values | _lengths(change) | _delay(change))
         return RefinementReport(WARN, ADVICE if change.has_moved else DELAY_ADVICE, values | _parameters(change))
@@ -173,8 +195,10 @@ class RigRefinement:
 
 def _lengths(change: RigChange) -> dict[str, str]:
     """Return the change of lengths, with its sigma."""
-    return {"lengths_percent": f"{100 * change.lengths:+.3f}",
-            "lengths_sigma_percent": f"{100 * change.lengths_sigma:.3f}"}
+    return {
+        "lengths_percent": f"{100 * change.lengths:+.3f}",
+        "lengths_sigma_percent": f"{100 * change.lengths_sigma:.3f}",
+    }
 
 
 def _delay(change: RigChange) -> dict[str, str]:
@@ -182,8 +206,11 @@ def _delay(change: RigChange) -> dict[str, str]:
     if change.delay_ms is None:
         return {}
     before, after, sigma = change.delay_ms
-    return {"upper_delay_ms_before": f"{before:.3f}", "upper_delay_ms_after": f"{after:.3f}",
-            "upper_delay_ms_sigma": f"{sigma:.3f}"}
+    return {
+        "upper_delay_ms_before": f"{before:.3f}",
+        "upper_delay_ms_after": f"{after:.3f}",
+        "upper_delay_ms_sigma": f"{sigma:.3f}",
+    }
 
 
 def _parameters(change: RigChange) -> dict[str, str]:
@@ -207,8 +234,14 @@ class _Estimate:
         with tempfile.TemporaryFile() as file:
             pickle.dump(request, file)
             file.seek(0)
-            self._process = subprocess.Popen(python("-m", PROCESS), stdin=file, stdout=self._out,
-                                             stderr=subprocess.DEVNULL, env=environment, start_new_session=True)
+            self._process = subprocess.Popen(
+                python("-m", PROCESS),
+                stdin=file,
+                stdout=self._out,
+                stderr=subprocess.DEVNULL,
+                env=environment,
+                start_new_session=True,
+            )
 
     def answer(self) -> RigChange | str | None:
         """Return the result, or the reason of none; None while it works."""

@@ -83,11 +83,15 @@ def shades(spans: Spans, clock: Clock) -> str:
     """Return the background of all charts, to be put into the page once."""
     seconds, _ = clock.unit
     axis = clock.axis(_LEFT, _RIGHT)
-    areas = (rectangles([(axis.px(a / seconds), axis.px(b / seconds)) for a, b in spans[rank]],
-                        (_TOP, _BOTTOM)) for rank in (1, 2))
+    areas = (
+        rectangles([(axis.px(a / seconds), axis.px(b / seconds)) for a, b in spans[rank]], (_TOP, _BOTTOM))
+        for rank in (1, 2)
+    )
     drawn = "".join(f"<path class='r{rank}' d='{d}'/>" for rank, d in enumerate(areas, 1) if d)
-    for_script = (f"data-clock='{axis.low!r} {axis.high!r} {seconds!r}' data-unit='{clock.unit[1]}' "
-                  f"data-box='{_LEFT} {_RIGHT} {_TOP} {_BOTTOM}'")
+    for_script = (
+        f"data-clock='{axis.low!r} {axis.high!r} {seconds!r}' data-unit='{clock.unit[1]}' "
+        f"data-box='{_LEFT} {_RIGHT} {_TOP} {_BOTTOM}'"
+    )
     inside = f"<rect x='{_LEFT}' y='{_TOP}' width='{_RIGHT - _LEFT}' height='{_BOTTOM - _TOP}'/>"
     return hidden(f"<clipPath id='inside'>{inside}</clipPath><g id='shades' {for_script}>{drawn}</g>")
 
@@ -115,8 +119,10 @@ def chart(
     footnote = f"<small>{escape(note)}</small>" if note else ""
     plot = f"<g clip-path='url(#inside)'><g class='zoom'><use href='#shades'/>{curves}</g></g>"
     image = "".join([*_grid(x, y), plot, *_frame(x, y, clock)])
-    return (f"<figure class='chart'><figcaption>{caption}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img' "
-            f"aria-label='{escape(title)}' data-y='{y.low!r} {y.high!r} {int(y.log)}'>{image}</svg>{footnote}</figure>")
+    return (
+        f"<figure class='chart'><figcaption>{caption}</figcaption><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img' "
+        f"aria-label='{escape(title)}' data-y='{y.low!r} {y.high!r} {int(y.log)}'>{image}</svg>{footnote}</figure>"
+    )
 
 
 def _curve(style: str, line: ChartLine, x: Axis, y: Axis) -> str:

@@ -105,5 +105,6 @@ class Events:
 
     def in_order(self) -> list[Event]:
         """Return the events in the order of their start."""
-        return sorted((event for source in self._sources.values() for event in source.events),
-                      key=lambda event: event.start_s)
+        return sorted(
+            (event for source in self._sources.values() for event in source.events), key=lambda event: event.start_s
+        )

@@ -27,8 +27,10 @@ from omnid.transport.status_names import (
 
 _STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping", "record")  # whose times are drawn
 _MAX_LOSSES: Final = 6  # curves
-_NO_STATUS: Final = ("The log holds no status of the daemon's parts, so rates, times of stages, latencies, drops and "
-                     "camera faults are unknown; omnid's own recordings hold it.")
+_NO_STATUS: Final = (
+    "The log holds no status of the daemon's parts, so rates, times of stages, latencies, drops and "
+    "camera faults are unknown; omnid's own recordings hold it."
+)
 
 
 def timing(data: ReportData, clock: Clock) -> list[str]:
@@ -43,27 +45,54 @@ def timing(data: ReportData, clock: Clock) -> list[str]:
     work = {name: statuses.series(stage_name(name), time_key(WORK, "p50")) for name in _STAGES}
     figures = [
         chart("Poses per second", [curve("", statuses.series(ODOMETRY, Key.RATE_HZ))], clock, zero=True),
-        chart("Age of the newest pose at each report", [curve("", statuses.series(ODOMETRY, Key.AGE_S))], clock,
-              unit="s", zero=True),
-        chart("From the image to its pose", [curve("median", p50), curve("99th percentile", p99)], clock, unit="ms",
-              zero=True, note="Of all poses since the start of the run."),
-        chart("Median work of a stage", [curve(name, series) for name, series in work.items() if series.count],
-              clock, unit="ms", log=True, note="Of all messages since the start of the run."),
-        chart("Messages dropped, deadlines missed, so far", _losses(statuses), clock, zero=True)]
+        chart(
+            "Age of the newest pose at each report",
+            [curve("", statuses.series(ODOMETRY, Key.AGE_S))],
+            clock,
+            unit="s",
+            zero=True,
+        ),
+        chart(
+            "From the image to its pose",
+            [curve("median", p50), curve("99th percentile", p99)],
+            clock,
+            unit="ms",
+            zero=True,
+            note="Of all poses since the start of the run.",
+        ),
+        chart(
+            "Median work of a stage",
+            [curve(name, series) for name, series in work.items() if series.count],
+            clock,
+            unit="ms",
+            log=True,
+            note="Of all messages since the start of the run.",
+        ),
+        chart("Messages dropped, deadlines missed, so far", _losses(statuses), clock, zero=True),
+    ]
     return [*head, _stage_table(statuses), grid(figures)]
 
 
 def _losses(statuses: StatusHistory) -> list[ChartLine]:
-    found = [(statuses.series(stage_name(name), key), f"{name}, {key}") for name, _ in statuses.stages()
-             for key in (Key.DROPPED, Key.MISSED)]
+    found = [
+        (statuses.series(stage_name(name), key), f"{name}, {key}")
+        for name, _ in statuses.stages()
+        for key in (Key.DROPPED, Key.MISSED)
+    ]
     worst = sorted((series.newest, name, series) for series, name in found if series.newest > 0)[::-1]
     return [curve(name, series) for _, name, series in worst[:_MAX_LOSSES]]
 
 
 def _stage_table(statuses: StatusHistory) -> str:
-    rows = [(escape(name), *(escape(values.get(key, "")) for key in (Key.PROCESSED, Key.RATE_HZ)), _lost(values),
-             *(rounded(values.get(time_key(WORK, statistic), "")) for statistic in ("p50", "p99", "max")))
-            for name, values in statuses.stages()]
+    rows = [
+        (
+            escape(name),
+            *(escape(values.get(key, "")) for key in (Key.PROCESSED, Key.RATE_HZ)),
+            _lost(values),
+            *(rounded(values.get(time_key(WORK, statistic), "")) for statistic in ("p50", "p99", "max")),
+        )
+        for name, values in statuses.stages()
+    ]
     head = ("stage", "messages", "per second, last", "dropped or missed", "p50 ms", "p99 ms", "max ms")
     footnote = "<small>At the last report. The work of a camera's stage is its wait for the next image.</small>"
     return f"<div class='scroll'>{table(head, rows)}</div>{footnote}" if rows else ""
@@ -86,17 +115,34 @@ def parts(data: ReportData, clock: Clock) -> list[str]:
     names = [name for name in statuses.newest if name not in (ODOMETRY, SUMMARY) and not name.startswith(STAGE_PREFIX)]
     if not names:
         return []
-    rows = [(escape(short_name(name)), escape(statuses.newest[name].message),
-             ", ".join(f"{escape(key)} {escape(value)}" for key, value in statuses.values(name).items()))
-            for name in names]
-    rates = [curve(short_name(name), statuses.series(name, Key.RATE_HZ)) for name in names
-             if statuses.series(name, Key.RATE_HZ).count]
-    late = [curve(title, statuses.series(WHEELS, time_key(TICK_LATE, statistic)))
-            for title, statistic in (("99th percentile", "p99"), ("maximum", "max"))]
-    figures = [chart("Images per second", rates, clock, zero=True),
-               chart("Lateness of the wheels' tick, so far", late, clock, unit="ms", zero=True)]
-    return ["<h2>Cameras, pairing, wheels</h2>", "<div class='words scroll'>",
-            table(("part", "at the last report", "counters"), rows), "</div>", grid(figures)]
+    rows = [
+        (
+            escape(short_name(name)),
+            escape(statuses.newest[name].message),
+            ", ".join(f"{escape(key)} {escape(value)}" for key, value in statuses.values(name).items()),
+        )
+        for name in names
+    ]
+    rates = [
+        curve(short_name(name), statuses.series(name, Key.RATE_HZ))
+        for name in names
+        if statuses.series(name, Key.RATE_HZ).count
+    ]
+    late = [
+        curve(title, statuses.series(WHEELS, time_key(TICK_LATE, statistic)))
+        for title, statistic in (("99th percentile", "p99"), ("maximum", "max"))
+    ]
+    figures = [
+        chart("Images per second", rates, clock, zero=True),
+        chart("Lateness of the wheels' tick, so far", late, clock, unit="ms", zero=True),
+    ]
+    return [
+        "<h2>Cameras, pairing, wheels</h2>",
+        "<div class='words scroll'>",
+        table(("part", "at the last report", "counters"), rows),
+        "</div>",
+        grid(figures),
+    ]
 
 
 def rounded(text: str) -> str:

@@ -34,8 +34,14 @@ def map_page(title: str, lines: Sequence[tuple[str, str]], places: PlaceMap, rig
     """Return the page; lines: names and values of the facts at its head."""
     driven = drives(places, rig)
     rows = [(escape(name), escape(value)) for name, value in lines]
-    parts = [f"<h1>{escape(title)}</h1>", facts(rows), "<h2>Keyframes and loops</h2>", _figure(places, rig, driven),
-             "<h2>Corrections by the loops</h2>", _corrections(places, driven)]
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        facts(rows),
+        "<h2>Keyframes and loops</h2>",
+        _figure(places, rig, driven),
+        "<h2>Corrections by the loops</h2>",
+        _corrections(places, driven),
+    ]
     return page(title, parts, SVG_STYLE + STYLE)
 
 
@@ -44,8 +50,12 @@ def _figure(places: PlaceMap, rig: PlaceRig, driven: Sequence[MappedDrive]) -> s
     cells = known_part(grid(places, rig, CELL_M))
     rows, columns = cells.cells.shape
     (left, bottom), top = cells.corner, cells.corner[1] + rows * cells.cell_m
-    paths = np.concatenate([np.array([[left, bottom], [left + columns * cells.cell_m, top]]),
-                            *(T[:, :2, 3] for drive in driven for T in (drive.T_map_base, drive.T_by_odometry))])
+    paths = np.concatenate(
+        [
+            np.array([[left, bottom], [left + columns * cells.cell_m, top]]),
+            *(T[:, :2, 3] for drive in driven for T in (drive.T_map_base, drive.T_by_odometry)),
+        ]
+    )
     low, high = paths.min(axis=0) - MARGIN_M, paths.max(axis=0) + MARGIN_M
     px_per_m = MAX_SIDE_PX / float((high - low).max())
 
@@ -53,16 +63,27 @@ def _figure(places: PlaceMap, rig: PlaceRig, driven: Sequence[MappedDrive]) -> s
         return float((xy[0] - low[0]) * px_per_m), float((high[1] - xy[1]) * px_per_m)
 
     at = {id: px(T[:2, 3]) for drive in driven for id, T in zip(drive.ids, drive.T_map_base, strict=True)}
-    parts = [_image(cells, px(np.array([left, top])), px_per_m), *_loops(places, at),
-             *(polyline([px(T[:2, 3]) for T in drive.T_by_odometry], "class='before'") for drive in driven),
-             *(polyline([px(T[:2, 3]) for T in drive.T_map_base], "class='after'") for drive in driven),
-             *_keyframes(places, at), *_scale(px_per_m)]
+    parts = [
+        _image(cells, px(np.array([left, top])), px_per_m),
+        *_loops(places, at),
+        *(polyline([px(T[:2, 3]) for T in drive.T_by_odometry], "class='before'") for drive in driven),
+        *(polyline([px(T[:2, 3]) for T in drive.T_map_base], "class='after'") for drive in driven),
+        *_keyframes(places, at),
+        *_scale(px_per_m),
+    ]
     box = f"0 0 {coord(float(high[0] - low[0]) * px_per_m)} {coord(float(high[1] - low[1]) * px_per_m)}"
-    keys = "".join((key("class='after'", "the path in the map"), key("class='before'", "by odometry alone"),
-                    key("class='loop'", "a place that was recognised")))
-    return (f"<figure class='sheet'><figcaption>{keys}</figcaption><svg viewBox='{box}' role='img' "
-            f"aria-label='Map of places'>{''.join(parts)}</svg><small>Dots: keyframes. Behind them what "
-            "their range scans saw: white is free, dark is occupied.</small></figure>")
+    keys = "".join(
+        (
+            key("class='after'", "the path in the map"),
+            key("class='before'", "by odometry alone"),
+            key("class='loop'", "a place that was recognised"),
+        )
+    )
+    return (
+        f"<figure class='sheet'><figcaption>{keys}</figcaption><svg viewBox='{box}' role='img' "
+        f"aria-label='Map of places'>{''.join(parts)}</svg><small>Dots: keyframes. Behind them what "
+        "their range scans saw: white is free, dark is occupied.</small></figure>"
+    )
 
 
 def _image(cells: Grid, corner: Point, px_per_m: float) -> str:
@@ -72,23 +93,29 @@ def _image(cells: Grid, corner: Point, px_per_m: float) -> str:
     png = base64.b64encode(cv2.imencode(".png", greys[::-1])[1].tobytes()).decode()
     rows, columns = greys.shape
     width, height = columns * cells.cell_m * px_per_m, rows * cells.cell_m * px_per_m
-    return (f"<image x='{coord(corner[0])}' y='{coord(corner[1])}' width='{coord(width)}' height='{coord(height)}' "
-            f"preserveAspectRatio='none' style='image-rendering:pixelated' href='data:image/png;base64,{png}'/>")
+    return (
+        f"<image x='{coord(corner[0])}' y='{coord(corner[1])}' width='{coord(width)}' height='{coord(height)}' "
+        f"preserveAspectRatio='none' style='image-rendering:pixelated' href='data:image/png;base64,{png}'/>"
+    )
 
 
 def _loops(places: PlaceMap, at: Mapping[int, Point]) -> Iterator[str]:
     for link in places.links:
         if link.is_loop:
             (x1, y1), (x2, y2) = at[link.a], at[link.b]
-            yield (f"<path class='loop' d='M{coord(x1)} {coord(y1)}L{coord(x2)} {coord(y2)}'>"
-                   f"<title>{link.a} to {link.b}: {link.inliers} features</title></path>")
+            yield (
+                f"<path class='loop' d='M{coord(x1)} {coord(y1)}L{coord(x2)} {coord(y2)}'>"
+                f"<title>{link.a} to {link.b}: {link.inliers} features</title></path>"
+            )
 
 
 def _keyframes(places: PlaceMap, at: Mapping[int, Point]) -> Iterator[str]:
     for id, (x, y) in at.items():
         keyframe = places.keyframes[id]
-        yield (f"<circle class='keyframe' cx='{coord(x)}' cy='{coord(y)}' r='2.5'><title>keyframe {id}, session "
-               f"{keyframe.session}, {len(keyframe.features.views)} features</title></circle>")
+        yield (
+            f"<circle class='keyframe' cx='{coord(x)}' cy='{coord(y)}' r='2.5'><title>keyframe {id}, session "
+            f"{keyframe.session}, {len(keyframe.features.views)} features</title></circle>"
+        )
 
 
 def _scale(px_per_m: float) -> Iterator[str]:
@@ -104,6 +131,14 @@ def _corrections(places: PlaceMap, driven: Sequence[MappedDrive]) -> str:
         own = set(drive.ids)
         loops = sum(link.is_loop and (link.a in own or link.b in own) for link in places.links)
         path_m = np.linalg.norm(np.diff(drive.T_map_base[:, :3, 3], axis=0), axis=1).sum()
-        rows.append((f"session {drive.session}, keyframes {drive.ids[0]} to {drive.ids[-1]}", str(len(drive.ids)),
-                     f"{path_m:.1f} m", str(loops), f"{1e3 * moved_m.max():.0f} mm", f"{1e3 * moved_m[-1]:.0f} mm"))
+        rows.append(
+            (
+                f"session {drive.session}, keyframes {drive.ids[0]} to {drive.ids[-1]}",
+                str(len(drive.ids)),
+                f"{path_m:.1f} m",
+                str(loops),
+                f"{1e3 * moved_m.max():.0f} mm",
+                f"{1e3 * moved_m[-1]:.0f} mm",
+            )
+        )
     return table(("drive", "keyframes", "path", "loops", "largest correction", "at its end"), rows)

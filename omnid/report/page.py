@@ -39,10 +39,12 @@ _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
 
 def page(title: str, parts: Sequence[str], style: str = "", script: str = "") -> str:
     """Return an HTML page of parts, which are HTML; style is appended to STYLE. It may run the script, and no other."""
-    text = (f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta http-equiv='Content-Security-Policy' "
-            f"content=\"{policy(script)}\"><meta name='viewport' content='width=device-width'>"
-            f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
-            f"<body>{''.join(parts)}{f'<script>{script}</script>' if script else ''}</body></html>\n")
+    text = (
+        f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta http-equiv='Content-Security-Policy' "
+        f"content=\"{policy(script)}\"><meta name='viewport' content='width=device-width'>"
+        f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
+        f"<body>{''.join(parts)}{f'<script>{script}</script>' if script else ''}</body></html>\n"
+    )
     return _CONTROL.sub(_REPLACEMENT, text)
 
 

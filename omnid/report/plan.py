@@ -63,16 +63,24 @@ def plan_figure(plan: Plan, clock: Clock) -> str:
     """Return the figure."""
     inside = np.abs(plan.points[:, 2] - plan.height_m - sum(Z_M) / 2) <= (Z_M[1] - Z_M[0]) / 2
     points_xy, confidence = plan.points[inside, :2].astype(float), plan.confidence[inside]
-    sheet = _plan_area([*((c.x_m, c.y_m) for c in plan.corners), *plan.truth, *plan.in_map],
-                       points_xy)
+    sheet = _plan_area([*((c.x_m, c.y_m) for c in plan.corners), *plan.truth, *plan.in_map], points_xy)
     width, height = sheet.size
-    parts = [*_map(sheet, points_xy, confidence), *_frame(sheet), *_line(sheet, plan.truth, "pt"),
-             *_line(sheet, plan.in_map, "pm"), *_path(sheet, plan.corners), *_times(sheet, plan.corners, clock),
-             *(_cross(*sheet.px(*position)) for position in plan.lost), *_ends(sheet, plan.corners)]
+    parts = [
+        *_map(sheet, points_xy, confidence),
+        *_frame(sheet),
+        *_line(sheet, plan.truth, "pt"),
+        *_line(sheet, plan.in_map, "pm"),
+        *_path(sheet, plan.corners),
+        *_times(sheet, plan.corners, clock),
+        *(_cross(*sheet.px(*position)) for position in plan.lost),
+        *_ends(sheet, plan.corners),
+    ]
     box = f"0 0 {coord(width + _MARGIN[0] + _MARGIN[2])} {coord(height + _MARGIN[1] + _MARGIN[3])}"
-    return (f"<figure class='plan'><figcaption><b>Path and map</b> {_keys(plan)}</figcaption><svg viewBox='{box}' "
-            f"role='img' aria-label='Path and map' data-m='{_metres(sheet)}'>{''.join(parts)}</svg>"
-            f"<small>{_footnote(plan, len(points_xy))}</small></figure>")
+    return (
+        f"<figure class='plan'><figcaption><b>Path and map</b> {_keys(plan)}</figcaption><svg viewBox='{box}' "
+        f"role='img' aria-label='Path and map' data-m='{_metres(sheet)}'>{''.join(parts)}</svg>"
+        f"<small>{_footnote(plan, len(points_xy))}</small></figure>"
+    )
 
 
 def _metres(sheet: _PlanArea) -> str:
@@ -95,8 +103,10 @@ def _footnote(plan: Plan, drawn: int) -> str:
     if not len(plan.points):
         return "The log holds no map that can be drawn."
     low, high = Z_M
-    return (f"Grey: {drawn} of the map's {len(plan.points)} points, those from {-low:g} m below the rig's height at "
-            f"the start to {high:g} m above it; the darker, the higher their confidence and number in a column.")
+    return (
+        f"Grey: {drawn} of the map's {len(plan.points)} points, those from {-low:g} m below the rig's height at "
+        f"the start to {high:g} m above it; the darker, the higher their confidence and number in a column."
+    )
 
 
 def _plan_area(path: Sequence[Point], points_xy: Array) -> _PlanArea:
@@ -125,9 +135,11 @@ def _map(sheet: _PlanArea, points_xy: Array, confidence: NDArray[np.float32]) ->
     ink = np.histogram2d(points_xy[:, 0], points_xy[:, 1], counts, sides, weights=weights)[0].T[::-1]
     png = cv2.imencode(".png", _tone(ink), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
     (left, top), (right, bottom) = sheet.px(sides[0][0], sides[1][1]), sheet.px(sides[0][1], sides[1][0])
-    yield (f"<image x='{coord(left)}' y='{coord(top)}' width='{coord(right - left)}' "
-           f"height='{coord(bottom - top)}' preserveAspectRatio='none' style='image-rendering:pixelated' "
-           f"href='data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'/>")
+    yield (
+        f"<image x='{coord(left)}' y='{coord(top)}' width='{coord(right - left)}' "
+        f"height='{coord(bottom - top)}' preserveAspectRatio='none' style='image-rendering:pixelated' "
+        f"href='data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'/>"
+    )
 
 
 def _tone(ink: Array) -> NDArray[np.uint8]:

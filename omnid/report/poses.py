@@ -108,10 +108,13 @@ class PoseHistory:
 
     def _add_measurements(self, record: OdometryRecord, t_s: float) -> None:
         variances = np.diag(record.covariance)
-        measured = {"speed": record.velocity[0], "yaw_rate": math.degrees(record.velocity[5]),
-                    "sigma_position": _root(float(variances[:3].sum())),
-                    "sigma_heading": math.degrees(_root(float(variances[5]))),
-                    "height": record.T_odom_base[2, 3]}
+        measured = {
+            "speed": record.velocity[0],
+            "yaw_rate": math.degrees(record.velocity[5]),
+            "sigma_position": _root(float(variances[:3].sum())),
+            "sigma_heading": math.degrees(_root(float(variances[5]))),
+            "height": record.T_odom_base[2, 3],
+        }
         for name, value in measured.items():
             self.series[name].add(t_s, float(value))
 

@@ -52,24 +52,44 @@ def report_html(path: Path, data: ReportData, true: Trajectory | None = None) ->
     clock = Clock(min(0.0, before_s), max(data.poses.end_s, 1e-2))
     spans = chart.spans_of(data.poses.series["state"].points(), data.poses.end_s)
     comparison = None if true is None else compare_with_truth(data.poses, data.T_base_rig, true)
-    top = [svg.hidden(svg.PATTERNS), chart.shades(spans, clock), *_head(path, data),
-           sections.key_figures(data), *_warnings(data, true),
-           plan.plan_figure(_plan(data, comparison), clock)]
-    story = ["<h2>Events</h2>", timeline(spans, data.poses.gaps, events, clock),
-             *_states_missing(data), *sections.events_table(data.events, clock)]
-    measured = [*(sections.truth(comparison, clock) if comparison else ()), *sections.motion(data, clock),
-                *sections.uncertainty(data, clock), *sections.in_map(data, clock), *health.timing(data, clock),
-                *health.parts(data, clock)]
-    rest = [*_images(path, data), *setup.setup(data), *setup.contents(data),
-            f"<p><small>Made by omnid {__version__}.</small></p>"]
+    top = [
+        svg.hidden(svg.PATTERNS),
+        chart.shades(spans, clock),
+        *_head(path, data),
+        sections.key_figures(data),
+        *_warnings(data, true),
+        plan.plan_figure(_plan(data, comparison), clock),
+    ]
+    story = [
+        "<h2>Events</h2>",
+        timeline(spans, data.poses.gaps, events, clock),
+        *_states_missing(data),
+        *sections.events_table(data.events, clock),
+    ]
+    measured = [
+        *(sections.truth(comparison, clock) if comparison else ()),
+        *sections.motion(data, clock),
+        *sections.uncertainty(data, clock),
+        *sections.in_map(data, clock),
+        *health.timing(data, clock),
+        *health.parts(data, clock),
+    ]
+    rest = [
+        *_images(path, data),
+        *setup.setup(data),
+        *setup.contents(data),
+        f"<p><small>Made by omnid {__version__}.</small></p>",
+    ]
     parts = [*top, *story, *measured, *rest]
     return page(f"{data.robot}: {path.name}", parts, svg.STYLE + plan.STYLE + _STYLE, chart_script())
 
 
 def _head(path: Path, data: ReportData) -> list[str]:
     found, frames = data.info, data.frames
-    facts = (f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
-             f"{data.topic}, from {utc(data.poses.start_ns)}.")
+    facts = (
+        f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
+        f"{data.topic}, from {utc(data.poses.start_ns)}."
+    )
     return [f"<h1>Run of {escape(data.robot)}</h1><p class='sub'>{escape(facts)}</p>"]
 
 
@@ -78,13 +98,17 @@ def _warnings(data: ReportData, true: Trajectory | None) -> list[str]:
     found, poses = data.info, data.poses
     lines = []
     if found.state is LogState.BROKEN:
-        lines.append(f"The log is cut or corrupt after byte {found.readable_bytes} of {found.size_bytes}; "
-                     "this is what could be read.")
+        lines.append(
+            f"The log is cut or corrupt after byte {found.readable_bytes} of {found.size_bytes}; "
+            "this is what could be read."
+        )
     if found.broken:
         lines.append(f"{found.broken} corrupt chunks or records were skipped.")
     if data.unreadable or poses.out_of_range:
-        lines.append(f"{data.unreadable + poses.out_of_range} messages were left out: not of their type, with a stamp "
-                     "far from the time of logging, or with a pose out of range.")
+        lines.append(
+            f"{data.unreadable + poses.out_of_range} messages were left out: not of their type, with a stamp "
+            "far from the time of logging, or with a pose out of range."
+        )
     if poses.late:
         lines.append(f"{poses.late} poses were left out: not later than the one before.")
     if true is not None and data.rig is None:
@@ -107,15 +131,21 @@ def _plan(data: ReportData, comparison: TruthComparison | None) -> plan.Plan:
     finite = np.isfinite(points).all(axis=1)
     confidence = cloud.confidence if cloud and drawn else np.empty(0, np.float32)
     height_m = float((data.poses.first @ data.T_base_rig)[2, 3])
-    return plan.Plan(corners, points[finite], confidence[finite], height_m, comparison.path if comparison else (),
-                     sections.path_in_map(data), _losses(data, corners))
+    return plan.Plan(
+        corners,
+        points[finite],
+        confidence[finite],
+        height_m,
+        comparison.path if comparison else (),
+        sections.path_in_map(data),
+        _losses(data, corners),
+    )
 
 
 def _losses(data: ReportData, corners: list[Corner]) -> list[tuple[float, float]]:
     """Return the positions on the path at which the pose was lost."""
     times = np.array([corner.t_s for corner in corners])
-    places = [corners[max(0, int(np.searchsorted(times, t_s, "right")) - 1)]
-              for t_s in _lost_s(data)[:_MOST_CROSSES]]
+    places = [corners[max(0, int(np.searchsorted(times, t_s, "right")) - 1)] for t_s in _lost_s(data)[:_MOST_CROSSES]]
     return [(corner.x_m, corner.y_m) for corner in places]
 
 
@@ -131,8 +161,10 @@ def _images(path: Path, data: ReportData) -> list[str]:
         return ["<h2>Images</h2>", note(f"Images, but {data.rig_fault}.")]
     start_ns = data.poses.start_ns
     wanted = [WantedImages(start_ns, "The lower camera's panorama at the first pose; forward is in the middle.")]
-    wanted += [WantedImages(start_ns + round(t_s * 1e9), f"The same when the pose was first lost, at {t_s:.2f} s.")
-               for t_s in _lost_s(data)[:1]]
+    wanted += [
+        WantedImages(start_ns + round(t_s * 1e9), f"The same when the pose was first lost, at {t_s:.2f} s.")
+        for t_s in _lost_s(data)[:1]
+    ]
     try:
         shown = [figure(image, caption, _JPEG_QUALITY) for image, caption in panoramas(path, data.rig, wanted)]
     except OmnidError as error:

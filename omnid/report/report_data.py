@@ -79,12 +79,23 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
     reader = RecordingReader(found, choose_odometry_topic(found, topic))
     rig, fault = _rig(reader.attachments)
     events = Events()
-    data = ReportData(found, reader.topic, reader.robot, reader.attachments, rig, fault, events,
-                      PoseHistory(events, keep_poses), StatusHistory(events))
+    data = ReportData(
+        found,
+        reader.topic,
+        reader.robot,
+        reader.attachments,
+        rig,
+        fault,
+        events,
+        PoseHistory(events, keep_poses),
+        StatusHistory(events),
+    )
     _Collector(data).collect(reader)
     if not data.poses.poses:
-        raise OmnidError(f"{path}: topic {data.topic!r} has no readable pose; `omnid log info {path}` tells whether "
-                         "the log is complete")
+        raise OmnidError(
+            f"{path}: topic {data.topic!r} has no readable pose; `omnid log info {path}` tells whether "
+            "the log is complete"
+        )
     return data
 
 

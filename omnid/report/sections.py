@@ -29,9 +29,12 @@ def key_figures(data: ReportData) -> str:
     """Return the key figures of the run."""
     poses, statuses = data.poses, data.statuses
     rate_hz = (poses.poses - 1) / poses.end_s if poses.end_s > 0 else math.nan
-    tiles = [("duration", _duration(poses.end_s)), ("path", f"{poses.length_m:.2f} m"),
-             ("poses", f"{poses.poses}, {rate_hz:.1f}/s" if rate_hz > 0 else str(poses.poses)),
-             *_shares(data)]
+    tiles = [
+        ("duration", _duration(poses.end_s)),
+        ("path", f"{poses.length_m:.2f} m"),
+        ("poses", f"{poses.poses}, {rate_hz:.1f}/s" if rate_hz > 0 else str(poses.poses)),
+        *_shares(data),
+    ]
     p50, p99 = (rounded(statuses.values(ODOMETRY).get(time_key(CAPTURE_TO_POSE, p), "")) for p in ("p50", "p99"))
     if p50:
         tiles.append(("image to pose, p50 / p99", f"{p50} / {p99} ms"))
@@ -69,8 +72,10 @@ def events_table(events: Events, clock: Clock) -> list[str]:
     found = events.in_order()
     if not found:
         return ["<p>No events: no change of state, no gap, no loss.</p>"]
-    rows = [(_time_text(event, clock), _LEVELS[event.level], escape(event.source), escape(_event_text(event)))
-            for event in found]
+    rows = [
+        (_time_text(event, clock), _LEVELS[event.level], escape(event.source), escape(_event_text(event)))
+        for event in found
+    ]
     count = events.left_out.total()
     by_source = ", ".join(f"{source}: {count}" for source, count in events.left_out.most_common(_MAX_SOURCES))
     more = [note(f"and {count} more: {by_source}")] if count else []
@@ -102,9 +107,11 @@ def motion(data: ReportData, clock: Clock) -> list[str]:
         if topic in drives:
             speed.append(curve(name, drives[topic].speed))
             yaw_rate.append(curve(name, drives[topic].yaw_rate))
-    figures = [chart("Forward speed", speed, clock, unit="m/s", zero=True),
-               chart("Yaw rate, to the left", yaw_rate, clock, unit="deg/s", zero=True),
-               chart("Height of the robot", [curve("", series["height"])], clock, unit="m")]
+    figures = [
+        chart("Forward speed", speed, clock, unit="m/s", zero=True),
+        chart("Yaw rate, to the left", yaw_rate, clock, unit="deg/s", zero=True),
+        chart("Height of the robot", [curve("", series["height"])], clock, unit="m"),
+    ]
     missing = [] if drives else [note("The log holds no commands to the wheels (…/drive, …/cmd/twist).")]
     return ["<h2>Motion</h2>", grid(figures), *missing]
 
@@ -114,12 +121,21 @@ def uncertainty(data: ReportData, clock: Clock) -> list[str]:
     series, statuses = data.poses.series, data.statuses
     tracked, inliers = (statuses.series(ODOMETRY, key) for key in (Key.TRACKED, Key.INLIERS))
     position, heading = [curve("", series["sigma_position"])], [curve("", series["sigma_heading"])]
-    figures = [chart("Standard deviation of the position, all axes", position, clock, unit="m", log=True),
-               chart("Standard deviation of the heading", heading, clock, unit="deg", log=True)]
+    figures = [
+        chart("Standard deviation of the position, all axes", position, clock, unit="m", log=True),
+        chart("Standard deviation of the heading", heading, clock, unit="deg", log=True),
+    ]
     missing = [] if any(figures) else [note("The covariances in the log are zero or negative: they were not set.")]
     if tracked.count > 2 and statuses.reports:
-        figures.append(chart("Landmarks", [curve("tracked", tracked), curve("inliers of the pose", inliers)], clock,
-                             zero=True, note="One value per report, not per pose."))
+        figures.append(
+            chart(
+                "Landmarks",
+                [curve("tracked", tracked), curve("inliers of the pose", inliers)],
+                clock,
+                zero=True,
+                note="One value per report, not per pose.",
+            )
+        )
     else:
         missing.append(note(_few_landmarks(tracked, inliers)))
     return ["<h2>Uncertainty</h2>", grid(figures), *missing]
@@ -142,13 +158,26 @@ def in_map(data: ReportData, clock: Clock) -> list[str]:
     rows = [(escape(name.replace("_", " ")), escape(value)) for name, value in values.items()]
     loops, keyframes = (statuses.series(PLACES, name) for name in ("loops", "keyframes"))
     figures = [
-        chart("From odometry's position to that in the map", [curve("", history.moved_m)], clock, unit="m", zero=True,
-              note="The correction map -> odom, where the robot is: odom itself does not jump."),
-        chart("From odometry's heading to that in the map", [curve("", history.turned_deg)], clock, unit="deg",
-              zero=True),
-        chart("Standard deviation of the position in the map, all axes", [curve("", history.sigma_m)], clock, unit="m",
-              log=True),
-        chart("Keyframes and loops", [curve("keyframes", keyframes), curve("loops", loops)], clock, zero=True)]
+        chart(
+            "From odometry's position to that in the map",
+            [curve("", history.moved_m)],
+            clock,
+            unit="m",
+            zero=True,
+            note="The correction map -> odom, where the robot is: odom itself does not jump.",
+        ),
+        chart(
+            "From odometry's heading to that in the map", [curve("", history.turned_deg)], clock, unit="deg", zero=True
+        ),
+        chart(
+            "Standard deviation of the position in the map, all axes",
+            [curve("", history.sigma_m)],
+            clock,
+            unit="m",
+            log=True,
+        ),
+        chart("Keyframes and loops", [curve("keyframes", keyframes), curve("loops", loops)], clock, zero=True),
+    ]
     return ["<h2>In the map</h2>", *([facts(rows)] if rows else []), grid(figures)]
 
 
@@ -164,17 +193,22 @@ def truth(comparison: TruthComparison, clock: Clock) -> list[str]:
     """Return the section with the errors of the path."""
     m = comparison.metrics
     ratio = "" if math.isnan(m.length_error_ratio) else f" ({100 * m.length_error_ratio:+.3f} %)"
-    rows = [("compared poses", f"{m.pairs}, {m.coverage:.1%} of the truth"),
-            ("length", f"{m.length_estimate_m:.4f} m, true {m.length_truth_m:.4f} m{ratio}"),
-            ("position (ATE)", f"rmse {_mm(m.ate_rmse_m)}, maximum {_mm(m.ate_max_m)}, at the end "
-             f"{_mm(m.end_error_m)}"),
-            ("heading", f"rmse {_deg(m.heading_rmse_rad)}, maximum {_deg(m.heading_max_rad)}, at the end "
-             f"{_deg(m.heading_end_rad)}"),
-            ("from pose to pose (RPE)", f"rmse {_mm(m.rpe_translation_rmse_m)}, {_deg(m.rpe_rotation_rmse_rad)}")]
+    rows = [
+        ("compared poses", f"{m.pairs}, {m.coverage:.1%} of the truth"),
+        ("length", f"{m.length_estimate_m:.4f} m, true {m.length_truth_m:.4f} m{ratio}"),
+        ("position (ATE)", f"rmse {_mm(m.ate_rmse_m)}, maximum {_mm(m.ate_max_m)}, at the end {_mm(m.end_error_m)}"),
+        (
+            "heading",
+            f"rmse {_deg(m.heading_rmse_rad)}, maximum {_deg(m.heading_max_rad)}, at the end {_deg(m.heading_end_rad)}",
+        ),
+        ("from pose to pose (RPE)", f"rmse {_mm(m.rpe_translation_rmse_m)}, {_deg(m.rpe_rotation_rmse_rad)}"),
+    ]
     heading = [(t, math.degrees(rad)) for t, rad in comparison.heading_rad.points()]
     position = [(t, 1e3 * error_m) for t, error_m in comparison.position_m.points()]
-    figures = [chart("Error of the position", [ChartLine("", position)], clock, unit="mm", zero=True),
-               chart("Error of the heading, to the left", [ChartLine("", heading)], clock, unit="deg", zero=True)]
+    figures = [
+        chart("Error of the position", [ChartLine("", position)], clock, unit="mm", zero=True),
+        chart("Error of the heading, to the left", [ChartLine("", heading)], clock, unit="deg", zero=True),
+    ]
     footnote = "<small>Of the rig; the first pose is aligned and nothing else, as `omnid eval` does.</small>"
     return ["<h2>Against the truth</h2>", facts(rows), footnote, grid(figures)]
 

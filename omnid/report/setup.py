@@ -26,8 +26,9 @@ _MAX_VALUE: Final = 120  # characters
 
 def setup(data: ReportData) -> list[str]:
     """Return the section with the rig and the settings that are not at their defaults."""
-    rig = [facts([(name, escape(value)) for name, value in _rig_rows(data.rig)])] if data.rig else \
-        [note(data.rig_fault)]
+    rig = (
+        [facts([(name, escape(value)) for name, value in _rig_rows(data.rig)])] if data.rig else [note(data.rig_fault)]
+    )
     settings = data.attachments.get("omnid.toml")
     found = None if settings is None else _changed(settings)
     if found is None:
@@ -46,16 +47,25 @@ def contents(data: ReportData) -> list[str]:
     rows = [(escape(name), escape(kind), str(count)) for name, (kind, count) in topics[:_MAX_TOPICS]]
     more = [note(f"and {len(topics) - _MAX_TOPICS} more topics")] if len(topics) > _MAX_TOPICS else []
     attached = ", ".join(f"{name} ({size} bytes)" for name, size in data.info.attachments.items())
-    return ["<h2>Content of the file</h2>", "<div class='words scroll'>", table(("topic", "type", "messages"), rows),
-            "</div>", *more, f"<p>Attached: {escape(attached or 'nothing')}.</p>"]
+    return [
+        "<h2>Content of the file</h2>",
+        "<div class='words scroll'>",
+        table(("topic", "type", "messages"), rows),
+        "</div>",
+        *more,
+        f"<p>Attached: {escape(attached or 'nothing')}.</p>",
+    ]
 
 
 def _rig_rows(rig: Rig) -> list[tuple[str, str]]:
     """Return properties of the rig as name and value."""
     rotation_deg = ", ".join(f"{value:.3g}" for value in np.rad2deg(se3.rotation_log(rig.T_base_rig[:3, :3])))
     position_m = ", ".join(f"{value:.3g}" for value in rig.T_base_rig[:3, 3])
-    rows = [("baseline", f"{rig.baseline_m * 1e3:.2f} mm"), ("lower camera", _camera(rig.lower)),
-            ("upper camera", _camera(rig.upper))]
+    rows = [
+        ("baseline", f"{rig.baseline_m * 1e3:.2f} mm"),
+        ("lower camera", _camera(rig.lower)),
+        ("upper camera", _camera(rig.upper)),
+    ]
     if np.allclose(rig.T_base_rig, np.eye(4)):
         return [*rows, ("on the robot", "not stated: the rig's frame is base_link")]
     return [*rows, ("on the robot", f"at {position_m} m, rotated by {rotation_deg} deg")]
@@ -76,8 +86,11 @@ def _changed(settings: bytes) -> list[tuple[str, str, str]] | None:
     except (ValueError, RecursionError):
         return None
     defaults = dict(_flat(parse_toml(dump(Config()))))
-    found = [(name, _shown(value), _shown(defaults[name]) if name in defaults else "unknown to this omnid")
-             for name, value in _flat(given) if name not in defaults or defaults[name] != value]
+    found = [
+        (name, _shown(value), _shown(defaults[name]) if name in defaults else "unknown to this omnid")
+        for name, value in _flat(given)
+        if name not in defaults or defaults[name] != value
+    ]
     return found[:_MAX_SETTINGS]
 
 

@@ -33,9 +33,21 @@ _COUNTERS: Final[dict[str, str]] = {  # of faults, with the text of the event wh
     Key.UNPAIRED_UPPER: "upper images without a partner",
 }
 _COUNTER_PREFIXES: Final = (status_names.STOPPED_PREFIX, status_names.REFUSED_PREFIX)  # of counters
-_PLOTTED: Final = frozenset({  # numbers whose course is kept
-    Key.INLIERS, Key.TRACKED, Key.RATE_HZ, Key.AGE_S, Key.DROPPED, Key.MISSED, time_key(CAPTURE_TO_POSE, "p50"),
-    time_key(CAPTURE_TO_POSE, "p99"), time_key(WORK, "p50"), time_key(TICK_LATE, "p99"), time_key(TICK_LATE, "max")})
+_PLOTTED: Final = frozenset(
+    {  # numbers whose course is kept
+        Key.INLIERS,
+        Key.TRACKED,
+        Key.RATE_HZ,
+        Key.AGE_S,
+        Key.DROPPED,
+        Key.MISSED,
+        time_key(CAPTURE_TO_POSE, "p50"),
+        time_key(CAPTURE_TO_POSE, "p99"),
+        time_key(WORK, "p50"),
+        time_key(TICK_LATE, "p99"),
+        time_key(TICK_LATE, "max"),
+    }
+)
 
 
 class StatusHistory:

@@ -96,7 +96,7 @@ def path_d(points: Iterable[Point]) -> str:
 def polyline(points: Sequence[Point], style: str) -> str:
     """Return a line through points [px]; a single point becomes a dot."""
     if len(points) == 1:
-        (x, y), = points
+        ((x, y),) = points
         return f"<path {style} d='M{coord(x - 1.3)} {coord(y)}h2.6'/>"
     return f"<path {style} d='{path_d(points)}'/>" if points else ""
 

@@ -19,30 +19,41 @@ def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock
     """Return the figure; parts without events have no lane."""
     sources = sorted({event.source for event in events} - {"state", "poses"}, key=lambda s: ("stage" in s, s))[:_LANES]
     x, height = clock.axis(_LEFT, _RIGHT), 42 + _LANE * len(sources)
-    parts = [*_band(spans, gaps, (x, clock.unit[0])),
-             *(_reset(x.px(event.start_s / clock.unit[0]), 19) for event in events if _is_reset(event))]
+    parts = [
+        *_band(spans, gaps, (x, clock.unit[0])),
+        *(_reset(x.px(event.start_s / clock.unit[0]), 19) for event in events if _is_reset(event)),
+    ]
     for row, source in enumerate(sources):
         parts += _lane(source, 42 + _LANE * row, [e for e in events if e.source == source], (x, clock.unit[0]))
     parts += time_ticks(x, float(height), clock)
-    return (f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption>"
-            f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events' "
-            f"data-x='{_LEFT} {_RIGHT}'>{''.join(parts)}</svg>"
-            "</figure>")
+    return (
+        f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption>"
+        f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events' "
+        f"data-x='{_LEFT} {_RIGHT}'>{''.join(parts)}</svg>"
+        "</figure>"
+    )
 
 
 def _band(spans: Spans, gaps: Sequence[Point], axis: tuple[Axis, float]) -> Iterator[str]:
     """Yield the band; the states cover the style that means unknown."""
     x, seconds = axis
     yield text((_LEFT - 8, 27), "state", "text-anchor='end'")
-    for style, found in ((_MISSING, [(x.low * seconds, x.high * seconds)]), *zip(_FILLS, spans, strict=True),
-                         (_MISSING, gaps)):
+    for style, found in (
+        (_MISSING, [(x.low * seconds, x.high * seconds)]),
+        *zip(_FILLS, spans, strict=True),
+        (_MISSING, gaps),
+    ):
         d = rectangles([(x.px(a / seconds), x.px(b / seconds)) for a, b in found], _BAND)
         yield f"<path {style} d='{d}'/>" if d else ""
 
 
 def _keys(events: Sequence[Event], lanes: bool) -> str:
-    keys = [area_key(style, name) for style, name in zip(
-        (*_FILLS, _MISSING), ("tracking", "degraded", "lost", "no pose, or its state is unknown"), strict=True)]
+    keys = [
+        area_key(style, name)
+        for style, name in zip(
+            (*_FILLS, _MISSING), ("tracking", "degraded", "lost", "no pose, or its state is unknown"), strict=True
+        )
+    ]
     if lanes:
         keys += [mark_key(_mark(level, 17, 6), name) for level, name in enumerate(("change", "warning", "error"))]
     if any(map(_is_reset, events)):

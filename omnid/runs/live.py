@@ -34,8 +34,14 @@ from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
 class LiveRun:
     """One run of the daemon."""
 
-    def __init__(self, config: Config, robot: LiveRobot, report: Report, rig: Rig | None = None,
-                 show: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        robot: LiveRobot,
+        report: Report,
+        rig: Rig | None = None,
+        show: Callable[[str], None] | None = None,
+    ) -> None:
         """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
         self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
         self._graph = _graph_that_waits(config) if robot.waits else _graph_in_time(config, report)
@@ -49,8 +55,14 @@ class LiveRun:
         compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
         offset_ns = time.time_ns() - self._robot.clock_ns()
         with ExitStack() as outputs:
-            session = Session(self._config, self._graph, outputs, lambda text: self._report(logging.WARNING, text),
-                              offset_ns=offset_ns, clock_ns=self._robot.clock_ns)
+            session = Session(
+                self._config,
+                self._graph,
+                outputs,
+                lambda text: self._report(logging.WARNING, text),
+                offset_ns=offset_ns,
+                clock_ns=self._robot.clock_ns,
+            )
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
             imported()

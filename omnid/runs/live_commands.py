@@ -27,25 +27,35 @@ from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENS
 Receive: TypeAlias = Callable[[Request], Answer | None]  # returns None where there is no answer, or not yet
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
 NO_PLANNER: Final = f"controller.sources.names lacks {PLANNER!r}: goals, paths and routes are off"
-NO_MAP_FILE: Final = ("the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
-                      "without --localize-only")
+NO_MAP_FILE: Final = (
+    "the robot keeps no map in a file: start its daemon with --map FILE.omap, or set places.map, "
+    "without --localize-only"
+)
 
 
 class LiveCommands:
     """The receivers of commands, requests and samples; without a motor only samples and requests to save the map."""
 
-    def __init__(self, session: Session, bus: Bus, controller: DriveLink | None,
-                 navigate: Callable[[NavigationCommand], None], report: Callable[[int, str], None]) -> None:
+    def __init__(
+        self,
+        session: Session,
+        bus: Bus,
+        controller: DriveLink | None,
+        navigate: Callable[[NavigationCommand], None],
+        report: Callable[[int, str], None],
+    ) -> None:
         """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`."""
         self._session, self._bus, self._controller = session, bus, controller
         settings, warn = session.config.controller, partial(report, logging.WARNING)
-        stamps = StampRule(settings.deadlines.command_s,
-                           synchronised=session.config.bus.command_clock == "synchronised")
+        stamps = StampRule(
+            settings.deadlines.command_s, synchronised=session.config.bus.command_clock == "synchronised"
+        )
         self.navigation = NavigationReceiver(navigate, stamps, report=warn)
         self.commands: CommandReceiver | None = None
         if controller is not None:
-            self.commands = CommandReceiver(controller, stamps, sources=settings.sources.names,
-                                            is_unique=lambda: bus.is_unique, report=warn)
+            self.commands = CommandReceiver(
+                controller, stamps, sources=settings.sources.names, is_unique=lambda: bus.is_unique, report=warn
+            )
             controller.statistics.take_arm_answer = self._answer_arm
 
     def subscribe(self, recorder: Recorder | None, sensors: SensorSources, saver: MapSaver | None) -> None:
@@ -60,8 +70,9 @@ class LiveCommands:
                 record = command_recorder(recorder, self._session.now_ns, topics)
                 table = {topic: _recorded(receive, record) for topic, receive in table.items()}
         # Samples are recorded with the poses.
-        table |= {topic: lambda request: sensors.receiver.receive(request.topic, request.payload)
-                  for topic in SENSOR_TOPICS}
+        table |= {
+            topic: lambda request: sensors.receiver.receive(request.topic, request.payload) for topic in SENSOR_TOPICS
+        }
         table[MAP] = _refusing(NO_MAP_FILE) if saver is None else saver.receive
         others = self.commands.receive if self.commands else _refusing(NO_MOTOR)  # counts unknown topics
 

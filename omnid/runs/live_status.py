@@ -36,12 +36,14 @@ def add_status_tickers(session: Session, status: StatusCollector, bus: Bus, reco
     graph.ticker("watchdog", service.period_s, service)
 
 
-def add_terminal_ticker(session: Session, show: Callable[[str], None], report: Callable[[int, str], None],
-                        words: Callable[[], str]) -> None:
+def add_terminal_ticker(
+    session: Session, show: Callable[[str], None], report: Callable[[int, str], None], words: Callable[[], str]
+) -> None:
     """Show the status in one line of a terminal; show: rewrites that line, which ends with the words."""
     line = StatusLine(session.statistics, session.graph.telemetry, TICKERS)
-    terminal = TerminalStatus(show, lambda: line() + words(), partial(report, logging.INFO), session.statistics,
-                              _ready(session.config))
+    terminal = TerminalStatus(
+        show, lambda: line() + words(), partial(report, logging.INFO), session.statistics, _ready(session.config)
+    )
     session.graph.ticker("terminal", terminal.period_s, terminal)
 
 

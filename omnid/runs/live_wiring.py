@@ -67,8 +67,9 @@ class LiveWiring:
         controller = robot.connect(session)
         bus = session.open_bus(rig)
         pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
-        sensors = SensorSources(config, pairing.motion, session, controller, self._report,
-                                with_images=robot.brings_samples)
+        sensors = SensorSources(
+            config, pairing.motion, session, controller, self._report, with_images=robot.brings_samples
+        )
         sensors.add_to(graph)
         recorder = self._recorder() if config.record.enabled else None
         # 2. From the cameras to pairs.
@@ -89,8 +90,11 @@ class LiveWiring:
         parts = run_places.known_to(RunParts(load=lambda: ladder.level, map_every_s=config.live.cloud_s))
         if controller:
             sinks.rings["controller-ring"] = RingToController(controller)
-            parts = replace(parts, drive=LiveDrive(controller, rig.T_base_rig, requests.end),
-                            navigation=self._navigation(controller, requests, bus, files))
+            parts = replace(
+                parts,
+                drive=LiveDrive(controller, rig.T_base_rig, requests.end),
+                navigation=self._navigation(controller, requests, bus, files),
+            )
         stages = wire(graph, pairs, front_end, config, sinks, parts)
         if config.live.shed_load and not robot.waits:
             graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
@@ -105,15 +109,31 @@ class LiveWiring:
         received.subscribe(recorder, sensors, saver)
         # 5. Status.
         images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))
-        status = [ladder.status, ThreadsStatus(), images, exposure.status, live_rig.status,
-                  *([received.navigation.status] if controller else ()),
-                  motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
-                  *([partial(places_status, stages.places)] if stages.places else ()),
-                  *([partial(floor_status, stages.floor)] if stages.floor else ()),
-                  *robot.status, *(part.status for part in (bus, recorder, saver) if part)]
-        sources = StatusSources(graph.telemetry, states, pairing, session.statistics, self._latency.to_pose,
-                                controller.statistics if controller else None, received.commands, TICKERS,
-                                tuple(status), session.clock_ns)
+        status = [
+            ladder.status,
+            ThreadsStatus(),
+            images,
+            exposure.status,
+            live_rig.status,
+            *([received.navigation.status] if controller else ()),
+            motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
+            *([partial(places_status, stages.places)] if stages.places else ()),
+            *([partial(floor_status, stages.floor)] if stages.floor else ()),
+            *robot.status,
+            *(part.status for part in (bus, recorder, saver) if part),
+        ]
+        sources = StatusSources(
+            graph.telemetry,
+            states,
+            pairing,
+            session.statistics,
+            self._latency.to_pose,
+            controller.statistics if controller else None,
+            received.commands,
+            TICKERS,
+            tuple(status),
+            session.clock_ns,
+        )
         add_status_tickers(session, StatusCollector(sources), bus, recorder)
 
     def _sinks(self, live_rig: LiveRig, bus: Bus) -> Sinks:
@@ -122,14 +142,18 @@ class LiveWiring:
         poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
-        return Sinks(poses={**poses, **live_rig.pose_sinks},
-                     bus=BusSink(bus, session.encoder(self._geometry.rig, config.live.cloud_points)))
+        return Sinks(
+            poses={**poses, **live_rig.pose_sinks},
+            bus=BusSink(bus, session.encoder(self._geometry.rig, config.live.cloud_points)),
+        )
 
     def _warn_of_unstated_height(self) -> None:
         """Warn where the rig does not state its height: until the images show the floor, nothing is called free."""
         if self._geometry.rig.height_m(self._session.config.obstacles.ring.floor_m) is None:
-            self._session.warn("the rig states no height of the cameras: the floor is looked for in the images; "
-                               f"until it is found, map, grid and obstacles call nothing free; {ADVICE}")
+            self._session.warn(
+                "the rig states no height of the cameras: the floor is looked for in the images; "
+                f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
+            )
 
     def _saver(self, run_places: RunPlaces, places: Places | None, bus: Bus) -> MapSaver | None:
         """Return what saves the map of places now and then; None where it stays as it is."""
@@ -142,17 +166,23 @@ class LiveWiring:
     def _recorder(self) -> Recorder:
         session, rig = self._session, self._geometry.rig
         encode = session.encoder(rig, session.config.record.cloud_points)
-        recorder = open_recorder(session.config, rig_toml(rig), self._report, encode=encode,
-                                 offset_ns=session.offset_ns)
+        recorder = open_recorder(
+            session.config, rig_toml(rig), self._report, encode=encode, offset_ns=session.offset_ns
+        )
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _navigation(self, controller: DriveLink, requests: RequestQueue, bus: Bus,
-                    files: RouteFiles) -> NavigationParts | None:
+    def _navigation(
+        self, controller: DriveLink, requests: RequestQueue, bus: Bus, files: RouteFiles
+    ) -> NavigationParts | None:
         """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
         config = self._session.config
         if PLANNER not in config.controller.sources.names:
             self._session.warn(NO_PLANNER)
             return None
-        return NavigationParts(requests, lambda: wheel_state(controller.statistics.state),
-                               PlannerDrive(controller, bus.answer, files), config.places.map)
+        return NavigationParts(
+            requests,
+            lambda: wheel_state(controller.statistics.state),
+            PlannerDrive(controller, bus.answer, files),
+            config.places.map,
+        )

@@ -14,6 +14,8 @@ def attached_rig(reader: LogReader, log: Path) -> Rig:
     """Return the rig of the rig.toml that is attached to the log; OmnidError if there is none."""
     attached = reader.attachments().get("rig.toml")
     if attached is None:
-        raise OmnidError(f"{log}: no rig.toml is attached to the log; give one with --rig, made by `omnid calibrate "
-                         "import camchain.yaml -o rig.toml`")
+        raise OmnidError(
+            f"{log}: no rig.toml is attached to the log; give one with --rig, made by `omnid calibrate "
+            "import camchain.yaml -o rig.toml`"
+        )
     return parse_rig(attached, None, f"{log}: attached rig.toml")

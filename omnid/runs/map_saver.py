@@ -29,8 +29,9 @@ class MapSaver:
 
     PERIOD_S: Final = 1.0
 
-    def __init__(self, run_places: RunPlaces, places: Places, every_s: float, answer: Callable[[int, Answer], object]
-                 ) -> None:
+    def __init__(
+        self, run_places: RunPlaces, places: Places, every_s: float, answer: Callable[[int, Answer], object]
+    ) -> None:
         """answer: takes the id of a request."""
         self._run_places, self._places, self._answer = run_places, places, answer
         self._every, self._ticks = max(1, round(every_s / self.PERIOD_S)), 0

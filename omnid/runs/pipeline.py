@@ -98,8 +98,14 @@ class NavigationParts(NamedTuple):
 
 def wheel_state(state: ControllerState) -> WheelState:
     """Return the part of the controller's state that the navigation needs."""
-    return WheelState(state.armed, state.needs_request, state.disarmed_by, state.reason, state.source,
-                      state.obstacle if state.blocked else "")
+    return WheelState(
+        state.armed,
+        state.needs_request,
+        state.disarmed_by,
+        state.reason,
+        state.source,
+        state.obstacle if state.blocked else "",
+    )
 
 
 class WiredStages(NamedTuple):
@@ -117,20 +123,29 @@ class WiredStages(NamedTuple):
         return None if user is None else user.floor
 
 
-def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Config, sinks: Sinks,
-         parts: RunParts | None = None) -> WiredStages:
+def wire(
+    graph: Graph,
+    pairs: Stream[FramePair],
+    front_end: FrontEnd,
+    config: Config,
+    sinks: Sinks,
+    parts: RunParts | None = None,
+) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
     geometry, parts = front_end.geometry, parts or RunParts()
     panoramas = graph.stage("dewarp", front_end.dewarp, pairs, direct=True)
     odometry = graph.stage("odometry", front_end.poses, panoramas)
     outgoing: dict[str, Stream[Outgoing]] = {
-        "bus": odometry, "bus-drive": _commands(graph, odometry, geometry, config, parts.drive)}
+        "bus": odometry,
+        "bus-drive": _commands(graph, odometry, geometry, config, parts.drive),
+    }
     mapping, maps = _mapping(graph, odometry, front_end, config, sinks, parts)
     places, in_map = _places(graph, odometry, front_end, config, sinks, parts)
     grids = _grids(graph, in_map, geometry, config, parts) if sinks.take_all else None
     obstacles, rings = _rings(graph, odometry, front_end, config, sinks, parts)
-    updates = _navigation(graph, geometry, config, parts, places,
-                          [odometry, *(stream for stream in (in_map, rings) if stream)])
+    updates = _navigation(
+        graph, geometry, config, parts, places, [odometry, *(stream for stream in (in_map, rings) if stream)]
+    )
     named = {"bus-map": maps, "bus-places": in_map, "bus-grid": grids, "bus-scan": rings, "bus-navigation": updates}
     outgoing.update({name: stream for name, stream in named.items() if stream})
     for name, pose_sink in sinks.poses.items():
@@ -144,8 +159,9 @@ def wire(graph: Graph, pairs: Stream[FramePair], front_end: FrontEnd, config: Co
     return WiredStages(front_end, mapping, places, obstacles)
 
 
-def _mapping(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
-             parts: RunParts) -> tuple[Mapping | None, Stream[MapUpdate] | None]:
+def _mapping(
+    graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks, parts: RunParts
+) -> tuple[Mapping | None, Stream[MapUpdate] | None]:
     """Join the map; None where no sink takes it."""
     if not (sinks.maps or sinks.take_all):
         return None, None
@@ -156,22 +172,30 @@ def _mapping(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd
     return mapping, maps
 
 
-def _places(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
-            parts: RunParts) -> tuple[Places | None, Stream[PlaceUpdate] | None]:
+def _places(
+    graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks, parts: RunParts
+) -> tuple[Places | None, Stream[PlaceUpdate] | None]:
     """Join the places; None where they are not consumed."""
     is_consumed = sinks.places or sinks.take_all or parts.navigation or parts.known_places is not None
     if not config.places.enabled or not is_consumed:
         return None, None
-    places = Places(front_end.geometry, config, front_end.dense, parts.known_places, localize_only=parts.localize_only,
-                    load=parts.load)
+    places = Places(
+        front_end.geometry,
+        config,
+        front_end.dense,
+        parts.known_places,
+        localize_only=parts.localize_only,
+        load=parts.load,
+    )
     in_map = graph.stage("places", places, odometry)
     for name, sink in sinks.places.items():
         graph.sink(name, sink, in_map)
     return places, in_map
 
 
-def _grids(graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry, config: Config, parts: RunParts
-           ) -> Stream[GridUpdate] | None:
+def _grids(
+    graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry, config: Config, parts: RunParts
+) -> Stream[GridUpdate] | None:
     """Join the occupancy grid of the places; None without places."""
     if in_map is None:
         return None
@@ -179,8 +203,9 @@ def _grids(graph: Graph, in_map: Stream[PlaceUpdate] | None, geometry: Geometry,
     return graph.stage("grid", MapGrid(config.mapping.voxel_m, T_base_rect, parts.map_every_s, parts.load), in_map)
 
 
-def _rings(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks,
-           parts: RunParts) -> tuple[Obstacles | None, Stream[ObstacleRing] | None]:
+def _rings(
+    graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, config: Config, sinks: Sinks, parts: RunParts
+) -> tuple[Obstacles | None, Stream[ObstacleRing] | None]:
     """Join the obstacle ring; None where it is not consumed."""
     if not config.obstacles.enabled or not (sinks.rings or sinks.take_all or parts.navigation):
         return None, None
@@ -191,24 +216,36 @@ def _rings(graph: Graph, odometry: Stream[OdometryUpdate], front_end: FrontEnd, 
     return obstacles, rings
 
 
-def _navigation(graph: Graph, geometry: Geometry, config: Config, parts: RunParts, places: Places | None,
-                inputs: Sequence[Stream[Any]]) -> Stream[NavigationUpdate] | None:
+def _navigation(
+    graph: Graph,
+    geometry: Geometry,
+    config: Config,
+    parts: RunParts,
+    places: Places | None,
+    inputs: Sequence[Stream[Any]],
+) -> Stream[NavigationUpdate] | None:
     """Join the navigation, whose setpoints go to the controller; None in a run without wheels."""
     given, T_base_rig = parts.navigation, geometry.rig.T_base_rig
     if given is None:
         return None
     is_new = parts.known_places is None or not parts.known_places.keyframes
     route_map = RouteMap(given.map_name, T_base_rig, geometry.T_rig_rect, is_new=is_new) if places else None
-    navigation = NavigationStage(config.navigation, config.controller.collision, T_base_rig, given.wheels,
-                                 Routes(route_map))
+    navigation = NavigationStage(
+        config.navigation, config.controller.collision, T_base_rig, given.wheels, Routes(route_map)
+    )
     requests = graph.source("requests", given.requests.batches, wake=given.requests.end)
     updates = graph.stage("navigation", navigation, *inputs, requests)
     graph.sink("planner", given.drive, updates, policy=NEWEST, depth=1)
     return updates
 
 
-def _commands(graph: Graph, odometry: Stream[OdometryUpdate], geometry: Geometry, config: Config,
-              drive: LiveDrive | ReplayDrive | SimulatedWheels | None) -> Stream[VelocityCommand]:
+def _commands(
+    graph: Graph,
+    odometry: Stream[OdometryUpdate],
+    geometry: Geometry,
+    config: Config,
+    drive: LiveDrive | ReplayDrive | SimulatedWheels | None,
+) -> Stream[VelocityCommand]:
     """Join the controller; return its commands. It never waits for a stage: that of a motor has its own process."""
     if isinstance(drive, LiveDrive):
         graph.sink("controller", drive, odometry, policy=NEWEST, depth=1)

@@ -33,8 +33,15 @@ class RigPlaces:
 class RunPlaces:
     """Holds the map that a run localises in; `places` is None where the run has no map but its own."""
 
-    def __init__(self, config: Config, geometry: Geometry, warn: Callable[[str], None],
-                 given: RigPlaces | None = None, *, build: bool = False) -> None:
+    def __init__(
+        self,
+        config: Config,
+        geometry: Geometry,
+        warn: Callable[[str], None],
+        given: RigPlaces | None = None,
+        *,
+        build: bool = False,
+    ) -> None:
         """given: a map in the memory, in the place of the file places.map; build: or else an empty one.
 
         warn: takes a line for the user.
@@ -79,8 +86,10 @@ class RunPlaces:
         for id, tag in tags.items():
             known = places.tags.known.get(id)
             if known is not None and known.size_m != tag.size_m:
-                raise OmnidError(f"places.tags {self._tags}: tag {id} ({tag.name}) has an edge of {tag.size_m:g} m, "
-                                 f"but {known.size_m:g} m in the map: correct it, or leave the tag out")
+                raise OmnidError(
+                    f"places.tags {self._tags}: tag {id} ({tag.name}) has an edge of {tag.size_m:g} m, "
+                    f"but {known.size_m:g} m in the map: correct it, or leave the tag out"
+                )
         places.tags.known |= tags
 
     def known_to(self, parts: RunParts) -> RunParts:
@@ -94,8 +103,9 @@ class RunPlaces:
         name = self._path or "the map"
         difference = given.rig.difference(self._rig)
         if difference:
-            raise OmnidError(f"{name}: this map was made with {difference}: build one with this rig, by "
-                             "`omnid map build`")
+            raise OmnidError(
+                f"{name}: this map was made with {difference}: build one with this rig, by `omnid map build`"
+            )
         if given.rig.rig_hash != self._rig.rig_hash:
             self._warn(f"{name}: the rig was calibrated again since this map was made")
         seen_by(given.places, given.rig, self._rig)
@@ -153,8 +163,13 @@ def place_rig(geometry: Geometry) -> PlaceRig:
     """Return the part of a rig on which a map depends."""
     rig = geometry.rig
     text = rig_toml(replace(rig, lower=_unmasked(rig.lower), upper=_unmasked(rig.upper), covariance=None))
-    return PlaceRig(geometry.cylinder.full_turn, rig.baseline_m, geometry.T_rig_rect, rig.T_base_rig,
-                    hashlib.sha256(text.encode()).hexdigest())
+    return PlaceRig(
+        geometry.cylinder.full_turn,
+        rig.baseline_m,
+        geometry.T_rig_rect,
+        rig.T_base_rig,
+        hashlib.sha256(text.encode()).hexdigest(),
+    )
 
 
 def new_places(settings: PlacesConfig) -> PlaceMap:

@@ -63,5 +63,7 @@ def progress_line(recorder: Recorder, graph: Graph) -> str:
     state = recorder.state
     dropped = sum(stage.dropped for stage in graph.telemetry.stages if stage.name == "record")
     written = state.messages - state.lost - state.refused
-    return (f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
-            f"refused {state.refused + recorder.invalid}, oldest files deleted {state.deleted}, {state.status}")
+    return (
+        f"recording: {written} messages in {state.files} files, lost {state.lost}, dropped {dropped}, "
+        f"refused {state.refused + recorder.invalid}, oldest files deleted {state.deleted}, {state.status}"
+    )

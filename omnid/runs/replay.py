@@ -96,8 +96,13 @@ class ReplayOptions:
     @property
     def files(self) -> list[tuple[str, Path]]:
         """The files that are written, each with its option."""
-        named = (("--tum", self.tum), ("--map-tum", self.map_tum), ("--cloud", self.cloud),
-                 ("--plan", self.plan), ("--record", self.record))
+        named = (
+            ("--tum", self.tum),
+            ("--map-tum", self.map_tum),
+            ("--cloud", self.cloud),
+            ("--plan", self.plan),
+            ("--record", self.record),
+        )
         return [(name, path) for name, path in named if path is not None]
 
 
@@ -125,16 +130,20 @@ class _Replay:
         if self._options.map_tum and not self._config.places.enabled:
             raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
         prepare_kernels(log_line)
-        graph = Graph(policy=NEWEST if self._options.drops else LOSSLESS, threaded=not self._options.inline,
-                      depth=self._config.graph.depth)
+        graph = Graph(
+            policy=NEWEST if self._options.drops else LOSSLESS,
+            threaded=not self._options.inline,
+            depth=self._config.graph.depth,
+        )
         with opencv_threads(self._config.graph.opencv_threads), ExitStack() as outputs:
             session = Session(self._config, graph, outputs, self._warnings.append)
             reader = self._reader()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(reader), reader.frames())
             health = examined_rig(reader, self._log, geometry, self._config)
-            run_places = RunPlaces(self._config, geometry, session.warn, self._options.rig_places,
-                                   build=self._options.build)
+            run_places = RunPlaces(
+                self._config, geometry, session.warn, self._options.rig_places, build=self._options.build
+            )
             front_end = FrontEnd(geometry, self._config, health)
             sinks, parts = self._sinks(session, front_end), run_places.known_to(self._parts(session, geometry))
             pairing = Synchronise(geometry.rig, self._config.pair, self._config.motion.R_base_imu)
@@ -157,8 +166,11 @@ class _Replay:
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""
         rig = self._options.rig if isinstance(self._options.rig, Path) else None
-        named = (("the log that is read", self._log), ("the rig that is read", rig),
-                 ("the configuration that is read", self._options.settings))
+        named = (
+            ("the log that is read", self._log),
+            ("the rig that is read", rig),
+            ("the configuration that is read", self._options.settings),
+        )
         in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]
         return [(what, path) for what, path in named if path is not None] + in_folder
 
@@ -166,8 +178,9 @@ class _Replay:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
         rig, motion = self._options.rig, motion_topics(self._config)
-        open_log = partial(LogReader, self._log, window=self._config.log.reorder_frames, span_s=self._options.span_s,
-                           motion=motion)
+        open_log = partial(
+            LogReader, self._log, window=self._config.log.reorder_frames, span_s=self._options.span_s, motion=motion
+        )
         named = ("", "")
         if rig and not (lower and upper):
             named = (read_rig(rig) if isinstance(rig, Path) else rig).topics
@@ -207,9 +220,11 @@ class _Replay:
             recorder = options.observer(front_end, session.graph.telemetry)
         if options.record:
             recorder = self._recorder(session, geometry, options.record)
-        sinks = Sinks(poses={"statistics": session.statistics},
-                      bus=self._bus(session, geometry) if options.publish else None,
-                      recording=None if recorder is None else RecordingSink(recorder))
+        sinks = Sinks(
+            poses={"statistics": session.statistics},
+            bus=self._bus(session, geometry) if options.publish else None,
+            recording=None if recorder is None else RecordingSink(recorder),
+        )
         if options.collect:
             sinks.poses["collect-poses"] = self._poses
             sinks.maps["collect-map"] = self._map
@@ -231,8 +246,12 @@ class _Replay:
         elif config.motor.port:
             controller = session.start_controller(UNPRIVILEGED, of_replay=True)
             self._drive = ReplayDrive(controller, config.controller.setpoint.setpoint(), geometry.rig.T_base_rig)
-        return RunParts(known_places=options.places, localize_only=options.localize_only, drive=self._drive,
-                        map_every_s=options.map_every_s)
+        return RunParts(
+            known_places=options.places,
+            localize_only=options.localize_only,
+            drive=self._drive,
+            map_every_s=options.map_every_s,
+        )
 
     def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
         try:

@@ -102,9 +102,18 @@ class LiveRig:
         self._health = front_end.health
         self._refinement: RigRefinement | None = None
         if config.rig.refine != "off":
-            self._refinement = session.outputs.enter_context(closing(
-                RigRefinement(front_end, config.rig, lambda: ladder.level < LoadLevel.REDUCED, file, session.warn,
-                              has_delay=config.camera.upper_delay_ms == 0)))
+            self._refinement = session.outputs.enter_context(
+                closing(
+                    RigRefinement(
+                        front_end,
+                        config.rig,
+                        lambda: ladder.level < LoadLevel.REDUCED,
+                        file,
+                        session.warn,
+                        has_delay=config.camera.upper_delay_ms == 0,
+                    )
+                )
+            )
         self._used = str(file.path) if file is not None and file.used is not None else ""
 
     @property

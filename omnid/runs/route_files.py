@@ -32,8 +32,12 @@ class RouteFiles:
 
     PERIOD_S: Final = 0.05  # so that a person does not notice it
 
-    def __init__(self, folder: RouteFolder, pass_on: Callable[[NavigationCommand], None],
-                 save_map: Callable[[], object] = nothing) -> None:
+    def __init__(
+        self,
+        folder: RouteFolder,
+        pass_on: Callable[[NavigationCommand], None],
+        save_map: Callable[[], object] = nothing,
+    ) -> None:
         """pass_on: takes requests, from any thread. save_map: asks for the map to be written, which routes need."""
         self._folder, self._pass_on, self.save_map = folder, pass_on, save_map
         self._waiting: deque[NavigationCommand] = deque()

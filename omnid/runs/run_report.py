@@ -25,7 +25,8 @@ from omnid.transport.codec import DiagnosticStatus
 READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
 PAIRING_DROPS: Final = ("unpaired", "repeated")  # begin the names of its counts
 BOOKKEEPING: Final = frozenset(  # left out of the timings
-    {"progress", "statistics", "collect-poses", "collect-map", "collect-places"})
+    {"progress", "statistics", "collect-poses", "collect-map", "collect-places"}
+)
 
 
 class RunReport:
@@ -38,8 +39,9 @@ class RunReport:
         """Return the counters of the run with the given statistics."""
         counters = RunCounters.of(statistics, self._pairing.counts["pairs"], self._drops())
         mapping, places = self._stages.mapping, self._stages.places
-        return replace(counters, map={} if mapping is None else mapping.counts,
-                       places={} if places is None else places.counts)
+        return replace(
+            counters, map={} if mapping is None else mapping.counts, places={} if places is None else places.counts
+        )
 
     def places(self) -> PlaceMap | None:
         """Return the map of places as it can be saved; None where there is none."""

@@ -59,11 +59,14 @@ class RunResult:
         length_m = float(np.linalg.norm(np.diff(self.T_odom_rig[:, :3, 3], axis=0), axis=1).sum())
         states = ", ".join(f"{count} {state}" for state, count in Counter(self.states).most_common())
         points = "no map" if self.map is None else f"{len(self.map.xyz)} map points"
-        return (f"<RunResult: {self.counters.poses} poses{f' ({states})' if states else ''}, {span_s:.1f} s, "
-                f"{length_m:.2f} m, {points}, {len(self.warnings)} warnings>")
+        return (
+            f"<RunResult: {self.counters.poses} poses{f' ({states})' if states else ''}, {span_s:.1f} s, "
+            f"{length_m:.2f} m, {points}, {len(self.warnings)} warnings>"
+        )
 
-    def evaluate(self, truth: str | PathLike[str] | Trajectory, *, tolerance_s: float = 0.01,
-                 alignment: str = "origin") -> Metrics:
+    def evaluate(
+        self, truth: str | PathLike[str] | Trajectory, *, tolerance_s: float = 0.01, alignment: str = "origin"
+    ) -> Metrics:
         """Return the errors of the poses against a true trajectory, as `omnid eval` prints them.
 
         truth: a TUM file, or a Trajectory of T_world_rig. tolerance_s: largest difference of the stamps of two poses.
@@ -86,11 +89,16 @@ class RunResult:
             raise OmnidError("to_dataframe: pandas is not installed: pip install 'omnid[pandas]'") from error
         T, count = self.T_odom_rig, len(self.stamps_ns)
         quaternions = np.reshape([se3.quaternion(R) for R in T[:, :3, :3]], (count, 4))
-        sigmas = {name: np.sqrt(np.linalg.eigvalsh(self.covariances[:, at, at])[:, -1])
-                  for name, at in (("sigma_m", slice(0, 3)), ("sigma_rad", slice(3, 6)))}
-        columns = {**dict(zip("xyz", T[:, :3, 3].T, strict=True)),
-                   **dict(zip(("qx", "qy", "qz", "qw"), quaternions.T, strict=True)), **sigmas,
-                   "state": [str(state) for state in self.states]}
+        sigmas = {
+            name: np.sqrt(np.linalg.eigvalsh(self.covariances[:, at, at])[:, -1])
+            for name, at in (("sigma_m", slice(0, 3)), ("sigma_rad", slice(3, 6)))
+        }
+        columns = {
+            **dict(zip("xyz", T[:, :3, 3].T, strict=True)),
+            **dict(zip(("qx", "qy", "qz", "qw"), quaternions.T, strict=True)),
+            **sigmas,
+            "state": [str(state) for state in self.states],
+        }
         return pandas.DataFrame(columns, index=pandas.DatetimeIndex(self.stamps_ns, tz="UTC", name="time"))
 
     def save_tum(self, path: str | PathLike[str]) -> None:

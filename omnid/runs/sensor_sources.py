@@ -25,8 +25,11 @@ from omnid.transport.topics import IMU, JOINT_STATES, WHEEL_ODOM
 def motion_topics(config: Config) -> MotionTopics:
     """Return the topics of a log to read. Raise OmnidError for half of a pair of joints."""
     settings = config.motion
-    return MotionTopics("" if settings.wheels == "off" else settings.wheel_topic or None,
-                        "" if settings.imu == "off" else settings.imu_topic or None, joint_wheels(config))
+    return MotionTopics(
+        "" if settings.wheels == "off" else settings.wheel_topic or None,
+        "" if settings.imu == "off" else settings.imu_topic or None,
+        joint_wheels(config),
+    )
 
 
 def joint_wheels(config: Config) -> JointWheels | None:
@@ -35,8 +38,9 @@ def joint_wheels(config: Config) -> JointWheels | None:
     if not left and not right:
         return None
     if not (left and right) or left == right:
-        raise OmnidError(f"motion.left_joint = {left!r}, motion.right_joint = {right!r}: expected the names of two "
-                         "joints, or none")
+        raise OmnidError(
+            f"motion.left_joint = {left!r}, motion.right_joint = {right!r}: expected the names of two joints, or none"
+        )
     drive = config.motor.drive.geometry()
     return JointWheels(left, right, drive.wheel_radius_m, drive.track_m)
 
@@ -57,19 +61,33 @@ class SensorSources:
     Where the images are those of a log, or of a simulation, both come with them: no others fit.
     """
 
-    def __init__(self, config: Config, inbox: MotionInbox, session: Session,
-                 controller: DriveLink | None, report: Callable[[int, str], None], *, with_images: bool = False
-                 ) -> None:
+    def __init__(
+        self,
+        config: Config,
+        inbox: MotionInbox,
+        session: Session,
+        controller: DriveLink | None,
+        report: Callable[[int, str], None],
+        *,
+        with_images: bool = False,
+    ) -> None:
         """Open the IMU; DriverError where its port cannot be opened. with_images: they come with the images."""
         self._inbox = inbox
         self.gyro: WitMotionGyro | None = None
         joints = joint_wheels(config)
         topics: set[str] = set() if with_images else self._open(config.motion, session, controller, report, joints)
-        self.receiver = SensorReceiver(inbox.add, session.offset_ns, frozenset(topics),
-                                       partial(report, logging.WARNING), joints)
+        self.receiver = SensorReceiver(
+            inbox.add, session.offset_ns, frozenset(topics), partial(report, logging.WARNING), joints
+        )
 
-    def _open(self, settings: MotionSensorSettings, session: Session, controller: DriveLink | None,
-              report: Callable[[int, str], None], joints: JointWheels | None) -> set[str]:
+    def _open(
+        self,
+        settings: MotionSensorSettings,
+        session: Session,
+        controller: DriveLink | None,
+        report: Callable[[int, str], None],
+        joints: JointWheels | None,
+    ) -> set[str]:
         """Open the devices; return the topics of the bus that are taken."""
         topics = set()
         if settings.wheels == "auto":

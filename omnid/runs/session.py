@@ -37,8 +37,14 @@ class Session:
     """One run: its graph, its statistics and its outputs, which are closed in reverse order when `outputs` closes."""
 
     def __init__(
-        self, config: Config, graph: Graph, outputs: ExitStack, warn: Callable[[str], None], *, offset_ns: int = 0,
-        clock_ns: Callable[[], int] = time.monotonic_ns
+        self,
+        config: Config,
+        graph: Graph,
+        outputs: ExitStack,
+        warn: Callable[[str], None],
+        *,
+        offset_ns: int = 0,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """warn: takes a line for the user; offset_ns: from the stamps of the frames to Unix time.
 
@@ -54,8 +60,10 @@ class Session:
         rig = with_rims(rig, frames)
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
             if camera.mask is None and not sees_directly(camera.camera):
-                self.warn(f"no mirror rim was found in the first images of the {name} camera: the whole image is used; "
-                          f"the mask can be given in the rig's file under [{name}.mask]")
+                self.warn(
+                    f"no mirror rim was found in the first images of the {name} camera: the whole image is used; "
+                    f"the mask can be given in the rig's file under [{name}.mask]"
+                )
         return geometry(rig, self.config.panorama)
 
     def open_bus(self, rig: Rig) -> Bus:
@@ -88,8 +96,10 @@ class Session:
         """Return the settings, without the collision monitor where no obstacles are looked for, which is told."""
         if not settings.collision.check or self.config.obstacles.enabled:
             return settings
-        self.warn("obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
-                  "against obstacles")
+        self.warn(
+            "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
+            "against obstacles"
+        )
         return settings.without_obstacles
 
     def encoder(self, rig: Rig, cloud_points: int) -> Encoder:

@@ -95,8 +95,10 @@ class Service:
 
     def _log_changes(self, stalled: dict[str, float]) -> None:
         for name in stalled.keys() - self._stalled:
-            log(logging.ERROR, f"stage '{name}' is stalled: {stalled[name]:.1f} s at one message; systemd's watchdog "
-                "is no longer fed")
+            log(
+                logging.ERROR,
+                f"stage '{name}' is stalled: {stalled[name]:.1f} s at one message; systemd's watchdog is no longer fed",
+            )
         for name in self._stalled - stalled.keys():
             log(logging.INFO, f"stage '{name}' goes on")
         self._stalled = frozenset(stalled)

@@ -50,8 +50,9 @@ def write_below(root: Path, name: str, text: str) -> None:
         # A link in the place of a folder: ENOTDIR on Linux, ELOOP elsewhere.
         if error.errno in (errno.ENOTDIR, errno.ELOOP) and any(one.is_symlink() for one in (path, *path.parents)):
             raise OmnidError(_link(path)) from error
-        raise OmnidError(f"{path} cannot be written: {error.strerror}; run this command with sudo, or name another "
-                         "--root") from error
+        raise OmnidError(
+            f"{path} cannot be written: {error.strerror}; run this command with sudo, or name another --root"
+        ) from error
     finally:
         if folder >= 0:
             os.close(folder)

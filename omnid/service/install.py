@@ -52,19 +52,23 @@ class Installation:
     def steps(self) -> list[Step]:
         """Return the steps that are still to be taken; OmnidError for a program that the unit cannot start."""
         if any(self.program.is_relative_to(folder) for folder in HIDDEN):
-            raise OmnidError(f"{self.program} is in a folder that the service cannot see: install omnid elsewhere, "
-                             "such as `sudo python3 -m venv /opt/omnid && sudo /opt/omnid/bin/pip install .`")
+            raise OmnidError(
+                f"{self.program} is in a folder that the service cannot see: install omnid elsewhere, "
+                "such as `sudo python3 -m venv /opt/omnid && sudo /opt/omnid/bin/pip install .`"
+            )
         return list(self._steps())
 
     @property
     def next_steps(self) -> str:
         """Instructions for what only the user knows."""
         units = "omnid omnid-web" if self.page else "omnid"
-        return ("Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints the lines), copy "
-                "rig.toml to /etc/omnid, describe the hardware in /etc/omnid/omnid.toml, and run\n"
-                "  sudo udevadm control --reload && sudo udevadm trigger\n"
-                f"  sudo {shlex.quote(str(self.program))} doctor --config /etc/omnid/omnid.toml\n"
-                f"  sudo systemctl daemon-reload && sudo systemctl enable --now {units}")
+        return (
+            "Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints the lines), copy "
+            "rig.toml to /etc/omnid, describe the hardware in /etc/omnid/omnid.toml, and run\n"
+            "  sudo udevadm control --reload && sudo udevadm trigger\n"
+            f"  sudo {shlex.quote(str(self.program))} doctor --config /etc/omnid/omnid.toml\n"
+            f"  sudo systemctl daemon-reload && sudo systemctl enable --now {units}"
+        )
 
     def _steps(self) -> Iterator[Step]:
         program = exec_word(self.program)
@@ -95,8 +99,10 @@ def exec_word(program: Path) -> str:
     """
     path = str(program)
     if not path.isprintable() or not _REFUSED.isdisjoint(path):
-        raise OmnidError(f"{plain(path)}: the path has characters that a systemd unit cannot name: install omnid "
-                         f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}")
+        raise OmnidError(
+            f"{plain(path)}: the path has characters that a systemd unit cannot name: install omnid "
+            f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}"
+        )
     escaped = path.replace("%", "%%")
     return escaped if _PLAIN.fullmatch(path) else f'"{escaped}"'
 

@@ -26,11 +26,14 @@ class SimulatedCameras:
         """samples: per pixel and axis."""
         self._world, self._seed, self._samples = world, seed, samples
         self._mounted = {"lower": rig.lower, "upper": rig.upper}
-        self._sensors = {name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
-                         for name, mounted in self._mounted.items()}
+        self._sensors = {
+            name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
+            for name, mounted in self._mounted.items()
+        }
 
-    def frame(self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers, *,
-              brightness: float = 1.0) -> Frame:
+    def frame(
+        self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers, *, brightness: float = 1.0
+    ) -> Frame:
         """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
         mounted, sensor = self._mounted[camera], self._sensors[camera]
         scene = Scene((*self._world.standing, *people.faces()))

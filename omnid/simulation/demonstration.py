@@ -108,8 +108,9 @@ class TeachAndRepeat:
 
 def both_paths(run: SimulatedRun, repeated_s: float) -> tuple[Array, Array]:
     """Return the true positions (N, 2), (M, 2) [m] in the world of the first drive and of the repetition."""
-    first, second = ([tick.pose[:2] for tick in run.ticks if (tick.time_s >= repeated_s) == later]
-                     for later in (False, True))
+    first, second = (
+        [tick.pose[:2] for tick in run.ticks if (tick.time_s >= repeated_s) == later] for later in (False, True)
+    )
     return np.array(first).reshape(-1, 2), np.array(second).reshape(-1, 2)
 
 

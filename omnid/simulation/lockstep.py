@@ -107,8 +107,11 @@ class SimulatedRun:
     def contacts(self) -> list[Tick]:
         """Return the first tick of each contact with an obstacle."""
         before = [None, *self.ticks]
-        return [tick for tick, last in zip(self.ticks, before, strict=False)
-                if tick.clearance_m <= 0 and (last is None or last.clearance_m > 0)]
+        return [
+            tick
+            for tick, last in zip(self.ticks, before, strict=False)
+            if tick.clearance_m <= 0 and (last is None or last.clearance_m > 0)
+        ]
 
     @property
     def clearance_m(self) -> float:
@@ -116,8 +119,17 @@ class SimulatedRun:
         return min(tick.clearance_m for tick in self.ticks)
 
 
-def simulate(world: World, robot: SimulatedRobot, drive: Drive, *, seconds: float, seed: int = 0,
-             config: Config | None = None, faults: Iterable[Fault] = (), tamper: Tamper | None = None) -> SimulatedRun:
+def simulate(
+    world: World,
+    robot: SimulatedRobot,
+    drive: Drive,
+    *,
+    seconds: float,
+    seed: int = 0,
+    config: Config | None = None,
+    faults: Iterable[Fault] = (),
+    tamper: Tamper | None = None,
+) -> SimulatedRun:
     """Drive for so many seconds of simulated time and return the run.
 
     tamper: changes the images; None: they are as the simulated cameras make them.
@@ -134,16 +146,30 @@ def simulate(world: World, robot: SimulatedRobot, drive: Drive, *, seconds: floa
 
 
 class _Lockstep:
-    def __init__(self, world: World, robot: SimulatedRobot, drive: Drive, seed: int, config: Config,
-                 faults: tuple[Fault, ...], tamper: Tamper | None) -> None:
+    def __init__(
+        self,
+        world: World,
+        robot: SimulatedRobot,
+        drive: Drive,
+        seed: int,
+        config: Config,
+        faults: tuple[Fault, ...],
+        tamper: Tamper | None,
+    ) -> None:
         self._tamper = tamper
         self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
         self._rig = with_masks(robot.rig)
         self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
         self._ticks: list[Tick] = []
         self._lines: list[tuple[float, str]] = []
-        self._vehicle = Vehicle(world, robot, config, seed, lambda tick, _: self._ticks.append(tick),
-                                lambda time_s, line: self._lines.append((time_s, line)))
+        self._vehicle = Vehicle(
+            world,
+            robot,
+            config,
+            seed,
+            lambda tick, _: self._ticks.append(tick),
+            lambda time_s, line: self._lines.append((time_s, line)),
+        )
         self._delay_ns = round(robot.pose_delay_s * 1e9)
         self._requests = LockstepRequests()
         self._files = RouteFiles(RouteFolder(Path(config.navigation.routes)), self._requests.put)
@@ -166,19 +192,29 @@ class _Lockstep:
         pairs = graph.stage("pair", Synchronise(shape.rig, config.pair), frames)
         run_places = RunPlaces(config, shape, nothing)
         navigation = NavigationParts(self._requests, self._wheels, Take(self._take_navigation), config.places.map)
-        sinks = Sinks(poses={"poses": Take(self._take_pose)}, rings={"rings": Take(self._take_ring)},
-                      places={"in map": Take(self._places.append)} if config.places.map else {})
-        self._stages = wire(graph, pairs, FrontEnd(shape, config), config, sinks,
-                            run_places.known_to(RunParts(navigation=navigation)))
+        sinks = Sinks(
+            poses={"poses": Take(self._take_pose)},
+            rings={"rings": Take(self._take_ring)},
+            places={"in map": Take(self._places.append)} if config.places.map else {},
+        )
+        self._stages = wire(
+            graph, pairs, FrontEnd(shape, config), config, sinks, run_places.known_to(RunParts(navigation=navigation))
+        )
         graph.run()
         run_places.finish()
         return SimulatedRun(
             np.array([stamp for stamp, _, _ in self._poses], np.int64),
             np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
             np.array([T for _, T, _ in self._poses]).reshape(-1, 4, 4),
-            tuple(state for _, _, state in self._poses), np.array(self._slipping, bool),
-            tuple(self._ticks), tuple(self._lines), tuple(self._rings),
-            tuple(self._navigation), tuple(self._places), self._rig.T_base_rig)
+            tuple(state for _, _, state in self._poses),
+            np.array(self._slipping, bool),
+            tuple(self._ticks),
+            tuple(self._lines),
+            tuple(self._rings),
+            tuple(self._navigation),
+            tuple(self._places),
+            self._rig.T_base_rig,
+        )
 
     def _messages(self, seconds: float) -> Iterator[Frame | MotionSample]:
         """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
@@ -202,8 +238,9 @@ class _Lockstep:
         brightness = 0.0 if self._has("dark") else 1.0
         for camera in CAMERAS:
             if not self._has(f"no {camera} image"):
-                frame = self._cameras.frame(camera, seq, stamp_ns, T_world_rig, self._vehicle.people,
-                                            brightness=brightness)
+                frame = self._cameras.frame(
+                    camera, seq, stamp_ns, T_world_rig, self._vehicle.people, brightness=brightness
+                )
                 yield frame if self._tamper is None else self._tamper(self._vehicle.time_s, frame)
 
     def _has(self, kind: str) -> bool:
@@ -213,9 +250,15 @@ class _Lockstep:
     def _send(self) -> None:
         """Send what the drive asks for now."""
         vehicle, controller = self._vehicle, self._vehicle.controller
-        moment = Moment(vehicle.time_s, vehicle.T_world_base, controller.state, self._odometry,
-                        self._poses[-1][1] if self._poses else np.eye(4), _newest(self._navigation),
-                        _newest(self._places))
+        moment = Moment(
+            vehicle.time_s,
+            vehicle.T_world_base,
+            controller.state,
+            self._odometry,
+            self._poses[-1][1] if self._poses else np.eye(4),
+            _newest(self._navigation),
+            _newest(self._places),
+        )
         arrival_ns = vehicle.now_ns + 1  # after the tick at this time, which has passed
         for request in self._drive(moment):
             if isinstance(request, Setpoint):

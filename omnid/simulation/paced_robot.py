@@ -75,8 +75,9 @@ class PacedRobot:
     waits: Final = True
     brings_samples: Final = True
 
-    def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int,
-                 report: Callable[[str], None]) -> None:
+    def __init__(
+        self, world: World, robot: SimulatedRobot, config: Config, seed: int, report: Callable[[str], None]
+    ) -> None:
         """report: takes a line at each contact with an obstacle."""
         self.rig = with_masks(robot.rig)
         self._world, self._robot, self._config, self._seed, self._report = world, robot, config, seed, report
@@ -137,8 +138,11 @@ class PacedRobot:
 
     def _status(self) -> DiagnosticStatus:
         time_s = (self.clock_ns() - self._start_ns) * 1e-9
-        values = {str(Key.REAL_TIME_FACTOR): f"{self._pace.value:.2f}", "time_s": f"{time_s:.1f}",
-                  "contacts": str(self.contacts)}
+        values = {
+            str(Key.REAL_TIME_FACTOR): f"{self._pace.value:.2f}",
+            "time_s": f"{time_s:.1f}",
+            "contacts": str(self.contacts),
+        }
         return DiagnosticStatus(SIMULATION, OK, "its time waits for the daemon", values)
 
     def _frames(self, settle: Callable[[], None], take: Callable[[MotionSample], None]) -> Iterator[Frame]:

@@ -67,8 +67,11 @@ class Walkers:
             started_s = self._started_s[number]
             if person.waits_within_m and started_s is not None:
                 self._started_s[number] = self._polite(number, started_s, passed_s, robot)
-            if self._started_s[number] is None and time_s >= person.start_s and (
-                    math.dist(robot, person.path[-1]) <= person.starts_within_m):
+            if (
+                self._started_s[number] is None
+                and time_s >= person.start_s
+                and (math.dist(robot, person.path[-1]) <= person.starts_within_m)
+            ):
                 self._started_s[number] = time_s
 
     def _polite(self, number: int, started_s: float, passed_s: float, robot: Point) -> float:
@@ -88,13 +91,18 @@ class Walkers:
 
     def faces(self) -> list[Rectangle]:
         """Return the people's rectangles in the world now."""
-        return [moved(face, place) for person, place in zip(self._people, self.places(), strict=True)
-                for face in person.faces]
+        return [
+            moved(face, place)
+            for person, place in zip(self._people, self.places(), strict=True)
+            for face in person.faces
+        ]
 
     def places(self) -> list[tuple[float, float, float]]:
         """Return x, y [m] and heading [rad] of each person now."""
-        return [person.place(0.0 if started_s is None else self.time_s - started_s)
-                for person, started_s in zip(self._people, self._started_s, strict=True)]
+        return [
+            person.place(0.0 if started_s is None else self.time_s - started_s)
+            for person, started_s in zip(self._people, self._started_s, strict=True)
+        ]
 
 
 def moved(face: Rectangle, place: tuple[float, float, float]) -> Rectangle:

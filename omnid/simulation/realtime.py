@@ -42,8 +42,15 @@ MOST_POSES: Final = 200_000  # kept of the truth: five hours; older ones give wa
 class RealtimeRobot:
     """A robot whose time is that of the computer; `port` is its serial port, `imu_port` that of its gyro."""
 
-    def __init__(self, world: World, robot: SimulatedRobot, protocol: str, drive: DifferentialDrive, seed: int = 0,
-                 report: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        world: World,
+        robot: SimulatedRobot,
+        protocol: str,
+        drive: DifferentialDrive,
+        seed: int = 0,
+        report: Callable[[str], None] | None = None,
+    ) -> None:
         """Open the terminal. report: takes a line at each contact with an obstacle."""
         self.rig = with_masks(robot.rig)
         self._robot, self._world, self._report = robot, world, report
@@ -126,8 +133,9 @@ class RealtimeRobot:
             del self.truth[next(iter(self.truth))]
         self.truth[stamp_ns] = pose
         walking = footprints(people.faces(), self._robot.height_m)
-        touches = min(clearance_m(segments, pose[:2], self._robot.radius_m) for segments in (self._standing, walking)
-                      ) <= 0
+        touches = (
+            min(clearance_m(segments, pose[:2], self._robot.radius_m) for segments in (self._standing, walking)) <= 0
+        )
         if touches and not self._touches:
             self.contacts += 1
             if self._report is not None:

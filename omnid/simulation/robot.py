@@ -90,7 +90,8 @@ def traction(wheels: WheelErrors, seed: int) -> Traction:
         kept = 1.0 - max((slip.share for slip in wheels.slips if slip.start_s <= passed_s < slip.end_s), default=0.0)
         left_m, right_m = (
             kept * travel_m * (1.0 + error) + wheels.noise * math.sqrt(abs(travel_m)) * rng.gauss(0.0, 1.0)
-            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right)))
+            for travel_m, error in ((left_m, wheels.left), (right_m, wheels.right))
+        )
         return left_m, right_m
 
     return over_ground

@@ -43,9 +43,16 @@ class Tick(NamedTuple):
 class Vehicle:
     """A body that is advanced by its caller. Messages to the controller arrive at their times, in order."""
 
-    def __init__(self, world: World, robot: SimulatedRobot, config: Config, seed: int,
-                 take_tick: Callable[[Tick, TickReport], None], report: Callable[[float, str], None],
-                 start_ns: int = START_NS) -> None:
+    def __init__(
+        self,
+        world: World,
+        robot: SimulatedRobot,
+        config: Config,
+        seed: int,
+        take_tick: Callable[[Tick, TickReport], None],
+        report: Callable[[float, str], None],
+        start_ns: int = START_NS,
+    ) -> None:
         """take_tick: takes each tick. report: takes lines of the controller, with the time since the start [s]."""
         self.now_ns = self._start_ns = start_ns
         self.people = Walkers(world.people)
@@ -54,11 +61,17 @@ class Vehicle:
         self.twin = SIMULATED_CONTROLLERS[config.motor.protocol](drive)
         base = self.twin.base
         base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
-        self.motor = LockstepMotor(PROTOCOLS[config.motor.protocol](drive), self.twin, config.motor.watchdog_ms,
-                                   lambda: self.now_ns)
-        self.controller = Controller(self.motor, config.controller, 1.0 / config.motor.rate_hz,
-                                     lambda line: report(self.time_s, line),
-                                     clock_ns=lambda: self.now_ns, limited=drive.limited)
+        self.motor = LockstepMotor(
+            PROTOCOLS[config.motor.protocol](drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
+        )
+        self.controller = Controller(
+            self.motor,
+            config.controller,
+            1.0 / config.motor.rate_hz,
+            lambda line: report(self.time_s, line),
+            clock_ns=lambda: self.now_ns,
+            limited=drive.limited,
+        )
         self._period_ns = round(1e9 / config.motor.rate_hz)
         self._tick_ns = start_ns
         self._waiting: list[tuple[int, int, Callable[[], None]]] = []
@@ -131,11 +144,11 @@ class Vehicle:
         status = self.motor.status
         if self._robot.has_odometry and status is not None and math.isfinite(status.velocity_mps):
             self.samples.append(WheelSample(self.now_ns, status.velocity_mps, status.yaw_rate_radps))
-        self._take_tick(Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason,
-                             self._clearance_m()), report)
+        self._take_tick(
+            Tick(self.time_s, self.twin.base.pose, report.command, report.state.reason, self._clearance_m()), report
+        )
 
     def _clearance_m(self) -> float:
         x_m, y_m, _ = self.twin.base.pose
         walking = footprints(self.people.faces(), self._robot.height_m)
         return min(clearance_m(segments, (x_m, y_m), self._robot.radius_m) for segments in (self._standing, walking))
-

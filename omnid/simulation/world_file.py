@@ -1,14 +1,14 @@
 """World files: TOML, described in omnid/simulation/WORLDS.md; textures follow from a seed.
 
-    schema = 1
-    start = [0.0, 0.0, 0.0]
-    [space]
-    low = [-3.0, -2.5]
-    high = [3.0, 2.5]
-    [[wall]]
-    points = [[-3.0, -2.5], [-3.0, 2.5], [3.0, 2.5], [3.0, -2.5], [-3.0, -2.5]]
-    texture = "brick"
-    posters_per_m = 0.5
+schema = 1
+start = [0.0, 0.0, 0.0]
+[space]
+low = [-3.0, -2.5]
+high = [3.0, 2.5]
+[[wall]]
+points = [[-3.0, -2.5], [-3.0, 2.5], [3.0, 2.5], [3.0, -2.5], [-3.0, -2.5]]
+texture = "brick"
+posters_per_m = 0.5
 """
 
 from __future__ import annotations
@@ -57,8 +57,10 @@ class WorldOptions:
 
     def __post_init__(self) -> None:
         if not (0.05 <= self.brightness <= 3.0 and 0.0 <= self.other_posters <= 1.0 and self.posters_seed >= 0):
-            raise OmnidError(f"world: brightness {self.brightness:g}, other posters {self.other_posters:g}, seed "
-                             f"{self.posters_seed}: give 0.05 to 3, 0 to 1, and 0 or more")
+            raise OmnidError(
+                f"world: brightness {self.brightness:g}, other posters {self.other_posters:g}, seed "
+                f"{self.posters_seed}: give 0.05 to 3, 0 to 1, and 0 or more"
+            )
 
 
 def shipped_worlds() -> list[str]:
@@ -74,8 +76,9 @@ def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) ->
         elif name.endswith(".toml"):
             text = decode(read_bytes(Path(name), MAX_BYTES), name)
         else:
-            raise OmnidError(f"world {name!r} is not known; name a file *.toml, or one of "
-                             f"{', '.join(shipped_worlds())}")
+            raise OmnidError(
+                f"world {name!r} is not known; name a file *.toml, or one of {', '.join(shipped_worlds())}"
+            )
         return parse_world(text, name, seed, options or WorldOptions())
     except CalibError as error:
         raise OmnidError(str(error)) from None
@@ -88,17 +91,21 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     require_schema(top, SCHEMA)
     rng = np.random.default_rng([seed, 41])
     space = _Space.of(top.table("space"))
-    walls, boxes, persons = (top.tables(key, most) for key, most in (
-        ("wall", MOST_WALLS), ("box", MOST_BOXES), ("person", MOST_PEOPLE)))
+    walls, boxes, persons = (
+        top.tables(key, most) for key, most in (("wall", MOST_WALLS), ("box", MOST_BOXES), ("person", MOST_PEOPLE))
+    )
     x_m, y_m, heading_deg = top.numbers("start", 3)
     # 1. What cannot be is refused before any texture is painted, which takes time and memory.
     if not space.contains((x_m, y_m)):
         top.fail("start", "a place within the space")
     for table in boxes:
         _check_box(table, space, (x_m, y_m))
-    area_m2 = (space.area_m2 + sum(_wall_area_m2(table, space.ceiling_m) for table in walls)
-               + sum(_box_area_m2(_size(table)) for table in boxes)
-               + sum(_box_area_m2(_person_size(table)) for table in persons))
+    area_m2 = (
+        space.area_m2
+        + sum(_wall_area_m2(table, space.ceiling_m) for table in walls)
+        + sum(_box_area_m2(_size(table)) for table in boxes)
+        + sum(_box_area_m2(_person_size(table)) for table in persons)
+    )
     if area_m2 > LARGEST_AREA_M2:
         raise CalibError(f"{name}: the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}")
     # 2. Surfaces with their textures, in the order in which the seed is used.
@@ -111,8 +118,9 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     if options.other_posters:
         standing = _exchanged(standing, options)
     brightness = options.brightness * (_positive(top, "light", 0.05, 3.0) if top.has("light") else 1.0)
-    return World(name, tuple(standing), people if options.people else (), (x_m, y_m, math.radians(heading_deg)),
-                 brightness)
+    return World(
+        name, tuple(standing), people if options.people else (), (x_m, y_m, math.radians(heading_deg)), brightness
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +139,9 @@ class _Space:
         if not (0.5 <= x1 - x0 <= LARGEST_M and 0.5 <= y1 - y0 <= LARGEST_M):
             table.fail("high", f"a corner 0.5 to {LARGEST_M:g} m beyond low")
         ceiling_m = _positive(table, "ceiling_m", 1.5, 20.0) if table.has("ceiling_m") else CEILING_M
-        floor, ceiling = (table.choice(key, textures.PAINTERS) if table.has(key) else "tiles"
-                          for key in ("floor", "ceiling"))
+        floor, ceiling = (
+            table.choice(key, textures.PAINTERS) if table.has(key) else "tiles" for key in ("floor", "ceiling")
+        )
         return _Space((x0, y0), (x1, y1), ceiling_m, (floor, ceiling))
 
     @property
@@ -141,15 +150,19 @@ class _Space:
         return 2 * (x1 - x0) * (y1 - y0)
 
     def contains(self, point: Point) -> bool:
-        return all(low - ROUNDING_M <= value <= high + ROUNDING_M
-                   for low, value, high in zip(self.low, point, self.high, strict=True))
+        return all(
+            low - ROUNDING_M <= value <= high + ROUNDING_M
+            for low, value, high in zip(self.low, point, self.high, strict=True)
+        )
 
     def floor_and_ceiling(self, rng: Random) -> list[Rectangle]:
         (x0, y0), (x1, y1) = self.low, self.high
         along, across = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
         floor, ceiling = (painted(rng, kind, (x1 - x0, y1 - y0), FLOOR_PX_PER_M) for kind in self.kinds)
-        return [Rectangle(np.array([x0, y1, 0.0]), along, -across, floor, "floor"),
-                Rectangle(np.array([x0, y0, self.ceiling_m]), along, across, ceiling, "ceiling")]
+        return [
+            Rectangle(np.array([x0, y1, 0.0]), along, -across, floor, "floor"),
+            Rectangle(np.array([x0, y0, self.ceiling_m]), along, across, ceiling, "ceiling"),
+        ]
 
 
 def _check_box(table: ValidatedTable, space: _Space, start: Point) -> None:
@@ -157,8 +170,11 @@ def _check_box(table: ValidatedTable, space: _Space, start: Point) -> None:
     x_m, y_m, yaw_rad = _box_pose(table)
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     along_m, across_m = (side / 2 for side in _size(table)[:2])
-    corners = [(x_m + c * i * along_m - s * j * across_m, y_m + s * i * along_m + c * j * across_m)
-               for i in (-1, 1) for j in (-1, 1)]
+    corners = [
+        (x_m + c * i * along_m - s * j * across_m, y_m + s * i * along_m + c * j * across_m)
+        for i in (-1, 1)
+        for j in (-1, 1)
+    ]
     if not all(map(space.contains, corners)):
         table.fail("at", "a place where the whole box is within the space")
     dx_m, dy_m = start[0] - x_m, start[1] - y_m
@@ -179,7 +195,8 @@ def _box_area_m2(size_m: tuple[float, float, float]) -> float:
 def _wall_area_m2(table: ValidatedTable, ceiling_m: float) -> float:
     """Return the area of a wall, of which doors are a part."""
     return _wall_height_m(table, ceiling_m) * sum(
-        math.dist(a, b) for a, b in pairwise(table.points("points", 2, MOST_POINTS)))
+        math.dist(a, b) for a, b in pairwise(table.points("points", 2, MOST_POINTS))
+    )
 
 
 def _wall_height_m(table: ValidatedTable, ceiling_m: float) -> float:
@@ -202,7 +219,7 @@ def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangl
     hung: list[Rectangle] = []
     for part in parts:
         if height_m >= CEILING_M - 0.2 and part.height_m > 0.8 * height_m and part.width_m > 0.6:
-            for side in (part, _other_side(part))[:1 + both]:
+            for side in (part, _other_side(part))[: 1 + both]:
                 hung += posters(rng, side, round(per_m * part.width_m), len(hung))
     return parts + hung
 
@@ -210,12 +227,16 @@ def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangl
 def _door(table: ValidatedTable) -> tuple[float, float, float]:
     """Return the distance from the wall's beginning, width and height [m] of a door."""
     table.allow_only(("at_m", "width_m", "height_m"))
-    return (_positive(table, "at_m", 0.0, LARGEST_M), _positive(table, "width_m", 0.3, 10.0),
-            _positive(table, "height_m", 0.3, 20.0) if table.has("height_m") else 2.1)
+    return (
+        _positive(table, "at_m", 0.0, LARGEST_M),
+        _positive(table, "width_m", 0.3, 10.0),
+        _positive(table, "height_m", 0.3, 20.0) if table.has("height_m") else 2.1,
+    )
 
 
-def _pieces(rng: Random, kind: str, ends: tuple[Point, Point], height_m: float,
-            doors: list[tuple[float, float, float]]) -> list[Rectangle]:
+def _pieces(
+    rng: Random, kind: str, ends: tuple[Point, Point], height_m: float, doors: list[tuple[float, float, float]]
+) -> list[Rectangle]:
     """Return a straight wall between two points, left and right as seen from its front, without its doors."""
     a, b = (np.array([*end, 0.0]) for end in ends)
     length_m = float(np.linalg.norm(b - a))
@@ -226,8 +247,11 @@ def _pieces(rng: Random, kind: str, ends: tuple[Point, Point], height_m: float,
         pieces.append((at_m, at_m + width_m, door_m))
         begin_m = at_m + width_m
     pieces.append((begin_m, length_m, 0.0))
-    return [_upright(rng, kind, (a + left * along, a + min(right, length_m) * along), (low, height_m))
-            for left, right, low in pieces if min(right, length_m) - left > 0.01 and height_m - low > 0.01]
+    return [
+        _upright(rng, kind, (a + left * along, a + min(right, length_m) * along), (low, height_m))
+        for left, right, low in pieces
+        if min(right, length_m) - left > 0.01 and height_m - low > 0.01
+    ]
 
 
 def _upright(rng: Random, kind: str, ends: tuple[Array, Array], heights_m: tuple[float, float]) -> Rectangle:
@@ -260,8 +284,11 @@ def _person(rng: Random, table: ValidatedTable) -> Person:
         _positive(table, "speed_mps", 0.0, 5.0) if table.has("speed_mps") else 1.0,
         table.choice("repeat", ("once", "loop", "back and forth")) if table.has("repeat") else "once",
         _positive(table, "start_s", 0.0, 1e5) if table.has("start_s") else 0.0,
-        *(_positive(table, key, 0.0, 100.0) if table.has(key) else 0.0
-          for key in ("starts_within_m", "waits_within_m")))
+        *(
+            _positive(table, key, 0.0, 100.0) if table.has(key) else 0.0
+            for key in ("starts_within_m", "waits_within_m")
+        ),
+    )
 
 
 def _person_size(table: ValidatedTable) -> tuple[float, float, float]:
@@ -285,5 +312,9 @@ def _positive(table: ValidatedTable, key: str, low: float, high: float) -> float
 def _exchanged(standing: list[Rectangle], options: WorldOptions) -> list[Rectangle]:
     """Return the rectangles with a share of the posters exchanged."""
     rng = np.random.default_rng([options.posters_seed, 42])
-    return [replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
-            if r.name.startswith("poster") and rng.random() < options.other_posters else r for r in standing]
+    return [
+        replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
+        if r.name.startswith("poster") and rng.random() < options.other_posters
+        else r
+        for r in standing
+    ]

@@ -38,8 +38,9 @@ class BusSink:
 
 
 def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
-    return PoseAttachment(odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks,
-                          time.time_ns())
+    return PoseAttachment(
+        odometry.seq, odometry.state, odometry.reset_counter, odometry.inliers, odometry.tracks, time.time_ns()
+    )
 
 
 class PanoramaSink:

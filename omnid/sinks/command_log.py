@@ -21,8 +21,9 @@ from omnid.transport.topics import EMPTY_SCHEMA
 _EMPTY: Final = b"\0\1\0\0\0"  # std_msgs/msg/Empty in CDR: the encapsulation header and one byte
 
 
-def command_recorder(recorder: Recorder, now_ns: Callable[[], int], topics: Mapping[str, str]
-                     ) -> Callable[[str, bytes], None]:
+def command_recorder(
+    recorder: Recorder, now_ns: Callable[[], int], topics: Mapping[str, str]
+) -> Callable[[str, bytes], None]:
     """Return a function that records a command, by key and payload, at the time of its arrival.
 
     It may be called in any thread and never raises. now_ns: the time of the log. topics: of commands, with their types;

@@ -28,8 +28,7 @@ FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a r
 class LiveDrive:
     """Pass the poses of `omnid run` on; setpoints come from the network."""
 
-    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64], ended: Callable[[], object] = nothing
-                 ) -> None:
+    def __init__(self, link: DriveLink, T_base_rig: NDArray[np.float64], ended: Callable[[], object] = nothing) -> None:
         """ended: called after the last pose."""
         self._link, self._T_base_rig, self._ended = link, T_base_rig, ended
 
@@ -71,9 +70,15 @@ class PlannerDrive:
 def granted_words(request: str, state: str) -> str:
     """Return what the robot does after a request, in a word, that it has accepted; state: of the navigation."""
     verb, _, name = request.partition(" ")
-    return {"goal": "it drives to the goal", "path": "it drives along the path", "resume": "it goes on",
-            "teach": f"it records the route {name}: drive it, then finish it", "finish": "the route is written",
-            "repeat": f"it repeats the route {name}", "stop": "the route has ended"}.get(verb, state)
+    return {
+        "goal": "it drives to the goal",
+        "path": "it drives along the path",
+        "resume": "it goes on",
+        "teach": f"it records the route {name}: drive it, then finish it",
+        "finish": "the route is written",
+        "repeat": f"it repeats the route {name}",
+        "stop": "the route has ended",
+    }.get(verb, state)
 
 
 class RingToController:
@@ -126,5 +131,7 @@ class ReplayDrive:
 
 
 def _motor_failed() -> DriverError:
-    return DriverError("the motor controller does not answer any more; its own watchdog stops the wheels: "
-                       "check its power and its cable")
+    return DriverError(
+        "the motor controller does not answer any more; its own watchdog stops the wheels: "
+        "check its power and its cable"
+    )

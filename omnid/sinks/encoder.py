@@ -23,8 +23,9 @@ from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
-Outgoing: TypeAlias = (OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing
-                       | NavigationUpdate)
+Outgoing: TypeAlias = (
+    OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing | NavigationUpdate
+)
 
 
 class OutgoingMessage(NamedTuple):
@@ -50,8 +51,9 @@ def map_encoding(config: Config, points: int) -> MapEncoding:
 class Encoder:
     """Encodes messages for ROS 2; the odom of the encoded ones is the base's frame at the first pair, not the rig's."""
 
-    def __init__(self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0,
-                 rig: Rig | None = None) -> None:
+    def __init__(
+        self, T_base_rig: NDArray[np.float64], map_encoding: MapEncoding, offset_ns: int = 0, rig: Rig | None = None
+    ) -> None:
         """offset_ns: from the stamps of the messages to Unix time; 0 for a log, whose stamps are Unix time.
 
         rig: with the mounting of the cameras, for the static frames; None: they are left out.
@@ -70,8 +72,13 @@ class Encoder:
             case PlaceUpdate():
                 yield from self._map_pose(message)
             case ObstacleRing():
-                payload = scan_cdr(message.stamp_ns + self.offset_ns, "base_link", message.ranges_m, message.sigma_m,
-                                   (0.0, self._map_encoding.max_range_m))
+                payload = scan_cdr(
+                    message.stamp_ns + self.offset_ns,
+                    "base_link",
+                    message.ranges_m,
+                    message.sigma_m,
+                    (0.0, self._map_encoding.max_range_m),
+                )
                 yield OutgoingMessage("scan", SCAN_SCHEMA, payload)
                 payload = moving_cdr(message.stamp_ns + self.offset_ns, "odom", message.moving)
                 yield OutgoingMessage("moving", codec.POINT_CLOUD_SCHEMA, payload)
@@ -88,8 +95,9 @@ class Encoder:
     def _poses(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
         stamp_ns = odometry.stamp_ns + self.offset_ns
         T_odom_base, covariance, velocity, velocity_covariance = of_base(odometry, self.T_base_rig)
-        pose = codec.odometry_cdr(stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity,
-                                  velocity_covariance)
+        pose = codec.odometry_cdr(
+            stamp_ns, T_odom_base, in_outer_axes(T_odom_base, covariance), velocity, velocity_covariance
+        )
         yield OutgoingMessage("odom", codec.ODOMETRY_SCHEMA, pose)
         yield OutgoingMessage("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
         edge = codec.FrameTransform("odom", "base_link", T_odom_base)
@@ -133,8 +141,7 @@ class Encoder:
 
 
 class StateReports:
-    """Yields a status whenever the state of the odometry, or of the pose in the map, changes; offset_ns: the Encoder's.
-    """
+    """Yields a status when the state of the odometry, or of the pose in the map, changes; offset_ns: the Encoder's."""
 
     def __init__(self, offset_ns: int = 0) -> None:
         self._offset_ns = offset_ns
@@ -148,8 +155,12 @@ class StateReports:
     def _in_map(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
         if update.state != self._last_in_map:
             self._last_in_map = update.state
-            status = codec.DiagnosticStatus(PLACES, codec.ERROR if update.state is MapState.LOST else codec.OK,
-                                            update.state, {Key.STATE: update.state})
+            status = codec.DiagnosticStatus(
+                PLACES,
+                codec.ERROR if update.state is MapState.LOST else codec.OK,
+                update.state,
+                {Key.STATE: update.state},
+            )
             yield status_report(update.stamp_ns + self._offset_ns, [status])
 
     def _of_odometry(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
@@ -157,8 +168,12 @@ class StateReports:
         if now != self._last:
             self._last = now
             level = list(TrackingState).index(odometry.state)
-            values: dict[str, str] = {Key.STATE: odometry.state, Key.RESETS: str(odometry.reset_counter),
-                                      Key.INLIERS: str(odometry.inliers), Key.TRACKED: str(odometry.tracks)}
+            values: dict[str, str] = {
+                Key.STATE: odometry.state,
+                Key.RESETS: str(odometry.reset_counter),
+                Key.INLIERS: str(odometry.inliers),
+                Key.TRACKED: str(odometry.tracks),
+            }
             status = codec.DiagnosticStatus(ODOMETRY, level, odometry.state, values)
             yield status_report(odometry.stamp_ns + self._offset_ns, [status])
 

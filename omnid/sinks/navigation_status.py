@@ -9,8 +9,12 @@ from omnid.navigation_state import NavigationState
 from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
 from omnid.transport.status_names import NAVIGATION, Key
 
-_LEVELS = {NavigationState.BLOCKED: WARN, NavigationState.NOT_LOCALISED: WARN, NavigationState.PAUSED: WARN,
-           NavigationState.FAILED: ERROR}
+_LEVELS = {
+    NavigationState.BLOCKED: WARN,
+    NavigationState.NOT_LOCALISED: WARN,
+    NavigationState.PAUSED: WARN,
+    NavigationState.FAILED: ERROR,
+}
 
 
 def navigation_status(update: NavigationUpdate) -> DiagnosticStatus:

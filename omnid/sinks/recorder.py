@@ -81,8 +81,13 @@ class Recorder:
     """
 
     def __init__(
-        self, log: MessageLog, robot: str, encode: Encoder | None = None, *, offset_ns: int = 0,
-        skip_invalid: bool = False
+        self,
+        log: MessageLog,
+        robot: str,
+        encode: Encoder | None = None,
+        *,
+        offset_ns: int = 0,
+        skip_invalid: bool = False,
     ) -> None:
         """offset_ns: from the stamps of the messages to Unix time; the encoder has the same."""
         self._log, self._robot, self._encode = log, robot, encode
@@ -105,8 +110,9 @@ class Recorder:
     def status(self) -> DiagnosticStatus:
         """Return the state as a diagnostic status, with counts of all that was lost after the inbox."""
         state = self.state
-        counts = {name: str(getattr(state, name)) for name in
-                  ("messages", "lost", "refused", "files", "deleted", "stops")}
+        counts = {
+            name: str(getattr(state, name)) for name in ("messages", "lost", "refused", "files", "deleted", "stops")
+        }
         values = {"file": state.file, **counts, "invalid": str(self.invalid)}
         level = ERROR if state.status == "stopped" else OK
         return DiagnosticStatus(RECORDING, level, state.problem or state.status, values)

@@ -22,8 +22,9 @@ class SimulatedWheels:
         self._now_ns, self._moves = 0, False
         self._rearm_s = 0.5e-3 * settings.watchdog_ms
         self._sent = self._stops = 0
-        self._motor = LockstepMotor(PROTOCOLS[settings.protocol](drive), self._controller, settings.watchdog_ms,
-                                    lambda: self._now_ns)
+        self._motor = LockstepMotor(
+            PROTOCOLS[settings.protocol](drive), self._controller, settings.watchdog_ms, lambda: self._now_ns
+        )
 
     @property
     def base(self) -> SimulatedBase:

@@ -25,8 +25,10 @@ class StaticFrames:
         edges = [FrameTransform("base_link", "rig", self._encode.T_base_rig)]
         rig = self._encode.rig
         if rig is not None:
-            edges += [FrameTransform("rig", name, se3.inverse(camera.T_cam_rig))
-                      for name, camera in (("lower", rig.lower), ("upper", rig.upper))]
+            edges += [
+                FrameTransform("rig", name, se3.inverse(camera.T_cam_rig))
+                for name, camera in (("lower", rig.lower), ("upper", rig.upper))
+            ]
         payload = transform_cdr(stamp_ns + self._encode.offset_ns, edges)
         self._is_given = True
         yield OutgoingMessage(TF_STATIC, TRANSFORM_SCHEMA, payload)

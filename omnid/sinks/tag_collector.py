@@ -62,5 +62,7 @@ class TagCollector:
     def tags(self) -> dict[int, TagEstimate]:
         """Return the tags by their ids; poses in the map, in the axes of the base at its start."""
         T_map_odom = self._T_base_rig @ self._T_map_odom
-        return {id: fused([T_map_odom @ T for T, _ in views], [covariance for _, covariance in views])
-                for id, views in sorted(self._seen.items())}
+        return {
+            id: fused([T_map_odom @ T for T, _ in views], [covariance for _, covariance in views])
+            for id, views in sorted(self._seen.items())
+        }

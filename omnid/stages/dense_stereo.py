@@ -52,8 +52,9 @@ class DenseStereo:
         points, pixels = se3.apply(self._geometry.T_rig_rect, points[kept]), np.column_stack([columns, rows])[kept]
         return DensePoints(disparity, pixels.astype(float), points, variance_m2)
 
-    def _match(self, panoramas: Panoramas, correction: DenseCorrection | None
-               ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    def _match(
+        self, panoramas: Panoramas, correction: DenseCorrection | None
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
         """Return columns (N,), rows (N,) and disparities (N,) [px] as seen of the matched pixels."""
         lower, pad = panoramas.lower, panoramas.lower.pad_px
         valid = np.pad(panoramas.usable, ((0, 0), (pad, pad)))
@@ -61,8 +62,13 @@ class DenseStereo:
             matcher = self._idle.pop()
         except IndexError:
             matcher = Matcher(lower.image.shape[:2], self._matching(lower.image.shape[0]))
-        pixels, disparity = matcher.match(lower.image, panoramas.upper.image, valid, lower.noise_grey,
-                                          None if correction is None else correction.column_shift(pad))
+        pixels, disparity = matcher.match(
+            lower.image,
+            panoramas.upper.image,
+            valid,
+            lower.noise_grey,
+            None if correction is None else correction.column_shift(pad),
+        )
         self._idle.append(matcher)
         rows, columns = np.divmod(pixels, lower.image.shape[1])
         return columns - pad, rows, disparity

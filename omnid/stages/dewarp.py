@@ -62,8 +62,9 @@ class Dewarp:
         tiles = self._tiles.update(pair.stamp_ns, {"lower": lower_grey, "upper": upper_grey}, self._noise_grey)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
 
-    def _panorama(self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
-                  ) -> tuple[PaddedPanorama, Light, NDArray[np.uint8]]:
+    def _panorama(
+        self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
+    ) -> tuple[PaddedPanorama, Light, NDArray[np.uint8]]:
         """Return a panorama, brightened if it is dim, its light, and (H, W) as the camera gave it.
 
         measured: measure the noise of this camera again.

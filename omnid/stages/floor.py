@@ -55,8 +55,12 @@ class CameraFloor:
             return ""
         floor = self._estimator.floor
         if floor is None:
-            return ("the rig does not state the height of the cameras, and the images do not show the floor: map, grid "
-                    f"and obstacles call nothing free; {ADVICE}")
-        return (f"the rig does not state the height of the cameras: the images show the floor {floor.height_m:.2f} m "
-                f"(sigma {floor.sigma_m:.2f}) below the lower one, tilted by {math.degrees(floor.tilt_rad):.1f} deg "
-                f"(sigma {math.degrees(floor.sigma_rad):.1f}), which is used; {ADVICE}")
+            return (
+                "the rig does not state the height of the cameras, and the images do not show the floor: map, grid "
+                f"and obstacles call nothing free; {ADVICE}"
+            )
+        return (
+            f"the rig does not state the height of the cameras: the images show the floor {floor.height_m:.2f} m "
+            f"(sigma {floor.sigma_m:.2f}) below the lower one, tilted by {math.degrees(floor.tilt_rad):.1f} deg "
+            f"(sigma {math.degrees(floor.sigma_rad):.1f}), which is used; {ADVICE}"
+        )

@@ -23,8 +23,9 @@ class FrontEnd:
     dense depth of their pairs for all stages that need it.
     """
 
-    def __init__(self, geometry: Geometry, config: Config, health: RigHealth | None = None, *,
-                 load: Load = full_load) -> None:
+    def __init__(
+        self, geometry: Geometry, config: Config, health: RigHealth | None = None, *, load: Load = full_load
+    ) -> None:
         """health: state of the rig; None: one of its own, as the configuration checks it."""
         self.geometry = geometry
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)

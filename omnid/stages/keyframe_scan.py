@@ -17,8 +17,9 @@ from omnid.stages.floor import CameraFloor
 Array = NDArray[np.float64]
 
 
-def keyframe_scan(depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Array, settings: RingSettings
-                  ) -> RangeScan:
+def keyframe_scan(
+    depth: DensePoints, camera_floor: CameraFloor, T_rig_rect: Array, settings: RingSettings
+) -> RangeScan:
     """Return the ranges (SECTORS,) by azimuth in the rectified frame, turned level; all unknown without a floor."""
     floor = camera_floor.floor
     if floor is None:

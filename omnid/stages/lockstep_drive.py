@@ -52,8 +52,7 @@ class LockstepDrive:
         return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
 
     def _tick_until(self, stamp_ns: int) -> None:
-        """Tick between the last pose and the next; once the wheels stand, more ticks change nothing and are left out.
-        """
+        """Tick between the last pose and the next; once the wheels stand, more ticks change nothing and are omitted."""
         if self._last_ns is None:
             return
         ticks = range(self._last_ns + self._period_ns, stamp_ns, self._period_ns)
@@ -76,5 +75,14 @@ def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -
     heading_rad, velocity_mps, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[0]), float(velocity[5])
     sigma_mps, sigma_radps = (math.sqrt(max(0.0, float(covariance[axis, axis]))) for axis in (0, 5))
     finite = all(map(math.isfinite, (heading_rad, velocity_mps, rate_radps)))
-    return ControllerPose(odometry.stamp_ns, heading_rad, rate_radps, odometry.state if finite else TrackingState.LOST,
-                          velocity_mps, sigma_mps, sigma_radps, odometry.reset_counter, odometry.witness)
+    return ControllerPose(
+        odometry.stamp_ns,
+        heading_rad,
+        rate_radps,
+        odometry.state if finite else TrackingState.LOST,
+        velocity_mps,
+        sigma_mps,
+        sigma_radps,
+        odometry.reset_counter,
+        odometry.witness,
+    )

@@ -36,8 +36,7 @@ def _is_step(last: Position, new: Position, step_m: float) -> bool:
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
-    def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0, load: Load = full_load
-                 ) -> None:
+    def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0, load: Load = full_load) -> None:
         """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
         at the end.
         """
@@ -97,5 +96,4 @@ class Mapping:
         """Return the voxels that enough frames have seen: false matches seldom repeat in the same place."""
         least = min(MIN_VOXEL_FRAMES, max(1, self._frames // 2))
         enough = min(self._config.min_frames, max(least, self._frames // FRAMES_PER_VOXEL_FRAME))
-        return MapUpdate(seq, stamp_ns, self._map.points(enough),
-                         np.array(self._path.with_end(), float).reshape(-1, 2))
+        return MapUpdate(seq, stamp_ns, self._map.points(enough), np.array(self._path.with_end(), float).reshape(-1, 2))

@@ -46,7 +46,7 @@ class MotionInbox:
         sane = [sample for sample in waiting if sample.stamp_ns - stamp_ns <= AHEAD_NS]
         self.dropped += len(waiting) - len(sane)
         due = [sample for sample in sane if sample.stamp_ns <= stamp_ns]
-        later = sane[len(due):]
+        later = sane[len(due) :]
         self._waiting.extendleft(reversed(later))
         first = {type(sample): sample for sample in reversed(later)}
         return (*due, *(sample for sample in later if sample is first[type(sample)]))

@@ -40,8 +40,9 @@ from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, Odome
 from omnid.stages.routes import KeyframeTie, Routes
 
 Array = NDArray[np.float64]
-NavigationInput: TypeAlias = (OdometryUpdate | PlaceUpdate | ObstacleRing | NavigationCommand
-                              | Iterable[NavigationCommand])
+NavigationInput: TypeAlias = (
+    OdometryUpdate | PlaceUpdate | ObstacleRing | NavigationCommand | Iterable[NavigationCommand]
+)
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
 RING_NS = 2_000_000_000  # older rings tell nothing: the collision monitor sees to it that the base does not drive on
@@ -52,8 +53,14 @@ FIRST_LEG_M = 1.0  # from the robot to a path, beyond which it is refused
 class NavigationStage:
     """Drive to goals, along paths and routes. Its frames are those of the base, as on the bus."""
 
-    def __init__(self, settings: NavigationSettings, collision: CollisionSettings, T_base_rig: Array,
-                 wheels: Callable[[], WheelState], routes: Routes) -> None:
+    def __init__(
+        self,
+        settings: NavigationSettings,
+        collision: CollisionSettings,
+        T_base_rig: Array,
+        wheels: Callable[[], WheelState],
+        routes: Routes,
+    ) -> None:
         """collision: the outline of the base.
 
         wheels: returns the controller's state; called at each pose and request."""
@@ -98,8 +105,18 @@ class NavigationStage:
         obstacles = self._obstacles(odometry.stamp_ns)
         nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._half_width_m
         self._now = now = Situation(
-            odometry.stamp_ns, pose, speed_mps, float(velocity[5]), odometry.state, odometry.reset_counter,
-            self._wheels(), self._in_map, obstacles, self._moving(odometry.stamp_ns), nearest_m)
+            odometry.stamp_ns,
+            pose,
+            speed_mps,
+            float(velocity[5]),
+            odometry.state,
+            odometry.reset_counter,
+            self._wheels(),
+            self._in_map,
+            obstacles,
+            self._moving(odometry.stamp_ns),
+            nearest_m,
+        )
         ended = self._routes.record(now, self._tie)
         if ended:
             self._answers.append(RequestAnswer(0, "teach", ended))
@@ -112,8 +129,9 @@ class NavigationStage:
             return None
         seen = np.isfinite(ring.ranges_m)
         ranges_m, directions = ring.ranges_m[seen].astype(np.float64), azimuths()[seen]
-        points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions),
-                                  np.zeros(len(ranges_m))])
+        points = np.column_stack(
+            [ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))]
+        )
         return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
 
     def _moving(self, stamp_ns: int) -> Forecast | None:
@@ -212,8 +230,10 @@ class NavigationStage:
         away_m = math.dist(pose[:2], path.xy[0])
         self._require_near(away_m)
         if away_m > FIRST_LEG_M:
-            raise OmnidError(f"the path begins {away_m:.1f} m away from the robot, expected at most {FIRST_LEG_M:g} m: "
-                             "drive to its start (`omnid goto`), or let it begin here")
+            raise OmnidError(
+                f"the path begins {away_m:.1f} m away from the robot, expected at most {FIRST_LEG_M:g} m: "
+                "drive to its start (`omnid goto`), or let it begin here"
+            )
         return drive_path(np.vstack([pose[None, :2], path.xy]), path.heading_rad)
 
     def _require_near(self, away_m: float) -> None:
@@ -239,9 +259,22 @@ class NavigationStage:
         self._given, self._given_ns = state, stamp_ns
         drive = navigator.drive
         return NavigationUpdate(
-            self._seq, stamp_ns, now.setpoint, now.state, now.reason, navigator.task, navigator.command_ns, now.left_m,
-            now.offset_m, len(drive.paths) if drive else 0, routes.teaching, routes.taught_m, routes.taught, answers,
-            plan)
+            self._seq,
+            stamp_ns,
+            now.setpoint,
+            now.state,
+            now.reason,
+            navigator.task,
+            navigator.command_ns,
+            now.left_m,
+            now.offset_m,
+            len(drive.paths) if drive else 0,
+            routes.teaching,
+            routes.taught_m,
+            routes.taught,
+            answers,
+            plan,
+        )
 
 
 def _word(request: NavigationRequest) -> str:

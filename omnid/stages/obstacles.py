@@ -34,7 +34,11 @@ UNKNOWN: Final = np.full(SECTORS, np.nan, np.float32)
 NOT_FREE: Final = np.zeros(SECTORS, np.float32)
 # Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.
 SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {
-    LoadLevel.FULL: 0, LoadLevel.SPARSE_MAP: 0, LoadLevel.NO_MAP: 250_000_000, LoadLevel.REDUCED: 300_000_000}
+    LoadLevel.FULL: 0,
+    LoadLevel.SPARSE_MAP: 0,
+    LoadLevel.NO_MAP: 250_000_000,
+    LoadLevel.REDUCED: 300_000_000,
+}
 
 
 class Obstacles:
@@ -78,8 +82,9 @@ class Obstacles:
         pose = transform(planar(T_odom_base))
         ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched)
         moving = self._tracker.update(odometry.stamp_ns, pose, *self._grid.pair_ring(evidence))
-        return ObstacleRing(odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base,
-                            moving, unwatched)
+        return ObstacleRing(
+            odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
+        )
 
     def _columns_of(self, floor: Floor | None, panoramas: Panoramas) -> Columns | None:
         """Return the columns for a floor, None without one; all panoramas of a run show the same part of the world."""
@@ -88,8 +93,14 @@ class Obstacles:
             T_rect_floor = geometry.rig.T_rect_rig @ se3.inverse(self.floor.T_floor_rig(floor))
             plane = floor_plane(T_rect_floor)
             self._of_floor = floor
-            self._columns = Columns(geometry.cylinder, geometry.rig.baseline_m, plane, settings.heights_m,
-                                    (NEAREST_M, settings.max_range_m), panoramas.visible)
+            self._columns = Columns(
+                geometry.cylinder,
+                geometry.rig.baseline_m,
+                plane,
+                settings.heights_m,
+                (NEAREST_M, settings.max_range_m),
+                panoramas.visible,
+            )
             self._grid.set_floor(T_rect_floor, plane.height_m)
         return self._columns
 
@@ -111,5 +122,10 @@ def controller_ring(ring: ObstacleRing) -> ControllerRing:
         x, y = (np.array([obstacle.x_m, obstacle.y_m]) - T[:2, 3]) @ T[:2, :2]
         vx, vy = np.array([obstacle.vx_mps, obstacle.vy_mps]) @ T[:2, :2]
         moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m))
-    return ControllerRing(ring.stamp_ns, tuple(np.maximum(nearest, 0.0).tolist()), tuple(ring.free_m.tolist()),
-                          tuple(moving), tuple(ring.unwatched.tolist()) if ring.unwatched.any() else ())
+    return ControllerRing(
+        ring.stamp_ns,
+        tuple(np.maximum(nearest, 0.0).tolist()),
+        tuple(ring.free_m.tolist()),
+        tuple(moving),
+        tuple(ring.unwatched.tolist()) if ring.unwatched.any() else (),
+    )

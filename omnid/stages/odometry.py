@@ -44,8 +44,7 @@ class OdometryMethod(Protocol):
 class OdometryStage:
     """Estimate poses in odom, which is the rig frame of the first pair."""
 
-    def __init__(self, geometry: Geometry, config: OdometryConfig, dense: DenseDepths,
-                 load: Load = full_load) -> None:
+    def __init__(self, geometry: Geometry, config: OdometryConfig, dense: DenseDepths, load: Load = full_load) -> None:
         """dense: computes the depth of keyframes."""
         self._dense, self._load = dense, load
         self._method = _method(geometry.model(config.noise_px), config, self._features)
@@ -73,8 +72,16 @@ class OdometryStage:
         self._agreement.add(pair.motion, float(self.sensors.values[BIAS][2]))
         sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
-        frame = StereoFrame(pair.seq, pair.lower, pair.upper, partial(self._disparity, pair), usable,
-                            pair.times, sensed, lost=pair.tiles.lost_pixels(pair.visible.shape))
+        frame = StereoFrame(
+            pair.seq,
+            pair.lower,
+            pair.upper,
+            partial(self._disparity, pair),
+            usable,
+            pair.times,
+            sensed,
+            lost=pair.tiles.lost_pixels(pair.visible.shape),
+        )
         estimate = self._method.process(frame, dt_s)
         if estimate.step is not None and last_ns is not None:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
@@ -82,11 +89,24 @@ class OdometryStage:
             self._agreement.add_step(last_ns, pair.stamp_ns, float(seen[0]), float(seen[5]))
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         return OdometryUpdate(
-            pair.seq, pair.stamp_ns, T_odom_rig, self._in_rig(estimate.covariance),
-            self._to_rig @ estimate.velocity, self._in_rig(estimate.velocity_covariance),
-            _state(estimate.state, pair), estimate.resets, estimate.inliers, estimate.tracked,
-            StereoDepth(pair, _moving(estimate.exposure)), estimate.features, pair.light, pair.motion,
-            estimate.is_keyframe, self._agreement.result, estimate.refused_mps, estimate.T_odom_rect,
+            pair.seq,
+            pair.stamp_ns,
+            T_odom_rig,
+            self._in_rig(estimate.covariance),
+            self._to_rig @ estimate.velocity,
+            self._in_rig(estimate.velocity_covariance),
+            _state(estimate.state, pair),
+            estimate.resets,
+            estimate.inliers,
+            estimate.tracked,
+            StereoDepth(pair, _moving(estimate.exposure)),
+            estimate.features,
+            pair.light,
+            pair.motion,
+            estimate.is_keyframe,
+            self._agreement.result,
+            estimate.refused_mps,
+            estimate.T_odom_rect,
             estimate.covariance,
         )
 

@@ -34,16 +34,25 @@ class Places:
     what updates carry.
     """
 
-    def __init__(self, geometry: Geometry, config: Config, dense: DenseDepths, places: PlaceMap | None = None, *,
-                 localize_only: bool = False, load: Load = full_load) -> None:
+    def __init__(
+        self,
+        geometry: Geometry,
+        config: Config,
+        dense: DenseDepths,
+        places: PlaceMap | None = None,
+        *,
+        localize_only: bool = False,
+        load: Load = full_load,
+    ) -> None:
         """dense: computes the depth of keyframes. places: a map to be extended, None: a new one. localize_only: the map
         stays as it is.
 
         Nothing is recognised or kept from LoadLevel.NO_MAP on.
         """
         self._dense, self._load = dense, load
-        self._localiser = MapLocaliser(geometry.model(config.odometry.noise_px), config.places.limits, places,
-                                       localize_only=localize_only)
+        self._localiser = MapLocaliser(
+            geometry.model(config.odometry.noise_px), config.places.limits, places, localize_only=localize_only
+        )
         self._T_rig_rect = geometry.T_rig_rect
         self._ring = config.obstacles.ring
         self.floor = CameraFloor(geometry.rig, config.obstacles.ring.floor_m)
@@ -82,8 +91,18 @@ class Places:
         covariance = self._to_rig @ pose.covariance @ self._to_rig.T
         T_keyframe_rig = self._T_rig_rect @ pose.T_keyframe_rect @ self._T_rect_rig
         scans = self._localiser.scans()
-        return PlaceUpdate(odometry.seq, odometry.stamp_ns, T_map_odom, T_map_rig, covariance, pose.state,
-                           pose.keyframe, T_keyframe_rig, scans, self._copied_keyframes(scans))
+        return PlaceUpdate(
+            odometry.seq,
+            odometry.stamp_ns,
+            T_map_odom,
+            T_map_rig,
+            covariance,
+            pose.state,
+            pose.keyframe,
+            T_keyframe_rig,
+            scans,
+            self._copied_keyframes(scans),
+        )
 
     def finish(self) -> list[PlaceUpdate]:
         """Count at the end."""
@@ -102,19 +121,29 @@ class Places:
         if self._keyframes is None or self._keyframes[0] is not scans:
             places = self._localiser.places
             ids = sorted(places.keyframes)
-            self._keyframes = scans, MapKeyframes({id: places.keyframes[id].stamp_ns for id in ids},
-                                                  {id: places.poses[id] for id in ids})
+            self._keyframes = (
+                scans,
+                MapKeyframes({id: places.keyframes[id].stamp_ns for id in ids}, {id: places.poses[id] for id in ids}),
+            )
         return self._keyframes[1]
 
     def _frame(self, odometry: OdometryUpdate) -> OdometryFrame:
         """Return the frame in terms of the rectified frame."""
         depth, pair = odometry.depth, odometry.depth.panoramas
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
-        stereo = StereoFrame(odometry.seq, pair.lower, pair.upper, lambda _: self._dense.of(depth).disparity, usable,
-                             pair.times)
-        return OdometryFrame(stereo, odometry.stamp_ns, odometry.T_odom_rect, odometry.covariance_rect,
-                             odometry.state is TrackingState.LOST, odometry.reset_counter, odometry.is_keyframe,
-                             lambda: self._scan(depth))
+        stereo = StereoFrame(
+            odometry.seq, pair.lower, pair.upper, lambda _: self._dense.of(depth).disparity, usable, pair.times
+        )
+        return OdometryFrame(
+            stereo,
+            odometry.stamp_ns,
+            odometry.T_odom_rect,
+            odometry.covariance_rect,
+            odometry.state is TrackingState.LOST,
+            odometry.reset_counter,
+            odometry.is_keyframe,
+            lambda: self._scan(depth),
+        )
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""

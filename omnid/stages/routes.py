@@ -55,8 +55,7 @@ class RouteMap:
 
 def refusal_of_name(name: str) -> str:
     """Return why a route cannot be taught under a name that there is already."""
-    return (f"there is a route {name} already: choose another name, or replace it (`omnid route teach {name} "
-            "--replace`)")
+    return f"there is a route {name} already: choose another name, or replace it (`omnid route teach {name} --replace`)"
 
 
 class KeyframeTie:
@@ -150,15 +149,23 @@ class Routes:
         if refusal or request.route is None:
             raise OmnidError(refusal or f"the route {request.name} was not read")
         if not request.route.fits(places.keyframe):
-            raise OmnidError(f"the route {request.name} was taught in another map ({request.route.map_name}) than "
-                             f"{places.name}: start with that map (`omnid run --map`), or teach it again")
+            raise OmnidError(
+                f"the route {request.name} was taught in another map ({request.route.map_name}) than "
+                f"{places.name}: start with that map (`omnid run --map`), or teach it again"
+            )
         return request.route
 
     def paths(self, route: Route, request: RouteRequest, now: Situation) -> list[DrivePath]:
         """Return the paths of a repetition. Raise OmnidError where it is impossible."""
         places = self._map()
-        return repeated_paths(route, places.keyframe, now.map_pose(), loops=request.loops, reverse=request.reverse,
-                              from_start=request.from_start)
+        return repeated_paths(
+            route,
+            places.keyframe,
+            now.map_pose(),
+            loops=request.loops,
+            reverse=request.reverse,
+            from_start=request.from_start,
+        )
 
     def follow_map(self, keyframes: MapKeyframes | None) -> None:
         """Take the keyframes of the map as they are now."""

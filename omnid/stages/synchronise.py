@@ -179,9 +179,14 @@ class Synchronise:
     def counts(self) -> dict[str, int]:
         """Pairs made, frames without a partner, images that could not be decoded, images that repeat earlier ones."""
         unpaired = self._matcher.unpaired
-        return {"pairs": self._pairs, "unpaired_lower": unpaired["lower"], "unpaired_upper": unpaired["upper"],
-                "broken": self._decode.broken, "repeated_lower": self.repeated["lower"].count,
-                "repeated_upper": self.repeated["upper"].count}
+        return {
+            "pairs": self._pairs,
+            "unpaired_lower": unpaired["lower"],
+            "unpaired_upper": unpaired["upper"],
+            "broken": self._decode.broken,
+            "repeated_lower": self.repeated["lower"].count,
+            "repeated_upper": self.repeated["upper"].count,
+        }
 
     @property
     def frozen(self) -> list[Camera]:
@@ -239,8 +244,14 @@ class Synchronise:
             return None
         seq = self._pairs
         self._pairs += 1
-        return FramePair(seq, lower.stamp_ns, lower_image, upper_image, self.skew.exposure_ns * 1e-9,
-                         self.motion.take(lower.stamp_ns))
+        return FramePair(
+            seq,
+            lower.stamp_ns,
+            lower_image,
+            upper_image,
+            self.skew.exposure_ns * 1e-9,
+            self.motion.take(lower.stamp_ns),
+        )
 
 
 def _gap_ns(frame: Frame, other: Frame) -> int:

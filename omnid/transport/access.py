@@ -13,8 +13,15 @@ from typing import Any, Final
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.topics import STOP, request_key
 
-_ALWAYS: Final = ("declare_subscriber", "declare_queryable", "query", "reply", "liveliness_token", "liveliness_query",
-                  "declare_liveliness_subscriber")
+_ALWAYS: Final = (
+    "declare_subscriber",
+    "declare_queryable",
+    "query",
+    "reply",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
 # A star does not match parts that begin with @; @adv is the history that zenoh keeps for ROS 2's late subscribers.
 _EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**", "**/@adv/**")
 
@@ -66,6 +73,7 @@ def _subject(name: str, **properties: list[str]) -> dict[str, Any]:
     return {"id": name, **properties}
 
 
-def _rule(name: str, flow: str, messages: tuple[str, ...], keys: list[str], permission: str = "allow"
-          ) -> dict[str, Any]:
+def _rule(
+    name: str, flow: str, messages: tuple[str, ...], keys: list[str], permission: str = "allow"
+) -> dict[str, Any]:
     return {"id": name, "permission": permission, "flows": [flow], "messages": list(messages), "key_exprs": keys}

@@ -94,9 +94,12 @@ class Bus:
             self._flooded, self._flooded_s = counts.total(), time.monotonic()
         if level == OK and time.monotonic() < self._flooded_s + FLOOD_S:
             level, message = WARN, f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
-        values = {"mode": self._config.mode, "lost": str(self.lost),
-                  status_names.SAME_NAME_COUNT: str(len(self._namesakes or ())),
-                  **{f"flooded, {key}": str(count) for key, count in sorted(counts.items())}}
+        values = {
+            "mode": self._config.mode,
+            "lost": str(self.lost),
+            status_names.SAME_NAME_COUNT: str(len(self._namesakes or ())),
+            **{f"flooded, {key}": str(count) for key, count in sorted(counts.items())},
+        }
         return DiagnosticStatus(status_names.BUS, level, message, values)
 
     @property
@@ -132,8 +135,9 @@ class Bus:
         if is_new and self._session is not None:
             self._declare_queryable(self._session, name)
 
-    def subscribe_commands(self, callback: RequestCallback, topics: Mapping[str, str],
-                           is_stopped: Callable[[], bool] = lambda: False) -> None:
+    def subscribe_commands(
+        self, callback: RequestCallback, topics: Mapping[str, str], is_stopped: Callable[[], bool] = lambda: False
+    ) -> None:
         """Call callback for messages on `<robot>/cmd/...` and queries that ask the same, in a thread of the bus.
 
         topics: with their types, each with a budget of its own; what exceeds it is dropped and counted.
@@ -163,8 +167,10 @@ class Bus:
 
     @property
     def _same_name(self) -> str:
-        return (f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands: this "
-                "one is not armed before the other has gone; change bus.robot of one of them")
+        return (
+            f"another robot on the bus has the name {self._config.robot!r}, and both obey the same commands: this "
+            "one is not armed before the other has gone; change bus.robot of one of them"
+        )
 
     def _open_peer(self) -> None:
         """Open the session of a peer; where ROS 2's router (rmw_zenohd) holds the endpoints, that of its client."""
@@ -174,8 +180,10 @@ class Bus:
             client = router_in_place(self._config) if self._config.ros2 == "rmw_zenoh" else None
             if client is None:
                 raise
-            self._warn(f"the zenoh router at {', '.join(client.connect)} is joined as a client: who "
-                       "may connect is decided there")
+            self._warn(
+                f"the zenoh router at {', '.join(client.connect)} is joined as a client: who "
+                "may connect is decided there"
+            )
             self._config = client
             self._open()
 

@@ -13,10 +13,21 @@ from omnid.settings import knob
 KEY: Final = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 _ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/[^/\s]+:\d{1,5}([?#].*)?|unixsock-stream/\S+")
 _ROS_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-_FILES: Final = ("config", "tls_ca", "tls_listen_key", "tls_listen_certificate", "tls_connect_key",
-                 "tls_connect_certificate", "password_file", "users_file")
-_PAIRS: Final = (("tls_listen_key", "tls_listen_certificate"), ("tls_connect_key", "tls_connect_certificate"),
-                 ("user", "password_file"))
+_FILES: Final = (
+    "config",
+    "tls_ca",
+    "tls_listen_key",
+    "tls_listen_certificate",
+    "tls_connect_key",
+    "tls_connect_certificate",
+    "password_file",
+    "users_file",
+)
+_PAIRS: Final = (
+    ("tls_listen_key", "tls_listen_certificate"),
+    ("tls_connect_key", "tls_connect_certificate"),
+    ("user", "password_file"),
+)
 _ENCRYPTED: Final = ("tls/", "quic/")
 _MAX_FILE_BYTES: Final = 1 << 20
 
@@ -26,8 +37,12 @@ class BusConfig:
     """Endpoints of the bus and permissions on it; keys are `<robot>/...`. The default is this machine only."""
 
     robot: str = knob("omnid", "first part of every key, and of the topics of --record")
-    mode: str = knob("peer", "peer: other programs connect to this one; client: all traffic goes through a router, "
-                     "which may be started later", choices=("peer", "client"))
+    mode: str = knob(
+        "peer",
+        "peer: other programs connect to this one; client: all traffic goes through a router, "
+        "which may be started later",
+        choices=("peer", "client"),
+    )
     listen: tuple[str, ...] = knob(("tcp/127.0.0.1:7447",), "zenoh endpoints to listen on")
     connect: tuple[str, ...] = knob((), "zenoh endpoints to connect to")
     retry_s: float = knob(2.0, "longest wait between two attempts to reach an endpoint of connect, s", low=0.1, high=60)
@@ -43,14 +58,20 @@ class BusConfig:
     users_file: str = knob("", "file with the users that may connect: lines user:password")
     command_names: tuple[str, ...] = knob((), "certificates (common names) that may send commands")
     command_users: tuple[str, ...] = knob((), "users that may send commands; with neither: all that can connect")
-    command_clock: str = knob("synchronised", "synchronised: stamps of commands must be within "
-                              "controller.deadlines.command_s of this machine's clock; arrival: for senders with "
-                              "another clock, stamps must only rise", choices=("synchronised", "arrival"))
-    ros2: str = knob("off", "connection to ROS 2: by rmw_zenoh or by zenoh-bridge-ros2dds",
-                     choices=("off", "rmw_zenoh", "ros2dds"))
+    command_clock: str = knob(
+        "synchronised",
+        "synchronised: stamps of commands must be within "
+        "controller.deadlines.command_s of this machine's clock; arrival: for senders with "
+        "another clock, stamps must only rise",
+        choices=("synchronised", "arrival"),
+    )
+    ros2: str = knob(
+        "off", "connection to ROS 2: by rmw_zenoh or by zenoh-bridge-ros2dds", choices=("off", "rmw_zenoh", "ros2dds")
+    )
     ros2_domain: int = knob(0, "ROS_DOMAIN_ID, for rmw_zenoh", low=0, high=232)
-    panorama_hz: float = knob(2.0, "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none",
-                              low=0, high=60)
+    panorama_hz: float = knob(
+        2.0, "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none", low=0, high=60
+    )
 
 
 def checked(config: BusConfig) -> BusConfig:

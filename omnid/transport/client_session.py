@@ -19,9 +19,20 @@ def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
 
     Raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings.
     """
-    chosen = {name: getattr(given, name) for name in
-              ("robot", "connect", "config", "retry_s", "tls_ca", "tls_connect_key", "tls_connect_certificate", "user",
-               "password_file")}
+    chosen = {
+        name: getattr(given, name)
+        for name in (
+            "robot",
+            "connect",
+            "config",
+            "retry_s",
+            "tls_ca",
+            "tls_connect_key",
+            "tls_connect_certificate",
+            "user",
+            "password_file",
+        )
+    }
     config = checked(BusConfig(mode="client", listen=(), **{**chosen, "connect": given.connect or (HERE,)}))
     deadline_s = time.monotonic() + timeout_s
     while True:

@@ -34,8 +34,18 @@ GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
 BOOL_SCHEMA = "std_msgs/msg/Bool"
 _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
-SCHEMAS = (ODOMETRY_SCHEMA, POSE_SCHEMA, MAP_POSE_SCHEMA, TRANSFORM_SCHEMA, POINT_CLOUD_SCHEMA, DIAGNOSTICS_SCHEMA,
-           TWIST_SCHEMA, VECTOR_SCHEMA, GRID_SCHEMA, HEADER_SCHEMA)
+SCHEMAS = (
+    ODOMETRY_SCHEMA,
+    POSE_SCHEMA,
+    MAP_POSE_SCHEMA,
+    TRANSFORM_SCHEMA,
+    POINT_CLOUD_SCHEMA,
+    DIAGNOSTICS_SCHEMA,
+    TWIST_SCHEMA,
+    VECTOR_SCHEMA,
+    GRID_SCHEMA,
+    HEADER_SCHEMA,
+)
 
 QUATERNION_TOLERANCE = 1e-3
 NS_PER_S = 1_000_000_000
@@ -155,15 +165,23 @@ def _covariance(matrix: ArrayLike) -> Array:
     return flat
 
 
-def odometry_cdr(stamp_ns: int, T_odom_base: Array, covariance: Array, velocity: Array, velocity_covariance: Array,
-                 frames: Frames = ("odom", "base_link")) -> bytes:
+def odometry_cdr(
+    stamp_ns: int,
+    T_odom_base: Array,
+    covariance: Array,
+    velocity: Array,
+    velocity_covariance: Array,
+    frames: Frames = ("odom", "base_link"),
+) -> bytes:
     """Encode a nav_msgs/msg/Odometry: pose in the parent frame, velocity (6,) [m/s, rad/s] in the child frame."""
     parent, child = frames
     twist = ros.geometry_msgs__msg__Twist(_vector(velocity[:3]), _vector(velocity[3:]))
     message = ros.nav_msgs__msg__Odometry(
-        header_message(stamp_ns, parent), child,
+        header_message(stamp_ns, parent),
+        child,
         ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_odom_base), _covariance(covariance)),
-        ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)))
+        ros.geometry_msgs__msg__TwistWithCovariance(twist, _covariance(velocity_covariance)),
+    )
     return message_cdr(message, ODOMETRY_SCHEMA)
 
 
@@ -174,8 +192,7 @@ def pose_stamped_cdr(stamp_ns: int, T_frame_body: Array, frame: str = "odom") ->
 
 
 def pose_with_covariance_cdr(stamp_ns: int, T_frame_body: Array, covariance: Array, frame: str = "map") -> bytes:
-    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in `frame`, its covariance in its axes.
-    """
+    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in `frame`, covariance in its axes."""
     pose = ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_frame_body), _covariance(covariance))
     message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, frame), pose)
     return message_cdr(message, MAP_POSE_SCHEMA)
@@ -196,14 +213,16 @@ def _edge(stamp_ns: int, edge: FrameTransform) -> ros.geometry_msgs__msg__Transf
 def diagnostics_cdr(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> bytes:
     """Encode a diagnostic_msgs/msg/DiagnosticArray."""
     entries = [_status(status) for status in statuses]
-    return message_cdr(ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries),
-                       DIAGNOSTICS_SCHEMA)
+    return message_cdr(
+        ros.diagnostic_msgs__msg__DiagnosticArray(header_message(stamp_ns, ""), entries), DIAGNOSTICS_SCHEMA
+    )
 
 
 def _status(status: DiagnosticStatus) -> ros.diagnostic_msgs__msg__DiagnosticStatus:
     if not 0 <= status.level <= 3:
         raise OmnidError(
-            f"diagnostic level {status.level} of {status.name}: expected 0 (ok), 1 (warning), 2 (error) or 3 (stale)")
+            f"diagnostic level {status.level} of {status.name}: expected 0 (ok), 1 (warning), 2 (error) or 3 (stale)"
+        )
     pairs = [ros.diagnostic_msgs__msg__KeyValue(key, value) for key, value in status.values.items()]
     return ros.diagnostic_msgs__msg__DiagnosticStatus(status.level, status.name, status.message, "", pairs)
 
@@ -224,8 +243,12 @@ def twist_from_cdr(payload: bytes) -> TwistRecord:
     """Decode a TwistStamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, TWIST_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__TwistStamped)
-    return TwistRecord(unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.twist.linear.x,
-                 message.twist.angular.z)
+    return TwistRecord(
+        unchecked_stamp_ns(message.header.stamp),
+        message.header.frame_id,
+        message.twist.linear.x,
+        message.twist.angular.z,
+    )
 
 
 def is_plain_twist(payload: bytes) -> bool:
@@ -244,8 +267,9 @@ def heading_from_cdr(payload: bytes) -> HeadingRecord:
     """Decode a Vector3Stamped; its numbers need not be finite. Raise OmnidError for any other bytes."""
     message = message_from_cdr(payload, VECTOR_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__Vector3Stamped)
-    return HeadingRecord(unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x,
-                          message.vector.z)
+    return HeadingRecord(
+        unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
+    )
 
 
 def header_cdr(stamp_ns: int, frame: str = "") -> bytes:

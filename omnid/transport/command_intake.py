@@ -31,8 +31,14 @@ class _Ring(NamedTuple):
 class CommandIntake:
     """Passes commands on within the budgets of their keys, by `process`, which one thread calls again and again."""
 
-    def __init__(self, session: zenoh.Session, config: BusConfig, topics: Mapping[str, str], requests: OpenRequests,
-                 callback: RequestCallback) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: BusConfig,
+        topics: Mapping[str, str],
+        requests: OpenRequests,
+        callback: RequestCallback,
+    ) -> None:
         """topics: those with a ring of their own; all others below `cmd` share one. requests: keeps the queries."""
         self._callback, self._open = callback, requests
         self._topics = frozenset((*topics, *_LAST))

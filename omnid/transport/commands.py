@@ -112,8 +112,15 @@ class CommandReceiver:
     Stops are always obeyed. The controller decides which of several sources and senders drives.
     """
 
-    def __init__(self, target: CommandTarget, stamps: StampRule, *, sources: Sequence[str] = (OPERATOR, PLANNER),
-                 report: Callable[[str], None] | None = None, is_unique: Callable[[], bool] = lambda: True) -> None:
+    def __init__(
+        self,
+        target: CommandTarget,
+        stamps: StampRule,
+        *,
+        sources: Sequence[str] = (OPERATOR, PLANNER),
+        report: Callable[[str], None] | None = None,
+        is_unique: Callable[[], bool] = lambda: True,
+    ) -> None:
         """stamps: the rule for the stamps; where the clocks differ, a plain Twist without stamp is accepted.
 
         sources: names; the first has the short topics cmd/twist and cmd/heading, too. report: takes lines for the log,
@@ -124,8 +131,9 @@ class CommandReceiver:
         self._stop_ns = 0  # arrival of the newest stop
         parsers = {TWIST: twist_command, HEADING: heading_command}
         self._topics = {f"cmd/{name}": (sources[0], parser) for name, parser in parsers.items()}
-        self._topics |= {f"cmd/{source}/{name}": (source, parser) for source in sources
-                         for name, parser in parsers.items()}
+        self._topics |= {
+            f"cmd/{source}/{name}": (source, parser) for source in sources for name, parser in parsers.items()
+        }
         self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
 

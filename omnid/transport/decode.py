@@ -130,9 +130,17 @@ def decode_navigation(payload: bytes, _: bytes = b"") -> NavigationReport:
 
     left_m, taught_m = (status_names.number(value(key)) for key in (Key.LEFT_M, Key.TAUGHT_M))
     return NavigationReport(
-        report.stamp_ns, value(Key.STATE), value(Key.REASON), value(Key.TASK), _whole(value(Key.COMMAND_NS)),
-        math.nan if left_m is None else left_m, value(Key.REQUEST), value(Key.REFUSAL), value(Key.TEACHING),
-        taught_m or 0.0)
+        report.stamp_ns,
+        value(Key.STATE),
+        value(Key.REASON),
+        value(Key.TASK),
+        _whole(value(Key.COMMAND_NS)),
+        math.nan if left_m is None else left_m,
+        value(Key.REQUEST),
+        value(Key.REFUSAL),
+        value(Key.TEACHING),
+        taught_m or 0.0,
+    )
 
 
 def _whole(text: str) -> int:
@@ -147,16 +155,25 @@ def decode_pose(payload: bytes, attachment: bytes, received_ns: int | None = Non
     """
     received_ns = time.time_ns() if received_ns is None else received_ns
     record = codec.odometry_from_cdr(payload)
-    return Pose(record.stamp_ns, record.T_odom_base, record.covariance, record.velocity, record.velocity_covariance,
-                PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(), received_ns)
+    return Pose(
+        record.stamp_ns,
+        record.T_odom_base,
+        record.covariance,
+        record.velocity,
+        record.velocity_covariance,
+        PoseAttachment.from_bytes(attachment) if attachment else PoseAttachment(),
+        received_ns,
+    )
 
 
 def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
     """Decode a DiagnosticArray. Raise OmnidError for any other bytes."""
     message = codec.message_from_cdr(payload, codec.DIAGNOSTICS_SCHEMA)
     assert isinstance(message, ros.diagnostic_msgs__msg__DiagnosticArray)
-    statuses = tuple(DiagnosticStatus(entry.name, int(entry.level), entry.message,
-                            {pair.key: pair.value for pair in entry.values}) for entry in message.status)
+    statuses = tuple(
+        DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
+        for entry in message.status
+    )
     return Diagnostics(_stamp_ns(message.header), statuses)
 
 
@@ -168,8 +185,10 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
     fields = [(entry.name, entry.offset) for entry in message.fields]
     own = fields == [(name, 4 * i) for i, name in enumerate(map_codec.CLOUD_FIELDS)] and not message.is_bigendian
     if not own or message.point_step != step or message.data.size % step:
-        raise OmnidError(f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
-                         f"expected the fields {', '.join(map_codec.CLOUD_FIELDS)} in {step} bytes")
+        raise OmnidError(
+            f"a cloud with {len(fields)} fields and {message.point_step} bytes a point was found; "
+            f"expected the fields {', '.join(map_codec.CLOUD_FIELDS)} in {step} bytes"
+        )
     packed = message.data.view("<f4").reshape(-1, len(map_codec.CLOUD_FIELDS))
     return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
 
@@ -178,8 +197,9 @@ def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     """Decode a PoseWithCovarianceStamped. Raise OmnidError unless the bytes are one with a finite, rigid pose."""
     message = codec.message_from_cdr(payload, codec.MAP_POSE_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
-    return PoseInMap(_stamp_ns(message.header), codec.rigid_transform(message.pose.pose),
-                   message.pose.covariance.reshape(6, 6))
+    return PoseInMap(
+        _stamp_ns(message.header), codec.rigid_transform(message.pose.pose), message.pose.covariance.reshape(6, 6)
+    )
 
 
 def decode_map(payload: bytes, _: bytes = b"") -> Map:
@@ -188,10 +208,17 @@ def decode_map(payload: bytes, _: bytes = b"") -> Map:
     assert isinstance(message, ros.nav_msgs__msg__OccupancyGrid)
     info, at = message.info, message.info.origin
     if message.data.size != info.width * info.height or not (info.resolution > 0 and abs(at.orientation.w) > ALIGNED):
-        raise OmnidError(f"a map with {message.data.size} cells of {info.resolution:g} m was found; expected "
-                         f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes")
-    return Map(_stamp_ns(message.header), message.header.frame_id, message.data.reshape(info.height, info.width),
-               float(info.resolution), (at.position.x, at.position.y))
+        raise OmnidError(
+            f"a map with {message.data.size} cells of {info.resolution:g} m was found; expected "
+            f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
+        )
+    return Map(
+        _stamp_ns(message.header),
+        message.header.frame_id,
+        message.data.reshape(info.height, info.width),
+        float(info.resolution),
+        (at.position.x, at.position.y),
+    )
 
 
 def _stamp_ns(header: ros.std_msgs__msg__Header) -> int:

@@ -19,8 +19,11 @@ ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
 _POLL_S: Final = 0.002
 _SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits
 # A stop must not be lost, and overtakes all else; requests go the same way.
-_QUALITY: Final[dict[str, Any]] = {"congestion_control": zenoh.CongestionControl.BLOCK,
-                                   "priority": zenoh.Priority.REAL_TIME, "express": True}
+_QUALITY: Final[dict[str, Any]] = {
+    "congestion_control": zenoh.CongestionControl.BLOCK,
+    "priority": zenoh.Priority.REAL_TIME,
+    "express": True,
+}
 
 
 class Driver:
@@ -52,8 +55,9 @@ class Driver:
         prefix = f"cmd/{source}" if source else "cmd"
         self._session, self._robot = session, robot
         self._twist, self._heading = f"{prefix}/{TWIST}", f"{prefix}/{HEADING}"
-        self._publishers = {topic: _command_publisher(session, f"{robot}/{topic}")
-                            for topic in (self._twist, self._heading, STOP, ARM)}
+        self._publishers = {
+            topic: _command_publisher(session, f"{robot}/{topic}") for topic in (self._twist, self._heading, STOP, ARM)
+        }
         self._sent, self._gid = 0, ros2.gid_of(str(session.zid()))
         self.asked_ns = 0  # time of sending of the newest request, which the reports of a drive repeat
 
@@ -65,8 +69,10 @@ class Driver:
     def require_connected(self) -> None:
         """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
         if not _happens(lambda: self.connected):
-            raise OmnidError(f"no robot {self._robot!r} receives commands there: check --robot and --connect, and that "
-                             "its daemon runs with a motor")
+            raise OmnidError(
+                f"no robot {self._robot!r} receives commands there: check --robot and --connect, and that "
+                "its daemon runs with a motor"
+            )
 
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """Drive with this forward speed and yaw rate (counter-clockwise)."""
@@ -113,14 +119,18 @@ class Driver:
         key = f"{self._robot}/{request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
             if not _happens(lambda: _matches(querier)):
-                raise OmnidError(f"no robot {self._robot!r} takes such requests there: check --robot and --connect, "
-                                 "and that its daemon runs, with a motor where it is to drive")
+                raise OmnidError(
+                    f"no robot {self._robot!r} takes such requests there: check --robot and --connect, "
+                    "and that its daemon runs, with a motor where it is to drive"
+                )
             self.asked_ns = now_ns = time.time_ns()
             for reply in querier.get(payload=payload_at(now_ns), attachment=self._attachment(now_ns)):
                 if reply.ok is not None and (answer := answer_of(reply.ok.payload.to_bytes())) is not None:
                     return answer
-        raise OmnidError(f"{self._robot} has not answered: either this program must not command it (bus.command_users, "
-                         "bus.command_names), or it gives no poses; see `omnid listen`")
+        raise OmnidError(
+            f"{self._robot} has not answered: either this program must not command it (bus.command_users, "
+            "bus.command_names), or it gives no poses; see `omnid listen`"
+        )
 
     def send(self, topic: str, payload: bytes) -> None:
         """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which tells senders apart.

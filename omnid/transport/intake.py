@@ -68,8 +68,13 @@ class Intake(Generic[T]):
     loses is not counted one by one. crowded: times at which more were left in the ring than may be taken.
     """
 
-    def __init__(self, key: str, next_message: Callable[[], T | None], budget: Budget,
-                 sender_of: Callable[[T], str] = lambda _: "") -> None:
+    def __init__(
+        self,
+        key: str,
+        next_message: Callable[[], T | None],
+        budget: Budget,
+        sender_of: Callable[[T], str] = lambda _: "",
+    ) -> None:
         self.key, self._next, self._budget, self._sender_of = key, next_message, budget, sender_of
         self._all = TokenBucket(Budget(TAKEN_PER_DECODED * budget.rate_hz, TAKEN_PER_DECODED * budget.burst))
         self._senders: OrderedDict[str, TokenBucket] = OrderedDict()

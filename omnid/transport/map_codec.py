@@ -14,8 +14,14 @@ CLOUD_FIELDS = ("x", "y", "z", "confidence")
 CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory
 
 
-def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: ArrayLike, *,
-                    T_frame_points: NDArray[np.float64] | None = None) -> bytes:
+def point_cloud_cdr(
+    stamp_ns: int,
+    frame: str,
+    points: ArrayLike,
+    confidence: ArrayLike,
+    *,
+    T_frame_points: NDArray[np.float64] | None = None,
+) -> bytes:
     """Encode a sensor_msgs/msg/PointCloud2 of points (N, 3) [m] with confidence (N,): float32, 16 bytes per point.
 
     T_frame_points (4, 4) maps the points into `frame`; None where they are given in it.
@@ -25,7 +31,9 @@ def point_cloud_cdr(stamp_ns: int, frame: str, points: ArrayLike, confidence: Ar
     fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(CLOUD_FIELDS)]
     message = ros.sensor_msgs__msg__PointCloud2(
         header=codec.header_message(stamp_ns, frame),
-        height=1, width=len(packed), fields=fields,
+        height=1,
+        width=len(packed),
+        fields=fields,
         is_bigendian=False,
         point_step=16,
         row_step=16 * len(packed),

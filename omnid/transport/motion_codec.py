@@ -33,13 +33,20 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int) -> bytes:
     """Encode angular velocities about the axes of the base."""
     rates = ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps)
     message = ros.sensor_msgs__msg__Imu(
-        header_message(stamp_ns, "base_link"), ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0), _UNKNOWN, rates,
-        np.zeros(9), ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0), _UNKNOWN)
+        header_message(stamp_ns, "base_link"),
+        ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
+        _UNKNOWN,
+        rates,
+        np.zeros(9),
+        ros.geometry_msgs__msg__Vector3(0.0, 0.0, 0.0),
+        _UNKNOWN,
+    )
     return message_cdr(message, IMU_SCHEMA)
 
 
-def sample_from_cdr(payload: bytes, schema: str, offset_ns: int, joints: JointWheels | None = None
-                    ) -> MotionSample | None:
+def sample_from_cdr(
+    payload: bytes, schema: str, offset_ns: int, joints: JointWheels | None = None
+) -> MotionSample | None:
     """Decode a sample from the network; None of other joints. offset_ns: from the stamps of images to the sender's
     clock. joints: the wheels in a JointState.
 

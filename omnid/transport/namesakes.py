@@ -31,9 +31,11 @@ class Namesakes:
         self._seen: set[str] = set()  # tokens of others
         self._behind: set[str] = set()  # those seen through a router that this session shares with them only
         liveliness = session.liveliness()
-        self._declared = [liveliness.declare_token(self._own),
-                          liveliness.declare_subscriber(self._names, self._on_token, history=True),
-                          liveliness.declare_token(f"{config.robot}/{ALIVE}")]
+        self._declared = [
+            liveliness.declare_token(self._own),
+            liveliness.declare_subscriber(self._names, self._on_token, history=True),
+            liveliness.declare_token(f"{config.robot}/{ALIVE}"),
+        ]
         self.search()
 
     def __len__(self) -> int:

@@ -41,8 +41,9 @@ class PlanarPath(NamedTuple):
 def goal_cdr(goal: PlanarGoal) -> bytes:
     """Encode a goal as a PoseStamped."""
     pose = _pose(goal.x_m, goal.y_m, goal.heading_rad)
-    return codec.message_cdr(ros.geometry_msgs__msg__PoseStamped(codec.header_message(goal.stamp_ns, goal.frame), pose),
-                             codec.POSE_SCHEMA)
+    return codec.message_cdr(
+        ros.geometry_msgs__msg__PoseStamped(codec.header_message(goal.stamp_ns, goal.frame), pose), codec.POSE_SCHEMA
+    )
 
 
 def goal_from_cdr(payload: bytes) -> PlanarGoal:
@@ -61,8 +62,10 @@ def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None
     headings: list[float | None] = [float(math.atan2(dy, dx)) for dx, dy in steps]
     headings[-1:] = [heading_rad]
     header = codec.header_message(stamp_ns, frame)
-    poses = [ros.geometry_msgs__msg__PoseStamped(header, _pose(float(x), float(y), heading))
-             for (x, y), heading in zip(points, headings, strict=True)]
+    poses = [
+        ros.geometry_msgs__msg__PoseStamped(header, _pose(float(x), float(y), heading))
+        for (x, y), heading in zip(points, headings, strict=True)
+    ]
     return codec.message_cdr(ros.nav_msgs__msg__Path(header, poses), PATH_SCHEMA)
 
 

@@ -49,8 +49,13 @@ class NavigationReceiver:
     that waited in a network must not start a drive minutes later.
     """
 
-    def __init__(self, target: Callable[[NavigationCommand], None], stamps: StampRule, *,
-                 report: Callable[[str], None] | None = None) -> None:
+    def __init__(
+        self,
+        target: Callable[[NavigationCommand], None],
+        stamps: StampRule,
+        *,
+        report: Callable[[str], None] | None = None,
+    ) -> None:
         """target: may be called from any thread. stamps: as of CommandReceiver. report: takes lines for the log."""
         self._target, self._stamps, self._report = target, stamps, report
         self.accepted = 0

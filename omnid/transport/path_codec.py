@@ -14,9 +14,14 @@ from omnid.transport.navigation_codec import PATH_SCHEMA
 
 FRAME: Final = "odom"
 # A PoseStamped of this frame: 17 bytes of header, padded to the 8 bytes of doubles, and 7 doubles.
-_POSE: Final = np.dtype({"names": ["sec", "nanosec", "length", "frame", "pose"],
-                         "formats": ["<i4", "<u4", "<u4", "S5", ("<f8", 7)], "offsets": [0, 4, 8, 12, 24],
-                         "itemsize": 80})
+_POSE: Final = np.dtype(
+    {
+        "names": ["sec", "nanosec", "length", "frame", "pose"],
+        "formats": ["<i4", "<u4", "<u4", "S5", ("<f8", 7)],
+        "offsets": [0, 4, 8, 12, 24],
+        "itemsize": 80,
+    }
+)
 
 
 def driven_path_cdr(stamp_ns: int, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> bytes:

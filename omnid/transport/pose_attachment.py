@@ -34,8 +34,9 @@ class PoseAttachment:
         except (ValueError, RecursionError):
             found = None
         if not isinstance(found, dict):
-            raise OmnidError(f"the {len(data)} bytes attached to a pose are not a JSON object; check that omnid sent "
-                             "them")
+            raise OmnidError(
+                f"the {len(data)} bytes attached to a pose are not a JSON object; check that omnid sent them"
+            )
         defaults = asdict(cls())
         known = {name: found[name] for name, default in defaults.items() if type(found.get(name)) is type(default)}
         return cls(**known)

@@ -74,8 +74,11 @@ class TopicPublisher:
     @property
     def is_received(self) -> bool:
         """True if there is a subscriber."""
-        found: list[Any] = [publisher.matching_status for publisher in (self._plain, self._ros)
-                            if isinstance(publisher, zenoh.Publisher)]  # zenoh's stub takes the status for a bool
+        found: list[Any] = [
+            publisher.matching_status
+            for publisher in (self._plain, self._ros)
+            if isinstance(publisher, zenoh.Publisher)
+        ]  # zenoh's stub takes the status for a bool
         return any(status.matching for status in found)
 
     def put(self, payload: bytes, attachment: bytes | None) -> None:
@@ -93,9 +96,13 @@ def _declared_publisher(session: zenoh.Session, key: str, topic: Topic) -> zenoh
     Poses were dropped there, and the latency is the same.
     """
     return session.declare_publisher(
-        key, encoding=zenoh.Encoding.APPLICATION_CDR, congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA, express=False,
-        reliability=zenoh.Reliability.RELIABLE)
+        key,
+        encoding=zenoh.Encoding.APPLICATION_CDR,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.REAL_TIME if topic.realtime else zenoh.Priority.DATA,
+        express=False,
+        reliability=zenoh.Reliability.RELIABLE,
+    )
 
 
 def _declared_keeper(session: zenoh.Session, key: str, topic: Topic) -> ext.AdvancedPublisher:
@@ -104,7 +111,14 @@ def _declared_keeper(session: zenoh.Session, key: str, topic: Topic) -> ext.Adva
     rmw_publisher_data.cpp of ros2/rmw_zenoh: a cache, detection of the publisher, sporadic heartbeats.
     """
     return ext.declare_advanced_publisher(
-        session, key, encoding=zenoh.Encoding.APPLICATION_CDR, congestion_control=zenoh.CongestionControl.DROP,
-        priority=zenoh.Priority.DATA, express=False, reliability=zenoh.Reliability.RELIABLE, cache=ext.CacheConfig(1),
+        session,
+        key,
+        encoding=zenoh.Encoding.APPLICATION_CDR,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=zenoh.Priority.DATA,
+        express=False,
+        reliability=zenoh.Reliability.RELIABLE,
+        cache=ext.CacheConfig(1),
         sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
-        publisher_detection=True)
+        publisher_detection=True,
+    )

@@ -46,8 +46,11 @@ def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limit
     head = pack("<iII", seconds, nanoseconds, len(name)) + name
     step = 2 * math.pi / len(ranges_m)
     numbers = pack("<7f", step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, *limits_m)
-    arrays = [part for values in (ranges_m, sigma_m)
-              for part in (pack("<I", len(values)), np.ascontiguousarray(values, "<f4").tobytes())]
+    arrays = [
+        part
+        for values in (ranges_m, sigma_m)
+        for part in (pack("<I", len(values)), np.ascontiguousarray(values, "<f4").tobytes())
+    ]
     return b"".join([b"\0\1\0\0", head, bytes(-len(head) % 4), numbers, *arrays])
 
 
@@ -57,9 +60,12 @@ def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
     assert isinstance(message, ros.sensor_msgs__msg__LaserScan)
     count = len(message.ranges)
     if count > MOST_RANGES or not (math.isfinite(message.angle_min) and math.isfinite(message.angle_increment)):
-        raise OmnidError(f"a scan of {count} ranges from {message.angle_min} rad by {message.angle_increment} rad was "
-                         f"found; expected finite angles and at most {MOST_RANGES} ranges")
+        raise OmnidError(
+            f"a scan of {count} ranges from {message.angle_min} rad by {message.angle_increment} rad was "
+            f"found; expected finite angles and at most {MOST_RANGES} ranges"
+        )
     azimuths = message.angle_min + message.angle_increment * np.arange(count)
     stamp_ns = int(message.header.stamp.sec) * NS_PER_S + int(message.header.stamp.nanosec)
-    return Scan(stamp_ns, message.header.frame_id, azimuths, message.ranges, message.intensities,
-                float(message.range_max))
+    return Scan(
+        stamp_ns, message.header.frame_id, azimuths, message.ranges, message.intensities, float(message.range_max)
+    )

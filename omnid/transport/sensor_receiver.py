@@ -23,8 +23,14 @@ LONGEST_PAYLOAD: Final = 8192  # bytes
 class SensorReceiver:
     """Passes valid samples on and counts the others; called from threads of the bus, never raises."""
 
-    def __init__(self, target: Callable[[MotionSample], None], offset_ns: int, topics: frozenset[str],
-                 report: Callable[[str], None], joints: JointWheels | None = None) -> None:
+    def __init__(
+        self,
+        target: Callable[[MotionSample], None],
+        offset_ns: int,
+        topics: frozenset[str],
+        report: Callable[[str], None],
+        joints: JointWheels | None = None,
+    ) -> None:
         """target: may be called from any thread. offset_ns: from the stamps of images to Unix time.
 
         topics: those that are used. report: takes a line for the log, once for each topic. joints: the wheels.

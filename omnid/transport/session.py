@@ -63,11 +63,13 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
 def _failure(config: BusConfig, cause: str) -> OmnidError:
     if config.mode == "client":
         endpoints = ", ".join(config.connect)
-        return Unreachable(f"bus cannot reach {endpoints}: start the robot or router there, or change bus.connect "
-                           f"({cause})")
+        return Unreachable(
+            f"bus cannot reach {endpoints}: start the robot or router there, or change bus.connect ({cause})"
+        )
     endpoints = ", ".join(config.listen)
-    return EndpointTaken(f"bus cannot listen on {endpoints}: stop the other program there or change bus.listen "
-                         f"({cause})")
+    return EndpointTaken(
+        f"bus cannot listen on {endpoints}: stop the other program there or change bus.listen ({cause})"
+    )
 
 
 def router_in_place(config: BusConfig) -> BusConfig | None:
@@ -121,8 +123,15 @@ def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]
     yield "listen/endpoints", [] if client else list(config.listen), "listen"
     yield "connect/endpoints", list(config.connect), "connect"
     yield "connect/exit_on_failure", client, ""
-    yield "connect/retry", {"period_init_ms": min(500, round(1e3 * config.retry_s)),
-                            "period_max_ms": round(1e3 * config.retry_s), "period_increase_factor": 2}, "retry_s"
+    yield (
+        "connect/retry",
+        {
+            "period_init_ms": min(500, round(1e3 * config.retry_s)),
+            "period_max_ms": round(1e3 * config.retry_s),
+            "period_increase_factor": 2,
+        },
+        "retry_s",
+    )
     if client:
         yield "connect/timeout_ms", _CONNECT_TIMEOUT_MS, ""
     yield "scouting/multicast/enabled", False, ""
@@ -151,15 +160,28 @@ def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
     plain = [*short, f"{config.robot}/cmd/*/*"]
     ros = [f"{config.ros2_domain}/{key}/*/*" for key in plain] if config.ros2 == "rmw_zenoh" else []
     requests = [f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS - {PATH})]
-    return [{"id": "commands", "flows": ["ingress"], "messages": ["put", "query"], "key_exprs": plain + ros + requests,
-             "size_limit": _MAX_COMMAND_BYTES}]
+    return [
+        {
+            "id": "commands",
+            "flows": ["ingress"],
+            "messages": ["put", "query"],
+            "key_exprs": plain + ros + requests,
+            "size_limit": _MAX_COMMAND_BYTES,
+        }
+    ]
 
 
 def _query_rates(config: BusConfig) -> list[dict[str, Any]]:
     """Return the rules that bound how often a link may ask."""
     keys = [f"{config.robot}/*", *(f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS))]
-    return [{"id": "queries", "flows": ["ingress"], "messages": ["query"],
-             "rules": [{"key_expr": key, "freq": _MAX_QUERIES_HZ} for key in keys]}]
+    return [
+        {
+            "id": "queries",
+            "flows": ["ingress"],
+            "messages": ["query"],
+            "rules": [{"key_expr": key, "freq": _MAX_QUERIES_HZ} for key in keys],
+        }
+    ]
 
 
 def _users(config: BusConfig) -> Iterator[tuple[str, Any, str]]:

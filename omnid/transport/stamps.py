@@ -20,7 +20,7 @@ MOST_ARM_STAMPS: Final = 256  # remembered, where the senders' clocks are others
 _CLOCKS: Final = 'synchronise the clocks, or set bus.command_clock = "arrival"'
 ADVICE: Final = {
     UNSTAMPED: "fill in the stamp (ROS 2: `header: auto`; String: last word stamp=NANOSECONDS); for a plain Twist set "
-               'bus.command_clock = "arrival"',
+    'bus.command_clock = "arrival"',
     TOO_OLD: _CLOCKS,
     EARLY: _CLOCKS,
     NOT_RISING: "one sender per topic, or arm the robot again for a sender whose clock began again",

@@ -49,8 +49,12 @@ GOAL: Final = "cmd/goal"
 PATH: Final = "cmd/path"
 NAVIGATION: Final = "cmd/navigation"
 ROUTE: Final = "cmd/route"
-NAVIGATION_TOPICS: Final = {GOAL: codec.POSE_SCHEMA, PATH: navigation_codec.PATH_SCHEMA,
-                            NAVIGATION: navigation_codec.STRING_SCHEMA, ROUTE: navigation_codec.STRING_SCHEMA}
+NAVIGATION_TOPICS: Final = {
+    GOAL: codec.POSE_SCHEMA,
+    PATH: navigation_codec.PATH_SCHEMA,
+    NAVIGATION: navigation_codec.STRING_SCHEMA,
+    ROUTE: navigation_codec.STRING_SCHEMA,
+}
 MAP: Final = "cmd/map"
 SAVE_MAP: Final = "save"  # the request on it
 MAP_TOPICS: Final = {MAP: navigation_codec.STRING_SCHEMA}
@@ -58,8 +62,11 @@ REQUEST_TOPICS: Final = frozenset((ARM, *NAVIGATION_TOPICS, MAP))  # that have a
 WHEEL_ODOM: Final = "cmd/wheel_odom"
 IMU: Final = "cmd/imu"
 JOINT_STATES: Final = "cmd/joint_states"
-SENSOR_TOPICS: Final = {WHEEL_ODOM: motion_codec.WHEEL_SCHEMA, IMU: motion_codec.IMU_SCHEMA,
-                        JOINT_STATES: motion_codec.JOINT_SCHEMA}
+SENSOR_TOPICS: Final = {
+    WHEEL_ODOM: motion_codec.WHEEL_SCHEMA,
+    IMU: motion_codec.IMU_SCHEMA,
+    JOINT_STATES: motion_codec.JOINT_SCHEMA,
+}
 TWIST: Final = "twist"
 HEADING: Final = "heading"
 _SETPOINTS: Final = {TWIST: codec.TWIST_SCHEMA, HEADING: codec.VECTOR_SCHEMA}
@@ -69,8 +76,16 @@ def command_topics(sources: Sequence[str]) -> dict[str, str]:
     """Return the topics of commands with their types; sources: names, of which the first has the short topics too."""
     setpoints = {f"cmd/{name}": schema for name, schema in _SETPOINTS.items()}
     named = {f"cmd/{source}/{name}": schema for source in sources for name, schema in _SETPOINTS.items()}
-    return {**setpoints, STOP: EMPTY_SCHEMA, ARM: codec.HEADER_SCHEMA, **CONTACT_TOPICS, **NAVIGATION_TOPICS,
-            **MAP_TOPICS, **SENSOR_TOPICS, **named}
+    return {
+        **setpoints,
+        STOP: EMPTY_SCHEMA,
+        ARM: codec.HEADER_SCHEMA,
+        **CONTACT_TOPICS,
+        **NAVIGATION_TOPICS,
+        **MAP_TOPICS,
+        **SENSOR_TOPICS,
+        **named,
+    }
 
 
 def request_key(topic: str) -> str:

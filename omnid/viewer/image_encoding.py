@@ -24,5 +24,18 @@ def compressed(image: RosImage) -> tuple[bytes, str]:
     """Return compressed bytes and their kind; raw images become grey JPEG. Raise FrameDecodeError where damaged."""
     if image.encoding in COMPRESSED:
         return bytes(image.data), image.encoding
-    return jpeg(gray(Frame(0, image.stamp_ns, "lower", image.encoding, image.data, image.width, image.height,
-                           image.step, image.bigendian))), "jpeg"
+    return jpeg(
+        gray(
+            Frame(
+                0,
+                image.stamp_ns,
+                "lower",
+                image.encoding,
+                image.data,
+                image.width,
+                image.height,
+                image.step,
+                image.bigendian,
+            )
+        )
+    ), "jpeg"

@@ -31,17 +31,24 @@ def layout(image: str, depth: bool) -> Any:
         rrb.TimePanel(timeline=TIMELINE, state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
-        auto_layout=False, auto_views=False,
+        auto_layout=False,
+        auto_views=False,
     )
 
 
 def _world() -> Any:
     """The path up to the current time, and everything else as of that time."""
-    until_now = rrb.VisibleTimeRanges(rrb.VisibleTimeRange(
-        TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()))
-    return rrb.Spatial3DView(origin="odom", name="World", overrides={"odom/path": [until_now]},
-                             eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=(0.0, 0.0, 0.0),
-                                                            eye_up=(0.0, 0.0, 1.0)))
+    until_now = rrb.VisibleTimeRanges(
+        rrb.VisibleTimeRange(
+            TIMELINE, start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.cursor_relative()
+        )
+    )
+    return rrb.Spatial3DView(
+        origin="odom",
+        name="World",
+        overrides={"odom/path": [until_now]},
+        eye_controls=rrb.EyeControls3D(position=EYE_M, look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0)),
+    )
 
 
 def _image(name: str, title: str) -> Any:
@@ -49,8 +56,11 @@ def _image(name: str, title: str) -> Any:
 
 
 def _texts() -> Any:
-    return rrb.Tabs(rrb.StateTimelineView(origin="state", name="State"), rrb.TextLogView(origin="log", name="Log"),
-                    rrb.TextDocumentView(origin="legend", name="Legend"))
+    return rrb.Tabs(
+        rrb.StateTimelineView(origin="state", name="State"),
+        rrb.TextLogView(origin="log", name="Log"),
+        rrb.TextDocumentView(origin="legend", name="Legend"),
+    )
 
 
 def _plot(name: str, title: str) -> Any:

@@ -43,8 +43,17 @@ class RecordingView:
         """Draw the pose that waits, in the state reported by now."""
         record, self._pending = self._pending, None
         if record is not None:
-            self._scene.pose(Pose(record.stamp_ns, record.T_odom_base, record.covariance, record.velocity,
-                                  record.velocity_covariance, PoseAttachment(state=self._state), record.stamp_ns))
+            self._scene.pose(
+                Pose(
+                    record.stamp_ns,
+                    record.T_odom_base,
+                    record.covariance,
+                    record.velocity,
+                    record.velocity_covariance,
+                    PoseAttachment(state=self._state),
+                    record.stamp_ns,
+                )
+            )
 
     def _diagnostics(self, diagnostics: Diagnostics) -> None:
         self._state = status_plots.odometry_state(diagnostics) or self._state

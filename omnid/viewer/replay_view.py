@@ -45,8 +45,9 @@ class ReplayView:
         elif isinstance(message, PlaceUpdate):
             self._places(message)
         elif isinstance(message, ObstacleRing):
-            self._scene.scan(Scan(message.stamp_ns, "base_link", azimuths(), message.ranges_m, message.sigma_m,
-                                  math.inf))
+            self._scene.scan(
+                Scan(message.stamp_ns, "base_link", azimuths(), message.ranges_m, message.sigma_m, math.inf)
+            )
 
     def _odometry(self, odometry: OdometryUpdate) -> None:
         scene = self._scene
@@ -77,8 +78,9 @@ class ReplayView:
         to_odom = se3.inverse(T_map_odom) @ T_base_rig @ self._geometry.T_rig_rect
         at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :3, 3], strict=True))
         loops = [(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at]
-        self._scene.places(update.stamp_ns, np.array(list(at.values())).reshape(-1, 3),
-                           np.array(loops).reshape(-1, 2, 3))
+        self._scene.places(
+            update.stamp_ns, np.array(list(at.values())).reshape(-1, 3), np.array(loops).reshape(-1, 2, 3)
+        )
 
     def _map(self, update: MapUpdate) -> None:
         points = se3.apply(self._geometry.rig.T_base_rig, update.points.xyz.astype(float)).astype(np.float32)
@@ -87,8 +89,9 @@ class ReplayView:
 
 def pose_of(odometry: OdometryUpdate, geometry: Geometry) -> Pose:
     """Return the pose of the base, as subscribers of the bus receive it."""
-    attachment = PoseAttachment(odometry.seq, odometry.state, resets=odometry.reset_counter, inliers=odometry.inliers,
-                                tracked=odometry.tracks)
+    attachment = PoseAttachment(
+        odometry.seq, odometry.state, resets=odometry.reset_counter, inliers=odometry.inliers, tracked=odometry.tracks
+    )
     base = of_base(odometry, geometry.rig.T_base_rig)
     in_odom_axes = base._replace(covariance=in_outer_axes(base.T_odom_base, base.covariance))
     return Pose(odometry.stamp_ns, *in_odom_axes, attachment, odometry.stamp_ns)

@@ -63,9 +63,14 @@ class RerunScene:
     def __init__(self, target: ViewerTarget, layout: Any, expected: int = 0) -> None:
         self._target, self._layout = target, layout
         self._stream: rr.RecordingStream | None = None
-        self._thinning = {"pose": Thinning(MAX_POSES, expected), "frame": Thinning(MAX_FRAMES, expected),
-                          "image": Thinning(MAX_FRAMES, expected), "cloud": Thinning(MAX_CLOUDS),
-                          "scan": Thinning(MAX_POSES), "places": Thinning(MAX_PLACES)}
+        self._thinning = {
+            "pose": Thinning(MAX_POSES, expected),
+            "frame": Thinning(MAX_FRAMES, expected),
+            "image": Thinning(MAX_FRAMES, expected),
+            "cloud": Thinning(MAX_CLOUDS),
+            "scan": Thinning(MAX_POSES),
+            "places": Thinning(MAX_PLACES),
+        }
         self._last_position: Array | None = None  # (3,) m, end of the path
         self._state = ""
         self._lines = 0
@@ -128,16 +133,19 @@ class RerunScene:
         stream = self._at(stamp_ns)
         dots = rr.Points2D(features.inliers, colors=style.INLIER.colour, radii=_px(style.INLIER.size_px))
         stream.log("panorama/inliers", dots)
-        stream.log("panorama/rejected", _lines_2d(style.crosses(features.rejected, style.REJECTED.size_px),
-                                                  style.REJECTED))
+        stream.log(
+            "panorama/rejected", _lines_2d(style.crosses(features.rejected, style.REJECTED.size_px), style.REJECTED)
+        )
         stream.log("panorama/new", _lines_2d(style.squares(features.new, style.NEW.size_px), style.NEW))
 
     def depth(self, stamp_ns: int, distance_mm: NDArray[np.uint16], points: Array) -> None:
         """Draw distances (H, W) over the panorama, 0 unknown, and points (N, 3) [m] in the rig."""
         stream = self._at(stamp_ns)
         png = cv2.imencode(".png", distance_mm, PNG_FAST)[1].tobytes()
-        stream.log("depth", rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0,
-                                                depth_range=style.depth_range(distance_mm)))
+        stream.log(
+            "depth",
+            rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0, depth_range=style.depth_range(distance_mm)),
+        )
         (points,) = style.evenly(MAX_RIG_POINTS, points)
         stream.log("odom/base_link/rig/points", _points_3d(points, 2.0))
 
@@ -169,8 +177,9 @@ class RerunScene:
         stream, known = self._at(scan.stamp_ns), np.isfinite(scan.ranges_m)
         unknown = np.isnan(scan.ranges_m)
         ranges = np.where(known, scan.ranges_m, UNKNOWN_AT_M)
-        points = np.column_stack([ranges * np.cos(scan.azimuths_rad), ranges * np.sin(scan.azimuths_rad),
-                                  np.zeros(len(ranges))])
+        points = np.column_stack(
+            [ranges * np.cos(scan.azimuths_rad), ranges * np.sin(scan.azimuths_rad), np.zeros(len(ranges))]
+        )
         for name, chosen, one in (("obstacles", known, style.OBSTACLE), ("unknown", unknown, style.UNKNOWN)):
             dots = rr.Points3D(points[chosen], colors=one.colour, radii=_px(one.size_px))
             stream.log(f"odom/base_link/{name}", dots)
@@ -217,9 +226,14 @@ class RerunScene:
         if ellipsoid is None:
             return
         label = f"{style.SIGMAS:g} sigma: {1e3 * ellipsoid.largest_m:.1f} mm, drawn x{ellipsoid.magnified}"
-        shape = rr.Ellipsoids3D(half_sizes=[ellipsoid.half_m], centers=[pose.T_odom_base[:3, 3]],
-                                quaternions=[rr.Quaternion(xyzw=se3.quaternion(ellipsoid.R))],
-                                colors=style.state_style(pose.state).colour, labels=[label], show_labels=False)
+        shape = rr.Ellipsoids3D(
+            half_sizes=[ellipsoid.half_m],
+            centers=[pose.T_odom_base[:3, 3]],
+            quaternions=[rr.Quaternion(xyzw=se3.quaternion(ellipsoid.R))],
+            colors=style.state_style(pose.state).colour,
+            labels=[label],
+            show_labels=False,
+        )
         self._opened().log("odom/covariance", shape)
         self._plot("sigma", "position mm", 1e3 * ellipsoid.largest_m / style.SIGMAS)
         self._plot("sigma", "heading mdeg", 1e3 * float(np.rad2deg(np.sqrt(max(0.0, pose.covariance[5, 5])))))
@@ -228,8 +242,9 @@ class RerunScene:
 def _log_static(stream: rr.RecordingStream) -> None:
     """Log the entities that never change."""
     stream.log("odom", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    axes = rr.Arrows3D(vectors=AXIS_M * np.eye(3), colors=style.AXES, radii=_px(2.5), labels=["x", "y", "z"],
-                       show_labels=False)
+    axes = rr.Arrows3D(
+        vectors=AXIS_M * np.eye(3), colors=style.AXES, radii=_px(2.5), labels=["x", "y", "z"], show_labels=False
+    )
     stream.log("odom/base_link", axes, static=True)
     stream.log("legend", rr.TextDocument(LEGEND, media_type="text/markdown"), static=True)
     states = style.STATES | {"unknown": style.UNKNOWN}

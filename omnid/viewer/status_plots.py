@@ -32,8 +32,11 @@ def latencies(diagnostics: Diagnostics) -> Iterator[tuple[tuple[str, ...], float
 
 def odometry_state(diagnostics: Diagnostics) -> TrackingState | None:
     """Return the tracking state; None where the message has none."""
-    found = (status_names.tracking_state(status.message, status.values) for status in diagnostics.statuses
-             if status.name == ODOMETRY)
+    found = (
+        status_names.tracking_state(status.message, status.values)
+        for status in diagnostics.statuses
+        if status.name == ODOMETRY
+    )
     return next((state for state in found if state is not None), None)
 
 

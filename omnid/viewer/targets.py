@@ -91,8 +91,10 @@ class RrdFile:
         """Raise OmnidError where the disk is nearly full: rerun 0.41 blocks for ever on a full one, at exit, too."""
         free = shutil.disk_usage(self._path.resolve().parent).free
         if free < MIN_FREE_BYTES:
-            raise OmnidError(f"-o {self._path}: the disk has {free >> 20} MB left, expected {MIN_FREE_BYTES >> 20} MB "
-                             "or more: free some space, or name a file on another disk")
+            raise OmnidError(
+                f"-o {self._path}: the disk has {free >> 20} MB left, expected {MIN_FREE_BYTES >> 20} MB "
+                "or more: free some space, or name a file on another disk"
+            )
 
     def finish(self) -> str:
         """Return how to open the file."""
@@ -120,9 +122,21 @@ class Viewer:
         web_port, port = self._ports()
         url = f"rerun+http://{LOCALHOST}:{port}/proxy"
         served = ["--serve-web", "--web-viewer-port", str(web_port)] if self._web else ["--expect-data-soon"]
-        self._process = _started(self._output, ["--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen",
-                                                "--memory-limit", MEMORY_LIMIT, "--server-memory-limit", MEMORY_LIMIT,
-                                                *served])
+        self._process = _started(
+            self._output,
+            [
+                "--bind",
+                LOCALHOST,
+                "--port",
+                str(port),
+                "--hide-welcome-screen",
+                "--memory-limit",
+                MEMORY_LIMIT,
+                "--server-memory-limit",
+                MEMORY_LIMIT,
+                *served,
+            ],
+        )
         _wait_for(port, self._process, self._output)
         stream = rr.RecordingStream(APPLICATION)
         stream.connect_grpc(url, default_blueprint=layout)
@@ -130,8 +144,11 @@ class Viewer:
         if self._web:
             page = f"http://{LOCALHOST}:{web_port}/?url={quote(url, safe='')}"
             forwarded = f"-L {web_port}:{LOCALHOST}:{web_port} -L {port}:{LOCALHOST}:{port}"
-            print(f"omnid: open {page} on this machine; on another one after: ssh {forwarded} {socket.gethostname()}",
-                  file=sys.stderr, flush=True)
+            print(
+                f"omnid: open {page} on this machine; on another one after: ssh {forwarded} {socket.gethostname()}",
+                file=sys.stderr,
+                flush=True,
+            )
         return stream
 
     def _ports(self) -> tuple[int, int]:
@@ -140,8 +157,10 @@ class Viewer:
             return _free_port(), _free_port()
         for port in (self._port, self._port + 1):
             if _accepts_connections(port):
-                raise OmnidError(f"--port {self._port}: another program listens on {port}; it needs that port and the "
-                                 "next one: stop the other program, or name another port")
+                raise OmnidError(
+                    f"--port {self._port}: another program listens on {port}; it needs that port and the "
+                    "next one: stop the other program, or name another port"
+                )
         return self._port, self._port + 1
 
     def flush(self) -> None:
@@ -188,8 +207,13 @@ def _flush(stream: rr.RecordingStream, fault: str) -> None:
 def opt_out() -> None:
     """Turn rerun's usage statistics off for this user; `rerun analytics enable` turns them on again."""
     with suppress(OSError, subprocess.SubprocessError):
-        subprocess.run(_rerun(["analytics", "disable"]), capture_output=True, timeout=TIMEOUT_S, check=False,
-                       env=python_environment())
+        subprocess.run(
+            _rerun(["analytics", "disable"]),
+            capture_output=True,
+            timeout=TIMEOUT_S,
+            check=False,
+            env=python_environment(),
+        )
 
 
 def _require_display() -> None:
@@ -204,8 +228,14 @@ def _rerun(arguments: list[str]) -> list[str]:
 
 def _started(output: IO[bytes], arguments: list[str]) -> subprocess.Popen[bytes]:
     """Start the viewer in a session of its own, which Ctrl-C does not end."""
-    return subprocess.Popen(_rerun(arguments), stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-                            start_new_session=True, env=python_environment(RUST_LOG="warn"))
+    return subprocess.Popen(
+        _rerun(arguments),
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=output,
+        start_new_session=True,
+        env=python_environment(RUST_LOG="warn"),
+    )
 
 
 def _wait_for(port: int, process: subprocess.Popen[bytes], output: IO[bytes]) -> None:

@@ -105,8 +105,13 @@ def _closing(scene: RerunScene, target: ViewerTarget) -> Iterator[None]:
 
 
 def _replayed(log: Log, config: Config, scene: RerunScene, replay: Replay) -> int:
-    options = ReplayOptions(rig=log.rig, topics=log.topics, settings=log.settings, map_every_s=MAP_EVERY_S,
-                            observer=lambda front_end, telemetry: ReplayView(scene, front_end, telemetry))
+    options = ReplayOptions(
+        rig=log.rig,
+        topics=log.topics,
+        settings=log.settings,
+        map_every_s=MAP_EVERY_S,
+        observer=lambda front_end, telemetry: ReplayView(scene, front_end, telemetry),
+    )
     return replay(log.path, config, options)
 
 
@@ -115,11 +120,16 @@ def _recorded(reader: RecordingReader, scene: RerunScene) -> int:
     RecordingView(reader, scene).show()
     unreadable = reader.unreadable.total()
     if unreadable or reader.damaged:
-        print(f"omnid: warning: {path}: {unreadable} messages and {reader.damaged} pieces of the file cannot be read "
-              "and are left out", file=sys.stderr)
+        print(
+            f"omnid: warning: {path}: {unreadable} messages and {reader.damaged} pieces of the file cannot be read "
+            "and are left out",
+            file=sys.stderr,
+        )
     if not scene.poses:
-        raise OmnidError(f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
-                         "the log is complete")
+        raise OmnidError(
+            f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
+            "the log is complete"
+        )
     return 0
 
 

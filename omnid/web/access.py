@@ -33,8 +33,10 @@ _READING: Final = ("GET", "HEAD")
 _STOPPING: Final = ("stop", "logout")  # last parts of the addresses to which the token for stops may post
 COOKIE_S: Final = 30 * 86_400  # for which a browser keeps the cookie
 MOST_ENDED: Final = 1000  # sessions
-_COOKIE: Final = re.compile(r"(?P<id>[0-9a-f]{16})\.(?P<role>all|stop)\.(?P<end_s>[0-9]{1,12})\."
-                            r"(?P<proof>[0-9a-f]{64})")
+_COOKIE: Final = re.compile(
+    r"(?P<id>[0-9a-f]{16})\.(?P<role>all|stop)\.(?P<end_s>[0-9]{1,12})\."
+    r"(?P<proof>[0-9a-f]{64})"
+)
 
 
 class Refusal(NamedTuple):
@@ -49,8 +51,11 @@ _NO_TOKEN: Final = Refusal(401, "no token", "a token is needed: open the address
 _WRONG_TOKEN: Final = Refusal(401, "wrong token", "the token is not that of this server")
 _STOP_ONLY: Final = Refusal(403, "stop only", "this token may see and stop, nothing else")
 _OTHER_ORIGIN: Final = Refusal(403, "cross-site", "requests of other sites are refused")
-_NO_ORIGIN: Final = Refusal(403, "no origin", "a request that changes something needs the header Origin of this page, "
-                            "or Authorization: Bearer TOKEN")
+_NO_ORIGIN: Final = Refusal(
+    403,
+    "no origin",
+    "a request that changes something needs the header Origin of this page, or Authorization: Bearer TOKEN",
+)
 
 
 class Role(StrEnum):
@@ -95,8 +100,9 @@ def _read_token(path: Path, option: str) -> str:
         raise OmnidError(f"{option} {path}: every user of this machine may read or write it: chmod 600 {path}")
     text = data.decode("ascii", "replace").strip()
     if not _TOKEN.fullmatch(text):
-        raise OmnidError(f"{option} {path}: expected one line of 16 to 256 letters without spaces; delete the file "
-                         "to have one made")
+        raise OmnidError(
+            f"{option} {path}: expected one line of 16 to 256 letters without spaces; delete the file to have one made"
+        )
     return text
 
 
@@ -159,8 +165,11 @@ class Access:
         headers = _Headers(scope["headers"])
         host = headers.only("host")
         if not self._is_host(host):
-            return Refusal(403, "unknown host", "this server is not known by that name: start omnid web with --host "
-                           "NAME, or use its address")
+            return Refusal(
+                403,
+                "unknown host",
+                "this server is not known by that name: start omnid web with --host NAME, or use its address",
+            )
         fault = self._other_site(scope, headers, host)
         if fault is None and not self._is_open(scope):
             fault = self._token_fault(scope, headers)

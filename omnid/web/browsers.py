@@ -40,7 +40,8 @@ class _Browser:
         """Return the next message; None if the browser has seen all."""
         for channel in self.channels:
             if channel.version > self.seen[channel.name] and (
-                    channel.name not in on_request or channel.name in self.wanted):
+                channel.name not in on_request or channel.name in self.wanted
+            ):
                 self.channels.remove(channel)
                 self.channels.append(channel)
                 return channel, channel.message(self.seen[channel.name])

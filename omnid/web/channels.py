@@ -97,8 +97,10 @@ class LivePath:
     def message(self, seen: int) -> Encoded:
         """Return the points [x, y] added since that version, or all with `from` 0; after a gap [x, y, 1]."""
         begin = seen - self._first if seen >= self._first else 0
-        points = [[round(point.x_m, 3), round(point.y_m, 3), *([1] if point.after_gap else [])]
-                  for point in self._path.vertices[begin:]]
+        points = [
+            [round(point.x_m, 3), round(point.y_m, 3), *([1] if point.after_gap else [])]
+            for point in self._path.vertices[begin:]
+        ]
         return compact({"type": self.name, "from": begin, "points": points})
 
 

@@ -44,8 +44,15 @@ NAVIGATION: Final = "navigation"
 MAP_POSE: Final = "map_pose"
 PANORAMA_S: Final = 0.4  # least time between two panoramas: what a robot publishes more often is left out
 MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
-_LARGEST: Final = {"odom": 1 << 16, MAP_POSE: 1 << 16, "status": 1 << 20, SCAN: 1 << 20, "map": MOST_CELLS + (1 << 16),
-                   PANORAMA: 1 << 23, NAVIGATION: 1 << 16}  # bytes
+_LARGEST: Final = {
+    "odom": 1 << 16,
+    MAP_POSE: 1 << 16,
+    "status": 1 << 20,
+    SCAN: 1 << 20,
+    "map": MOST_CELLS + (1 << 16),
+    PANORAMA: 1 << 23,
+    NAVIGATION: 1 << 16,
+}  # bytes
 _NEWEST_ONLY: Final = (NAVIGATION, SCAN, "map", PANORAMA)
 _JPEG: Final = b"\xff\xd8"
 Receiver = Callable[[str, bytes, bytes], None]
@@ -77,9 +84,18 @@ class RobotFeed:
         self._scan_channel = Newest(SCAN, lambda: self._scan)
         self._navigation_channel = Newest(NAVIGATION, lambda: self._navigation)
         self._end_panorama: Callable[[], None] | None = None
-        self.browsers = Browsers((self._state_channel, self.path, self._parts_channel, self._map_channel,
-                                  self._panorama_channel, self._scan_channel, self._navigation_channel),
-                                 on_request=frozenset((PANORAMA,)))
+        self.browsers = Browsers(
+            (
+                self._state_channel,
+                self.path,
+                self._parts_channel,
+                self._map_channel,
+                self._panorama_channel,
+                self._scan_channel,
+                self._navigation_channel,
+            ),
+            on_request=frozenset((PANORAMA,)),
+        )
 
     async def run(self) -> None:
         """Connect to the robot as soon as it can be reached, and follow it until this task is cancelled."""
@@ -217,9 +233,18 @@ class RobotFeed:
             await asyncio.to_thread(end)
 
     def _encode_state(self) -> str:
-        return state_message(self.bus.robot, self.state, self.link,
-                             {"server_ms": server_ms(), "dropped": self.inbox.dropped, "browsers": len(self.browsers),
-                              "panoramas": self._panorama_channel.version, "map_in_odom": self._map_in_odom})
+        return state_message(
+            self.bus.robot,
+            self.state,
+            self.link,
+            {
+                "server_ms": server_ms(),
+                "dropped": self.inbox.dropped,
+                "browsers": len(self.browsers),
+                "panoramas": self._panorama_channel.version,
+                "map_in_odom": self._map_in_odom,
+            },
+        )
 
 
 def _latched(robot: Robot) -> tuple[Diagnostics | None, Map | None]:

@@ -68,8 +68,9 @@ class FleetFeed:
         self.stops += 1
         if self._fleet is None:
             return Answer(False, f"no stop is sent: use the emergency stops. There is no connection: {self.link}")
-        reports = {name: state.statuses.get(WHEELS) for name, state in self.state.robots.items()
-                   if state.alive is not False}
+        reports = {
+            name: state.statuses.get(WHEELS) for name, state in self.state.robots.items() if state.alive is not False
+        }
         with_wheels = {name for name, report in reports.items() if report or not self.state.robots[name].statuses}
         waiting, end_s = set(with_wheels), time.monotonic() + STOP_S
         await within(self._thread, partial(_stop_each, self._fleet, sorted(reports.keys() - with_wheels)))
@@ -81,12 +82,18 @@ class FleetFeed:
                 waiting = {name for name in waiting if not _confirms(self.state.robots[name], reports[name])}
         confirmed = len(with_wheels) - len(waiting)
         if not waiting:
-            return Answer(bool(with_wheels), f"all {confirmed} robots stop: their wheels stand until they are armed"
-                          if with_wheels else "no robot with wheels is there")
+            return Answer(
+                bool(with_wheels),
+                f"all {confirmed} robots stop: their wheels stand until they are armed"
+                if with_wheels
+                else "no robot with wheels is there",
+            )
         named = ", ".join(plain(name) for name in sorted(waiting)[:_MOST_NAMED])
         more = f" and {len(waiting) - _MOST_NAMED} others" if len(waiting) > _MOST_NAMED else ""
-        return Answer(False, f"NOT confirmed by {named}{more}: use the emergency stop. {confirmed} of "
-                      f"{len(with_wheels)} robots stop")
+        return Answer(
+            False,
+            f"NOT confirmed by {named}{more}: use the emergency stop. {confirmed} of {len(with_wheels)} robots stop",
+        )
 
     async def _connect(self) -> None:
         while self._fleet is None:
@@ -124,8 +131,15 @@ class FleetFeed:
 
     def _encode(self) -> str:
         robots = sorted(self.state.robots.items(), key=lambda entry: (-severity(entry[1]), entry[0]))
-        return compact({"type": "fleet", "link": plain(self.link), "refused": len(self.state.refused),
-                        "dropped": self.inbox.dropped, "robots": [_row(name, state) for name, state in robots]})
+        return compact(
+            {
+                "type": "fleet",
+                "link": plain(self.link),
+                "refused": len(self.state.refused),
+                "dropped": self.inbox.dropped,
+                "robots": [_row(name, state) for name, state in robots],
+            }
+        )
 
 
 def _row(name: str, state: RobotState) -> dict[str, Any]:
@@ -133,9 +147,14 @@ def _row(name: str, state: RobotState) -> dict[str, Any]:
     pose, worst = state.pose, worst_part(state)
     wheels = None if state.alive is False else state.statuses.get(WHEELS)
     return {
-        "key": robot_key(name), "name": plain(name), "level": severity(state), "state": word_of(state),
-        "rate_hz": finite(state.rate_hz), "silent_s": finite(round(state.time_since_pose_s)),
-        "x_m": None if pose is None else finite(pose.x_m), "y_m": None if pose is None else finite(pose.y_m),
+        "key": robot_key(name),
+        "name": plain(name),
+        "level": severity(state),
+        "state": word_of(state),
+        "rate_hz": finite(state.rate_hz),
+        "silent_s": finite(round(state.time_since_pose_s)),
+        "x_m": None if pose is None else finite(pose.x_m),
+        "y_m": None if pose is None else finite(pose.y_m),
         "yaw_rad": None if pose is None else finite(pose.yaw_rad),
         "armed": None if wheels is None else wheels.values.get(Key.ARMED) == "1",
         "problem": "" if worst is None else plain(f"{short_name(worst.name)}: {worst.message}"),

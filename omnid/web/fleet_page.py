@@ -52,8 +52,11 @@ class FleetPage:
 
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
-        return [WebSocketRoute("/live", self._live), Route("/stop", self._stop, methods=["POST"]),
-                Mount("/robot/{key}", app=self._robot)]
+        return [
+            WebSocketRoute("/live", self._live),
+            Route("/stop", self._stop, methods=["POST"]),
+            Mount("/robot/{key}", app=self._robot),
+        ]
 
     def metrics(self, guard: Guard) -> str:
         """Return the metrics of all robots and of this server."""

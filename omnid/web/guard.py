@@ -16,8 +16,10 @@ Receive = Callable[[], Awaitable[Message]]
 Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-POLICY: Final = ("default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
-                 "form-action 'self'; base-uri 'none'; frame-ancestors 'none'")
+POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
 # A report shows text from logs of unknown origin: it runs its own script only, loads nothing, and has no origin.
 REPORT_POLICY: Final = f"{policy(chart_script())}; frame-ancestors 'none'; sandbox allow-scripts"
 _HEADERS: Final = (
@@ -56,8 +58,11 @@ class Guard:
             await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": refusal.reason})
             return
         body = f"omnid web: {refusal.text}\n".encode()
-        headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode()),
-                   (b"connection", b"close")]
+        headers = [
+            (b"content-type", b"text/plain; charset=utf-8"),
+            (b"content-length", str(len(body)).encode()),
+            (b"connection", b"close"),
+        ]
         protected = _protected(send)
         await protected({"type": "http.response.start", "status": refusal.status, "headers": headers})
         await protected({"type": "http.response.body", "body": body})

@@ -16,8 +16,11 @@ from omnid.web.snapshot import LONGEST_VALUE, MOST_VALUES
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 _QUANTILES: Final = (0.5, 0.99)
-_TEXTS: Final = {"dropped": "Messages of the robot that the inbox dropped", "stops": "Stops asked for",
-                 "arms": "Requests to arm"}
+_TEXTS: Final = {
+    "dropped": "Messages of the robot that the inbox dropped",
+    "stops": "Stops asked for",
+    "arms": "Requests to arm",
+}
 Sample = tuple[Mapping[str, str], float]  # labels and value
 
 
@@ -26,22 +29,31 @@ def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], c
     return "".join(_lines(state, browsers, refused, counts))
 
 
-def fleet_metrics(robots: Mapping[str, RobotState], browsers: Browsers, refused: Mapping[str, int],
-                  counts: Mapping[str, int]) -> str:
+def fleet_metrics(
+    robots: Mapping[str, RobotState], browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]
+) -> str:
     """Return the metrics of all robots, by the label `robot`, and of the server; arguments as those of `metrics`."""
     return "".join((*_robots(robots), *_server(browsers, refused, counts)))
 
 
 def _robots(robots: Mapping[str, RobotState]) -> Iterator[str]:
     for name, kind, text, value in (
-            ("omnid_up", "gauge", "1 if the daemon's token is on the bus", lambda state: float(state.alive is True)),
-            ("omnid_pose_rate_hz", "gauge", "Poses received per second", lambda state: state.rate_hz),
-            ("omnid_poses_total", "counter", "Poses received", lambda state: state.poses),
-            ("omnid_poses_missed_total", "counter", "Skipped sequence numbers", lambda state: state.missed)):
+        ("omnid_up", "gauge", "1 if the daemon's token is on the bus", lambda state: float(state.alive is True)),
+        ("omnid_pose_rate_hz", "gauge", "Poses received per second", lambda state: state.rate_hz),
+        ("omnid_poses_total", "counter", "Poses received", lambda state: state.poses),
+        ("omnid_poses_missed_total", "counter", "Skipped sequence numbers", lambda state: state.missed),
+    ):
         yield from _metric(name, kind, text, [({"robot": robot}, value(state)) for robot, state in robots.items()])
-    yield from _metric("omnid_status_level", "gauge", "0 good, 1 warning, 2 error, 3 stale",
-                       [({"robot": robot, "part": short_name(part.name)}, part.level)
-                        for robot, state in robots.items() for part in state.statuses.values()])
+    yield from _metric(
+        "omnid_status_level",
+        "gauge",
+        "0 good, 1 warning, 2 error, 3 stale",
+        [
+            ({"robot": robot, "part": short_name(part.name)}, part.level)
+            for robot, state in robots.items()
+            for part in state.statuses.values()
+        ],
+    )
 
 
 def _lines(
@@ -51,16 +63,26 @@ def _lines(
     yield from _metric("omnid_pose_rate_hz", "gauge", "Poses received per second", [({}, state.rate_hz)])
     yield from _metric("omnid_poses_total", "counter", "Poses received", [({}, state.poses)])
     yield from _metric("omnid_poses_missed_total", "counter", "Skipped sequence numbers", [({}, state.missed)])
-    yield from _metric("omnid_messages_broken_total", "counter", "Messages that could not be decoded",
-                       [({}, state.broken)])
-    yield from _metric("omnid_tracking_state", "gauge", "1 for the state of the newest pose",
-                       [({"state": str(name)}, float(state.state == name)) for name in TrackingState])
+    yield from _metric(
+        "omnid_messages_broken_total", "counter", "Messages that could not be decoded", [({}, state.broken)]
+    )
+    yield from _metric(
+        "omnid_tracking_state",
+        "gauge",
+        "1 for the state of the newest pose",
+        [({"state": str(name)}, float(state.state == name)) for name in TrackingState],
+    )
     for name, text, histogram in (
-            ("omnid_pose_age_seconds", "From the images to the arrival of a pose", state.age),
-            ("omnid_network_seconds", "From the robot's network to the arrival of a pose", state.network)):
+        ("omnid_pose_age_seconds", "From the images to the arrival of a pose", state.age),
+        ("omnid_network_seconds", "From the robot's network to the arrival of a pose", state.network),
+    ):
         yield from _quantiles(name, text, histogram)
-    yield from _metric("omnid_status_level", "gauge", "0 good, 1 warning, 2 error, 3 stale",
-                       [({"part": short_name(part.name)}, part.level) for part in state.statuses.values()])
+    yield from _metric(
+        "omnid_status_level",
+        "gauge",
+        "0 good, 1 warning, 2 error, 3 stale",
+        [({"part": short_name(part.name)}, part.level) for part in state.statuses.values()],
+    )
     yield from _metric("omnid_status_value", "gauge", "Numbers of the status", _values(state))
     yield from _server(browsers, refused, counts)
 
@@ -68,14 +90,16 @@ def _lines(
 def _server(browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> Iterator[str]:
     for name, count in counts.items():
         yield from _metric(f"omnid_web_{name}_total", "counter", _TEXTS[name], [({}, count)])
-    yield from _quantiles("omnid_web_answer_seconds", "From a message to the answer of a browser that has drawn it",
-                          browsers.answer)
+    yield from _quantiles(
+        "omnid_web_answer_seconds", "From a message to the answer of a browser that has drawn it", browsers.answer
+    )
     yield from _metric("omnid_web_browsers", "gauge", "Open pages", [({}, len(browsers))])
     for name, text, label, counts in (
-            ("omnid_web_sent_total", "Messages sent to browsers", "channel", browsers.sent),
-            ("omnid_web_skipped_total", "Messages that a newer one replaced", "channel", browsers.skipped),
-            ("omnid_web_closed_total", "Pages that were disconnected", "reason", browsers.closed),
-            ("omnid_web_refused_total", "Requests that were refused", "reason", refused)):
+        ("omnid_web_sent_total", "Messages sent to browsers", "channel", browsers.sent),
+        ("omnid_web_skipped_total", "Messages that a newer one replaced", "channel", browsers.skipped),
+        ("omnid_web_closed_total", "Pages that were disconnected", "reason", browsers.closed),
+        ("omnid_web_refused_total", "Requests that were refused", "reason", refused),
+    ):
         yield from _metric(name, "counter", text, [({label: key}, count) for key, count in counts.items()])
 
 

@@ -71,7 +71,7 @@ class ConnectionPlaces:
         candidates = {key: place for key, place in self._places.items() if not place.is_known} or self._places
         if not candidates:
             return
-        (host, _), = Counter(place.host for place in candidates.values()).most_common(1)
+        ((host, _),) = Counter(place.host for place in candidates.values()).most_common(1)
         oldest = next(key for key, place in candidates.items() if place.host == host)  # they are kept in their order
         self._places.pop(oldest).end()
         self.lost += 1
@@ -86,8 +86,13 @@ class ConnectionPlaces:
 class Acceptor:
     """Accepts connections and opens them, with TLS or without; it takes the place of a server of asyncio."""
 
-    def __init__(self, listener: socket.socket, protocol: Callable[[], asyncio.Protocol], tls: ssl.SSLContext | None,
-                 places: ConnectionPlaces) -> None:
+    def __init__(
+        self,
+        listener: socket.socket,
+        protocol: Callable[[], asyncio.Protocol],
+        tls: ssl.SSLContext | None,
+        places: ConnectionPlaces,
+    ) -> None:
         """Begin to accept, in the running event loop; listener: listens already."""
         listener.setblocking(False)
         self._listener, self._protocol, self._tls, self._places = listener, protocol, tls, places
@@ -117,6 +122,7 @@ class Acceptor:
         timeout: Any = HANDSHAKE_S if self._tls else None
         with suppress(OSError, asyncio.CancelledError):  # errors of TLS are OSErrors
             place.transport, _ = await asyncio.get_running_loop().connect_accepted_socket(
-                self._protocol, connection, ssl=self._tls, ssl_handshake_timeout=timeout)
+                self._protocol, connection, ssl=self._tls, ssl_handshake_timeout=timeout
+            )
             return
         connection.close()

@@ -56,9 +56,19 @@ class Recordings:
 
     def described(self) -> dict[str, Any]:
         """Return the list as a message for the page."""
-        return {"folder": plain(str(self.folder.absolute())), "recordings": [
-            {"key": found.key, "name": plain(found.path.name), "size_bytes": found.size_bytes,
-             "changed_s": round(found.changed_s), "state": _state(found.path)} for found in self.list()]}
+        return {
+            "folder": plain(str(self.folder.absolute())),
+            "recordings": [
+                {
+                    "key": found.key,
+                    "name": plain(found.path.name),
+                    "size_bytes": found.size_bytes,
+                    "changed_s": round(found.changed_s),
+                    "state": _state(found.path),
+                }
+                for found in self.list()
+            ],
+        }
 
     async def report(self, key: str) -> Path:
         """Return the HTML page about a recording. Raise OmnidError with the reason where there is none."""
@@ -79,8 +89,12 @@ class Recordings:
         self._count += 1
         page = self._reports / f"{self._count}.html"
         process = await asyncio.create_subprocess_exec(
-            *python("-m", "omnid", "report", str(log.absolute()), "-o", str(page)), env=python_environment(),
-            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.PIPE)
+            *python("-m", "omnid", "report", str(log.absolute()), "-o", str(page)),
+            env=python_environment(),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.DEVNULL,
+            stderr=asyncio.subprocess.PIPE,
+        )
         with suppress(OSError):  # it has ended already
             os.setpriority(os.PRIO_PROCESS, process.pid, NICE)
         try:

@@ -25,10 +25,16 @@ class RobotPage:
 
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
-        return [WebSocketRoute("/live", self._live), Route("/stop", self._stop, methods=["POST"]),
-                Route("/arm", self._arm, methods=["POST"]), Route("/route", self._route, methods=["POST"]),
-                Route("/navigation", self._navigation, methods=["POST"]), Route("/map", self._map, methods=["POST"]),
-                Route("/drive", self._drive, methods=["POST"]), Route("/goal", self._goal, methods=["POST"])]
+        return [
+            WebSocketRoute("/live", self._live),
+            Route("/stop", self._stop, methods=["POST"]),
+            Route("/arm", self._arm, methods=["POST"]),
+            Route("/route", self._route, methods=["POST"]),
+            Route("/navigation", self._navigation, methods=["POST"]),
+            Route("/map", self._map, methods=["POST"]),
+            Route("/drive", self._drive, methods=["POST"]),
+            Route("/goal", self._goal, methods=["POST"]),
+        ]
 
     def metrics(self, guard: Guard) -> str:
         """Return the metrics of the robot and of this server."""

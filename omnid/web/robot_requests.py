@@ -55,8 +55,9 @@ class RobotRequests:
         """Ask the robot to save its map now."""
         return await self._asked("map", Driver.save_map)
 
-    async def _asked_in_words(self, kind: str, request: Request, check: Callable[[str], object],
-                              ask: Callable[[Driver, str], Answer]) -> Answer:
+    async def _asked_in_words(
+        self, kind: str, request: Request, check: Callable[[str], object], ask: Callable[[Driver, str], Answer]
+    ) -> Answer:
         try:
             text = await text_of(request)
             check(text)

@@ -73,17 +73,21 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
         host, port = listener.getsockname()[:2]
         local = ipaddress.ip_address(host).is_loopback
         own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", *_names_of_machine())
-        access = Access(token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}",
-                        stop_token)
+        access = Access(
+            token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}", stop_token
+        )
         guard, follow = _site(bus, settings, access, Path(reports))
         server = _Server(_uvicorn_config(guard, settings), guard.places)
         raise_file_limit()
         scheme = "http" if settings.tls is None else "https"
         _print_addresses(f"{scheme}://{_address(host)}:{port}/", token, stop_token)
         if not local and settings.tls is None:
-            log_unlimited(logging.WARNING, "the page can be reached from the network without encryption: everyone who "
-                          "can listen there learns the token, and may arm the robot; use --tls-certificate and "
-                          "--tls-key, or a network that you trust")
+            log_unlimited(
+                logging.WARNING,
+                "the page can be reached from the network without encryption: everyone who "
+                "can listen there learns the token, and may arm the robot; use --tls-certificate and "
+                "--tls-key, or a network that you trust",
+            )
         asyncio.run(_run(server, follow, listener))
 
 
@@ -179,15 +183,29 @@ def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
         if path is not None and not os.access(path, os.R_OK):
             raise OmnidError(f"{option} {path}: cannot be read; name a PEM file")
     config = uvicorn.Config(
-        guard, loop="asyncio", http=_Protocol, ws="websockets-sansio", interface="asgi3", lifespan="off",
-        ws_max_size=LONGEST_MESSAGE, ws_ping_interval=None, ws_per_message_deflate=False, log_config=None,
-        access_log=False, proxy_headers=False, server_header=False,
-        timeout_graceful_shutdown=END_S, ssl_certfile=certificate, ssl_keyfile=key)
+        guard,
+        loop="asyncio",
+        http=_Protocol,
+        ws="websockets-sansio",
+        interface="asgi3",
+        lifespan="off",
+        ws_max_size=LONGEST_MESSAGE,
+        ws_ping_interval=None,
+        ws_per_message_deflate=False,
+        log_config=None,
+        access_log=False,
+        proxy_headers=False,
+        server_header=False,
+        timeout_graceful_shutdown=END_S,
+        ssl_certfile=certificate,
+        ssl_keyfile=key,
+    )
     try:
         config.load()
     except OSError as error:  # of ssl
-        raise OmnidError(f"--tls-certificate {certificate}: {error.strerror or error}; name a certificate and its key "
-                         "in PEM") from error
+        raise OmnidError(
+            f"--tls-certificate {certificate}: {error.strerror or error}; name a certificate and its key in PEM"
+        ) from error
     return config
 
 
@@ -196,8 +214,9 @@ def _listening(listen: str) -> Iterator[socket.socket]:
     """Yield a socket that listens on HOST:PORT. Raise OmnidError where that cannot be."""
     found = _LISTEN.fullmatch(listen)
     if found is None or int(found[2]) > 65535:
-        raise OmnidError(f"--listen {listen}: expected HOST:PORT, such as {DEFAULT_LISTEN}, or 0.0.0.0:8447 for the "
-                         "network")
+        raise OmnidError(
+            f"--listen {listen}: expected HOST:PORT, such as {DEFAULT_LISTEN}, or 0.0.0.0:8447 for the network"
+        )
     host, port = found[1].strip("[]"), int(found[2])
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
@@ -205,8 +224,9 @@ def _listening(listen: str) -> Iterator[socket.socket]:
         # A browser speaks first, with TLS too. The system keeps connections on which nothing has come to itself.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENCE_S)
     except OSError as error:
-        raise OmnidError(f"--listen {listen}: {error.strerror or error}; stop the other program there, or name another "
-                         "address") from error
+        raise OmnidError(
+            f"--listen {listen}: {error.strerror or error}; stop the other program there, or name another address"
+        ) from error
     with listener:
         yield listener
 

@@ -26,16 +26,21 @@ _FORM_S: Final = 5.0
 class Site:
     """The answers to requests that the guard has let in."""
 
-    def __init__(self, index: str, routes: Sequence[BaseRoute], metrics: Callable[[Guard], str], access: Access,
-                 secure: bool) -> None:
+    def __init__(
+        self, index: str, routes: Sequence[BaseRoute], metrics: Callable[[Guard], str], access: Access, secure: bool
+    ) -> None:
         """index: the first page, a file of STATIC. routes: further addresses.
 
         secure: True if the server speaks TLS, so that browsers send the cookie over TLS only.
         """
         self._page, self._metrics_text, self._access, self._secure = index, metrics, access, secure
-        outer = [Route("/", self._index), Route("/login", self._login, methods=["POST"]),
-                 Route("/logout", self._logout, methods=["POST"]),
-                 Route("/metrics", self._metrics), Mount("/static", StaticFiles(directory=STATIC))]
+        outer = [
+            Route("/", self._index),
+            Route("/login", self._login, methods=["POST"]),
+            Route("/logout", self._logout, methods=["POST"]),
+            Route("/metrics", self._metrics),
+            Mount("/static", StaticFiles(directory=STATIC)),
+        ]
         self.guard = Guard(Starlette(routes=[*outer, *routes]), access)
 
     async def _index(self, request: Request) -> Response:
@@ -74,8 +79,14 @@ class Site:
             self.guard.refused["wrong token"] += 1
             return FileResponse(STATIC / "login.html", status_code=401)
         response = RedirectResponse("/", 303)
-        response.set_cookie(self._access.cookie, self._access.new_cookie(role), max_age=COOKIE_S, httponly=True,
-                            samesite="lax", secure=self._secure)
+        response.set_cookie(
+            self._access.cookie,
+            self._access.new_cookie(role),
+            max_age=COOKIE_S,
+            httponly=True,
+            samesite="lax",
+            secure=self._secure,
+        )
         return response
 
     async def _metrics(self, _: Request) -> Response:

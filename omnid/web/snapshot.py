@@ -50,15 +50,27 @@ def state_message(robot: str, state: RobotState, link: str, extra: Mapping[str, 
 
     link: why there is no connection to the robot; empty with one. extra: further entries.
     """
-    return compact({
-        "type": "state", "robot": plain(robot), "link": plain(link), "alive": state.alive, "state": state.state,
-        "fresh": state.rate_hz > 0, "rate_hz": finite(state.rate_hz), "missed": state.missed, "broken": state.broken,
-        "pose": None if state.pose is None else _pose(state.pose), "age_ms": _quantiles_ms(state.age),
-        "network_ms": _quantiles_ms(state.network), "wheels": _wheels(state), "in_map": _in_map(state),
-        "pace": plain(state.real_time_factor),
-        "warnings": _warnings(state, link),
-        **extra,
-    })
+    return compact(
+        {
+            "type": "state",
+            "robot": plain(robot),
+            "link": plain(link),
+            "alive": state.alive,
+            "state": state.state,
+            "fresh": state.rate_hz > 0,
+            "rate_hz": finite(state.rate_hz),
+            "missed": state.missed,
+            "broken": state.broken,
+            "pose": None if state.pose is None else _pose(state.pose),
+            "age_ms": _quantiles_ms(state.age),
+            "network_ms": _quantiles_ms(state.network),
+            "wheels": _wheels(state),
+            "in_map": _in_map(state),
+            "pace": plain(state.real_time_factor),
+            "warnings": _warnings(state, link),
+            **extra,
+        }
+    )
 
 
 def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] | None:
@@ -73,11 +85,23 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] 
 def parts_message(state: RobotState) -> str:
     """Return the message `parts`: all status entries, the worst first, stages last."""
     parts = sorted(state.statuses.values(), key=_importance)
-    return compact({"type": "parts", "parts": [
-        {"name": plain(short_name(part.name)), "level": part.level % 4, "message": plain(part.message),
-         "values": [[plain(key)[:LONGEST_VALUE], plain(value)[:LONGEST_VALUE]]
-                    for key, value in list(part.values.items())[:MOST_VALUES]]}
-        for part in parts]})
+    return compact(
+        {
+            "type": "parts",
+            "parts": [
+                {
+                    "name": plain(short_name(part.name)),
+                    "level": part.level % 4,
+                    "message": plain(part.message),
+                    "values": [
+                        [plain(key)[:LONGEST_VALUE], plain(value)[:LONGEST_VALUE]]
+                        for key, value in list(part.values.items())[:MOST_VALUES]
+                    ],
+                }
+                for part in parts
+            ],
+        }
+    )
 
 
 def map_message(grid: Map) -> bytes:
@@ -90,8 +114,15 @@ def map_message(grid: Map) -> bytes:
         return with_header({"type": "map", "width": 0, "height": 0, "frame": plain(grid.frame)}, b"")
     step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
-    header = {"type": "map", "width": cells.shape[1], "height": cells.shape[0], "frame": grid.frame,
-              "cell_m": step * grid.cell_m, "x_m": grid.corner[0], "y_m": grid.corner[1]}
+    header = {
+        "type": "map",
+        "width": cells.shape[1],
+        "height": cells.shape[0],
+        "frame": grid.frame,
+        "cell_m": step * grid.cell_m,
+        "x_m": grid.corner[0],
+        "y_m": grid.corner[1],
+    }
     return with_header(header, zlib.compress(cells.tobytes(), 1))
 
 
@@ -109,18 +140,33 @@ def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
     nearest = int(ranges_m.argmin())
     chosen = np.unique(np.append(np.arange(0, len(ranges_m), -(-len(ranges_m) // MOST_SECTORS)), nearest))
     angles = azimuths_rad[chosen] + place.yaw_rad
-    points = np.column_stack([place.x_m + ranges_m[chosen] * np.cos(angles),
-                              place.y_m + ranges_m[chosen] * np.sin(angles)])
+    points = np.column_stack(
+        [place.x_m + ranges_m[chosen] * np.cos(angles), place.y_m + ranges_m[chosen] * np.sin(angles)]
+    )
     turn_deg = math.degrees(math.remainder(float(azimuths_rad[nearest]), 2 * math.pi))
-    return compact({"type": "scan", "points": [[finite(x), finite(y)] for x, y in points.round(3)],
-                    "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)]})
+    return compact(
+        {
+            "type": "scan",
+            "points": [[finite(x), finite(y)] for x, y in points.round(3)],
+            "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)],
+        }
+    )
 
 
 def navigation_message(report: NavigationReport) -> str:
     """Return the message `navigation`: what is driven or taught, and what became of the newest request."""
-    return compact({"type": "navigation", "state": plain(report.state), "reason": plain(report.reason),
-                    "task": plain(report.task), "left_m": finite(report.left_m), "teaching": plain(report.teaching),
-                    "taught_m": finite(report.taught_m), "refusal": plain(report.refusal)})
+    return compact(
+        {
+            "type": "navigation",
+            "state": plain(report.state),
+            "reason": plain(report.reason),
+            "task": plain(report.task),
+            "left_m": finite(report.left_m),
+            "teaching": plain(report.teaching),
+            "taught_m": finite(report.taught_m),
+            "refusal": plain(report.refusal),
+        }
+    )
 
 
 def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
@@ -129,7 +175,7 @@ def _reduced(cells: np.ndarray[Any, np.dtype[np.uint8]], step: int) -> np.ndarra
         return cells
     height, width = (-(-edge // step) for edge in cells.shape)
     padded = np.zeros((height * step, width * step), np.uint8)
-    padded[:cells.shape[0], :cells.shape[1]] = cells
+    padded[: cells.shape[0], : cells.shape[1]] = cells
     reduced: np.ndarray[Any, np.dtype[np.uint8]] = padded.reshape(height, step, width, step).max(axis=(1, 3))
     return reduced
 
@@ -138,10 +184,17 @@ def _pose(pose: Pose) -> dict[str, Any]:
     sigma = np.sqrt(np.maximum(0.0, pose.covariance.diagonal()))
     found = pose.attachment
     return {
-        "x_m": finite(pose.x_m), "y_m": finite(pose.y_m), "z_m": finite(pose.z_m), "yaw_rad": finite(pose.yaw_rad),
-        "speed_mps": finite(float(pose.velocity[0])), "sigma_mm": finite(1e3 * float(sigma[:3].max())),
-        "sigma_deg": finite(math.degrees(sigma[3:].max())), "inliers": found.inliers, "tracked": found.tracked,
-        "resets": found.resets, "sent_ms": found.sent_ns * 1e-6 if 0 < found.sent_ns < 2**63 else None,
+        "x_m": finite(pose.x_m),
+        "y_m": finite(pose.y_m),
+        "z_m": finite(pose.z_m),
+        "yaw_rad": finite(pose.yaw_rad),
+        "speed_mps": finite(float(pose.velocity[0])),
+        "sigma_mm": finite(1e3 * float(sigma[:3].max())),
+        "sigma_deg": finite(math.degrees(sigma[3:].max())),
+        "inliers": found.inliers,
+        "tracked": found.tracked,
+        "resets": found.resets,
+        "sent_ms": found.sent_ns * 1e-6 if 0 < found.sent_ns < 2**63 else None,
     }
 
 
@@ -150,8 +203,12 @@ def _wheels(state: RobotState) -> dict[str, Any] | None:
     status = state.statuses.get(WHEELS)
     if status is None or state.alive is False:
         return None
-    return {"armed": status.values.get(Key.ARMED) == "1", "message": plain(status.message), "level": status.level % 4,
-            "source": plain(status.values.get(Key.SOURCE, ""))}
+    return {
+        "armed": status.values.get(Key.ARMED) == "1",
+        "message": plain(status.message),
+        "level": status.level % 4,
+        "source": plain(status.values.get(Key.SOURCE, "")),
+    }
 
 
 def _in_map(state: RobotState) -> str | None:

@@ -83,13 +83,19 @@ class StickCommands:
             limits = await self._limits_of_robot()
             if request.moves and not is_recent(request.stamp_ms):  # the limits took their time
                 return Answer(False, "the stick is ready now")
-            twist = (FIRST_SHARE * request.forward * limits.velocity_mps,
-                     FIRST_SHARE * request.turn * limits.yaw_rate_radps)
+            twist = (
+                FIRST_SHARE * request.forward * limits.velocity_mps,
+                FIRST_SHARE * request.turn * limits.yaw_rate_radps,
+            )
             await within(self._thread, partial(driver.twist, *twist))
         finally:
             self._sending = False
-        return Answer(True, f"it drives by the stick: {twist[0]:+.2f} m/s, {math.degrees(twist[1]):+.0f}°/s"
-                      if any(twist) else "the stick is released: it stands")
+        return Answer(
+            True,
+            f"it drives by the stick: {twist[0]:+.2f} m/s, {math.degrees(twist[1]):+.0f}°/s"
+            if any(twist)
+            else "the stick is released: it stands",
+        )
 
     def _refusal(self, request: StickRequest) -> str:
         if self._wheels.is_stopping:

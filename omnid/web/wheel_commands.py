@@ -45,7 +45,8 @@ class WheelCommands:
             self._again = False
             try:
                 stopping = asyncio.get_running_loop().run_in_executor(
-                    self._thread, lambda: stop(self._feed.bus, connection=self._feed.robot))
+                    self._thread, lambda: stop(self._feed.bus, connection=self._feed.robot)
+                )
                 answer = Answer(True, "the robot stops: its wheels stand until it is armed")
                 if not await stopping:
                     answer = Answer(False, "the stop is NOT confirmed: use the emergency stop")
@@ -65,8 +66,10 @@ class WheelCommands:
             return f"There is no connection: {self._feed.link}"
         if self._driver is None or not self._driver.connected:
             return "No robot of that name receives commands there: does its daemon run, with a motor?"
-        return ("Either this program must not command it (bus.command_users, bus.command_names), or the clocks differ; "
-                "see `refused` in the entry of the wheels")
+        return (
+            "Either this program must not command it (bus.command_users, bus.command_names), or the clocks differ; "
+            "see `refused` in the entry of the wheels"
+        )
 
 
 async def within(thread: ThreadPoolExecutor, send: Callable[[], T]) -> T | None:

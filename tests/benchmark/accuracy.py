@@ -21,16 +21,32 @@ from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
 from tests.benchmark.results import Cell, Column, ResultTable
 
-COLUMNS: Final = (Column("log"), Column("pairs"), Column("length", "%", 3), Column("ATE rmse", "mm", 2),
-                  Column("end", "mm", 2), Column("heading, max", "deg", 3), Column("RPE", "mm", 2), Column("states"))
+COLUMNS: Final = (
+    Column("log"),
+    Column("pairs"),
+    Column("length", "%", 3),
+    Column("ATE rmse", "mm", 2),
+    Column("end", "mm", 2),
+    Column("heading, max", "deg", 3),
+    Column("RPE", "mm", 2),
+    Column("states"),
+)
 
 
 def row(folder: Path, overrides: Sequence[str]) -> list[Cell]:
     """Return one row of the table: the errors of one log, and the shares of its states."""
     result = omnid.replay(folder / "log.mcap", rig_of(folder), overrides=overrides)
     m = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), read_tum(folder / "truth.txt"))
-    return [folder.name, m.pairs, 100 * m.length_error_ratio, 1e3 * m.ate_rmse_m, 1e3 * m.end_error_m,
-            math.degrees(m.heading_max_rad), 1e3 * m.rpe_translation_rmse_m, summary_entries(result.counters)["states"]]
+    return [
+        folder.name,
+        m.pairs,
+        100 * m.length_error_ratio,
+        1e3 * m.ate_rmse_m,
+        1e3 * m.end_error_m,
+        math.degrees(m.heading_max_rad),
+        1e3 * m.rpe_translation_rmse_m,
+        summary_entries(result.counters)["states"],
+    ]
 
 
 def rig_of(folder: Path) -> Rig:

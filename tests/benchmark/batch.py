@@ -31,12 +31,16 @@ KILLED_AFTER_S = 8.0
 def batch(logs: Path, out: Path, *words: str) -> tuple[float, Counter[str], int]:
     """Run a batch; return its time, the results by state, and the number of attempts beyond the first."""
     start_s = time.monotonic()
-    subprocess.run([sys.executable, "-m", "omnid", "batch", str(logs), "--out", str(out), *words], check=True,
-                   capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "omnid", "batch", str(logs), "--out", str(out), *words], check=True, capture_output=True
+    )
     results = [json.loads(path.read_text()) for path in out.glob("*/result.json")]
     assert (out / CSV_FILE).exists()
-    return (time.monotonic() - start_s, Counter(result["status"] for result in results),
-            sum(result["attempts"] - 1 for result in results))
+    return (
+        time.monotonic() - start_s,
+        Counter(result["status"] for result in results),
+        sum(result["attempts"] - 1 for result in results),
+    )
 
 
 @contextmanager
@@ -45,15 +49,43 @@ def dask(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     with ExitStack() as ends:
         known = folder / "scheduler.json"
-        scheduler = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1",
-                                      "--port", "0", "--no-dashboard", "--scheduler-file", str(known)], **quiet)
+        scheduler = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "distributed.cli.dask_scheduler",
+                "--host",
+                "127.0.0.1",
+                "--port",
+                "0",
+                "--no-dashboard",
+                "--scheduler-file",
+                str(known),
+            ],
+            **quiet,
+        )
         ends.callback(scheduler.kill)
         while not known.exists():
             time.sleep(0.1)
         address = json.loads(known.read_text())["address"]
-        workers = [subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1",
-                                     "--no-dashboard", "--no-nanny", "--local-directory", str(folder)], **quiet)
-                   for _ in range(2)]
+        workers = [
+            subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "distributed.cli.dask_worker",
+                    address,
+                    "--nthreads",
+                    "1",
+                    "--no-dashboard",
+                    "--no-nanny",
+                    "--local-directory",
+                    str(folder),
+                ],
+                **quiet,
+            )
+            for _ in range(2)
+        ]
         for worker in workers:
             ends.callback(worker.kill)
         yield address, workers
@@ -61,8 +93,11 @@ def dask(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
 
 def same(first: Path, other: Path) -> bool:
     """True if both series have the same trajectories and clouds."""
-    return all((other / path.relative_to(first)).read_bytes() == path.read_bytes()
-               for name in ("est.txt", "cloud.ply") for path in first.glob(f"*/{name}"))
+    return all(
+        (other / path.relative_to(first)).read_bytes() == path.read_bytes()
+        for name in ("est.txt", "cloud.ply")
+        for path in first.glob(f"*/{name}")
+    )
 
 
 def text(states: Counter[str]) -> str:
@@ -75,8 +110,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--logs", type=int, default=50)
     count = parser.parse_args().logs
-    columns = (Column(f"{count} logs"), Column("time", "s", 0), Column("results"), Column("repeated"),
-               Column("same bytes"))
+    columns = (
+        Column(f"{count} logs"),
+        Column("time", "s", 0),
+        Column("results"),
+        Column("repeated"),
+        Column("same bytes"),
+    )
     table = ResultTable("batch", "speed", "Many logs", columns)
     with tempfile.TemporaryDirectory() as folder:
         top = Path(folder)

@@ -99,8 +99,13 @@ def main(arguments: list[str]) -> int:
         outcomes = ", ".join(f"{name} {_outcomes(found)}" for name, found in outcomes_of.items())
         print(f"{rendered.name}: {outcomes}", flush=True)
     kinds, family = ("found", "wrong", "missed"), f"boards, {'near' if args.near else 'hard'}"
-    table = ResultTable(family.replace(", ", "_"), "calibration", f"Board detection, {'near' if args.near else 'hard'}",
-                        (Column("detector"), Column("images"), *map(Column, kinds)), REMARKS)
+    table = ResultTable(
+        family.replace(", ", "_"),
+        "calibration",
+        f"Board detection, {'near' if args.near else 'hard'}",
+        (Column("detector"), Column("images"), *map(Column, kinds)),
+        REMARKS,
+    )
     for name, all_of in sums.items():
         table.add(name, args.count, *(all_of[kind] for kind in kinds), seed=(family, args.seed))
     return 0 if meets_requirement(sums, args.count) else 1

@@ -78,8 +78,20 @@ def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> str:
     """Calibrate by the images of a folder, and return the printed line."""
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
-        code = omnid_main(["calibrate", "rig", str(folder), "--corners", f"{BOARD.columns}x{BOARD.rows}", "--square-mm",
-                           f"{1e3 * BOARD.square_m:g}", "-o", str(output), *options])
+        code = omnid_main(
+            [
+                "calibrate",
+                "rig",
+                str(folder),
+                "--corners",
+                f"{BOARD.columns}x{BOARD.rows}",
+                "--square-mm",
+                f"{1e3 * BOARD.square_m:g}",
+                "-o",
+                str(output),
+                *options,
+            ]
+        )
     if code != 0:
         raise SystemExit(f"{folder}: calibrate ended with code {code}")
     return text.getvalue().strip()
@@ -95,8 +107,11 @@ def in_true_frame(found: Rig, truth: Rig) -> Rig:
     T_found_true = se3.transform(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right, np.zeros(3))
     T_lower_rig = T_found_true @ truth.lower.T_cam_rig
     T_upper_lower = found.upper.T_cam_rig @ se3.inverse(found.lower.T_cam_rig)
-    return replace(found, lower=replace(found.lower, T_cam_rig=T_lower_rig),
-                   upper=replace(found.upper, T_cam_rig=T_upper_lower @ T_lower_rig))
+    return replace(
+        found,
+        lower=replace(found.lower, T_cam_rig=T_lower_rig),
+        upper=replace(found.upper, T_cam_rig=T_upper_lower @ T_lower_rig),
+    )
 
 
 def drive(folder: Path, rig: Rig) -> tuple[float, float, float]:
@@ -117,8 +132,14 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--only", choices=("boards", "drive"), help="render and stop")
     parser.add_argument("--options", nargs="*", default=[], help="further words for `calibrate rig`, like model=omni")
     args = parser.parse_args(arguments)
-    columns = (Column("seed"), Column("calibrated by"), Column("length", "%", 3), Column("ATE", "mm", 2),
-               Column("heading, max", "deg", 3), Column("calibration"))
+    columns = (
+        Column("seed"),
+        Column("calibrated by"),
+        Column("length", "%", 3),
+        Column("ATE", "mm", 2),
+        Column("heading, max", "deg", 3),
+        Column("calibration"),
+    )
     table = ResultTable("boards_chain", "calibration", "Boards, rig, drive with real mirrors", columns)
     for seed in args.seeds:
         boards, log = (args.folder / f"{kind}_a{args.amount:g}_s{seed}" for kind in ("boards", "drive"))
@@ -139,8 +160,13 @@ def main(arguments: Sequence[str]) -> int:
             again = calibrate_drive([room / "log.mcap"], read_rig(boards / "rig.toml"))
             write_rig(boards / "rig_drive.toml", again.rig)
             errors = f"{again.first_sigma_px:.3f} -> {again.adjustment.sigma_px:.3f} px"
-            table.add(seed, "boards, then a drive", *drive(log, in_true_frame(again.rig, truth)),
-                      f"{errors}, lengths {100 * again.scale_change:+.3f} %", seed=("rigs of boards", seed))
+            table.add(
+                seed,
+                "boards, then a drive",
+                *drive(log, in_true_frame(again.rig, truth)),
+                f"{errors}, lengths {100 * again.scale_change:+.3f} %",
+                seed=("rigs of boards", seed),
+            )
     return 0
 
 

@@ -64,20 +64,36 @@ def render_near_board(seed: int, number: int) -> HardBoard:
     centre = tuple((side - 1) / 2 + rng.uniform(-8, 8) for side in SIZE)
     camera = EquidistantCamera(rng.uniform(*FOCAL_PX), (centre[0], centre[1]), SIZE)
     renderer = BoardRenderer.of(board, camera, Mask((centre[0], centre[1]), 0.0, float(np.hypot(*SIZE))))
-    sensor = Sensor(noise_sigma=rng.uniform(0.5, 4), blur_px=rng.uniform(*SHARP_PX), vignette=rng.uniform(0, 0.7),
-                    jpeg_quality=int(rng.integers(60, 96)))
+    sensor = Sensor(
+        noise_sigma=rng.uniform(0.5, 4),
+        blur_px=rng.uniform(*SHARP_PX),
+        vignette=rng.uniform(0, 0.7),
+        jpeg_quality=int(rng.integers(60, 96)),
+    )
     low, light = rng.uniform(15, 70), rng.uniform(60, 170)
     cover = COVERS[number % len(COVERS)]
     frame = partial(_framed, cover, low if rng.uniform() < 0.5 else low + light, np.random.default_rng([seed, number]))
-    options = {"sensor": sensor, "frame": frame, "supersample": 2, "seed": number, "contrast": (low, low + light),
-               "shadow": rng.choice([1.0, rng.uniform(0.3, 0.8)])}
+    options = {
+        "sensor": sensor,
+        "frame": frame,
+        "supersample": 2,
+        "seed": number,
+        "contrast": (low, low + light),
+        "shadow": rng.choice([1.0, rng.uniform(0.3, 0.8)]),
+    }
     T, blur = _near_pose(rng, camera, board), rng.uniform(*DEFOCUSED_PX)
     rendered, empty = (renderer.render_board(pose, **options) for pose in (T, BEHIND_THE_WALLS))
     shape = MountedSensor.of(sensor, renderer.mounted.visible, SIZE)
-    images = [cv2.imdecode(np.frombuffer(shape.jpeg(_defocused(made.image, blur, number)), np.uint8),
-                           cv2.IMREAD_GRAYSCALE).astype(np.uint8) for made in (rendered, empty)]
-    name = (f"{number:03d} near {board.columns}x{board.rows} cover {cover:g} noise {sensor.noise_sigma:.1f} blur up to "
-            f"{blur:.1f} step {light:.0f}")
+    images = [
+        cv2.imdecode(
+            np.frombuffer(shape.jpeg(_defocused(made.image, blur, number)), np.uint8), cv2.IMREAD_GRAYSCALE
+        ).astype(np.uint8)
+        for made in (rendered, empty)
+    ]
+    name = (
+        f"{number:03d} near {board.columns}x{board.rows} cover {cover:g} noise {sensor.noise_sigma:.1f} blur up to "
+        f"{blur:.1f} step {light:.0f}"
+    )
     return HardBoard(name, board, images[0], images[1], rendered.corners)
 
 

@@ -1,5 +1,4 @@
-"""Rendered mirror and fisheye images of checkerboards that are hard to find, each from one number, with exact corners.
-"""
+"""Rendered mirror and fisheye images of checkerboards that are hard to find, each from a number, with exact corners."""
 
 from __future__ import annotations
 
@@ -53,15 +52,25 @@ def render_hard_board(seed: int, number: int) -> HardBoard:
     radius_m = rng.uniform(1.2, 3.5)
     painted = six_walls(lambda: _painted(rng, walls, radius_m), radius_m)
     low, light = rng.uniform(15, 90), rng.uniform(45, 160)
-    options = {"sensor": sensor, "supersample": 2, "walls": painted, "seed": number,
-             "contrast": (low, min(250.0, low + light)), "shadow": rng.choice([1.0, 1.0, rng.uniform(0.35, 0.8)])}
+    options = {
+        "sensor": sensor,
+        "supersample": 2,
+        "walls": painted,
+        "seed": number,
+        "contrast": (low, min(250.0, low + light)),
+        "shadow": rng.choice([1.0, 1.0, rng.uniform(0.35, 0.8)]),
+    }
     rendered = renderer.render_board(_pose(rng, kind, renderer), **options)
     empty = renderer.render_board(BEHIND_THE_WALLS, **options)
     exposure = MountedSensor.of(sensor, mask, size)
-    images = [cv2.imdecode(np.frombuffer(exposure.jpeg(made.image), np.uint8), cv2.IMREAD_GRAYSCALE)
-                for made in (rendered, empty)]
-    name = (f"{number:03d} {kind} {size[0]}x{size[1]} {walls} {board.columns}x{board.rows} noise "
-            f"{sensor.noise_sigma:.1f} blur {sensor.blur_px:.1f} step {light:.0f}")
+    images = [
+        cv2.imdecode(np.frombuffer(exposure.jpeg(made.image), np.uint8), cv2.IMREAD_GRAYSCALE)
+        for made in (rendered, empty)
+    ]
+    name = (
+        f"{number:03d} {kind} {size[0]}x{size[1]} {walls} {board.columns}x{board.rows} noise "
+        f"{sensor.noise_sigma:.1f} blur {sensor.blur_px:.1f} step {light:.0f}"
+    )
     return HardBoard(name, board, images[0].astype(np.uint8), images[1].astype(np.uint8), rendered.corners)
 
 
@@ -79,8 +88,12 @@ def _camera(rng: Random, kind: str, size: tuple[int, int]) -> tuple[OmniCamera, 
 
 
 def _sensor(rng: Random) -> Sensor:
-    return Sensor(noise_sigma=rng.uniform(0.5, 7), blur_px=rng.uniform(0.3, 1.6), vignette=rng.uniform(0, 0.6),
-                  jpeg_quality=int(rng.integers(40, 96)))
+    return Sensor(
+        noise_sigma=rng.uniform(0.5, 7),
+        blur_px=rng.uniform(0.3, 1.6),
+        vignette=rng.uniform(0, 0.6),
+        jpeg_quality=int(rng.integers(40, 96)),
+    )
 
 
 def _pose(rng: Random, kind: str, renderer: BoardRenderer) -> Array:
@@ -109,9 +122,12 @@ def _painted(rng: Random, kind: str, radius_m: float) -> Image:
     side = min(1400, round(2 * radius_m * 200))
     px_per_m = side / (2 * radius_m)
     own: dict[str, Callable[[], Image]] = {
-        "windows": lambda: _windows(rng, side, px_per_m), "chequers": lambda: _chequers(rng, side, px_per_m),
-        "stripes": lambda: _stripes(rng, side, px_per_m), "page": lambda: textures._page(rng, (side, side)),
-        "clouds": lambda: textures.plaster(rng, (side, side), px_per_m)}
+        "windows": lambda: _windows(rng, side, px_per_m),
+        "chequers": lambda: _chequers(rng, side, px_per_m),
+        "stripes": lambda: _stripes(rng, side, px_per_m),
+        "page": lambda: textures._page(rng, (side, side)),
+        "clouds": lambda: textures.plaster(rng, (side, side), px_per_m),
+    }
     return own[kind]() if kind in own else textures.PAINTERS[kind](rng, (side, side), px_per_m)
 
 

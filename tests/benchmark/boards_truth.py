@@ -34,8 +34,10 @@ LIMITS = {"focal_percent": 0.05, "centre_px": 0.1, "turn_deg": 0.02, "baseline_m
 def random_rig(seed: int, size: int) -> Rig:
     """Return a rig of two different mirror cameras, the upper one rotated and shifted."""
     rng, mounted = np.random.default_rng([seed, 5]), []
-    T_upper_lower = se3.transform(se3.rotation_exp([*rng.uniform(-0.03, 0.03, 2), rng.uniform(-0.5, 0.5)]),
-                                  [*rng.uniform(-0.006, 0.006, 2), rng.uniform(0.13, 0.22)])
+    T_upper_lower = se3.transform(
+        se3.rotation_exp([*rng.uniform(-0.03, 0.03, 2), rng.uniform(-0.5, 0.5)]),
+        [*rng.uniform(-0.006, 0.006, 2), rng.uniform(0.13, 0.22)],
+    )
     for T in (np.eye(4), T_upper_lower):
         xi, focal = rng.uniform(0.75, 1.0), rng.uniform(0.25, 0.28) * size
         u, v = (size - 1) / 2 + rng.uniform(-0.01, 0.01, 2) * size
@@ -74,24 +76,31 @@ def errors(found: RigCalibration, truth: Rig) -> dict[str, tuple[float, float]]:
     motion = se3.log(found.T_upper_lower @ se3.inverse(T))
     baseline_m = float(np.linalg.norm(se3.inverse(T)[:3, 3]))
     focal, centre = [], []
-    for camera, mounted, values in zip((found.lower, found.upper), (truth.lower, truth.upper), found.parameters,
-                                       strict=True):
+    for camera, mounted, values in zip(
+        (found.lower, found.upper), (truth.lower, truth.upper), found.parameters, strict=True
+    ):
         assert isinstance(camera, UnifiedCamera) and isinstance(mounted.camera, UnifiedCamera)
         sigma = {name: value_sigma for name, _, value_sigma in values}
         focal += _scale(camera, mounted.camera, sigma["fu"])
-        centre += [(abs(a - b), abs(a - b) / sigma[name]) for a, b, name in
-                   zip(camera.center, mounted.camera.center, ("pu", "pv"), strict=True)]
+        centre += [
+            (abs(a - b), abs(a - b) / sigma[name])
+            for a, b, name in zip(camera.center, mounted.camera.center, ("pu", "pv"), strict=True)
+        ]
     turn_deg = float(np.rad2deg(np.linalg.norm(motion[3:])))
     off_m = abs(found.baseline_m - baseline_m)
-    return {"focal_percent": max(focal), "centre_px": max(centre),
-            "turn_deg": (turn_deg, float(np.abs(motion[3:] / found.motion_sigma[3:]).max())),
-            "baseline_mm": (1e3 * off_m, off_m / found.baseline_sigma_m)}
+    return {
+        "focal_percent": max(focal),
+        "centre_px": max(centre),
+        "turn_deg": (turn_deg, float(np.abs(motion[3:] / found.motion_sigma[3:]).max())),
+        "baseline_mm": (1e3 * off_m, off_m / found.baseline_sigma_m),
+    }
 
 
 def _scale(camera: UnifiedCamera, truth: UnifiedCamera, sigma_px: float) -> list[tuple[float, float]]:
     """Return the scale error at the horizon [%], and in sigmas: fu and xi alone are strongly correlated."""
-    at: list[Array] = [one.project(np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]]))
-                       for one in (camera, truth)]
+    at: list[Array] = [
+        one.project(np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])) for one in (camera, truth)
+    ]
     sizes = [np.array([np.ptp(p[:2, 0]), np.ptp(p[2:, 1])]) for p in at]
     off = np.abs(sizes[0] / sizes[1] - 1)
     return [(100 * float(part), float(part) * abs(truth.focal[0]) / sigma_px) for part in off]

@@ -44,8 +44,12 @@ LK_QUALITY, LK_APART_PX = 0.001, 8
 LUCAS_KANADE: Final = cv2.calcOpticalFlowPyrLK  # not the one that is timed as a step
 Image = NDArray[np.uint8]
 Labels = tuple[str, ...]
-COLUMNS: Final = (Column("step"), Column("time a pair", "ms", 2), Column("of SGBM + LK", "", 3),
-                  Column("calls a pair", "", 2))
+COLUMNS: Final = (
+    Column("step"),
+    Column("time a pair", "ms", 2),
+    Column("of SGBM + LK", "", 3),
+    Column("calls a pair", "", 2),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +75,13 @@ class ReferenceKernels:
         self.lk_ns: list[int] = []
         self._before: Image | None = None
         self._sgbm = cv2.StereoSGBM.create(
-            minDisparity=0, numDisparities=SGBM_DISPARITIES, blockSize=SGBM_BLOCK_PX, P1=8 * SGBM_BLOCK_PX**2,
-            P2=32 * SGBM_BLOCK_PX**2, mode=cv2.STEREO_SGBM_MODE_SGBM)
+            minDisparity=0,
+            numDisparities=SGBM_DISPARITIES,
+            blockSize=SGBM_BLOCK_PX,
+            P1=8 * SGBM_BLOCK_PX**2,
+            P2=32 * SGBM_BLOCK_PX**2,
+            mode=cv2.STEREO_SGBM_MODE_SGBM,
+        )
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Time the kernels at every REFERENCE_EVERY-th pair; after the first pairs, forget the steps so far."""
@@ -104,16 +113,20 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Bu
     reference = ReferenceKernels(clock)
     with TemporaryDirectory() as work, measured_steps(clock):
         graph = Graph(threaded=False)
-        sinks = Sinks({"trajectory": TrajectoryFile(Path(work) / "t"), "reference": reference},
-                      {"map": MapFile(Path(work) / "m")})
+        sinks = Sinks(
+            {"trajectory": TrajectoryFile(Path(work) / "t"), "reference": reference}, {"map": MapFile(Path(work) / "m")}
+        )
         read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
         paired = graph.stage("pair", Synchronise(place.rig, config.pair), read)
         wire(graph, paired, FrontEnd(place, config), config, sinks)
         graph.run()
     count = pairs - SKIPPED
-    return Budget({path: ns * 1e-6 / count for path, ns in clock.own_ns.items()},
-                  {path: calls / count for path, calls in clock.calls.items()},
-                  1e-6 * median(reference.sgbm_ns), 1e-6 * median(reference.lk_ns))
+    return Budget(
+        {path: ns * 1e-6 / count for path, ns in clock.own_ns.items()},
+        {path: calls / count for path, calls in clock.calls.items()},
+        1e-6 * median(reference.sgbm_ns),
+        1e-6 * median(reference.lk_ns),
+    )
 
 
 def rows(budgets: Sequence[Budget]) -> Iterator[list[Cell]]:
@@ -143,8 +156,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, metavar="FOLDER")
     parser.add_argument("--pairs", type=int, default=200, help="pairs of a run (default: %(default)s)")
-    parser.add_argument("--hz", type=float, default=10.0, help="pairs a second by their stamps, whatever the log's own "
-                        "rate is: the map takes 5 a second; the motion from pair to pair stays (default: %(default)s)")
+    parser.add_argument(
+        "--hz",
+        type=float,
+        default=10.0,
+        help="pairs a second by their stamps, whatever the log's own "
+        "rate is: the map takes 5 a second; the motion from pair to pair stays (default: %(default)s)",
+    )
     parser.add_argument("--runs", type=int, default=5, help="runs, of which the medians are printed (default: 5)")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="computing processes per core beside it")
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", dest="overrides")

@@ -85,7 +85,7 @@ def round_by_path(line: Array, path: Array) -> AskedOnceLocalised:
     def asked(moment: Moment) -> Request:
         assert moment.place is not None
         near_m = np.linalg.norm(path[:SEEK_POINTS] - moment.place.T_map_rig[:2, 3], axis=1)
-        return PathRequest(NavigationFrame.MAP, path[int(np.argmin(near_m)):], 0.0)
+        return PathRequest(NavigationFrame.MAP, path[int(np.argmin(near_m)) :], 0.0)
 
     return AskedOnceLocalised(line, 0, asked)
 
@@ -94,8 +94,11 @@ def building_round(seed: int, size_px: int) -> RoundEnd:
     """Make the map and drive the round in it."""
     line, robot, rng = lap(WHOLE_M), make_robot(size_px), random.Random(seed)
     path = np.vstack([line, START]) - START  # the map begins at the first pose, which has the heading 0
-    start = (START[0] + rng.uniform(-ASIDE_M, ASIDE_M), START[1] + rng.uniform(-ASIDE_M, ASIDE_M),
-             rng.uniform(-ASIDE_RAD, ASIDE_RAD))
+    start = (
+        START[0] + rng.uniform(-ASIDE_M, ASIDE_M),
+        START[1] + rng.uniform(-ASIDE_M, ASIDE_M),
+        rng.uniform(-ASIDE_RAD, ASIDE_RAD),
+    )
     with tempfile.TemporaryDirectory() as folder:
         config = load_config(None, [f"places.map={Path(folder) / 'building.omap'}"])
         world = replace(load_world(WORLD, seed), start=(*START, 0.0), people=())
@@ -104,9 +107,15 @@ def building_round(seed: int, size_px: int) -> RoundEnd:
         run = simulate(replace(world, start=start), robot, script, seconds=LONGEST_S, seed=seed + 1000, config=config)
     true = np.array([tick.pose for tick in run.ticks])
     stops = dict.fromkeys(line for _, line in run.lines if line.startswith("the wheels stop"))
-    return RoundEnd(script.end or "time is over", math.dist(true[-1, :2], START), abs(wrap_angle(float(true[-1, 2]))),
-                    float(cross_track_m(np.vstack([line, START]), true[true_way_m(true) > 1.0, :2]).max(initial=0.0)),
-                    "; ".join(stops)[:120], len(first.stamps_ns) + len(run.stamps_ns), run)
+    return RoundEnd(
+        script.end or "time is over",
+        math.dist(true[-1, :2], START),
+        abs(wrap_angle(float(true[-1, 2]))),
+        float(cross_track_m(np.vstack([line, START]), true[true_way_m(true) > 1.0, :2]).max(initial=0.0)),
+        "; ".join(stops)[:120],
+        len(first.stamps_ns) + len(run.stamps_ns),
+        run,
+    )
 
 
 def true_way_m(true: Array) -> Array:

@@ -35,8 +35,10 @@ COLUMNS = (Column("pairs"), Column("time", "s", 1), Column("processor time", "s"
 def rig() -> Rig:
     """Return a rig of two perfect mirrors, the upper one turned about every axis."""
     mounted = []
-    for xi, focal, center, T in ((0.93, (-213.5, 214.8), (641.3, 398.2), np.eye(4)),
-                                 (0.97, (-216.7, 215.8), (637.6, 403.1), T_UPPER_LOWER)):
+    for xi, focal, center, T in (
+        (0.93, (-213.5, 214.8), (641.3, 398.2), np.eye(4)),
+        (0.97, (-216.7, 215.8), (637.6, 403.1), T_UPPER_LOWER),
+    ):
         mounted.append(MountedCamera(UnifiedCamera(xi, focal, center, SIZE), T, Mask(center, 52.0, 387.0)))
     return Rig(mounted[0], mounted[1])
 
@@ -69,8 +71,9 @@ def main() -> None:
         truth = render(folder, pairs)
         before_s, start_s = used_s(), time.monotonic()
         words = [folder, "--corners", "7x6", "--square-mm", 30, "--quiet", "-o", folder / "rig.toml"]
-        subprocess.run([sys.executable, "-m", "omnid", "calibrate", "rig", *map(str, words)], check=True,
-                       stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [sys.executable, "-m", "omnid", "calibrate", "rig", *map(str, words)], check=True, stdout=subprocess.DEVNULL
+        )
         taken_s = time.monotonic() - start_s
         error = read_rig(folder / "rig.toml").baseline_m / truth.baseline_m - 1
         table.add(pairs, taken_s, used_s() - before_s, 100 * error)

@@ -49,8 +49,12 @@ def receive_us(ring: ControllerRing) -> float:
 def main() -> None:
     """Print the table."""
     columns = ("straight on, a tick", "on an arc, a tick", "a new ring")
-    table = ResultTable("collision_tick", "speed", "Processor time of the collision monitor",
-                        (Column("ring"), *(Column(name, "us", 0) for name in columns)))
+    table = ResultTable(
+        "collision_tick",
+        "speed",
+        "Processor time of the collision monitor",
+        (Column("ring"), *(Column(name, "us", 0) for name in columns)),
+    )
     for name, ring in RINGS.items():
         table.add(name, tick_us(ring, Twist(0.5)), tick_us(ring, Twist(0.4, 0.6)), receive_us(ring))
 

@@ -24,9 +24,28 @@ ROOT: Final = Path(__file__).parents[2]
 PACKAGES: Final = ("omnid/core", "calib")
 PAGE: Final = ROOT / "docs" / "constants.md"
 UNITS: Final = {
-    "PX": "px", "M": "m", "MM": "mm", "S": "s", "MS": "ms", "US": "us", "NS": "ns", "RAD": "rad", "DEG": "deg",
-    "MPS": "m/s", "RADPS": "rad/s", "HZ": "Hz", "BYTES": "bytes", "MB": "MB", "KB": "kB", "GREY": "grey levels",
-    "RATIO": "share", "SHARE": "share", "PART": "share", "SIGMA": "sigma", "SIGMAS": "sigma", "SQUARED": "squared",
+    "PX": "px",
+    "M": "m",
+    "MM": "mm",
+    "S": "s",
+    "MS": "ms",
+    "US": "us",
+    "NS": "ns",
+    "RAD": "rad",
+    "DEG": "deg",
+    "MPS": "m/s",
+    "RADPS": "rad/s",
+    "HZ": "Hz",
+    "BYTES": "bytes",
+    "MB": "MB",
+    "KB": "kB",
+    "GREY": "grey levels",
+    "RATIO": "share",
+    "SHARE": "share",
+    "PART": "share",
+    "SIGMA": "sigma",
+    "SIGMAS": "sigma",
+    "SQUARED": "squared",
 }
 # Words by which a comment says why: a cause, a source, a measurement or a trial.
 REASON: Final = re.compile(
@@ -35,10 +54,13 @@ REASON: Final = re.compile(
     r"default|the paper|the standard|IEEE|ROS|REP|ISO|RFC|OpenCV|covers|needed|needs|stay(s)? below|as in|as for|"
     r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact|guards? against|larger than any"
     r"|more than (the|any)|the limit of|are not resolved|(say|tell)s? (nothing|the same)|misread|to the last digit)\b"
-    r"|\([^()]* (19|20)\d\d\)|[:;] |, so (?!many|much)", re.IGNORECASE)
+    r"|\([^()]* (19|20)\d\d\)|[:;] |, so (?!many|much)",
+    re.IGNORECASE,
+)
 SOURCE: Final = re.compile(
     r"\([A-Z][\w .&-]* (?:et al\.,? )?(?:19|20)\d\d[^)]*\)|Dang et al[^:;]*|(?:section|eq\.) [IVX()\d.A-Z]+"
-    r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+")
+    r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+"
+)
 SEEDS: Final = re.compile(r"[Ss]et (?:by|on|with)[^.;]*|(?:[Bb]y trial on )?(?:development )?seeds(?: [\d ,to]+)?")
 
 
@@ -98,8 +120,9 @@ class Comments:
     def __init__(self, text: str) -> None:
         self._lines = text.splitlines()
         tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-        self._of = {token.start[0]: token.string.lstrip("# ").strip() for token in tokens
-                    if token.type == tokenize.COMMENT}
+        self._of = {
+            token.start[0]: token.string.lstrip("# ").strip() for token in tokens if token.type == tokenize.COMMENT
+        }
 
     def at(self, first: int, last: int) -> str:
         """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason.
@@ -130,8 +153,9 @@ def _is_neutral(value: ast.expr) -> bool:
     """True if a value is built of zeros and ones, as Pose2(0.0, 0.0, 0.0) and np.eye(3): what changes nothing."""
     if not isinstance(value, ast.Call):
         return False
-    numbers = [part.value for part in ast.walk(value)
-               if isinstance(part, ast.Constant) and type(part.value) in (int, float)]
+    numbers = [
+        part.value for part in ast.walk(value) if isinstance(part, ast.Constant) and type(part.value) in (int, float)
+    ]
     return ast.unparse(value.func) in ("np.eye", "np.zeros") or (len(numbers) > 0 and {*numbers} <= {0, 1})
 
 
@@ -168,9 +192,13 @@ def is_structure(names: Sequence[ast.expr], parts: Sequence[ast.expr]) -> bool:
     spelled = {"NOTHING": 0.0, "ZERO": 0.0, "HALF": 0.5, "ONE": 1.0, "FIRST": 1, "SECOND": 2, "THIRD": 3}
     if counts or all(map(_is_neutral, parts)):
         return True
-    return all(isinstance(name, ast.Name) and name.id in spelled and isinstance(part, ast.Call)
-               and [arg.value for arg in part.args if isinstance(arg, ast.Constant)] == [spelled[name.id]]
-               for name, part in zip(names, parts, strict=True))
+    return all(
+        isinstance(name, ast.Name)
+        and name.id in spelled
+        and isinstance(part, ast.Call)
+        and [arg.value for arg in part.args if isinstance(arg, ast.Constant)] == [spelled[name.id]]
+        for name, part in zip(names, parts, strict=True)
+    )
 
 
 def _knob(node: ast.stmt, comments: Comments, path: str) -> Iterator[Constant]:
@@ -188,17 +216,31 @@ def page(found: list[Constant]) -> str:
     """Return the document: a summary for each room, then a table for each file."""
     rooms = Counter(Path(one.path).parent.as_posix() for one in found)
     lacking = Counter(Path(one.path).parent.as_posix() for one in missing(found))
-    lines = ["# Constants of omnid/core and calib", "",
-             "Made by `python -m tests.benchmark.constants --write`. A constant without a comment, or whose comment "
-             "says what it is and not why it has this value, counts as one without a reason.", "",
-             "| room | constants and settings | constants without a reason |", "|---|---|---|",
-             *(f"| `{room}` | {count} | {lacking[room]} |" for room, count in sorted(rooms.items())),
-             f"| all | {len(found)} | {sum(lacking.values())} |"]
+    lines = [
+        "# Constants of omnid/core and calib",
+        "",
+        "Made by `python -m tests.benchmark.constants --write`. A constant without a comment, or whose comment "
+        "says what it is and not why it has this value, counts as one without a reason.",
+        "",
+        "| room | constants and settings | constants without a reason |",
+        "|---|---|---|",
+        *(f"| `{room}` | {count} | {lacking[room]} |" for room, count in sorted(rooms.items())),
+        f"| all | {len(found)} | {sum(lacking.values())} |",
+    ]
     for path in sorted({one.path for one in found}):
-        lines += ["", f"## `{path}`", "",
-                  "| name | value | unit | reason | source | set on |", "|---|---|---|---|---|---|"]
-        lines += [f"| `{one.name}` | `{_cell(one.value)}` | {one.unit} | {_cell(one.comment)} | {_cell(one.source)} | "
-                  f"{_cell(one.seeds)} |" for one in found if one.path == path]
+        lines += [
+            "",
+            f"## `{path}`",
+            "",
+            "| name | value | unit | reason | source | set on |",
+            "|---|---|---|---|---|---|",
+        ]
+        lines += [
+            f"| `{one.name}` | `{_cell(one.value)}` | {one.unit} | {_cell(one.comment)} | {_cell(one.source)} | "
+            f"{_cell(one.seeds)} |"
+            for one in found
+            if one.path == path
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -224,8 +266,10 @@ def main() -> None:
         for one in missing(found):
             print(f"{one.path}:{one.line}: {one.name} = {one.value}  # {one.comment or 'no comment'}")
     undescribed = sum(not one.comment for one in found)
-    print(f"{len(found)} constants and settings, {sum(one.is_knob for one in found)} of them settings; "
-          f"{undescribed} without a comment, {len(missing(found))} without a reason")
+    print(
+        f"{len(found)} constants and settings, {sum(one.is_knob for one in found)} of them settings; "
+        f"{undescribed} without a comment, {len(missing(found))} without a reason"
+    )
 
 
 if __name__ == "__main__":

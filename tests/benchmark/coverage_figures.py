@@ -44,13 +44,25 @@ def main() -> None:
     rooms: dict[str, list[dict[str, int]]] = defaultdict(list)
     for path, summary in sorted(files.items()):
         rooms[Path(path).parent.as_posix()].append(summary)
-    columns = (Column("room"), Column("statements"), Column("of them run", "%", 1), Column("branches"),
-               Column("of them taken", "%", 1))
-    table = ResultTable("coverage", "faults", "Coverage of core and controller by their tests", columns,
-                        ("Compiled functions (*_kernels.py) are left out.",))
+    columns = (
+        Column("room"),
+        Column("statements"),
+        Column("of them run", "%", 1),
+        Column("branches"),
+        Column("of them taken", "%", 1),
+    )
+    table = ResultTable(
+        "coverage",
+        "faults",
+        "Coverage of core and controller by their tests",
+        columns,
+        ("Compiled functions (*_kernels.py) are left out.",),
+    )
     for room, summaries in [*rooms.items(), ("all", list(files.values()))]:
-        statements, run, branches, taken = (sum(one[key] for one in summaries) for key in (
-            "num_statements", "covered_lines", "num_branches", "covered_branches"))
+        statements, run, branches, taken = (
+            sum(one[key] for one in summaries)
+            for key in ("num_statements", "covered_lines", "num_branches", "covered_branches")
+        )
         table.add(room, statements, 100 * run / max(1, statements), branches, 100 * taken / max(1, branches))
 
 

@@ -22,9 +22,14 @@ from tests.replay.live import Operator
 LEAST_SHARE: Final = 0.002  # of a core; threads below it make one row
 OTHERS: Final = "others"
 ENDED: Final = "threads that ended"
-COLUMNS: Final = (Column("rate, thread"), Column("threads"), Column("share of a core", "", 3),
-                  *(Column(name, "MB", 0) for name in ("resident", "most")),
-                  *(Column(name, "ms", 1) for name in ("pose p50", "pose p99")), Column("poses/s", "", 1))
+COLUMNS: Final = (
+    Column("rate, thread"),
+    Column("threads"),
+    Column("share of a core", "", 3),
+    *(Column(name, "MB", 0) for name in ("resident", "most")),
+    *(Column(name, "ms", 1) for name in ("pose p50", "pose p99")),
+    Column("poses/s", "", 1),
+)
 
 
 def memory_mb(pid: int) -> tuple[float, float]:
@@ -35,8 +40,10 @@ def memory_mb(pid: int) -> tuple[float, float]:
 
 def measure(table: ResultTable, rate_hz: float, seconds: float, warm_s: float, settings: list[str]) -> None:
     """Run the daemon at a rate of pairs, and add its rows."""
-    with tempfile.TemporaryDirectory() as folder, \
-            daemon(Path(folder), rate_hz / float(HZ), *settings) as (process, operator, _):
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        daemon(Path(folder), rate_hz / float(HZ), *settings) as (process, operator, _),
+    ):
         pid = process.process.pid
         time.sleep(warm_s)
         before, before_s, start_s = thread_times(pid), process_time_s(pid), time.monotonic()

@@ -32,8 +32,9 @@ from tests.benchmark.accuracy import rig_of
 from tests.benchmark.results import Column, ResultTable
 from tests.simulation.motion_samples import SensorErrors, motion_samples
 
-ERRORS = SensorErrors(distance=1.03, turn=0.95, wheel_offset_s=0.015, gyro_offset_s=-0.01,
-                      bias_radps=(0.01, -0.006, 0.015))
+ERRORS = SensorErrors(
+    distance=1.03, turn=0.95, wheel_offset_s=0.015, gyro_offset_s=-0.01, bias_radps=(0.01, -0.006, 0.015)
+)
 SENSED_SEED = 7
 
 
@@ -52,8 +53,11 @@ def dark_drive(folder: Path, dark_s: tuple[float, float], errors: SensorErrors |
     rig = with_rims(rig, reader.frames())
     shape = geometry(rig, config.panorama)
     T_base_rig = rig.T_base_rig
-    samples: list[MotionSample] = [] if errors is None else motion_samples(
-        truth.stamps_ns, T_base_rig @ truth.T @ se3.inverse(T_base_rig), errors, SENSED_SEED)
+    samples: list[MotionSample] = (
+        []
+        if errors is None
+        else motion_samples(truth.stamps_ns, T_base_rig @ truth.T @ se3.inverse(T_base_rig), errors, SENSED_SEED)
+    )
     pairing, front_end = Synchronise(rig, config.pair), FrontEnd(shape, config, RigHealth(shape.cylinder, "off"))
     drive = DarkDrive([], [], front_end.odometry)
     start_ns, given = int(truth.stamps_ns[0]), 0
@@ -95,7 +99,7 @@ def dark_result(drive: DarkDrive, T_odom_rig: NDArray[np.float64]) -> DarkResult
         true = se3.inverse(T_odom_rig[first]) @ T_odom_rig[index]
         return se3.inverse(true) @ found
 
-    steps = T_odom_rig[first:last + 1]
+    steps = T_odom_rig[first : last + 1]
     states = [drive.poses[int(index)].state.value for index in dark]
     covariance = drive.poses[last].covariance[:3, :3]
     wrong = drive.poses[last].T_odom_rig[:3, 3] - (se3.inverse(T_odom_rig[0]) @ T_odom_rig[last])[:3, 3]
@@ -103,10 +107,12 @@ def dark_result(drive: DarkDrive, T_odom_rig: NDArray[np.float64]) -> DarkResult
     return DarkResult(
         float(np.linalg.norm(np.diff(steps[:, :3, 3], axis=0), axis=1).sum()),
         float(np.abs([se3.yaw(se3.inverse(a) @ b) for a, b in pairwise(steps)]).sum()),
-        float(np.linalg.norm(error(last)[:3, 3])), abs(float(se3.yaw(error(last)))),
+        float(np.linalg.norm(error(last)[:3, 3])),
+        abs(float(se3.yaw(error(last)))),
         math.sqrt(float(wrong @ np.linalg.solve(covariance, wrong)) / 3),
         float(np.linalg.norm(error(after)[:3, 3])),
-        {state: states.count(state) for state in dict.fromkeys(states)})
+        {state: states.count(state) for state in dict.fromkeys(states)},
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -117,18 +123,36 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seconds", type=float, default=3.0, help="its length, s")
     parser.add_argument("--without", action="store_true", help="no sensors")
     args = parser.parse_args(arguments)
-    columns = (Column("log"), Column("dark", "s", 1), Column("driven", "m", 2), Column("turned", "deg", 0),
-               Column("error at its end", "mm", 1), Column("goal: 2 cm + 1 %", "mm", 0), Column("heading", "deg", 2),
-               Column("error over sigma", "", 1), Column("after it", "mm", 1), Column("states"))
+    columns = (
+        Column("log"),
+        Column("dark", "s", 1),
+        Column("driven", "m", 2),
+        Column("turned", "deg", 0),
+        Column("error at its end", "mm", 1),
+        Column("goal: 2 cm + 1 %", "mm", 0),
+        Column("heading", "deg", 2),
+        Column("error over sigma", "", 1),
+        Column("after it", "mm", 1),
+        Column("states"),
+    )
     sensors = "no sensors" if args.without else "with wheels and gyro"
     table = ResultTable("darkness", "light and skew", f"Darkness {sensors}", columns)
     for folder in args.folders:
         drive = dark_drive(folder, (args.start, args.start + args.seconds), None if args.without else ERRORS)
         found = dark_result(drive, read_tum(folder / "truth.txt").T)
-        table.add(folder.name, args.seconds, found.driven_m, math.degrees(found.turned_rad), 1e3 * found.error_m,
-                  1e3 * (0.02 + 0.01 * found.driven_m), math.degrees(found.heading_rad), found.sigmas,
-                  1e3 * found.after_m, ", ".join(f"{state} {count}" for state, count in found.states.items()),
-                  folder=folder)
+        table.add(
+            folder.name,
+            args.seconds,
+            found.driven_m,
+            math.degrees(found.turned_rad),
+            1e3 * found.error_m,
+            1e3 * (0.02 + 0.01 * found.driven_m),
+            math.degrees(found.heading_rad),
+            found.sigmas,
+            1e3 * found.after_m,
+            ", ".join(f"{state} {count}" for state, count in found.states.items()),
+            folder=folder,
+        )
 
 
 if __name__ == "__main__":

@@ -111,13 +111,24 @@ def row(case: Case, run: SimulatedRun) -> list[Cell]:
     if case.goals:
         goal = case.goals[-1]
         error_deg = math.degrees(wrap_angle(float(se3.yaw(end)) - math.radians(goal[2])))
-        ends = [100 * math.dist(end[:2, 3], goal[:2]), abs(error_deg),
-                100 * legs_offset_m(run.truth_in_odom, case.goals)]
+        ends = [
+            100 * math.dist(end[:2, 3], goal[:2]),
+            abs(error_deg),
+            100 * legs_offset_m(run.truth_in_odom, case.goals),
+        ]
     state = f"{run.navigation[-1].state} {run.navigation[-1].reason}".strip() if case.goals and run.navigation else ""
     moved = np.diff([tick.pose[:2] for tick in run.ticks], axis=0)
     stops = [line for _, line in run.lines if line.startswith("the wheels stop")]
-    return [state, *ends, float(np.linalg.norm(moved, axis=1).sum()), len(run.contacts), run.clearance_m,
-            dark(case, run), slip(case, run), "; ".join(dict.fromkeys(stops))[:120]]
+    return [
+        state,
+        *ends,
+        float(np.linalg.norm(moved, axis=1).sum()),
+        len(run.contacts),
+        run.clearance_m,
+        dark(case, run),
+        slip(case, run),
+        "; ".join(dict.fromkeys(stops))[:120],
+    ]
 
 
 def dark(case: Case, run: SimulatedRun) -> str:
@@ -127,7 +138,7 @@ def dark(case: Case, run: SimulatedRun) -> str:
     for fault in case.faults:
         first, last = np.searchsorted(times_s, (fault.start_s, fault.end_s)) - 1
         truth, estimate = (se3.inverse(poses[first]) @ poses[last] for poses in (run.T_world_base, run.T_odom_base))
-        way_m = np.linalg.norm(np.diff(run.T_world_base[first:last + 1, :2, 3], axis=0), axis=1).sum()
+        way_m = np.linalg.norm(np.diff(run.T_world_base[first : last + 1, :2, 3], axis=0), axis=1).sum()
         error_m = np.linalg.norm((se3.inverse(truth) @ estimate)[:2, 3])
         texts.append(f"{way_m:.2f} m, {100 * error_m:.1f} cm")
     return "; ".join(texts)
@@ -152,9 +163,21 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
     parser.add_argument("--size", type=int, default=512)
     arguments = parser.parse_args()
-    columns = (Column("case"), Column("seed"), Column("end"), Column("end error", "cm", 1), Column("heading", "deg", 2),
-               Column("off the legs", "cm", 1), Column("way", "m", 2), Column("contacts"), Column("clearance", "m", 2),
-               Column("in the dark"), Column("slip noticed"), Column("stops"), Column("processor time a pair", "s", 2))
+    columns = (
+        Column("case"),
+        Column("seed"),
+        Column("end"),
+        Column("end error", "cm", 1),
+        Column("heading", "deg", 2),
+        Column("off the legs", "cm", 1),
+        Column("way", "m", 2),
+        Column("contacts"),
+        Column("clearance", "m", 2),
+        Column("in the dark"),
+        Column("slip noticed"),
+        Column("stops"),
+        Column("processor time a pair", "s", 2),
+    )
     table = ResultTable("drive", "driving", "A simulated robot in a closed loop", columns)
     for name in [*CASES, BUILDING] if "all" in arguments.cases else arguments.cases:
         for seed in arguments.seeds:
@@ -176,9 +199,19 @@ def round_row(seed: int, size_px: int) -> list[Cell]:
     started_s = time.process_time()
     end = building_round(seed, size_px)
     way_m = np.linalg.norm(np.diff([tick.pose[:2] for tick in end.run.ticks], axis=0), axis=1).sum()
-    return [end.words, 100 * end.error_m, math.degrees(end.error_rad), 100 * end.off_path_m, float(way_m),
-            len(end.run.contacts), end.run.clearance_m, None, None, end.stops,
-            (time.process_time() - started_s) / end.pairs]
+    return [
+        end.words,
+        100 * end.error_m,
+        math.degrees(end.error_rad),
+        100 * end.off_path_m,
+        float(way_m),
+        len(end.run.contacts),
+        end.run.clearance_m,
+        None,
+        None,
+        end.stops,
+        (time.process_time() - started_s) / end.pairs,
+    ]
 
 
 if __name__ == "__main__":

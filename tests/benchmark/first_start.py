@@ -36,8 +36,12 @@ def first_start() -> tuple[float, float, float]:
 def main() -> None:
     """Print a row for the start, and one for each function."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    columns = (Column("what"), Column("time", "s", 1), Column("processor time", "s", 1),
-               Column("largest process", "MB", 0))
+    columns = (
+        Column("what"),
+        Column("time", "s", 1),
+        Column("processor time", "s", 1),
+        Column("largest process", "MB", 0),
+    )
     table = ResultTable("first_start", "speed", "First start: compilation of all functions", columns)
     table.add(f"start with an empty cache, {len(os.sched_getaffinity(0))} cores", *first_start())
     for name in kernel_store.kernel_files():

@@ -33,8 +33,9 @@ STATUSES = 25  # parts of a robot in each status
 def robots(names: list[str], endpoint: str, hz: float, count: int, start: multiprocessing.synchronize.Barrier) -> None:
     """Publish count poses of each robot."""
     buses = [Bus(BusConfig(robot=name, listen=(), connect=(endpoint,))) for name in names]
-    status = codec.diagnostics_cdr(10**18, [DiagnosticStatus(f"part {n}", 0, "good", {"value": "1.5"})
-                                            for n in range(STATUSES)])
+    status = codec.diagnostics_cdr(
+        10**18, [DiagnosticStatus(f"part {n}", 0, "good", {"value": "1.5"}) for n in range(STATUSES)]
+    )
     pose = codec.pose_stamped_cdr(10**18, np.eye(4))
     start.wait()
     begin_s = time.monotonic()
@@ -43,8 +44,11 @@ def robots(names: list[str], endpoint: str, hz: float, count: int, start: multip
             due_s = begin_s + (number + index / len(buses)) / hz
             time.sleep(max(0.0, due_s - time.monotonic()))
             now_ns = time.time_ns()
-            bus.publish("odom", codec.odometry_cdr(now_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6)),
-                        PoseAttachment(number, "tracking", 0, 50, 60, now_ns).to_bytes())
+            bus.publish(
+                "odom",
+                codec.odometry_cdr(now_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6)),
+                PoseAttachment(number, "tracking", 0, 50, 60, now_ns).to_bytes(),
+            )
             bus.publish("pose", pose)
             bus.publish("/tf", codec.transform_cdr(now_ns, []))
             if number % max(1, round(hz)) == 0:
@@ -84,8 +88,9 @@ def main() -> None:
             groups = [names[at : at + ROBOTS_IN_A_PROCESS] for at in range(0, len(names), ROBOTS_IN_A_PROCESS)]
             spawn = multiprocessing.get_context("spawn")  # a fork has zenoh's locks, but not its threads
             start = spawn.Barrier(len(groups) + 1)
-            processes = [spawn.Process(target=robots, args=(group, endpoint, args.hz, count, start))
-                         for group in groups]
+            processes = [
+                spawn.Process(target=robots, args=(group, endpoint, args.hz, count, start)) for group in groups
+            ]
             for process in processes:
                 process.start()
             start.wait()
@@ -97,8 +102,15 @@ def main() -> None:
         router.kill()
     sent = count * args.robots
     p50, p99 = (1e3 * float(np.percentile(latencies_s, part)) for part in (50, 99))
-    columns = (Column("robots"), Column("poses/s each"), Column("sent"), Column("received"),
-               Column("latency p50", "ms", 1), Column("latency p99", "ms", 1), Column("router, of one core", "%", 0))
+    columns = (
+        Column("robots"),
+        Column("poses/s each"),
+        Column("sent"),
+        Column("received"),
+        Column("latency p50", "ms", 1),
+        Column("latency p99", "ms", 1),
+        Column("router, of one core", "%", 0),
+    )
     table = ResultTable("fleet", "speed", "Many robots behind one router", columns)
     table.add(args.robots, args.hz, sent, len(latencies_s), p50, p99, 100 * router_share)
 

@@ -40,9 +40,18 @@ from omnid.stages.front_end import FrontEnd
 from tests.benchmark.results import Cell, Column, ResultTable
 
 Array = NDArray[np.float64]
-COLUMNS = (Column("log"), Column("height of the cameras"), Column("found - true", "cm", 1), Column("sigma", "cm", 1),
-           Column("tilt", "deg", 2), Column("points"), Column("in free cells", "%", 2),
-           Column("in occupied cells", "%", 1), Column("in unknown cells", "%", 1), Column("free cells"))
+COLUMNS = (
+    Column("log"),
+    Column("height of the cameras"),
+    Column("found - true", "cm", 1),
+    Column("sigma", "cm", 1),
+    Column("tilt", "deg", 2),
+    Column("points"),
+    Column("in free cells", "%", 2),
+    Column("in occupied cells", "%", 1),
+    Column("in unknown cells", "%", 1),
+    Column("free cells"),
+)
 
 
 class FloorOfKeyframes:
@@ -93,8 +102,9 @@ def _row(folder: Path, rig: Rig, T_world_odom: Array, height_m: float) -> list[C
         seen.append(FloorOfKeyframes(front_end, config))
         return seen[0]
 
-    result = run_log(folder / "log.mcap", config,
-                     ReplayOptions(rig=rig, inline=True, build=True, collect=True, observer=observer))
+    result = run_log(
+        folder / "log.mcap", config, ReplayOptions(rig=rig, inline=True, build=True, collect=True, observer=observer)
+    )
     assert result.map is not None and result.rig_places is not None
     points = result.map.xyz.astype(float)
     above = se3.apply(T_world_odom, points)[:, 2]
@@ -103,10 +113,17 @@ def _row(folder: Path, rig: Rig, T_world_odom: Array, height_m: float) -> list[C
     drawn = grid(result.rig_places.places, result.rig_places.rig, CELL_M)
     found = shares(drawn, standing[:, :2])
     floor = seen[0].camera_floor.floor or Floor(np.nan, np.nan, np.nan, np.nan)
-    estimate = [np.nan] * 3 if rig.height_m() else [
-        100 * (floor.height_m - height_m), 100 * floor.sigma_m, np.degrees(floor.tilt_rad)]
-    return [*estimate, found.points, *(100 * n / max(1, found.points) for n in found[1:]),
-            int((drawn.cells == FREE).sum())]
+    estimate = (
+        [np.nan] * 3
+        if rig.height_m()
+        else [100 * (floor.height_m - height_m), 100 * floor.sigma_m, np.degrees(floor.tilt_rad)]
+    )
+    return [
+        *estimate,
+        found.points,
+        *(100 * n / max(1, found.points) for n in found[1:]),
+        int((drawn.cells == FREE).sum()),
+    ]
 
 
 def rig_of(folder: Path) -> Rig:
@@ -127,11 +144,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("logs", type=Path, nargs="+", metavar="LOG")
     arguments = parser.parse_args()
-    table = ResultTable("free_cells", "obstacles", "Points of the cloud in free cells of the map", COLUMNS, (
-        "Points whose true height is between 0.1 m and the robot's top; at most 1 % of them may lie in free cells. Of "
-        "`two_walls` (768 px) and `sample` (the same drive at 512 px) the renderer is POV-Ray. The floor's noise and "
-        "the grid were fitted on the sample, rooms 601 and 602, and two_walls 601 and 602; for this table only "
-        "those of 603 and 604 are validation.",))
+    table = ResultTable(
+        "free_cells",
+        "obstacles",
+        "Points of the cloud in free cells of the map",
+        COLUMNS,
+        (
+            "Points whose true height is between 0.1 m and the robot's top; at most 1 % of them may lie in free cells. "
+            "Of `two_walls` (768 px) and `sample` (the same drive at 512 px) the renderer is POV-Ray. The floor's "
+            "noise and the grid were fitted on the sample, rooms 601 and 602, and two_walls 601 and 602; for this "
+            "table only those of 603 and 604 are validation.",
+        ),
+    )
     for folder in arguments.logs:
         for row in measure(folder):
             table.add(*row, folder=folder)

@@ -20,18 +20,30 @@ from omnid.runs.run_result import RunResult
 from tests.benchmark.accuracy import rig_of
 from tests.benchmark.results import Cell, Column, ResultTable
 
-COLUMNS: Final = (Column("log"), Column("length", "%", 3), Column("ATE rmse", "mm", 2),
-                  Column("ATE in good light", "mm", 2), Column("ratio", "", 1), Column("error over sigma, rms", "", 2),
-                  Column("states"))
+COLUMNS: Final = (
+    Column("log"),
+    Column("length", "%", 3),
+    Column("ATE rmse", "mm", 2),
+    Column("ATE in good light", "mm", 2),
+    Column("ratio", "", 1),
+    Column("error over sigma, rms", "", 2),
+    Column("states"),
+)
 
 
 def row(dim: Path, bright: Path) -> list[Cell]:
     """Return one row of the table: a drive in bad light, and the same in good light."""
     result, found = replayed(dim)
     reference = replayed(bright)[1]
-    return [dim.name, 100 * found.length_error_ratio, 1e3 * found.ate_rmse_m, 1e3 * reference.ate_rmse_m,
-            found.ate_rmse_m / reference.ate_rmse_m, error_over_sigma(result, read_tum(dim / "truth.txt")),
-            summary_entries(result.counters)["states"]]
+    return [
+        dim.name,
+        100 * found.length_error_ratio,
+        1e3 * found.ate_rmse_m,
+        1e3 * reference.ate_rmse_m,
+        found.ate_rmse_m / reference.ate_rmse_m,
+        error_over_sigma(result, read_tum(dim / "truth.txt")),
+        summary_entries(result.counters)["states"],
+    ]
 
 
 def replayed(folder: Path) -> tuple[RunResult, Metrics]:

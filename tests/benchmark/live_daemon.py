@@ -27,8 +27,20 @@ def daemon(folder: Path, pace: float, *settings: str) -> Iterator[tuple[Daemon, 
         base = Base(folder)
         ends.callback(base.close)
         words = [f'bus.listen=["tcp/127.0.0.1:{port}"]', *settings]
-        command = [sys.executable, "-m", "omnid", "run", "--log", f"{FOLDER}/log.mcap", "--pace", str(pace), *RIG,
-                   "--motor", str(base.port), *(part for word in words for part in ("--set", word))]
+        command = [
+            sys.executable,
+            "-m",
+            "omnid",
+            "run",
+            "--log",
+            f"{FOLDER}/log.mcap",
+            "--pace",
+            str(pace),
+            *RIG,
+            "--motor",
+            str(base.port),
+            *(part for word in words for part in ("--set", word)),
+        ]
         process = ends.enter_context(started(command, port))
         wait_until(lambda: answers(port) or not process.alive, "the daemon's answer")
         operator = Operator(port)

@@ -38,9 +38,19 @@ SPEED_MPS: Final = 0.5
 FALSE_M: Final = 1.0
 BESIDE_M: Final = 0.2  # of the robot's outline: what stands there may be its reason to stop
 AHEAD: Final = slice(170, 190)  # sectors of the ring
-CASES: Final = {"person at 0.8 m": 12.0, "person at 1.5 m": 12.0, "box": 12.0, "low box": 12.0, "plain pole": 12.0,
-                "pole": 12.0, "white wall": 20.0, "free": 24.0, "person crosses": 9.0, "edge 8 cm": 10.0,
-                "edge 15 cm": 10.0}
+CASES: Final = {
+    "person at 0.8 m": 12.0,
+    "person at 1.5 m": 12.0,
+    "box": 12.0,
+    "low box": 12.0,
+    "plain pole": 12.0,
+    "pole": 12.0,
+    "white wall": 20.0,
+    "free": 24.0,
+    "person crosses": 9.0,
+    "edge 8 cm": 10.0,
+    "edge 15 cm": 10.0,
+}
 
 
 class Drive(NamedTuple):
@@ -65,39 +75,74 @@ def world_text(case: str, rng: random.Random) -> str:
     end = "plain" if case == "white wall" else "brick"
     end_m = rng.uniform(3.5, 4.5) if case == "white wall" else length
     posters = 0.0 if case == "white wall" else 0.6
-    lines = ["schema = 1", "start = [0.0, 0.0, 0.0]", "[space]", f"low = [-2.0, {right}]", f"high = [{end_m}, {left}]",
-             "[[wall]]", f"points = [[-2.0, {left}], [{end_m}, {left}]]", f'texture = "{walls[0]}"',
-             "posters_per_m = 0.6",
-             "[[wall]]", f"points = [[{end_m}, {right}], [-2.0, {right}]]", f'texture = "{walls[1]}"',
-             "posters_per_m = 0.6",
-             "[[wall]]", f"points = [[{end_m}, {left}], [{end_m}, {right}]]", f'texture = "{end}"',
-             f"posters_per_m = {posters}",
-             "[[wall]]", f"points = [[-2.0, {right}], [-2.0, {left}]]", 'texture = "brick"']
+    lines = [
+        "schema = 1",
+        "start = [0.0, 0.0, 0.0]",
+        "[space]",
+        f"low = [-2.0, {right}]",
+        f"high = [{end_m}, {left}]",
+        "[[wall]]",
+        f"points = [[-2.0, {left}], [{end_m}, {left}]]",
+        f'texture = "{walls[0]}"',
+        "posters_per_m = 0.6",
+        "[[wall]]",
+        f"points = [[{end_m}, {right}], [-2.0, {right}]]",
+        f'texture = "{walls[1]}"',
+        "posters_per_m = 0.6",
+        "[[wall]]",
+        f"points = [[{end_m}, {left}], [{end_m}, {right}]]",
+        f'texture = "{end}"',
+        f"posters_per_m = {posters}",
+        "[[wall]]",
+        f"points = [[-2.0, {right}], [-2.0, {left}]]",
+        'texture = "brick"',
+    ]
     if case == "box":
         size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), rng.uniform(0.4, 1.2)]
-        lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]", f"size_m = {size}",
-                  f"yaw_deg = {rng.uniform(-40, 40)}"]
+        lines += [
+            "[[box]]",
+            f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
+            f"size_m = {size}",
+            f"yaw_deg = {rng.uniform(-40, 40)}",
+        ]
     if case == "low box":
         size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), 0.08]
-        lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]", f"size_m = {size}",
-                  f"yaw_deg = {rng.uniform(-40, 40)}"]
+        lines += [
+            "[[box]]",
+            f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
+            f"size_m = {size}",
+            f"yaw_deg = {rng.uniform(-40, 40)}",
+        ]
     if case.endswith("pole"):
         side = rng.uniform(0.03, 0.06)
         texture = "white" if case == "plain pole" else "granite"
-        lines += ["[[box]]", f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
-                  f"size_m = [{side}, {side}, 1.8]", f'texture = "{texture}"', f"yaw_deg = {rng.uniform(-40, 40)}"]
+        lines += [
+            "[[box]]",
+            f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
+            f"size_m = [{side}, {side}, 1.8]",
+            f'texture = "{texture}"',
+            f"yaw_deg = {rng.uniform(-40, 40)}",
+        ]
     if case == "person crosses":
         # Unless one of them stops, the person is in the way when the robot comes there, or 0.8 s before at most.
         at_m, side, speed_mps = rng.uniform(2.8, 3.5), rng.choice((1, -1)), rng.uniform(0.8, 1.6)
         aside = side * (min(left, -right) - 0.3)
         before_m = SPEED_MPS * (abs(aside) / speed_mps + rng.uniform(0.0, 0.8))
-        lines += ["[[person]]", f"path = [[{at_m}, {aside}], [{at_m}, {-aside}]]", f"speed_mps = {speed_mps}",
-                  f"starts_within_m = {math.hypot(before_m, aside)}"]
+        lines += [
+            "[[person]]",
+            f"path = [[{at_m}, {aside}], [{at_m}, {-aside}]]",
+            f"speed_mps = {speed_mps}",
+            f"starts_within_m = {math.hypot(before_m, aside)}",
+        ]
     elif case.startswith("person"):
         within_m, side = float(case.split()[2]), rng.choice((1, -1))
         at_m, aside = rng.uniform(2.3, 3.0), side * (min(left, -right) - 0.3)
-        lines += ["[[person]]", f"path = [[{at_m}, {aside}], [{at_m}, {rng.uniform(-0.1, 0.1)}]]",
-                  f"speed_mps = {rng.uniform(0.8, 1.4)}", f"starts_within_m = {within_m + 0.2 + abs(aside) * 0.4}"]
+        lines += [
+            "[[person]]",
+            f"path = [[{at_m}, {aside}], [{at_m}, {rng.uniform(-0.1, 0.1)}]]",
+            f"speed_mps = {rng.uniform(0.8, 1.4)}",
+            f"starts_within_m = {within_m + 0.2 + abs(aside) * 0.4}",
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -117,8 +162,14 @@ def run(case: str, seed: int, size_px: int, overrides: list[str]) -> Drive:
         edges = np.zeros((0, 2, 2))
         if case.startswith("edge"):
             world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
-        done = simulate(world, make_robot(size_px), ahead, seconds=CASES[case], seed=seed,
-                        config=load_config(None, ["places.enabled=false", *overrides]))
+        done = simulate(
+            world,
+            make_robot(size_px),
+            ahead,
+            seconds=CASES[case],
+            seed=seed,
+            config=load_config(None, ["places.enabled=false", *overrides]),
+        )
     return judged(done, world, edges)
 
 
@@ -133,11 +184,15 @@ def with_edge(world: World, at_m: float, drop_m: float) -> tuple[World, Array]:
         column = round(share * part.texture.shape[1])
         along, across, end = part.edge_u * share, part.edge_v, part.edge_u * (1 - share)
         corner, down = part.origin + along - (0, 0, drop_m), np.array([0.0, 0.0, -drop_m])
-        standing += [replace(part, edge_u=along, texture=part.texture[:, :column].copy()),
-                     replace(part, origin=corner, edge_u=end, texture=part.texture[:, column:].copy())]
+        standing += [
+            replace(part, edge_u=along, texture=part.texture[:, :column].copy()),
+            replace(part, origin=corner, edge_u=end, texture=part.texture[:, column:].copy()),
+        ]
         # What closes the walls below the old floor.
-        standing += [Rectangle(first - down, way, down, part.texture[:64].copy(), "wall") for first, way in
-                     ((corner, end), (corner + across, end), (corner + end, across))]
+        standing += [
+            Rectangle(first - down, way, down, part.texture[:64].copy(), "wall")
+            for first, way in ((corner, end), (corner + across, end), (corner + end, across))
+        ]
         edge = np.array([[(corner)[:2], (corner + across)[:2]]])
     return replace(world, standing=tuple(standing)), edge
 
@@ -158,14 +213,26 @@ def judged(done: SimulatedRun, world: World, edges: Array) -> Drive:
     false = sum(ahead_m[int(np.argmin(np.abs(times - at_s)))] > FALSE_M for at_s, _ in lines)
     speeds = np.linalg.norm(np.diff([tick.pose[:2] for tick in done.ticks], axis=0), axis=1) / np.diff(times)
     near_mps = speeds[np.array(ahead_m)[1:] <= FALSE_M].max(initial=0.0)
-    rings = [ring for ring in done.rings
-             if ahead_m[int(np.argmin(np.abs(times - (ring.stamp_ns - START_NS) * 1e-9)))] <= FALSE_M]
+    rings = [
+        ring
+        for ring in done.rings
+        if ahead_m[int(np.argmin(np.abs(times - (ring.stamp_ns - START_NS) * 1e-9)))] <= FALSE_M
+    ]
     unknown = sum(bool(np.isnan(ring.ranges_m[AHEAD]).mean() > 0.5) for ring in rings)
     driven_m = math.dist(done.ticks[0].pose[:2], done.ticks[-1].pose[:2])
-    reasons = "; ".join(f"{at_s:.1f} s {text.removeprefix('the wheels stop: ').partition(';')[0]}"
-                        for at_s, text in lines)
-    return Drive(len(done.contacts) + over, min(done.clearance_m, *to_edge_m), len(lines), false, driven_m,
-                 float(near_mps), (unknown, len(rings)), reasons)
+    reasons = "; ".join(
+        f"{at_s:.1f} s {text.removeprefix('the wheels stop: ').partition(';')[0]}" for at_s, text in lines
+    )
+    return Drive(
+        len(done.contacts) + over,
+        min(done.clearance_m, *to_edge_m),
+        len(lines),
+        false,
+        driven_m,
+        float(near_mps),
+        (unknown, len(rings)),
+        reasons,
+    )
 
 
 def room_ahead_m(segments: Array, pose: tuple[float, float, float], radius_m: float) -> float:
@@ -188,20 +255,53 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     drives = []
-    columns = (Column("case"), Column("seed"), Column("contacts"), Column("least clearance", "m", 2), Column("stops"),
-               Column("false stops"), Column("driven", "m", 2), Column("highest speed within 1 m", "m/s", 2),
-               Column("unknown rings within 1 m"), Column("rings within 1 m"), Column("reasons"))
-    table = ResultTable(f"obstacle_stops_{arguments.case.replace(' ', '_')}", "obstacles",
-                        f"Stops of the collision monitor: {arguments.case}", columns)
+    columns = (
+        Column("case"),
+        Column("seed"),
+        Column("contacts"),
+        Column("least clearance", "m", 2),
+        Column("stops"),
+        Column("false stops"),
+        Column("driven", "m", 2),
+        Column("highest speed within 1 m", "m/s", 2),
+        Column("unknown rings within 1 m"),
+        Column("rings within 1 m"),
+        Column("reasons"),
+    )
+    table = ResultTable(
+        f"obstacle_stops_{arguments.case.replace(' ', '_')}",
+        "obstacles",
+        f"Stops of the collision monitor: {arguments.case}",
+        columns,
+    )
     for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
         drive = run(arguments.case, seed, arguments.size, arguments.overrides)
         drives.append(drive)
-        table.add(arguments.case, seed, drive.contacts, drive.clearance_m, drive.stops, drive.false_stops,
-                  drive.driven_m, drive.near_mps, *drive.unknown, drive.reasons, seed=("obstacle stops", seed))
-    table.add("all", None, sum(drive.contacts for drive in drives), min(drive.clearance_m for drive in drives),
-              sum(drive.stops for drive in drives), sum(drive.false_stops for drive in drives),
-              sum(drive.driven_m for drive in drives), max(drive.near_mps for drive in drives),
-              *(sum(drive.unknown[k] for drive in drives) for k in (0, 1)), None)
+        table.add(
+            arguments.case,
+            seed,
+            drive.contacts,
+            drive.clearance_m,
+            drive.stops,
+            drive.false_stops,
+            drive.driven_m,
+            drive.near_mps,
+            *drive.unknown,
+            drive.reasons,
+            seed=("obstacle stops", seed),
+        )
+    table.add(
+        "all",
+        None,
+        sum(drive.contacts for drive in drives),
+        min(drive.clearance_m for drive in drives),
+        sum(drive.stops for drive in drives),
+        sum(drive.false_stops for drive in drives),
+        sum(drive.driven_m for drive in drives),
+        max(drive.near_mps for drive in drives),
+        *(sum(drive.unknown[k] for drive in drives) for k in (0, 1)),
+        None,
+    )
 
 
 if __name__ == "__main__":

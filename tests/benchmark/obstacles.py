@@ -143,8 +143,9 @@ def measure(folder: Path, overrides: list[str], counts: Counts) -> None:
     rig, truth = read_rig(folder / "rig.toml"), read_tum(folder / "truth.txt")
     config = load_config(None, ["places.enabled=false", *overrides])
     found = RingCollector()
-    run_log(folder / "log.mcap", config,
-            ReplayOptions(rig=rig, inline=True, observer=lambda geometry, telemetry: found))
+    run_log(
+        folder / "log.mcap", config, ReplayOptions(rig=rig, inline=True, observer=lambda geometry, telemetry: found)
+    )
     scene = build(match[1], int(match[3]), pairs=len(truth.T)).scene
     segments = Segments(scene.rectangles, config.obstacles.ring.heights_m)
     poses = dict(zip(truth.stamps_ns.tolist(), truth.T @ np.linalg.inv(rig.T_base_rig), strict=True))
@@ -170,8 +171,14 @@ def rows(counts: Counts) -> Iterator[list[Cell]]:
         total = sum(counts.of[group].values())
         shares = [100 * counts.of[group][one] / total for one in CLASSES]
         errors = np.abs(counts.errors_m.get(group, [np.nan]))
-        yield [group.split("|")[1], total, *shares, 100 * counts.false_alarms[group] / max(1, counts.ranges[group]),
-               100 * float(np.median(errors)), 100 * float(np.quantile(errors, 0.95))]
+        yield [
+            group.split("|")[1],
+            total,
+            *shares,
+            100 * counts.false_alarms[group] / max(1, counts.ranges[group]),
+            100 * float(np.median(errors)),
+            100 * float(np.quantile(errors, 0.95)),
+        ]
 
 
 def main() -> None:
@@ -183,9 +190,14 @@ def main() -> None:
     counts = Counts()
     for folder in arguments.logs:
         measure(folder, arguments.overrides, counts)
-    columns = (Column("sectors of"), Column("number"), *(Column(one, "%", 1) for one in CLASSES),
-               Column("false alarms of ranges", "%", 2), Column("error, median", "cm", 1),
-               Column("error, p95", "cm", 1))
+    columns = (
+        Column("sectors of"),
+        Column("number"),
+        *(Column(one, "%", 1) for one in CLASSES),
+        Column("false alarms of ranges", "%", 2),
+        Column("error, median", "cm", 1),
+        Column("error, p95", "cm", 1),
+    )
     table = ResultTable("obstacles", "obstacles", "Recall of the obstacle ring", columns)
     table.seeds = [seed for folder in arguments.logs if (seed := family_and_seed(folder.name))]
     for row in rows(counts):

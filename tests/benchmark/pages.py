@@ -27,8 +27,10 @@ def pages(published: Path = PUBLISHED) -> dict[str, str]:
     """Return the text of each page by its file name, the index among them."""
     words = tomllib.loads(QUESTIONS_FILE.read_text())
     results = [(path.name, read_result(path)) for path in sorted(published.glob("*.json"))]
-    made = {page_name(question): _page(words[question], [one for one in results if one[1]["question"] == question])
-            for question in QUESTIONS}
+    made = {
+        page_name(question): _page(words[question], [one for one in results if one[1]["question"] == question])
+        for question in QUESTIONS
+    }
     return made | {INDEX: _index(words, results)}
 
 
@@ -45,17 +47,20 @@ def _section(name: str, result: dict[str, Any]) -> str:
     for row in result["rows"]:
         cells = (column.shown(cell).replace("|", "\\|") for column, cell in zip(columns, row, strict=True))
         lines.append(f"| {' | '.join(cells)} |")
-    parts = [f"## {result['title']}", *(["\n".join(result["remarks"])] if result["remarks"] else []),
-             f"```\n{result['command']}\n```", f"{_origin(result)} Data: `tests/benchmark/results/{name}`.",
-             "\n".join(lines)]
+    parts = [
+        f"## {result['title']}",
+        *(["\n".join(result["remarks"])] if result["remarks"] else []),
+        f"```\n{result['command']}\n```",
+        f"{_origin(result)} Data: `tests/benchmark/results/{name}`.",
+        "\n".join(lines),
+    ]
     return "\n\n".join(parts)
 
 
 def _origin(result: dict[str, Any]) -> str:
     """Return a sentence about seeds, commit, date, machine and load."""
     load = "not recorded" if result["load"] is None else f"{result['load']:g}"
-    return (f"{_seeds(result['seeds'])} Commit {result['commit']}, {result['date']}; {result['machine']}; "
-            f"load {load}.")
+    return f"{_seeds(result['seeds'])} Commit {result['commit']}, {result['date']}; {result['machine']}; load {load}."
 
 
 def _seeds(seeds: list[dict[str, Any]]) -> str:
@@ -65,8 +70,10 @@ def _seeds(seeds: list[dict[str, Any]]) -> str:
     roles: dict[str, dict[str, list[int]]] = {}
     for seed in seeds:
         roles.setdefault(seed["role"], {}).setdefault(seed["family"], []).append(seed["seed"])
-    return " ".join(f"Seeds of {role}: " + "; ".join(f"{family} {ranges(numbers)}" for family, numbers in of.items())
-                    + "." for role, of in sorted(roles.items()))
+    return " ".join(
+        f"Seeds of {role}: " + "; ".join(f"{family} {ranges(numbers)}" for family, numbers in of.items()) + "."
+        for role, of in sorted(roles.items())
+    )
 
 
 def ranges(numbers: list[int]) -> str:
@@ -83,8 +90,11 @@ def ranges(numbers: list[int]) -> str:
 def _index(words: dict[str, dict[str, str]], results: list[tuple[str, dict[str, Any]]]) -> str:
     lines = [words["index"]["text"].strip(), "", "| question | tables |", "|---|---|"]
     for question in QUESTIONS:
-        titles = [f"[{result['title']}]({page_name(question)}#{_anchor(result['title'])})" for _, result in results
-                  if result["question"] == question]
+        titles = [
+            f"[{result['title']}]({page_name(question)}#{_anchor(result['title'])})"
+            for _, result in results
+            if result["question"] == question
+        ]
         lines.append(f"| [{words[question]['title']}]({page_name(question)}) | {', '.join(titles)} |")
     return f"# {words['index']['title']}\n\n" + "\n".join(lines) + "\n"
 

@@ -36,7 +36,7 @@ def main() -> None:
     """Print the table."""
     graph = laps(1, nodes=2000, per_lap=250, loops=200, wrong=0.1)
     result = optimise(graph.start, graph.edges)
-    accepted = result.accepted[len(graph.odometry):]
+    accepted = result.accepted[len(graph.odometry) :]
     rng, room = np.random.default_rng(0), CORNERED
     poses = np.array([pose(*rng.uniform(-1, 1, 2), rng.uniform(-3, 3)) for _ in range(1000)])
     scans = [scan_of(room, T) for T in poses]
@@ -52,21 +52,32 @@ def main() -> None:
         search, queries = PlaceSearch(StereoModel(RIG.cylinder, RIG.baseline_m)), some_places(3, 200, seed=7)
         query, ids = queries.keyframes[1], sorted(places.keyframes)
         rows = (
-            ("pose graph: 2,000 nodes, 200 loops, 10 % of them wrong",
-             seconds(lambda: optimise(graph.start, graph.edges)),
-             f"{result.steps} steps, {int(accepted[~graph.right].sum())} wrong and "
-             f"{int((~accepted[graph.right]).sum())} right loops misjudged"),
-            ("map of 999 keyframes: read", seconds(lambda: read_places(path_of_map)),
-             f"{size / 999 / 1e3:.1f} kB each"),
+            (
+                "pose graph: 2,000 nodes, 200 loops, 10 % of them wrong",
+                seconds(lambda: optimise(graph.start, graph.edges)),
+                f"{result.steps} steps, {int(accepted[~graph.right].sum())} wrong and "
+                f"{int((~accepted[graph.right]).sum())} right loops misjudged",
+            ),
+            (
+                "map of 999 keyframes: read",
+                seconds(lambda: read_places(path_of_map)),
+                f"{size / 999 / 1e3:.1f} kB each",
+            ),
             ("the same: written, synced, read again", seconds(lambda: write_places(path_of_map, places, RIG)), ""),
-            ("search of a frame in all of it, which shows no place of it",
-             seconds(lambda: search.far(query.thumbnail, query.features, places, ids), 5),
-             f"{places.nbytes / 1e6:.0f} MB in memory"),
+            (
+                "search of a frame in all of it, which shows no place of it",
+                seconds(lambda: search.far(query.thumbnail, query.features, places, ids), 5),
+                f"{places.nbytes / 1e6:.0f} MB in memory",
+            ),
             ("grid of 1,000 range scans, 0.05 m", seconds(lambda: scan_grid(scans, poses, 0.05)), ""),
             ("particle filter: one update, 1,000 particles", seconds(lambda: particles.update(scans[0]), 25), ""),
         )
-    table = ResultTable("place_times", "speed", "Times of the map of places",
-                        (Column("what"), Column("processor time", "ms", 1), Column("remark")))
+    table = ResultTable(
+        "place_times",
+        "speed",
+        "Times of the map of places",
+        (Column("what"), Column("processor time", "ms", 1), Column("remark")),
+    )
     for name, taken_s, note in rows:
         table.add(name, 1e3 * taken_s, note)
 

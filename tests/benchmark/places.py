@@ -53,25 +53,62 @@ LAP = 0.5  # share of a two_laps log that is the first lap
 SEARCHES, PERIOD_NS = 6, 200_000_000  # of a query, after which it is given up
 AFTER_CUT = 50  # pairs of a log after it was cut
 LAPS: Final = (
-    Column("log"), Column("rig off by", "deg", 1), Column("odometry: ATE", "mm", 1), Column("its end", "mm", 1),
-    Column("live in the map: ATE", "mm", 1), Column("its end", "mm", 1), Column("ratio", "", 2),
-    Column("at the end: ATE", "mm", 1), Column("its ratio", "", 2), Column("loops"), Column("false loops"),
-    Column("loop after revisit", "m", 1), Column("keyframes"), Column("processor time of places", "%", 1))
+    Column("log"),
+    Column("rig off by", "deg", 1),
+    Column("odometry: ATE", "mm", 1),
+    Column("its end", "mm", 1),
+    Column("live in the map: ATE", "mm", 1),
+    Column("its end", "mm", 1),
+    Column("ratio", "", 2),
+    Column("at the end: ATE", "mm", 1),
+    Column("its ratio", "", 2),
+    Column("loops"),
+    Column("false loops"),
+    Column("loop after revisit", "m", 1),
+    Column("keyframes"),
+    Column("processor time of places", "%", 1),
+)
 SESSIONS: Final = (
-    Column("session"), Column("keyframes"), Column("dropped so far"), Column("loops"), Column("file", "MB", 1),
-    Column("read, processor time", "s", 2), Column("processor time of places", "%", 1),
-    Column("a pair, mean", "ms", 1), Column("a pair, most", "ms", 0), Column("localised", "%", 1),
-    Column("live ATE in the map", "mm", 1), Column("largest memory", "MB", 0))
+    Column("session"),
+    Column("keyframes"),
+    Column("dropped so far"),
+    Column("loops"),
+    Column("file", "MB", 1),
+    Column("read, processor time", "s", 2),
+    Column("processor time of places", "%", 1),
+    Column("a pair, mean", "ms", 1),
+    Column("a pair, most", "ms", 0),
+    Column("localised", "%", 1),
+    Column("live ATE in the map", "mm", 1),
+    Column("largest memory", "MB", 0),
+)
 KIDNAPPED: Final = (
-    Column("log"), Column("carried", "m", 1), Column("localised after", "s", 1), Column("error after that", "mm", 0),
-    Column("wrong after that"), Column("largest step of odom", "mm", 0))
+    Column("log"),
+    Column("carried", "m", 1),
+    Column("localised after", "s", 1),
+    Column("error after that", "mm", 0),
+    Column("wrong after that"),
+    Column("largest step of odom", "mm", 0),
+)
 QUERIES: Final = (
-    Column("map"), Column("queries"), Column("right", "%", 1), Column("wrong"), Column("not localised"),
-    Column("time to localise, p95", "s", 1), Column("error p50", "mm", 1), Column("error, most", "mm", 1),
-    Column("heading, most", "deg", 2), Column("longest search, processor time", "ms", 0), Column("the wrong ones"))
-TABLES: Final = {"laps": ("Loops on closed drives, and places that look alike", LAPS),
-                 "queries": ("Queries in a map", QUERIES), "kidnapped": ("A log that goes on elsewhere", KIDNAPPED),
-                 "sessions": ("One map extended by session after session", SESSIONS)}
+    Column("map"),
+    Column("queries"),
+    Column("right", "%", 1),
+    Column("wrong"),
+    Column("not localised"),
+    Column("time to localise, p95", "s", 1),
+    Column("error p50", "mm", 1),
+    Column("error, most", "mm", 1),
+    Column("heading, most", "deg", 2),
+    Column("longest search, processor time", "ms", 0),
+    Column("the wrong ones"),
+)
+TABLES: Final = {
+    "laps": ("Loops on closed drives, and places that look alike", LAPS),
+    "queries": ("Queries in a map", QUERIES),
+    "kidnapped": ("A log that goes on elsewhere", KIDNAPPED),
+    "sessions": ("One map extended by session after session", SESSIONS),
+}
 
 
 def disturbed(rig: Rig, degrees: float, seed: int) -> Rig:
@@ -92,14 +129,29 @@ def laps_row(folder: Path, degrees: float, seed: int) -> list[Cell]:
     with timed_places() as spent:
         result = replayed(folder, degrees, seed)
     share = sum(spent) / (time.process_time() - started)
-    odom, live, final = (evaluate(Trajectory(result.stamps_ns, T), truth)
-                         for T in (result.T_odom_rig, result.T_map_rig_live, result.T_map_rig))
+    odom, live, final = (
+        evaluate(Trajectory(result.stamps_ns, T), truth)
+        for T in (result.T_odom_rig, result.T_map_rig_live, result.T_map_rig)
+    )
     errors = loop_errors(result.places or PlaceMap(), truth, read_rig(folder / "rig.toml"))
     false = sum(m > FALSE_M or rad > FALSE_RAD for m, rad in errors)
     after_m = after_revisit_m(truth.T, result.map_states)
-    return [folder.name, degrees, 1e3 * odom.ate_rmse_m, 1e3 * odom.end_error_m, 1e3 * live.ate_rmse_m,
-            1e3 * live.end_error_m, live.ate_rmse_m / odom.ate_rmse_m, 1e3 * final.ate_rmse_m,
-            final.ate_rmse_m / odom.ate_rmse_m, len(errors), false, after_m, len(result.places or ()), 100 * share]
+    return [
+        folder.name,
+        degrees,
+        1e3 * odom.ate_rmse_m,
+        1e3 * odom.end_error_m,
+        1e3 * live.ate_rmse_m,
+        1e3 * live.end_error_m,
+        live.ate_rmse_m / odom.ate_rmse_m,
+        1e3 * final.ate_rmse_m,
+        final.ate_rmse_m / odom.ate_rmse_m,
+        len(errors),
+        false,
+        after_m,
+        len(result.places or ()),
+        100 * share,
+    ]
 
 
 @contextmanager
@@ -123,12 +175,14 @@ def timed_places() -> Iterator[list[float]]:
 
 def loop_errors(places: PlaceMap, truth: Trajectory, rig: Rig) -> list[tuple[float, float]]:
     """Return the errors [m, rad] of the loops of a map."""
+
     def pose(id: int) -> Array:
         nearest = np.abs(truth.stamps_ns - places.keyframes[id].stamp_ns).argmin()
         return np.asarray(truth.T[nearest] @ se3.inverse(rig.T_rect_rig))
 
-    return [motion_errors(link.T_a_b, se3.inverse(pose(link.a)) @ pose(link.b))
-            for link in places.links if link.is_loop]
+    return [
+        motion_errors(link.T_a_b, se3.inverse(pose(link.a)) @ pose(link.b)) for link in places.links if link.is_loop
+    ]
 
 
 def after_revisit_m(T: Array, states: Sequence[MapState]) -> float:
@@ -171,8 +225,9 @@ def queries(folder: Path, seed: int, count: int) -> list[Answer]:
     cameras = RenderedCameras.of(rig, ring(seed))
     answers = []
     for number in range(count):
-        T = poses[rng.integers(round(LAP * len(poses)))] @ se3.exp([*rng.uniform(-0.28, 0.28, 2), 0, 0, 0,
-                                                                   rng.uniform(-np.pi, np.pi)])
+        T = poses[rng.integers(round(LAP * len(poses)))] @ se3.exp(
+            [*rng.uniform(-0.28, 0.28, 2), 0, 0, 0, rng.uniform(-np.pi, np.pi)]
+        )
         scene = with_people(with_other_posters(ring(seed), rng, 0.2), rng, T[:2, 3])
         here = replace(cameras, scene=scene)
         answers.append(_asked(here, result.places, (poses[0], T), (number, float(rng.uniform(0.7, 1.3)))))
@@ -184,14 +239,23 @@ def _asked(cameras: RenderedCameras, places: PlaceMap, poses: tuple[Array, Array
     localiser = MapLocaliser(cameras.model, PlaceLimits(), deepcopy(places), localize_only=True)
     T_rig_rect = se3.inverse(cameras.rig.T_rect_rig)
     T_map_rect = se3.inverse(poses[0] @ T_rig_rect) @ poses[1] @ T_rig_rect
-    ideal = [view[1] * render_grey(cameras.scene, mounted, poses[1])
-             for mounted in (cameras.rig.lower, cameras.rig.upper)]
+    ideal = [
+        view[1] * render_grey(cameras.scene, mounted, poses[1]) for mounted in (cameras.rig.lower, cameras.rig.upper)
+    ]
     rng, longest_s = np.random.default_rng([view[0], 42]), 0.0
     for search in range(SEARCHES):
         lower, upper = (sensor.expose(image, rng) for sensor, image in zip(cameras.exposures, ideal, strict=True))
         stereo = cameras.stereo_frame(SEARCHES * view[0] + search, lower, upper)
-        frame = OdometryFrame(stereo, search * PERIOD_NS, np.eye(4), 1e-8 * np.eye(6), False, 0, True,
-                              lambda: np.full(360, np.nan, np.float32))
+        frame = OdometryFrame(
+            stereo,
+            search * PERIOD_NS,
+            np.eye(4),
+            1e-8 * np.eye(6),
+            False,
+            0,
+            True,
+            lambda: np.full(360, np.nan, np.float32),
+        )
         started = time.process_time()
         pose = localiser.process(frame)
         longest_s = max(longest_s, time.process_time() - started)
@@ -204,15 +268,29 @@ def queries_row(name: str, answers: Sequence[Answer]) -> list[Cell]:
     """Return the share that was localised, and the time it took."""
     right = [answer for answer in answers if answer.is_right]
     times = sorted(answer.time_s for answer in answers)
-    wrong = [f"{number} by {answer.error_m:.3f} m, {math.degrees(answer.error_rad):.2f} deg"
-             for number, answer in enumerate(answers) if answer.is_wrong]
+    wrong = [
+        f"{number} by {answer.error_m:.3f} m, {math.degrees(answer.error_rad):.2f} deg"
+        for number, answer in enumerate(answers)
+        if answer.is_wrong
+    ]
     errors: tuple[Cell, ...] = (None, None, None)
     if right:
-        errors = (1e3 * float(np.median([a.error_m for a in right])), 1e3 * max(a.error_m for a in right),
-                  math.degrees(max(a.error_rad for a in right)))
-    return [name, len(answers), 100 * len(right) / len(answers), len(wrong),
-            sum(math.isinf(answer.time_s) for answer in answers), times[int(0.95 * len(times))], *errors,
-            1e3 * max(answer.work_s for answer in answers), "; ".join(wrong)]
+        errors = (
+            1e3 * float(np.median([a.error_m for a in right])),
+            1e3 * max(a.error_m for a in right),
+            math.degrees(max(a.error_rad for a in right)),
+        )
+    return [
+        name,
+        len(answers),
+        100 * len(right) / len(answers),
+        len(wrong),
+        sum(math.isinf(answer.time_s) for answer in answers),
+        times[int(0.95 * len(times))],
+        *errors,
+        1e3 * max(answer.work_s for answer in answers),
+        "; ".join(wrong),
+    ]
 
 
 def kidnapped_row(folder: Path, seed: int) -> list[Cell]:
@@ -257,10 +335,20 @@ def session_rows(folder: Path, count: int) -> Iterator[list[Cell]]:
             read_s = time.process_time() - began
             error = evaluate(Trajectory(result.stamps_ns, result.T_map_rig_live), truth)
             localised = sum(state is MapState.LOCALIZED for state in result.map_states) / len(result.map_states)
-            yield [f"{session + 1}{'' if settings else ', default'}", len(places), places.dropped, places.loops,
-                   path.stat().st_size / 1e6, read_s, 100 * share, 1e3 * sum(spent) / len(spent), 1e3 * max(spent),
-                   100 * localised, 1e3 * error.ate_rmse_m,
-                   resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3]
+            yield [
+                f"{session + 1}{'' if settings else ', default'}",
+                len(places),
+                places.dropped,
+                places.loops,
+                path.stat().st_size / 1e6,
+                read_s,
+                100 * share,
+                1e3 * sum(spent) / len(spent),
+                1e3 * max(spent),
+                100 * localised,
+                1e3 * error.ate_rmse_m,
+                resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+            ]
 
 
 def main() -> None:

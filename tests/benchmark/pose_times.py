@@ -66,8 +66,11 @@ def main() -> None:
     pairs = graph.stage("pair", Synchronise(place.rig, config.pair), read)
     wire(graph, pairs, FrontEnd(place, config), config, Sinks({"times": times}))
     graph.run()
-    columns = (Column("time of odometry"), *(Column(name, "ms", 1) for name in ("p50", "p90", "p99", "mean")),
-               Column("pairs above 1 ms", "%", 0))
+    columns = (
+        Column("time of odometry"),
+        *(Column(name, "ms", 1) for name in ("p50", "p90", "p99", "mean")),
+        Column("pairs above 1 ms", "%", 0),
+    )
     table = ResultTable("pose_times", "speed", "Processor time of odometry until a pose and after it", columns)
     for label, all_ms in (("until the pose", times.until_pose), ("after it", times.after_pose)):
         ms = np.array(all_ms[SKIPPED:])

@@ -43,8 +43,19 @@ FOLDER_VARIABLE: Final = "OMNID_RESULTS"
 SCHEMA: Final = 1
 QUESTIONS: Final = ("accuracy", "calibration", "places", "obstacles", "driving", "light and skew", "speed", "faults")
 KEYS: Final[dict[str, Any]] = {
-    "schema": int, "question": str, "title": str, "command": str, "commit": str, "machine": str, "date": str,
-    "load": (int, float, type(None)), "seeds": list, "remarks": list, "columns": list, "rows": list}
+    "schema": int,
+    "question": str,
+    "title": str,
+    "command": str,
+    "commit": str,
+    "machine": str,
+    "date": str,
+    "load": (int, float, type(None)),
+    "seeds": list,
+    "remarks": list,
+    "columns": list,
+    "rows": list,
+}
 Cell: TypeAlias = float | int | str | bool | None
 Seed: TypeAlias = tuple[str, int]  # family and number
 
@@ -129,10 +140,20 @@ class ResultTable:
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the file."""
         seeds = [{"family": family, "seed": seed, "role": role_of(family, seed)} for family, seed in self.seeds]
-        return {"schema": SCHEMA, "question": self.question, "title": self.title, "command": command(),
-                "commit": commit(), "machine": machine(), "date": self.date, "load": self.load, "seeds": seeds,
-                "remarks": list(self.remarks), "columns": [asdict(column) for column in self.columns],
-                "rows": self.rows}
+        return {
+            "schema": SCHEMA,
+            "question": self.question,
+            "title": self.title,
+            "command": command(),
+            "commit": commit(),
+            "machine": machine(),
+            "date": self.date,
+            "load": self.load,
+            "seeds": seeds,
+            "remarks": list(self.remarks),
+            "columns": [asdict(column) for column in self.columns],
+            "rows": self.rows,
+        }
 
     def _print(self, text: str) -> None:
         if not self.quiet:
@@ -210,8 +231,12 @@ def commit() -> str:
     words = ["git", "-C", str(ROOT)]
     try:
         name = subprocess.run([*words, "rev-parse", "--short=9", "HEAD"], capture_output=True, text=True, check=True)
-        changed = subprocess.run([*words, "status", "--porcelain", "--", "omnid", "calib", "drivers"],
-                                 capture_output=True, text=True, check=True)
+        changed = subprocess.run(
+            [*words, "status", "--porcelain", "--", "omnid", "calib", "drivers"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
     return name.stdout.strip() + ("+" if changed.stdout.strip() else "")
@@ -220,10 +245,15 @@ def commit() -> str:
 def machine() -> str:
     """Return processor, cores and versions."""
     try:
-        models = [line.partition(":")[2].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-                  if line.startswith("model name")]
+        models = [
+            line.partition(":")[2].strip()
+            for line in Path("/proc/cpuinfo").read_text().splitlines()
+            if line.startswith("model name")
+        ]
     except OSError:
         models = []
     cores = os.cpu_count() or 1
-    return (f"{cores} cores, {models[0] if models else platform.machine()}, Python {platform.python_version()}, "
-            f"OpenCV {cv2.__version__}, numpy {np.__version__}")
+    return (
+        f"{cores} cores, {models[0] if models else platform.machine()}, Python {platform.python_version()}, "
+        f"OpenCV {cv2.__version__}, numpy {np.__version__}"
+    )

@@ -49,8 +49,15 @@ from tests.simulation.mirrors import MirrorCamera
 NOISE_PX = 0.015
 DRIVE_M, DIRECTIONS, STEPS = 0.1, 4, 8
 RINGS, RING_PIXELS = (0.35, 0.6, 0.85), 72
-NAMES = ("scale", "heading", *(f"{side} elevation {ring}" for side in ("lower", "upper") for ring in RINGS),
-         "rotation x", "rotation y", "rotation z", "baseline")
+NAMES = (
+    "scale",
+    "heading",
+    *(f"{side} elevation {ring}" for side in ("lower", "upper") for ring in RINGS),
+    "rotation x",
+    "rotation y",
+    "rotation z",
+    "baseline",
+)
 
 
 def projected_views(seed: int, amount: float, noise_px: float) -> list[PairView]:
@@ -68,8 +75,10 @@ def projected_views(seed: int, amount: float, noise_px: float) -> list[PairView]
 
 def calibrated(views: list[PairView], size: tuple[int, int]) -> RigCalibration:
     """Fit the rig by default, as `omnid calibrate rig` does to the same corners."""
-    chosen = [select_calibration([view.seen[side] for view in views if view.seen[side] is not None], BOARD, size)
-              for side in (0, 1)]
+    chosen = [
+        select_calibration([view.seen[side] for view in views if view.seen[side] is not None], BOARD, size)
+        for side in (0, 1)
+    ]
     mirrors = [one.polynomial for one in chosen]
     assert mirrors[0] is not None and mirrors[1] is not None
     cameras = (chosen[0].calibration.camera, chosen[1].calibration.camera)
@@ -85,8 +94,9 @@ def mounted_rig(found: RigCalibration) -> Rig:
 def drive_errors(rig: Rig, truth: Rig) -> Array:
     """Return the rms over directions of the errors of a drive's length (relative) and heading [rad/m]."""
     T_rig_rect, T_true_rect = se3.inverse(rig.T_rect_rig), se3.inverse(truth.T_rect_rig)
-    azimuth, slope, distance = (part.ravel() for part in np.meshgrid(
-        2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M))
+    azimuth, slope, distance = (
+        part.ravel() for part in np.meshgrid(2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M)
+    )
     points = distance[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth), slope])
     start = _pixels(truth, se3.apply(T_true_rect, points))
     seen = np.isfinite(start).all(axis=1)
@@ -117,8 +127,10 @@ def _between_frames(rig: Rig, truth: Rig) -> Array:
     angle = np.repeat(2 * np.pi * np.arange(RING_PIXELS) / RING_PIXELS, len(RINGS))
     part = radius * np.tile(RINGS, RING_PIXELS)
     pixels = np.column_stack([u + part * np.cos(angle), v + part * np.sin(angle)])
-    rays = [one.lower.camera.lift(pixels) @ (one.T_rect_rig[:3, :3] @ one.lower.T_cam_rig[:3, :3].T).T
-            for one in (rig, truth)]
+    rays = [
+        one.lower.camera.lift(pixels) @ (one.T_rect_rig[:3, :3] @ one.lower.T_cam_rig[:3, :3].T).T
+        for one in (rig, truth)
+    ]
     return se3.transform(_rotation(rays[1], rays[0]), np.zeros(3))
 
 
@@ -130,8 +142,9 @@ def _rotation(first: Array, second: Array) -> Array:
 
 def _pixels(rig: Rig, in_rig: Array) -> Array:
     """Return the pixels (N, 4) of points (N, 3) at their own distances."""
-    return np.column_stack([project_near(mounted.camera, se3.apply(mounted.T_cam_rig, in_rig))
-                            for mounted in (rig.lower, rig.upper)])
+    return np.column_stack(
+        [project_near(mounted.camera, se3.apply(mounted.T_cam_rig, in_rig)) for mounted in (rig.lower, rig.upper)]
+    )
 
 
 def _by_point(rig: Rig, points: Array) -> Array:
@@ -169,8 +182,12 @@ def ray_values(rig: Rig, truth: Rig) -> Array:
 def _ring_elevations(camera: OmniCamera, true: MountedCamera) -> list[float]:
     (u, v), outer = true.visible.center, true.visible.outer_px
     angle = 2 * np.pi * np.arange(RING_PIXELS) / RING_PIXELS
-    means = [_central(camera).lift(np.column_stack([u + outer * ring * np.cos(angle), v + outer * ring * np.sin(angle)])
-                                   ).mean(axis=0) for ring in RINGS]
+    means = [
+        _central(camera)
+        .lift(np.column_stack([u + outer * ring * np.cos(angle), v + outer * ring * np.sin(angle)]))
+        .mean(axis=0)
+        for ring in RINGS
+    ]
     axis = means[0] / np.linalg.norm(means[0])
     return [float(np.arccos(mean @ axis)) for mean in means]
 
@@ -190,8 +207,9 @@ def true_baseline_m(truth: Rig) -> float:
             continue
         (u, v), outer = mounted.visible.center, mounted.visible.outer_px
         angle, part = np.meshgrid(2 * np.pi * np.arange(48) / 48, np.linspace(0.3, 0.95, 14))
-        origin, d = camera.rays(np.column_stack([u + outer * (part * np.cos(angle)).ravel(),
-                                                 v + outer * (part * np.sin(angle)).ravel()]))
+        origin, d = camera.rays(
+            np.column_stack([u + outer * (part * np.cos(angle)).ravel(), v + outer * (part * np.sin(angle)).ravel()])
+        )
         across = np.eye(3) - d[:, :, None] * d[:, None, :]
         terms = [wavefront.offsets(d, tuple(one), 1.0) for one in np.eye(wavefront.TERMS)]
         J = np.concatenate([across, np.stack(terms, axis=-1)], axis=2).reshape(-1, 3 + wavefront.TERMS)
@@ -206,8 +224,14 @@ def scores(rig: Rig, truth: Rig) -> dict[str, float]:
     assert predicted is not None and covariance is not None
     drive = drive_errors(rig, truth) / (predicted.scale, predicted.heading_rad_m)
     steps = np.diag(SIGMA_STEP * covariance.sigmas)
-    J = np.stack([ray_values(perturbed_rig(rig, covariance.names, step), truth)
-                  - ray_values(perturbed_rig(rig, covariance.names, -step), truth) for step in steps], axis=-1)
+    J = np.stack(
+        [
+            ray_values(perturbed_rig(rig, covariance.names, step), truth)
+            - ray_values(perturbed_rig(rig, covariance.names, -step), truth)
+            for step in steps
+        ],
+        axis=-1,
+    )
     sigmas = np.sqrt(np.einsum("ip,pq,iq->i", J, covariance.correlation, J)) / (2 * SIGMA_STEP)
     right = [value for true in (truth.lower, truth.upper) for value in _ring_elevations(true.camera, true)]
     off = ray_values(rig, truth) - [*right, 0.0, 0.0, 0.0, true_baseline_m(truth)]
@@ -236,8 +260,12 @@ def main(arguments: Sequence[str]) -> int:
         words = " ".join(f"{value:+.2f}" for value in found[-1].values())
         print(f"seed {seed}, {type(rig.lower.camera).__name__}, {line}, {drive_uncertainty(rig)}: {words}", flush=True)
     noise = f"corners with noise of {args.noise_px:g} px" if args.folder is None else "rendered images"
-    table = ResultTable("rig_sigmas", "calibration", f"Errors over stated standard deviations of boards, {noise}",
-                        (Column("quantity"), Column("rms", "", 2), Column("mean", "", 2)))
+    table = ResultTable(
+        "rig_sigmas",
+        "calibration",
+        f"Errors over stated standard deviations of boards, {noise}",
+        (Column("quantity"), Column("rms", "", 2), Column("mean", "", 2)),
+    )
     table.seeds = [("rigs of boards", seed) for seed in args.seeds]
     for name in NAMES:
         values = np.array([one[name] for one in found])

@@ -57,8 +57,10 @@ def lap(length_m: float) -> Array:
     points = [START]
     for before, corner, after in zip(np.roll(CORNERS, 1, axis=0), CORNERS, np.roll(CORNERS, -1, axis=0), strict=True):
         u, v = (np.sign(other - corner) for other in (before, after))  # the sides are along the axes
-        points += [tuple(corner + RADIUS_M * (u * (1 - math.sin(t)) + v * (1 - math.cos(t))))
-                   for t in np.linspace(0.0, math.pi / 2, 15)]
+        points += [
+            tuple(corner + RADIUS_M * (u * (1 - math.sin(t)) + v * (1 - math.cos(t))))
+            for t in np.linspace(0.0, math.pi / 2, 15)
+        ]
     corners = np.array([*points, START])
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     at_m = np.arange(0.0, min(length_m, way_m[-1]), SPACING_M)
@@ -73,7 +75,7 @@ class Driver:
 
     def setpoint(self, T_world_base: Array, velocity_mps: float) -> Setpoint | None:
         """Return what is wanted of the wheels; None at the end of the line."""
-        near = self._line[self._at:self._at + 40]
+        near = self._line[self._at : self._at + 40]
         self._at += int(np.argmin(np.linalg.norm(near - T_world_base[:2, 3], axis=1)))
         if self._at >= len(self._line) - 2:
             return None
@@ -157,8 +159,17 @@ def changed_world(seed: int, number: int, rng: random.Random, people: bool) -> W
     """Return the building at a later time of the day."""
     options = WorldOptions(brightness=rng.uniform(0.6, 1.3), other_posters=0.2, posters_seed=number + 1)
     person = load_world("corridor").people[0]
-    walking = tuple(replace(person, path=path, speed_mps=rng.uniform(0.6, 1.0), start_s=rng.uniform(0.0, 10.0),
-                            repeat="back and forth", waits_within_m=1.0) for path in DOORS)
+    walking = tuple(
+        replace(
+            person,
+            path=path,
+            speed_mps=rng.uniform(0.6, 1.0),
+            start_s=rng.uniform(0.0, 10.0),
+            repeat="back and forth",
+            waits_within_m=1.0,
+        )
+        for path in DOORS
+    )
     return replace(load_world(WORLD, seed, options), people=walking if people else ())
 
 
@@ -169,15 +180,27 @@ def row(lesson: Array, run: SimulatedRun, end: str) -> list[Cell]:
     repeated = way_m > SETTLED_M
     off_cm = 100 * cross_track_m(lesson, path)
     on_path = repeated & ~on_detour(run, way_m)
-    waits = dict.fromkeys(f"{update.state}: {update.reason}" for update in run.navigation
-                          if update.reason and not update.state.is_end)
+    waits = dict.fromkeys(
+        f"{update.state}: {update.reason}" for update in run.navigation if update.reason and not update.state.is_end
+    )
     waits |= dict.fromkeys(line for _, line in run.lines if line.startswith("the wheels stop"))
     avoided_s = sum(update.state is NavigationState.AVOIDING for update in run.navigation) * 0.1
     p95, most = (np.percentile(off_cm[repeated], 95), off_cm[repeated].max()) if repeated.any() else (None, None)
     without = np.percentile(off_cm[on_path], 95) if on_path.any() else None
     end_error_cm = 100 * math.dist(path[-1], lesson[-1])
-    return [end, p95, without, most, avoided_s, end_error_cm, float(way_m[-1]), run.ticks[-1].time_s,
-            len(run.contacts), run.clearance_m, "; ".join(waits)[:300]]
+    return [
+        end,
+        p95,
+        without,
+        most,
+        avoided_s,
+        end_error_cm,
+        float(way_m[-1]),
+        run.ticks[-1].time_s,
+        len(run.contacts),
+        run.clearance_m,
+        "; ".join(waits)[:300],
+    ]
 
 
 def on_detour(run: SimulatedRun, way_m: Array) -> NDArray[np.bool_]:
@@ -194,8 +217,9 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
     """Teach a route and repeat it; yield a row for each drive."""
     line = lap(length_m)
     with tempfile.TemporaryDirectory() as folder:
-        config: Config = load_config(None, [f"places.map={Path(folder) / 'building.omap'}",
-                                            f"navigation.routes={Path(folder) / 'routes'}"])
+        config: Config = load_config(
+            None, [f"places.map={Path(folder) / 'building.omap'}", f"navigation.routes={Path(folder) / 'routes'}"]
+        )
         world = replace(load_world(WORLD, seed), start=(*START, 0.0))
         started_s, lesson = time.process_time(), Lesson(line)
         run = simulate(world, robot, lesson, seconds=LONGEST_S, seed=seed, config=config)
@@ -205,13 +229,20 @@ def series(seed: int, length_m: float, repeats: int, robot: SimulatedRobot, peop
             rng, started_s = random.Random(1000 * seed + number), time.process_time()
             begin = round(STARTS[number] * len(line))
             (x, y), (ahead_x, ahead_y) = line[begin], line[begin + 2]
-            start = (x + rng.uniform(-ASIDE_M, ASIDE_M), y + rng.uniform(-ASIDE_M, ASIDE_M),
-                     math.atan2(ahead_y - y, ahead_x - x) + rng.uniform(-ASIDE_RAD, ASIDE_RAD))
+            start = (
+                x + rng.uniform(-ASIDE_M, ASIDE_M),
+                y + rng.uniform(-ASIDE_M, ASIDE_M),
+                math.atan2(ahead_y - y, ahead_x - x) + rng.uniform(-ASIDE_RAD, ASIDE_RAD),
+            )
             world = replace(changed_world(seed, number, rng, people), start=start)
             script = repetition(line, begin)
             run = simulate(world, robot, script, seconds=LONGEST_S, seed=100 * seed + number, config=config)
-            yield [seed, f"from {STARTS[number] * SPACING_M * len(line):.0f} m",
-                   *row(taught, run, script.end or "time is over"), time.process_time() - started_s]
+            yield [
+                seed,
+                f"from {STARTS[number] * SPACING_M * len(line):.0f} m",
+                *row(taught, run, script.end or "time is over"),
+                time.process_time() - started_s,
+            ]
 
 
 def main() -> None:
@@ -224,10 +255,22 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=2, help="rays of a pixel, per axis")
     parser.add_argument("--no-people", action="store_true")
     arguments = parser.parse_args()
-    columns = (Column("seed"), Column("drive"), Column("end"), Column("off the lesson p95", "cm", 1),
-               Column("p95 without detours", "cm", 1), Column("most", "cm", 1), Column("around obstacles", "s", 0),
-               Column("end error", "cm", 1), Column("way", "m", 1), Column("time", "s", 0), Column("contacts"),
-               Column("clearance", "m", 2), Column("stood or slowed"), Column("processor time", "s", 0))
+    columns = (
+        Column("seed"),
+        Column("drive"),
+        Column("end"),
+        Column("off the lesson p95", "cm", 1),
+        Column("p95 without detours", "cm", 1),
+        Column("most", "cm", 1),
+        Column("around obstacles", "s", 0),
+        Column("end error", "cm", 1),
+        Column("way", "m", 1),
+        Column("time", "s", 0),
+        Column("contacts"),
+        Column("clearance", "m", 2),
+        Column("stood or slowed"),
+        Column("processor time", "s", 0),
+    )
     table = ResultTable("route_series", "driving", f"Repeated route of {arguments.length:g} m", columns)
     robot = replace(make_robot(arguments.size), samples=arguments.samples)
     for seed in arguments.seeds:

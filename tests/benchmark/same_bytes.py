@@ -64,8 +64,7 @@ LOGS = {
     "struts": Log(f"struts --seed 5 --pairs 30 {SMALL}"),
     "rooms": Log(f"rooms --seed 6 --pairs 40 {SMALL}"),
     "skewed": Log(f"two_walls --seed 7 --pairs 25 --speed 1.4 --skew-ms 15 {SMALL}"),
-    "rolling": Log(f"rooms --seed 8 --pairs 25 --line-time-us 52 {SMALL}",
-                   options=("--set", "camera.line_time_us=52")),
+    "rolling": Log(f"rooms --seed 8 --pairs 25 --line-time-us 52 {SMALL}", options=("--set", "camera.line_time_us=52")),
     "bridged": Log(f"rooms --seed 9 --pairs 30 {SMALL}"),
 }
 
@@ -93,8 +92,9 @@ def add_wheels_and_gyro(folder: Path) -> None:
 
 def _entry(sample: MotionSample) -> Entry:
     if isinstance(sample, WheelSample):
-        return Entry("/base/wheel_odometry", "nav_msgs/msg/Odometry", wheel_cdr(sample, sample.stamp_ns),
-                     sample.stamp_ns)
+        return Entry(
+            "/base/wheel_odometry", "nav_msgs/msg/Odometry", wheel_cdr(sample, sample.stamp_ns), sample.stamp_ns
+        )
     return Entry("/imu/data", "sensor_msgs/msg/Imu", gyro_cdr(sample, sample.stamp_ns), sample.stamp_ns)
 
 
@@ -107,13 +107,29 @@ def replay(name: str, logs: Path, outputs: Path) -> Digests:
         rig = imported(rig, outputs)
     outputs.mkdir(parents=True, exist_ok=True)
     files = [word for option, file in FILES.items() for word in (option, str(outputs / file))]
-    command = [sys.executable, "-P", "-m", "omnid", "replay", str(path), "--inline", "--quiet", *files, *log.options,
-               "--record", str(outputs / RECORDING), *(["--rig", str(rig)] if rig.exists() else [])]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "omnid",
+        "replay",
+        str(path),
+        "--inline",
+        "--quiet",
+        *files,
+        *log.options,
+        "--record",
+        str(outputs / RECORDING),
+        *(["--rig", str(rig)] if rig.exists() else []),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise SystemExit(f"{name}: {done.stderr.strip() or done.stdout.strip()}")
-    digests = {file: hashlib.sha256((outputs / file).read_bytes()).hexdigest() for file in FILES.values()
-               if (outputs / file).exists()}
+    digests = {
+        file: hashlib.sha256((outputs / file).read_bytes()).hexdigest()
+        for file in FILES.values()
+        if (outputs / file).exists()
+    }
     return digests | topic_digests(outputs / RECORDING)
 
 
@@ -122,8 +138,12 @@ def imported(camchain: Path, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     rig = folder / "rig.toml"
     rig.unlink(missing_ok=True)
-    subprocess.run([sys.executable, "-P", "-m", "omnid", "calibrate", "import", str(camchain), "-o", str(rig)],
-                   cwd=ROOT, check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-P", "-m", "omnid", "calibrate", "import", str(camchain), "-o", str(rig)],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+    )
     return rig
 
 
@@ -150,8 +170,11 @@ def numbers(recording: Path, topic: str) -> list[list[float]]:
     """Return all numbers of each message of a topic; messages that hold none of a known type are empty."""
     store = get_typestore(Stores.ROS2_HUMBLE)
     with recording.open("rb") as file:
-        return [list(_numbers_in(store.deserialize_cdr(message.data, schema.name)))
-                for schema, _, message in make_reader(file).iter_messages([topic]) if schema is not None]
+        return [
+            list(_numbers_in(store.deserialize_cdr(message.data, schema.name)))
+            for schema, _, message in make_reader(file).iter_messages([topic])
+            if schema is not None
+        ]
 
 
 def _numbers_in(value: object) -> Iterator[float]:
@@ -192,13 +215,15 @@ def compare(folder: Path, names: Iterable[str]) -> int:
         for name in names:
             outputs = Path(work) / name
             now, before = replay(name, folder / "logs", outputs), recorded[name]
-            changed: dict[str, object] = {each: "differs" for each in sorted(now.keys() | before.keys())
-                                          if now.get(each) != before.get(each)}
+            changed: dict[str, object] = {
+                each: "differs" for each in sorted(now.keys() | before.keys()) if now.get(each) != before.get(each)
+            }
             for file in changed.keys() & {"odom.txt", "map.txt"}:
                 changed[file] = largest_difference(folder / "outputs" / name / file, outputs / file)
             for topic in (each for each in changed if each.startswith("/")):
-                changed[topic] = largest_difference_of(topic, folder / "outputs" / name / RECORDING,
-                                                       outputs / RECORDING)
+                changed[topic] = largest_difference_of(
+                    topic, folder / "outputs" / name / RECORDING, outputs / RECORDING
+                )
             if changed:
                 different[name] = changed
             print(f"{name}: {len(now)} outputs, {len(changed)} differ", file=sys.stderr, flush=True)
@@ -208,12 +233,21 @@ def compare(folder: Path, names: Iterable[str]) -> int:
 
 def main() -> int:
     """Record or compare."""
-    parser = argparse.ArgumentParser(prog="python -m tests.benchmark.same_bytes", description=__doc__,
-                                     formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.benchmark.same_bytes",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("command", choices=("record", "compare"))
     parser.add_argument("folder", type=Path, metavar="DIR")
-    parser.add_argument("--only", nargs="+", choices=sorted(LOGS), default=list(LOGS), metavar="LOG",
-                        help=f"these logs: {', '.join(LOGS)}")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=sorted(LOGS),
+        default=list(LOGS),
+        metavar="LOG",
+        help=f"these logs: {', '.join(LOGS)}",
+    )
     args = parser.parse_args()
     names = [name for name in args.only if LOGS[name].path is None or LOGS[name].path.exists()]
     if args.command == "compare":

@@ -62,8 +62,9 @@ class Finder(MetaPathFinder):
         self.loader: ScaledLoader | None = None
         self._name, self._factor = name, factor
 
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-                  ) -> ModuleSpec | None:
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         """Return the module's usual specification with the other loader."""
         if fullname != self._module:
             return None
@@ -131,8 +132,11 @@ def places(folder: Path) -> dict[str, float]:
 
     result, truth = replayed(folder, PLACES_WRONG_DEG, 1), read_tum(folder / "truth.txt")
     errors = loop_errors(result.places or PlaceMap(), truth, rig_of(folder))
-    return {"ate_mm": 1e3 * evaluate(Trajectory(result.stamps_ns, result.T_map_rig), truth).ate_rmse_m,
-            "loops": len(errors), "false": sum(m > FALSE_M or rad > FALSE_RAD for m, rad in errors)}
+    return {
+        "ate_mm": 1e3 * evaluate(Trajectory(result.stamps_ns, result.T_map_rig), truth).ate_rmse_m,
+        "loops": len(errors),
+        "false": sum(m > FALSE_M or rad > FALSE_RAD for m, rad in errors),
+    }
 
 
 def rig(folder: Path) -> dict[str, str]:

@@ -44,9 +44,16 @@ class Case(NamedTuple):
 
 
 CASES: Final = (
-    Case("pinhole", 30), Case("pinhole", 60), Case("pinhole", 90), Case("equidistant", 180), Case("ds", 180),
-    Case("eucm", 180), Case("equidistant", 270, (800, 480)), Case("pinhole", 30, beyond_m=1.2),
-    Case("pinhole", 90, beyond_m=1.2))
+    Case("pinhole", 30),
+    Case("pinhole", 60),
+    Case("pinhole", 90),
+    Case("equidistant", 180),
+    Case("ds", 180),
+    Case("eucm", 180),
+    Case("equidistant", 270, (800, 480)),
+    Case("pinhole", 30, beyond_m=1.2),
+    Case("pinhole", 90, beyond_m=1.2),
+)
 
 REMARKS: Final = (
     "Pairs of equal lenses of 640x480 px (equidistant_270: 800x480), 0.2 m apart, the upper one turned by 0.7 "
@@ -69,14 +76,24 @@ def measure(case: Case, seed: int, pairs: int, table: ResultTable) -> None:
         write_log(folder, rig, poses, corridor(seed, STEP_M * pairs + 2.0 + case.beyond_m), seed=seed)
         result, truth = omnid.replay(folder / "log.mcap", rig=folder / "rig.toml"), read_tum(folder / "truth.txt")
     found = evaluate(Trajectory(result.stamps_ns, result.T_odom_rig), truth)
-    wrong = se3.log(se3.inverse(se3.inverse(truth.T[0]) @ truth.T) @ (se3.inverse(result.T_odom_rig[0])
-                                                                      @ result.T_odom_rig))[1:]
+    wrong = se3.log(
+        se3.inverse(se3.inverse(truth.T[0]) @ truth.T) @ (se3.inverse(result.T_odom_rig[0]) @ result.T_odom_rig)
+    )[1:]
     covariance = result.covariances[1:]
     squared = np.einsum("ni,nij,nj->n", wrong[:, :3], np.linalg.inv(covariance[:, :3, :3]), wrong[:, :3]) / 3
     states = ", ".join(f"{state} {count}" for state, count in Counter(map(str, result.states)).items())
-    table.add(f"{case.name}, seed {seed}", 360 * cylinder.width / cylinder.turn_px, cylinder.width,
-              100 * found.length_error_ratio, 1e3 * found.ate_rmse_m, 1e3 * float(np.linalg.norm(wrong[-1, :3])),
-              math.sqrt(float(np.median(squared))), math.sqrt(float(squared.max())), states, seed=("sectors", seed))
+    table.add(
+        f"{case.name}, seed {seed}",
+        360 * cylinder.width / cylinder.turn_px,
+        cylinder.width,
+        100 * found.length_error_ratio,
+        1e3 * found.ate_rmse_m,
+        1e3 * float(np.linalg.norm(wrong[-1, :3])),
+        math.sqrt(float(np.median(squared))),
+        math.sqrt(float(squared.max())),
+        states,
+        seed=("sectors", seed),
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -86,9 +103,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--pairs", type=int, default=100)
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES])
     args = parser.parse_args(arguments)
-    columns = (Column("lens, field [deg]"), Column("sector", "deg", 1), Column("columns"), Column("length", "%", 2),
-               Column("ATE rmse", "mm", 1), Column("error at the end", "mm", 1),
-               Column("error over sigma, median", "", 1), Column("largest", "", 1), Column("states"))
+    columns = (
+        Column("lens, field [deg]"),
+        Column("sector", "deg", 1),
+        Column("columns"),
+        Column("length", "%", 2),
+        Column("ATE rmse", "mm", 1),
+        Column("error at the end", "mm", 1),
+        Column("error over sigma, median", "", 1),
+        Column("largest", "", 1),
+        Column("states"),
+    )
     table = ResultTable("sectors", "accuracy", "Lenses that see a sector", columns, REMARKS)
     for case in CASES:
         for seed in args.seeds if args.only is None or case.name in args.only else []:

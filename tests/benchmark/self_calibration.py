@@ -35,14 +35,23 @@ from tests.benchmark.results import Cell, Column, ResultTable
 from tests.simulation.rigs import with_upper_rotated
 
 COLUMNS: Final = (
-    Column("drive"), Column("trial"), Column("error before", "px", 3), Column("error after", "px", 3), Column("misfit"),
-    Column("model"), Column("length", "%", 3), Column("ATE (rigid)", "mm", 2), Column("ATE (first pose)", "mm", 2),
-    Column("heading, max", "deg", 3), Column("stated sigma of lengths", "%", 2), Column("processor time", "s", 0))
+    Column("drive"),
+    Column("trial"),
+    Column("error before", "px", 3),
+    Column("error after", "px", 3),
+    Column("misfit"),
+    Column("model"),
+    Column("length", "%", 3),
+    Column("ATE (rigid)", "mm", 2),
+    Column("ATE (first pose)", "mm", 2),
+    Column("heading, max", "deg", 3),
+    Column("stated sigma of lengths", "%", 2),
+    Column("processor time", "s", 0),
+)
 
 
 def perturbed(rig: Rig) -> Rig:
-    """Return a rig of unified cameras with errors: the horizon stays with xi, the cameras err in opposite directions.
-    """
+    """Return a rig of unified cameras with errors: the horizon stays with xi, cameras err in opposite directions."""
     sides = []
     for mounted, sign in ((rig.lower, 1.0), (rig.upper, -1.0)):
         camera = mounted.camera
@@ -63,8 +72,9 @@ def parameter_scores(found: Rig, truth: Rig) -> dict[str, float]:
     # The parameters are those of a rig frame that stays with the lower camera.
     X = se3.inverse(truth.lower.T_cam_rig) @ found.lower.T_cam_rig
     lower, upper = (replace(mounted, T_cam_rig=mounted.T_cam_rig @ X) for mounted in (truth.lower, truth.upper))
-    parameters, true = (RigParameters.about(rig, ("k1", "k2", "p1", "p2"))
-                        for rig in (found, replace(truth, lower=lower, upper=upper)))
+    parameters, true = (
+        RigParameters.about(rig, ("k1", "k2", "p1", "p2")) for rig in (found, replace(truth, lower=lower, upper=upper))
+    )
     turned = parameters.transform_steps(true.rig) * parameters.units
     errors = dict(zip(parameters.names, (parameters.values - true.values - turned).tolist(), strict=True))
     return {name: errors[name] / found.covariance.sigma(name) for name in found.covariance.names if name in errors}
@@ -83,11 +93,32 @@ def row(drive: Path, trial: Path, start: Rig, scores: list[dict[str, float]] | N
     common = np.isin(truth.stamps_ns, result.stamps_ns)
     rigid = rigid_error_m(result.T_odom_rig[:, :3, 3], truth.T[common, :3, 3])
     uncertainty = drive_uncertainty(found.rig)
-    terms = " ".join(sorted({name.split()[-1] for name in found.adjustment.parameters.names if name[-2:] in
-                             ("k1", "k2", "p1", "p2")})) or "as the file"
-    return [drive.name, trial.name, found.first_sigma_px, found.adjustment.sigma_px, found.is_misfit, terms,
-            100 * m.length_error_ratio, 1e3 * rigid, 1e3 * m.ate_rmse_m, math.degrees(m.heading_max_rad),
-            100 * uncertainty.scale if uncertainty else None, spent_s]
+    terms = (
+        " ".join(
+            sorted(
+                {
+                    name.split()[-1]
+                    for name in found.adjustment.parameters.names
+                    if name[-2:] in ("k1", "k2", "p1", "p2")
+                }
+            )
+        )
+        or "as the file"
+    )
+    return [
+        drive.name,
+        trial.name,
+        found.first_sigma_px,
+        found.adjustment.sigma_px,
+        found.is_misfit,
+        terms,
+        100 * m.length_error_ratio,
+        1e3 * rigid,
+        1e3 * m.ate_rmse_m,
+        math.degrees(m.heading_max_rad),
+        100 * uncertainty.scale if uncertainty else None,
+        spent_s,
+    ]
 
 
 def rigid_error_m(found: Array, truth: Array) -> float:
@@ -114,8 +145,12 @@ def main() -> None:
         table.add(*row(drive, trial, start, scores if args.sigmas else None), folder=drive)
     if scores:
         title = "Errors over stated standard deviations of drives"
-        sigmas = ResultTable("self_calibration_sigmas", "calibration", title,
-                             (Column("parameter"), Column("rms", "", 2), Column("errors")))
+        sigmas = ResultTable(
+            "self_calibration_sigmas",
+            "calibration",
+            title,
+            (Column("parameter"), Column("rms", "", 2), Column("errors")),
+        )
         sigmas.seeds = table.seeds
         for name in sorted({name for one in scores for name in one}):
             values = [one[name] for one in scores if name in one]

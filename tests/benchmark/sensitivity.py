@@ -34,12 +34,25 @@ SIZES_PX: Final = (384, 768, 1152)
 TIMEOUT_S: Final = 1800.0
 # Room or file below omnid/core: the names of its constants.
 CONSTANTS: Final = {
-    "odometry/limits": ("features", "refresh", "keyframes", "min_inliers", "min_inlier_ratio", "good_inliers",
-                        "good_inlier_ratio"),
+    "odometry/limits": (
+        "features",
+        "refresh",
+        "keyframes",
+        "min_inliers",
+        "min_inlier_ratio",
+        "good_inliers",
+        "good_inlier_ratio",
+    ),
     "odometry/odometry": ("NEAR_RATIO", "GOOD_TRACKED_RATIO", "TEXTURED_CORNERS", "TRACKED_SHARE"),
     "odometry/pose_estimation": ("RANSAC_THRESHOLD_PX",),
-    "odometry/frame_to_map": ("OUTLIER_SQUARED", "FEW_RATIO", "LIKELY_RATIO", "ENOUGH_RATIO", "COARSE_SIGMA_PX",
-                              "CORRELATED_LANDMARKS"),
+    "odometry/frame_to_map": (
+        "OUTLIER_SQUARED",
+        "FEW_RATIO",
+        "LIKELY_RATIO",
+        "ENOUGH_RATIO",
+        "COARSE_SIGMA_PX",
+        "CORRELATED_LANDMARKS",
+    ),
     "odometry/corners": ("CELL_PX", "MIN_RESPONSE", "NOISE_RESPONSE", "CROSS_PX", "APART_PX"),
     "odometry/static_mask": ("MIN_FLOW_RAD", "SAME_LEVEL", "MIN_CONTRAST", "EVIDENCE"),
     "odometry/plane_patches": ("SAME_SURFACE_PX", "SLOPE_PRIOR", "MIN_NOISE_GREY", "SLOPE_REACH_PX"),
@@ -81,8 +94,9 @@ def chosen() -> list[Constant]:
     everything, found = constants(), []
     for room, names in CONSTANTS.items():
         for name in names:
-            same = [one for one in everything if one.name == name
-                    and re.match(rf"omnid/core/{room}(/|\.py$)", one.path)]
+            same = [
+                one for one in everything if one.name == name and re.match(rf"omnid/core/{room}(/|\.py$)", one.path)
+            ]
             if len(same) != 1:
                 raise ValueError(f"omnid/core/{room}: one {name} was expected, {len(same)} found")
             found += same
@@ -93,8 +107,11 @@ def logs_of(kind: str, folders: Sequence[str], size_px: int) -> tuple[str, ...]:
     """Return the folders that a kind of constant is tried on."""
     families = {"places": ("two_laps",), "rig": ("two_walls",)}.get(kind)
     sized = [folder for folder in folders if f"_{size_px}px_" in Path(folder).name]
-    return tuple(folder for folder in sized
-                 if (Path(folder).name.startswith(families) if families else "two_laps" not in Path(folder).name))
+    return tuple(
+        folder
+        for folder in sized
+        if (Path(folder).name.startswith(families) if families else "two_laps" not in Path(folder).name)
+    )
 
 
 def kind_of(constant: Constant) -> str:
@@ -134,11 +151,17 @@ def words_of(trial: Trial, own: Outcome, changed: Outcome) -> tuple[float | None
             ratios.append(after["ate_mm"] / before["ate_mm"])
             if after.get("not_tracking", 0) > before.get("not_tracking", 0) + 0.005:
                 remarks.append(f"{name}: {100 * after['not_tracking']:.0f} % not tracking")
-            remarks += [f"{key} {before[key]} to {after[key]}" for key in ("loops", "false")
-                        if key in after and after[key] != before[key]]
+            remarks += [
+                f"{key} {before[key]} to {after[key]}"
+                for key in ("loops", "false")
+                if key in after and after[key] != before[key]
+            ]
         else:
-            remarks += [f"rig {turned} off: {before[turned]} to {outcome}" for turned, outcome in after.items()
-                        if outcome != before[turned]]
+            remarks += [
+                f"rig {turned} off: {before[turned]} to {outcome}"
+                for turned, outcome in after.items()
+                if outcome != before[turned]
+            ]
     mean = math.exp(sum(map(math.log, ratios)) / len(ratios)) if ratios else None
     return mean, "; ".join(remarks)
 
@@ -153,10 +176,17 @@ def rounded(value: str) -> str:
 
 def table(folders: Sequence[str], kept: dict[str, Outcome]) -> ResultTable:
     """Return the rows of all constants that were tried at one size at least."""
-    columns = (Column("constant"), Column("file"), Column("value"), Column("tried"),
-               *(Column(f"ATE ratio at {size_px} px", "", 2) for size_px in SIZES_PX), Column("what else changed"))
-    result = ResultTable("sensitivity", "accuracy", "Sensitivity to constants, times 0.67 and 1.5", columns, REMARKS,
-                         quiet=True)
+    columns = (
+        Column("constant"),
+        Column("file"),
+        Column("value"),
+        Column("tried"),
+        *(Column(f"ATE ratio at {size_px} px", "", 2) for size_px in SIZES_PX),
+        Column("what else changed"),
+    )
+    result = ResultTable(
+        "sensitivity", "accuracy", "Sensitivity to constants, times 0.67 and 1.5", columns, REMARKS, quiet=True
+    )
     for constant in chosen():
         for factor in FACTORS:
             ratios, remarks, tried = list[float | None](), dict[str, None](), ""

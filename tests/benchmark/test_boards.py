@@ -36,8 +36,9 @@ def test_finds_the_board_and_not_a_torn_floor_and_drops_corners_at_a_shadow(numb
     view = find_board(rendered.image, rendered.board).view
     assert view is not None and find_board(rendered.empty, rendered.board).view is None
     truth = rendered.corners.reshape(rendered.board.rows, rendered.board.columns, 2)
-    errors = [float(np.nanmax(np.linalg.norm(view.pixels - order, axis=1)))
-              for order in corner_orders(truth, rendered.board)]
+    errors = [
+        float(np.nanmax(np.linalg.norm(view.pixels - order, axis=1))) for order in corner_orders(truth, rendered.board)
+    ]
     assert min(errors) < worst_px
 
 

@@ -125,8 +125,14 @@ def test_latency_and_cost(way: str) -> None:
         cost = publish([sink], 30, 300)
         time.sleep(0.5)
         found = new_counts(listener)
-    columns = (Column("way"), Column("one way p50", "ms", 2), Column("one way p99", "ms", 2), Column("poses of 300"),
-               Column("publishing p50", "ms", 2), Column("publishing p99", "ms", 2))
+    columns = (
+        Column("way"),
+        Column("one way p50", "ms", 2),
+        Column("one way p99", "ms", 2),
+        Column("poses of 300"),
+        Column("publishing p50", "ms", 2),
+        Column("publishing p99", "ms", 2),
+    )
     table = ResultTable("bus_latency", "speed", "Poses on the bus", columns, continued=True)
     table.add(way, found["p50_ms"], found["p99_ms"], found["received"], 1e3 * cost.p(0.5), 1e3 * cost.p(0.99))
     assert found["newest"] == 329 and found["missed"] == 0
@@ -150,8 +156,13 @@ def test_poses_pass_a_restarted_router_within_five_seconds() -> None:
         time.sleep(0.3)
         near, far = new_counts(direct), new_counts(behind)
     missed_s = far["missed"] / RATE_HZ - 3.0
-    columns = (Column("fault"), Column("direct: missed"), Column("direct: received"),
-               Column("behind the router: poses again after", "s", 1), Column("measured", "s", 0))
+    columns = (
+        Column("fault"),
+        Column("direct: missed"),
+        Column("direct: received"),
+        Column("behind the router: poses again after", "s", 1),
+        Column("measured", "s", 0),
+    )
     table = ResultTable("bus_router", "speed", "A router that is killed", columns)
     table.add("router killed for 3 s", near["missed"], near["received"], missed_s, time.monotonic() - back_s)
     assert near["missed"] == 0 and near["newest"] == far["newest"] == 299 and missed_s < 5.0
@@ -173,8 +184,22 @@ with zenoh.open(config) as session:
 def test_a_slow_subscriber_does_not_delay_others(scene: Path) -> None:
     """Run the daemon on a log, alone and with a subscriber that takes half a second for each message."""
     endpoint = free_endpoint()
-    words = [sys.executable, "-m", "omnid", "run", "--log", scene / "log.mcap", "--rig", scene / "rig.toml",
-             "--set", f"bus.listen=['{endpoint}']", "--set", "bus.panorama_hz=10", "--set", "live.cloud_s=0.5"]
+    words = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        scene / "log.mcap",
+        "--rig",
+        scene / "rig.toml",
+        "--set",
+        f"bus.listen=['{endpoint}']",
+        "--set",
+        "bus.panorama_hz=10",
+        "--set",
+        "live.cloud_s=0.5",
+    ]
     with subprocess.Popen(words, stderr=subprocess.DEVNULL) as daemon:
         try:
             with Robot(connect=(endpoint,), timeout_s=30.0) as robot, robot.subscribe(Diagnostics) as reports:
@@ -184,15 +209,25 @@ def test_a_slow_subscriber_does_not_delay_others(scene: Path) -> None:
                 last = full(reports)
         finally:
             daemon.terminate()
-    work_ms, cost_ms = ([float(last.value("omnid: stage bus", f"{kind}_{which}_ms")) for which in ("p50", "p99")]
-                        for kind in ("work", "cpu"))
-    columns = (Column("subscribers"), Column("poses/s", "", 1), Column("capture to network p50", "ms", 1),
-               Column("capture to network p99", "ms", 1))
+    work_ms, cost_ms = (
+        [float(last.value("omnid: stage bus", f"{kind}_{which}_ms")) for which in ("p50", "p99")]
+        for kind in ("work", "cpu")
+    )
+    columns = (
+        Column("subscribers"),
+        Column("poses/s", "", 1),
+        Column("capture to network p50", "ms", 1),
+        Column("capture to network p99", "ms", 1),
+    )
     table = ResultTable("bus_slow_subscriber", "speed", "A slow subscriber on the bus", columns)
     for name, figures in rates.items():
         table.add(name, *figures)
-    times = ResultTable("bus_publishing", "speed", "Time to publish a pose",
-                        (Column("time"), Column("p50", "ms", 2), Column("p99", "ms", 2)))
+    times = ResultTable(
+        "bus_publishing",
+        "speed",
+        "Time to publish a pose",
+        (Column("time"), Column("p50", "ms", 2), Column("p99", "ms", 2)),
+    )
     times.add("processor", *cost_ms)
     times.add("with waiting for the interpreter", *work_ms)
     alone, slow = rates.values()
@@ -245,11 +280,20 @@ def test_a_fleet_on_one_router_loses_no_pose() -> None:
         share = (cpu_s(router.pid) - before_s) / (time.monotonic() - started_s)
         time.sleep(0.5)
         found = new_counts(listener)
-    columns = (Column("robots"), Column("poses/s each"), Column("sent"), Column("received"), Column("missed"),
-               Column("one way p50", "ms", 2), Column("one way p99", "ms", 2), Column("router, of one core", "%", 0))
+    columns = (
+        Column("robots"),
+        Column("poses/s each"),
+        Column("sent"),
+        Column("received"),
+        Column("missed"),
+        Column("one way p50", "ms", 2),
+        Column("one way p99", "ms", 2),
+        Column("router, of one core", "%", 0),
+    )
     table = ResultTable("bus_fleet", "speed", "Robots of one process behind a router", columns)
-    table.add(FLEET, RATE_HZ, FLEET * 300, found["received"], found["missed"], found["p50_ms"], found["p99_ms"],
-              100 * share)
+    table.add(
+        FLEET, RATE_HZ, FLEET * 300, found["received"], found["missed"], found["p50_ms"], found["p99_ms"], 100 * share
+    )
     assert found["newest"] == 329 and found["missed"] == 0
 
 

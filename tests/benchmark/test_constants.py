@@ -34,8 +34,18 @@ class Settings:
 
 def test_reads_names_values_units_and_comments() -> None:
     found = {one.name: one for one in constants_of(SOURCE, "a.py")}
-    assert list(found) == ["FIRST_PX", "SECOND_PX", "THIRD_PX", "FOURTH_PX", "FIFTH_PX", "ALONE_M", "OTHER_RAD",
-                           "STEP_RAD", "PLAIN", "window_px"]
+    assert list(found) == [
+        "FIRST_PX",
+        "SECOND_PX",
+        "THIRD_PX",
+        "FOURTH_PX",
+        "FIFTH_PX",
+        "ALONE_M",
+        "OTHER_RAD",
+        "STEP_RAD",
+        "PLAIN",
+        "window_px",
+    ]
     assert (found["SECOND_PX"].value, found["SECOND_PX"].unit) == ("2.5", "px")
     assert found["SECOND_PX"].comment == "Measured on a bench. of a window"
     assert found["THIRD_PX"].comment == found["FOURTH_PX"].comment == "A third one.", "the first one ends there"

@@ -26,10 +26,25 @@ GROWTH_MB = 8.0  # allowed growth from the first half to the second: noise of th
 STAGES = ("lower", "upper", "pair", "dewarp", "odometry", "mapping", "bus", "bus-drive", "bus-map")
 
 
-FIGURES = ("pose p50", "pose p99", "pose max", "wheel p50", "wheel p99", "wheel max", "tick p50", "tick p99",
-           "tick p999", "tick max", "publishing cpu p50", "publishing cpu p99")
-COLUMNS = (Column("images, busy processes per core"), *(Column(name, "ms", 1) for name in FIGURES),
-           *map(Column, ("poses/s", "ticks", "missed", "lost_reports", "dropped", "load")))
+FIGURES = (
+    "pose p50",
+    "pose p99",
+    "pose max",
+    "wheel p50",
+    "wheel p99",
+    "wheel max",
+    "tick p50",
+    "tick p99",
+    "tick p999",
+    "tick max",
+    "publishing cpu p50",
+    "publishing cpu p99",
+)
+COLUMNS = (
+    Column("images, busy processes per core"),
+    *(Column(name, "ms", 1) for name in FIGURES),
+    *map(Column, ("poses/s", "ticks", "missed", "lost_reports", "dropped", "load")),
+)
 
 
 def number(text: str) -> float | str | None:
@@ -50,16 +65,24 @@ def figures(operator: Operator, load: float) -> dict[str, str]:
     drops = {name: operator.values(f"stage {name}").get("dropped", "?") for name in STAGES}
     lost = " ".join(f"{name} {count}" for name, count in drops.items() if count != "0")
     values |= {f"publishing cpu {q}": operator.values("stage bus").get(f"cpu_{q}_ms", "") for q in ("p50", "p99")}
-    return values | {"poses/s": odometry.get("rate_hz", ""), "ticks": wheels["sent"], "missed": missed,
-                     "lost_reports": lost_reports, "dropped": lost or "0", "load": f"{load:.1f}"}
+    return values | {
+        "poses/s": odometry.get("rate_hz", ""),
+        "ticks": wheels["sent"],
+        "missed": missed,
+        "lost_reports": lost_reports,
+        "dropped": lost or "0",
+        "load": f"{load:.1f}",
+    }
 
 
 @pytest.mark.benchmark
 @pytest.mark.parametrize("per_core", [0, 1, 4], ids=["alone", "busy", "overloaded"])
 @pytest.mark.parametrize("rate_hz", [10, 30])
 def test_latencies_and_the_deadline_of_the_motor_tick(tmp_path: Path, rate_hz: int, per_core: int) -> None:
-    with busy_processes(per_core * (os.cpu_count() or 1)), \
-            daemon(tmp_path, rate_hz / float(HZ), f"motor.rate_hz={MOTOR_HZ}") as (_, operator, base):
+    with (
+        busy_processes(per_core * (os.cpu_count() or 1)),
+        daemon(tmp_path, rate_hz / float(HZ), f"motor.rate_hz={MOTOR_HZ}") as (_, operator, base),
+    ):
         time.sleep(MEASURE_S)
         found = figures(operator, os.getloadavg()[0])
         assert base.line.base.errors == 0
@@ -94,12 +117,25 @@ def test_memory_descriptors_and_threads_do_not_grow(tmp_path: Path) -> None:
     half = len(sizes) // 2
     before, after = sizes[:half], sizes[half:]
     megabytes = [size[0] for size in sizes]
-    columns = (Column("time", "s", 0), Column("poses/s", "", 1), Column("poses"),
-               *(Column(name, "MB", 1) for name in ("resident after 20 s", "after half", "at the end", "most")),
-               Column("descriptors"), Column("threads"))
+    columns = (
+        Column("time", "s", 0),
+        Column("poses/s", "", 1),
+        Column("poses"),
+        *(Column(name, "MB", 1) for name in ("resident after 20 s", "after half", "at the end", "most")),
+        Column("descriptors"),
+        Column("threads"),
+    )
     table = ResultTable("soak", "speed", "Memory of the live daemon", columns)
-    table.add(SOAK_S, number(rate_hz), len(operator.poses), megabytes[0], megabytes[half], megabytes[-1],
-              max(megabytes), *(", ".join(map(str, sorted({size[k] for size in sizes}))) for k in (1, 2)))
+    table.add(
+        SOAK_S,
+        number(rate_hz),
+        len(operator.poses),
+        megabytes[0],
+        megabytes[half],
+        megabytes[-1],
+        max(megabytes),
+        *(", ".join(map(str, sorted({size[k] for size in sizes}))) for k in (1, 2)),
+    )
     assert drives and max(size[0] for size in after) <= max(size[0] for size in before) + GROWTH_MB
     for index in (1, 2):
         assert max(size[index] for size in after) <= max(size[index] for size in before)

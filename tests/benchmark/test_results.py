@@ -28,7 +28,9 @@ def test_each_row_is_printed_and_in_the_file(folder: Path, capsys: pytest.Captur
     result = read_result(folder / "drive.json")
     assert result["rows"][1] == ["two_walls_dim_s6", None, None]
     assert [(seed["family"], seed["seed"], seed["role"]) for seed in result["seeds"]] == [
-        ("rooms", 2, "development"), ("two_walls", 6, "validation")]
+        ("rooms", 2, "development"),
+        ("two_walls", 6, "validation"),
+    ]
     assert "| rooms_s2 | 0.12 | yes |\n| two_walls_dim_s6 |  |  |\n" in capsys.readouterr().out
 
 
@@ -43,12 +45,17 @@ def test_a_row_of_another_length_is_refused(folder: Path) -> None:
         ResultTable("drive", "driving", "Drives", COLUMNS).add("rooms_s2", 0.1)
 
 
-@pytest.mark.parametrize(("key", "value", "fault"), [
-    ("question", "weather", "a question of"),
-    ("rows", [["a", 1]], "3 cells"), ("rows", [["a", [1], None]], "no number"),
-    ("load", "high", "load: of another type"), ("extra", 1, "an object with the keys"),
-    ("seeds", [{"family": "rooms", "seed": 2, "role": "held-out"}], "seeds.toml says development"),
-])
+@pytest.mark.parametrize(
+    ("key", "value", "fault"),
+    [
+        ("question", "weather", "a question of"),
+        ("rows", [["a", 1]], "3 cells"),
+        ("rows", [["a", [1], None]], "no number"),
+        ("load", "high", "load: of another type"),
+        ("extra", 1, "an object with the keys"),
+        ("seeds", [{"family": "rooms", "seed": 2, "role": "held-out"}], "seeds.toml says development"),
+    ],
+)
 def test_what_does_not_follow_the_schema_is_named(folder: Path, key: str, value: object, fault: str) -> None:
     ResultTable("drive", "driving", "Drives", COLUMNS).add("rooms_s2", 0.1, True)
     result = json.loads((folder / "drive.json").read_text())
@@ -58,7 +65,11 @@ def test_what_does_not_follow_the_schema_is_named(folder: Path, key: str, value:
 
 def test_roles_of_seeds() -> None:
     assert [role_of("rooms", seed) for seed in (2, 600, 899, 900)] == [
-        "development", "validation", "validation", "held-out"]
+        "development",
+        "validation",
+        "validation",
+        "held-out",
+    ]
     assert role_of("two_walls", 8) == "validation" and role_of("struts", 8) == "development"
 
 

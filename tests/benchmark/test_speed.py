@@ -55,8 +55,9 @@ def test_pairs_per_second(tmp_path: Path, threaded: bool, hz: int) -> None:
     cv2.setNumThreads(config.graph.opencv_threads)
     place = geometry(with_rims(rig, frames), config.panorama)
     graph = Graph(threaded=threaded)
-    sinks = Sinks({"statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "t")},
-                  {"map": MapFile(tmp_path / "m")})
+    sinks = Sinks(
+        {"statistics": statistics, "trajectory": TrajectoryFile(tmp_path / "t")}, {"map": MapFile(tmp_path / "m")}
+    )
     read = graph.source("read", lambda: to_and_fro(frames, PAIRS, round(1e9 / hz)))
     wire(graph, graph.stage("pair", Synchronise(place.rig, config.pair), read), FrontEnd(place, config), config, sinks)
     started_s = time.perf_counter()

@@ -61,8 +61,18 @@ MEASURE = """() => {
 @contextlib.contextmanager
 def sample_daemon(endpoint: str) -> Iterator[subprocess.Popen[bytes]]:
     log = str(files("omnid.sample") / "log.mcap")
-    command = [sys.executable, "-m", "omnid", "run", "--log", log, "--motor", "simulated", "--set",
-               f'bus.listen=["{endpoint}"]']
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        log,
+        "--motor",
+        "simulated",
+        "--set",
+        f'bus.listen=["{endpoint}"]',
+    ]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL) as daemon:
         try:
             yield daemon
@@ -83,8 +93,13 @@ def measured(name: str, daemon: subprocess.Popen[bytes], server: WebServer, robo
             ages_ms.append(1e-6 * (newest.attachment.sent_ns - newest.stamp_ns))
         used_s, span_s = [cpu_s(pid) - at for pid, at in zip(pids, before, strict=True)], time.monotonic() - begin_s
     count = newest.attachment.seq - first.attachment.seq
-    columns = (Column("browsers"), Column("poses/s", "", 1), Column("daemon, processor time a pose", "ms", 1),
-               Column("capture to network p50", "ms", 0), Column("page's server, of one core", "%", 1))
+    columns = (
+        Column("browsers"),
+        Column("poses/s", "", 1),
+        Column("daemon, processor time a pose", "ms", 1),
+        Column("capture to network p50", "ms", 0),
+        Column("page's server, of one core", "%", 1),
+    )
     table = ResultTable("web_processor", "speed", "Processor time of the page", columns, continued=True)
     table.add(name, count / span_s, 1e3 * used_s[0] / count, np.percentile(ages_ms, 50), 100 * used_s[1] / span_s)
 
@@ -118,9 +133,14 @@ def test_latency_and_processor_time() -> None:
                 times_ms = np.array(page.evaluate("() => window.times"))
             page.close()
             shown, drawn = (np.percentile(times_ms[:, which], (50, 99)) for which in (0, 1))
-            columns = (Column("browsers"), Column("poses"), Column("network to text p50", "ms", 1),
-                       Column("network to text p99", "ms", 1), Column("network to drawn frame p50", "ms", 1),
-                       Column("network to drawn frame p99", "ms", 1))
+            columns = (
+                Column("browsers"),
+                Column("poses"),
+                Column("network to text p50", "ms", 1),
+                Column("network to text p99", "ms", 1),
+                Column("network to drawn frame p50", "ms", 1),
+                Column("network to drawn frame p99", "ms", 1),
+            )
             table = ResultTable("web_latency", "speed", "Latency of the page", columns, continued=True)
             table.add(f"Chromium and {others} others", len(times_ms), *shown, *drawn)
             assert len(times_ms) > 30
@@ -131,8 +151,12 @@ def test_processor_time_at_30_hz() -> None:
     endpoint = free_endpoint()
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server:
         sinks, seq = [sink_on(bus)], 0
-        table = ResultTable("web_poses", "speed", "The page's server at 30 poses/s, poses alone",
-                            (Column("browsers"), Column("of one core", "%", 1)))
+        table = ResultTable(
+            "web_poses",
+            "speed",
+            "The page's server at 30 poses/s, poses alone",
+            (Column("browsers"), Column("of one core", "%", 1)),
+        )
         for browsers in (0, 1, 10):
             with script(VISITORS, f"ws://{server.host}/live", server.token, str(browsers)):
                 publish(sinks, seq, 60)
@@ -150,9 +174,26 @@ def test_poses_are_the_same_with_ten_browsers(scene: Path, tmp_path: Path) -> No
 
     def path(name: str) -> bytes:
         tum = tmp_path / name
-        subprocess.run([sys.executable, "-m", "omnid", "replay", scene / "log.mcap", "--rig", scene / "rig.toml",
-                        "--quiet", "--publish", "--tum", tum, "--set", f'bus.listen=["{endpoint}"]'], cwd=ROOT,
-                       check=True, stdout=subprocess.DEVNULL)
+        subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "omnid",
+                "replay",
+                scene / "log.mcap",
+                "--rig",
+                scene / "rig.toml",
+                "--quiet",
+                "--publish",
+                "--tum",
+                tum,
+                "--set",
+                f'bus.listen=["{endpoint}"]',
+            ],
+            cwd=ROOT,
+            check=True,
+            stdout=subprocess.DEVNULL,
+        )
         return tum.read_bytes()
 
     alone = path("alone.txt")

@@ -22,19 +22,27 @@ def misaligned(lower: OmniCamera, upper: OmniCamera) -> Rig:
     T_lower_rig = se3.exp([0.01, -0.02, 0.03, 0.04, -0.05, 0.6]) @ T_DOWN
     T_upper_lower = se3.exp([-0.008, 0.011, 0.17, 0.03, 0.02, -0.25])
     T_base_rig = se3.exp([0.1, 0.2, 0.3, 0.01, 0.02, 0.03])
-    return Rig(MountedCamera(lower, T_lower_rig), MountedCamera(upper, T_upper_lower @ T_lower_rig), T_base_rig,
-               ("/front/lower/image_raw", "/front/upper/image_raw"))
+    return Rig(
+        MountedCamera(lower, T_lower_rig),
+        MountedCamera(upper, T_upper_lower @ T_lower_rig),
+        T_base_rig,
+        ("/front/lower/image_raw", "/front/upper/image_raw"),
+    )
 
 
 def omni_cameras() -> tuple[UnifiedCamera, UnifiedCamera]:
-    return (UnifiedCamera(0.93, (-205.0, 211.0), (381.5, 386.25), (768, 770)),
-            UnifiedCamera(1.1, (-214.0, 206.0), (390.0, 379.0), (780, 768), (-0.01, 0.002, 1e-4, -2e-4)))
+    return (
+        UnifiedCamera(0.93, (-205.0, 211.0), (381.5, 386.25), (768, 770)),
+        UnifiedCamera(1.1, (-214.0, 206.0), (390.0, 379.0), (780, 768), (-0.01, 0.002, 1e-4, -2e-4)),
+    )
 
 
 def ocam_cameras() -> tuple[OcamCamera, OcamCamera]:
     curved = (-131.64, 0.0, 1.88e-3, 9.4e-8, -6.1e-10)
-    return (OcamCamera(curved, (382.4, 514.6), (0.99923, 2.2e-4, -2.1e-4), (1024, 768)),
-            OcamCamera((-110.0, 0.0, 2.1e-3), (390.0, 500.0), (1.001, -1e-3, 2e-3), (1000, 780)))
+    return (
+        OcamCamera(curved, (382.4, 514.6), (0.99923, 2.2e-4, -2.1e-4), (1024, 768)),
+        OcamCamera((-110.0, 0.0, 2.1e-3), (390.0, 500.0), (1.001, -1e-3, 2e-3), (1000, 780)),
+    )
 
 
 @pytest.fixture(params=["omni", "ocam"])

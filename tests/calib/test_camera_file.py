@@ -48,13 +48,16 @@ def test_mask_round_trip_as_file_and_embedded(tmp_path: Path) -> None:
         np.testing.assert_array_equal(mask.image, 255 - image if name else image)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("schema = 1", "schema = 2", "schema: expected version 1"),
-    ('model = "ocam"', 'model = "lens"', "camera.model: expected omni or ocam"),
-    ("[camera]", "[lower]", "unknown key|expected a table"),
-    ("c = 0.99923", "cc = 0.99923", "camera.intrinsics.cc: unknown key"),
-    ("schema = 1", "schema = ", "not a TOML file"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("schema = 1", "schema = 2", "schema: expected version 1"),
+        ('model = "ocam"', 'model = "lens"', "camera.model: expected omni or ocam"),
+        ("[camera]", "[lower]", "unknown key|expected a table"),
+        ("c = 0.99923", "cc = 0.99923", "camera.intrinsics.cc: unknown key"),
+        ("schema = 1", "schema = ", "not a TOML file"),
+    ],
+)
 def test_errors_name_the_key(old: str, new: str, message: str) -> None:
     text = camera_toml(CameraFile(OCAM), QUALITY)
     assert old in text

@@ -15,8 +15,11 @@ from calib.panorama import fit_cylinder
 from calib.rig_file import parse_rig, rig_toml
 
 # As the data set has it: centimetres, and numbers of the lidar and of the lenses, which are not used.
-HELVIPAD = {"stereo_baseline": 19.1, "lidar_camera_baseline": 45.0,
-            "intrinsic_parameters": {"K": [[855.9, 0, 1451.2], [0, 852.77, 1451.71], [0, 0, 1]], "D": [0, 0, 0, 0]}}
+HELVIPAD = {
+    "stereo_baseline": 19.1,
+    "lidar_camera_baseline": 45.0,
+    "intrinsic_parameters": {"K": [[855.9, 0, 1451.2], [0, 852.77, 1451.71], [0, 0, 1]], "D": [0, 0, 0, 0]},
+}
 
 
 @pytest.fixture
@@ -57,10 +60,17 @@ def test_the_rig_file_keeps_the_model() -> None:
     assert again.lower.camera == rig.lower.camera and 'model = "equirectangular"' in rig_toml(rig)
 
 
-@pytest.mark.parametrize(("text", "found"), [
-    ("{}", "stereo_baseline"), ('{"stereo_baseline": "19"}', "stereo_baseline"), ("[1]", "stereo_baseline"),
-    ("{", "not a JSON file"), ('{"stereo_baseline": 1910}', "expected 0.001 to 5.0 m"),
-    ('{"stereo_baseline": NaN}', "expected 0.001 to 5.0 m")])
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("{}", "stereo_baseline"),
+        ('{"stereo_baseline": "19"}', "stereo_baseline"),
+        ("[1]", "stereo_baseline"),
+        ("{", "not a JSON file"),
+        ('{"stereo_baseline": 1910}', "expected 0.001 to 5.0 m"),
+        ('{"stereo_baseline": NaN}', "expected 0.001 to 5.0 m"),
+    ],
+)
 def test_other_files_are_refused_in_one_line(calibration: Path, text: str, found: str) -> None:
     calibration.write_text(text)
     with pytest.raises(CalibError, match=found):

@@ -205,9 +205,10 @@ def test_columns_of_a_recorded_pair_are_equal(shared_data: Path) -> None:
     folder = shared_data / "two_walls_crooked"
     rig = import_kalibr(folder / "camchain.yaml")
     cylinder = fit_cylinder(rig)
-    lower, upper = (cv2.remap(image, *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
-                    for image, mounted in zip(first_images(folder / "log.mcap", rig.topics), (rig.lower, rig.upper),
-                                              strict=True))
+    lower, upper = (
+        cv2.remap(image, *remap_tables(rig, mounted, cylinder), cv2.INTER_LINEAR)
+        for image, mounted in zip(first_images(folder / "log.mcap", rig.topics), (rig.lower, rig.upper), strict=True)
+    )
     offset = tracked(lower, upper)
     assert len(offset) > 150
     assert abs(np.median(offset[:, 0])) < 0.1

@@ -117,8 +117,9 @@ def test_refuses_a_rig_with_huge_images(omni_rig: Rig) -> None:
 def png_of(width: int, height: int, content: bytes) -> bytes:
     """Return a grey PNG with the given header."""
     chunks = ((b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)), (b"IDAT", content), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(struct.pack(">I", len(data)) + name + data
-                                         + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks)
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+    )
 
 
 def test_refuses_a_mask_of_another_size_before_it_is_decoded(omni_rig: Rig) -> None:
@@ -150,11 +151,23 @@ def test_an_embedded_mask_is_a_png(omni_rig: Rig, name: str) -> None:
 @pytest.mark.parametrize(
     "text",
     [
-        "", "a.b.c = 1.5e-3\n", "[a.b]\r\nc = '...........'\r\n", '"a.b.c.d.e.f.g.h.i.j.k" = 1', "a = 1 # ..........",
-        'a = """\n"quoted" ""two\\""" .........."""', "a = '''...'....''...........'''", "a = '''x'''''",
-        'a = """x"""""', "a = ''\nb = \"\"", 'a = "\\"#.........."', "a = 'it is \"'\nb = '\\'",
+        "",
+        "a.b.c = 1.5e-3\n",
+        "[a.b]\r\nc = '...........'\r\n",
+        '"a.b.c.d.e.f.g.h.i.j.k" = 1',
+        "a = 1 # ..........",
+        'a = """\n"quoted" ""two\\""" .........."""',
+        "a = '''...'....''...........'''",
+        "a = '''x'''''",
+        'a = """x"""""',
+        "a = ''\nb = \"\"",
+        'a = "\\"#.........."',
+        "a = 'it is \"'\nb = '\\'",
         "a = 2001-01-01T00:00:00.5Z",
-        "a = [" + "1.5, " * 5000 + "]", f"a = '{'0' * 10000}'", "# it's\na = 1", "a . b = { c = [ 0.1 , 0.2 ] }",
+        "a = [" + "1.5, " * 5000 + "]",
+        f"a = '{'0' * 10000}'",
+        "# it's\na = 1",
+        "a . b = { c = [ 0.1 , 0.2 ] }",
     ],
 )
 def test_parses_the_same_as_tomllib(text: str) -> None:
@@ -189,8 +202,9 @@ def enlarged(rig: Rig, factor: float) -> Rig:
         assert isinstance(camera, UnifiedCamera)
         width, height = (round(side_px * factor) for side_px in camera.size)
         focal, center = (tuple(factor * value for value in values) for values in (camera.focal, camera.center))
-        larger = UnifiedCamera(camera.xi, (focal[0], focal[1]), (center[0], center[1]), (width, height),
-                               camera.distortion)
+        larger = UnifiedCamera(
+            camera.xi, (focal[0], focal[1]), (center[0], center[1]), (width, height), camera.distortion
+        )
         mounted.append(MountedCamera(larger, side.T_cam_rig))
     return Rig(mounted[0], mounted[1])
 

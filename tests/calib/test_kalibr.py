@@ -65,20 +65,46 @@ def test_refuses_to_export_an_ocam_rig(ocam_rig: Rig) -> None:
         export_kalibr(ocam_rig)
 
 
-@pytest.mark.parametrize(("model", "distortion", "intrinsics", "coefficients", "expected"), [
-    ("ds", "none", "[-0.27, 0.55, 310.0, 315.0, 380.0, 390.0]", "[]",
-     DoubleSphereCamera(-0.27, 0.55, (310.0, 315.0), (380.0, 390.0), (768, 770))),
-    ("eucm", "none", "[0.63, 1.1, 240.0, 244.0, 380.0, 390.0]", "[]",
-     ExtendedUnifiedCamera(0.63, 1.1, (240.0, 244.0), (380.0, 390.0), (768, 770))),
-    ("pinhole", "equidistant", "[225.0, 228.0, 380.0, 390.0]", "[-0.012, 0.003, -0.001, 0.0002]",
-     EquidistantCamera((-0.012, 0.003, -0.001, 0.0002), (225.0, 228.0), (380.0, 390.0), (768, 770))),
-    ("pinhole", "radtan", "[225.0, 228.0, 380.0, 390.0]", "[-0.1, 0.01, 0.001, 0.0002]",
-     UnifiedCamera(0.0, (225.0, 228.0), (380.0, 390.0), (768, 770), (-0.1, 0.01, 0.001, 0.0002))),
-])
-def test_reads_lenses_and_keeps_them_in_rig_files(tmp_path: Path, model: str, distortion: str, intrinsics: str,
-                                                  coefficients: str, expected: OmniCamera) -> None:
-    camera = (f"  camera_model: {model}\n  intrinsics: {intrinsics}\n  distortion_model: {distortion}\n"
-              f"  distortion_coeffs: {coefficients}\n  resolution: [768, 770]\n")
+@pytest.mark.parametrize(
+    ("model", "distortion", "intrinsics", "coefficients", "expected"),
+    [
+        (
+            "ds",
+            "none",
+            "[-0.27, 0.55, 310.0, 315.0, 380.0, 390.0]",
+            "[]",
+            DoubleSphereCamera(-0.27, 0.55, (310.0, 315.0), (380.0, 390.0), (768, 770)),
+        ),
+        (
+            "eucm",
+            "none",
+            "[0.63, 1.1, 240.0, 244.0, 380.0, 390.0]",
+            "[]",
+            ExtendedUnifiedCamera(0.63, 1.1, (240.0, 244.0), (380.0, 390.0), (768, 770)),
+        ),
+        (
+            "pinhole",
+            "equidistant",
+            "[225.0, 228.0, 380.0, 390.0]",
+            "[-0.012, 0.003, -0.001, 0.0002]",
+            EquidistantCamera((-0.012, 0.003, -0.001, 0.0002), (225.0, 228.0), (380.0, 390.0), (768, 770)),
+        ),
+        (
+            "pinhole",
+            "radtan",
+            "[225.0, 228.0, 380.0, 390.0]",
+            "[-0.1, 0.01, 0.001, 0.0002]",
+            UnifiedCamera(0.0, (225.0, 228.0), (380.0, 390.0), (768, 770), (-0.1, 0.01, 0.001, 0.0002)),
+        ),
+    ],
+)
+def test_reads_lenses_and_keeps_them_in_rig_files(
+    tmp_path: Path, model: str, distortion: str, intrinsics: str, coefficients: str, expected: OmniCamera
+) -> None:
+    camera = (
+        f"  camera_model: {model}\n  intrinsics: {intrinsics}\n  distortion_model: {distortion}\n"
+        f"  distortion_coeffs: {coefficients}\n  resolution: [768, 770]\n"
+    )
     near = "  T_cam_imu: [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, {}], [0.0, 0.0, 0.0, 1.0]]\n"
     rig = parse_kalibr(f"cam0:\n{camera}{near.format(0.0)}cam1:\n{camera}{near.format(-0.2)}")
     assert rig.lower.camera == rig.upper.camera == expected
@@ -100,8 +126,9 @@ def test_uses_the_camera_chain_without_imu_transforms() -> None:
     x_lower = rig.lower.T_cam_rig[:3, 0]
     z_lower = se3.inverse(T_UPPER_LOWER)[:3, 3] / rig.baseline_m
     u_lower = np.array([-1.0, 0, 0])  # fu < 0: the image's u runs against the camera's x
-    np.testing.assert_allclose(x_lower, (u_lower - z_lower * (z_lower @ u_lower)) / np.sqrt(1 - (z_lower @ u_lower)**2),
-                               atol=1e-3)
+    np.testing.assert_allclose(
+        x_lower, (u_lower - z_lower * (z_lower @ u_lower)) / np.sqrt(1 - (z_lower @ u_lower) ** 2), atol=1e-3
+    )
     np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 2], z_lower, atol=1e-14)
 
 
@@ -112,10 +139,18 @@ def test_combines_one_imu_transform_with_the_chain() -> None:
         np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-14)
 
 
-@pytest.mark.parametrize(("topics", "lower_is_cam0"), [
-    (("/lower/image", "/upper/image"), True), (("/upper/image", "/lower/image"), False),
-    (("/cam_top/image", ""), False), (("", "/rig/Top"), True), (("/bottom", "/x"), True),
-    (("/desktop/a", "/desktop/b"), True), (("/follower/a", "/laptop/b"), True)])
+@pytest.mark.parametrize(
+    ("topics", "lower_is_cam0"),
+    [
+        (("/lower/image", "/upper/image"), True),
+        (("/upper/image", "/lower/image"), False),
+        (("/cam_top/image", ""), False),
+        (("", "/rig/Top"), True),
+        (("/bottom", "/x"), True),
+        (("/desktop/a", "/desktop/b"), True),
+        (("/follower/a", "/laptop/b"), True),
+    ],
+)
 def test_identifies_the_lower_camera_by_topic_or_height(topics: tuple[str, str], lower_is_cam0: bool) -> None:
     rig = parse_kalibr(chain(BOTH, None, topics))
     np.testing.assert_array_equal(rig.lower.T_cam_rig, BOTH[not lower_is_cam0])
@@ -151,22 +186,25 @@ def test_selects_two_of_three_cameras_by_name() -> None:
     assert parse_kalibr(unused, lower="cam1", upper="cam2").topics == (NAMED[1], "")
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("camera_model: omni", "camera_model: fov", "cam0.camera_model: expected omni.*found 'fov'"),
-    ("camera_model: omni", "camera_model: pinhole", "cam0.intrinsics"),
-    ("camera_model: omni", "camera_model: ds", "cam0"),
-    ("distortion_model: radtan", "distortion_model: equidistant", "distortion_model: expected radtan or none"),
-    ("[0.01, -0.02, 0.003, 0.004]", "[]", "cam0.distortion_coeffs: expected 4 finite numbers"),
-    ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[-207.0, 208.0, 383.5, 384.5]", "cam0.intrinsics: expected 5"),
-    ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[1.0, 0.0, 208.0, 383.5, 384.5]", "cam0: omni camera: expected"),
-    ("[768, 770]", "768", "cam0.resolution"),
-    ("cam1:", "cam0:", "not a YAML file"),
-    ("cam1:", "camera1:", "expected two cameras"),
-    ("T_cam_imu: [[", "T_cam_imu: [[9", "cam0.T_cam_imu: expected a rotation"),
-    ("rostopic: /lower", "rostopic: [/lower]\n  x: /lower", "cam0.rostopic: expected a string"),
-    ("cam0:", "- cam0:", "not a YAML file"),
-    ("cam0:", "cam0: [a]\ncam2:", "cam0: expected a table"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("camera_model: omni", "camera_model: fov", "cam0.camera_model: expected omni.*found 'fov'"),
+        ("camera_model: omni", "camera_model: pinhole", "cam0.intrinsics"),
+        ("camera_model: omni", "camera_model: ds", "cam0"),
+        ("distortion_model: radtan", "distortion_model: equidistant", "distortion_model: expected radtan or none"),
+        ("[0.01, -0.02, 0.003, 0.004]", "[]", "cam0.distortion_coeffs: expected 4 finite numbers"),
+        ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[-207.0, 208.0, 383.5, 384.5]", "cam0.intrinsics: expected 5"),
+        ("[1.0, -207.0, 208.0, 383.5, 384.5]", "[1.0, 0.0, 208.0, 383.5, 384.5]", "cam0: omni camera: expected"),
+        ("[768, 770]", "768", "cam0.resolution"),
+        ("cam1:", "cam0:", "not a YAML file"),
+        ("cam1:", "camera1:", "expected two cameras"),
+        ("T_cam_imu: [[", "T_cam_imu: [[9", "cam0.T_cam_imu: expected a rotation"),
+        ("rostopic: /lower", "rostopic: [/lower]\n  x: /lower", "cam0.rostopic: expected a string"),
+        ("cam0:", "- cam0:", "not a YAML file"),
+        ("cam0:", "cam0: [a]\ncam2:", "cam0: expected a table"),
+    ],
+)
 def test_errors_name_the_key(old: str, new: str, message: str) -> None:
     text = chain(BOTH, T_UPPER_LOWER, NAMED)
     assert old in text
@@ -175,24 +213,35 @@ def test_errors_name_the_key(old: str, new: str, message: str) -> None:
     assert str(caught.value).startswith("c.yaml: ") and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("wrong", [se3.inverse(T_UPPER_LOWER), T_UPPER_LOWER @ se3.exp([0.0015, 0, 0, 0, 0, 0]),
-                                   T_UPPER_LOWER @ se3.exp([0, 0, 0, 0, 0.002, 0])])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        se3.inverse(T_UPPER_LOWER),
+        T_UPPER_LOWER @ se3.exp([0.0015, 0, 0, 0, 0, 0]),
+        T_UPPER_LOWER @ se3.exp([0, 0, 0, 0, 0.002, 0]),
+    ],
+)
 def test_refuses_contradicting_transforms(wrong: Array) -> None:
     with pytest.raises(CalibError, match=r"cam1: T_cam_imu and T_cn_cnm1 contradict each other by"):
         parse_kalibr(chain(BOTH, wrong, NAMED))
     parse_kalibr(chain(BOTH, T_UPPER_LOWER @ se3.exp([0.0005, 0, 0, 0, 0.001, 0]), NAMED))
 
 
-@pytest.mark.parametrize(("text", "arguments", "message"), [
-    (chain((None, None), None, NAMED), {}, "no transform between cam0 and cam1"),
-    (chain((None, None), T_UPPER_LOWER), {}, "neither topics nor heights"),
-    (chain((BOTH[0], BOTH[0]), None), {}, "neither topics nor heights"),
-    (chain((BOTH[0], BOTH[0]), None, NAMED), {}, "viewpoints must lie apart"),
-    (chain(BOTH, None), {"lower": "cam7"}, "there is no camera cam7, found cam0, cam1"),
-    (chain(BOTH, None), {"lower": "cam1", "upper": "cam1"}, "must be two cameras"),
-    (f"cam0:{CAMERA}", {}, "expected two cameras .*found cam0"),
-    ("", {}, "expected a YAML mapping"), ("[" * 3000, {}, "not a YAML file"), ("!!python/none x", {}, "YAML"),
-])
+@pytest.mark.parametrize(
+    ("text", "arguments", "message"),
+    [
+        (chain((None, None), None, NAMED), {}, "no transform between cam0 and cam1"),
+        (chain((None, None), T_UPPER_LOWER), {}, "neither topics nor heights"),
+        (chain((BOTH[0], BOTH[0]), None), {}, "neither topics nor heights"),
+        (chain((BOTH[0], BOTH[0]), None, NAMED), {}, "viewpoints must lie apart"),
+        (chain(BOTH, None), {"lower": "cam7"}, "there is no camera cam7, found cam0, cam1"),
+        (chain(BOTH, None), {"lower": "cam1", "upper": "cam1"}, "must be two cameras"),
+        (f"cam0:{CAMERA}", {}, "expected two cameras .*found cam0"),
+        ("", {}, "expected a YAML mapping"),
+        ("[" * 3000, {}, "not a YAML file"),
+        ("!!python/none x", {}, "YAML"),
+    ],
+)
 def test_refuses_files_with_missing_information(text: str, arguments: dict[str, str], message: str) -> None:
     with pytest.raises(CalibError, match=message):
         parse_kalibr(text, **arguments)
@@ -205,7 +254,7 @@ def test_damaged_text_is_a_calib_error_or_a_rig() -> None:
         for at in random.integers(0, len(text), 3):
             damaged[at] = random.integers(0, 256)
         try:
-            parse_kalibr(bytes(damaged[:random.integers(1, len(text) + 400)]))
+            parse_kalibr(bytes(damaged[: random.integers(1, len(text) + 400)]))
         except CalibError as error:
             assert "\n" not in str(error)
 

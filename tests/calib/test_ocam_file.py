@@ -42,8 +42,12 @@ T_LOWER_UPPER = se3.exp([0.02, -0.01, -0.2, 0.02, 0.05, 0.3])
 def test_parses_every_number_as_the_toolbox_defines_it() -> None:
     for text in (TEXT, TEXT.encode(), TEXT.replace("\n", "\r\n")):
         assert parse_ocam(text, "direct") == OcamCamera(
-            (-231.5, 0.0, 1.54e-3, -5.96e-7, 1.59e-9), (240.378942, 318.540278), (1.000529, 0.000053, 0.000122),
-            (640, 480), "direct")
+            (-231.5, 0.0, 1.54e-3, -5.96e-7, 1.59e-9),
+            (240.378942, 318.540278),
+            (1.000529, 0.000053, 0.000122),
+            (640, 480),
+            "direct",
+        )
 
 
 def test_camera_round_trip_is_exact(ocam_rig: Rig) -> None:
@@ -78,20 +82,23 @@ def test_refuses_to_export_an_omni_camera(omni_rig: Rig) -> None:
         export_ocam(omni_rig.lower.camera)
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("5 -2.315000e+02", "6 -2.315000e+02", "line 3: expected 7 finite numbers"),
-    ("5 -2.315000e+02", "x -2.315000e+02", "line 3: expected a count"),
-    ("5 -2.315000e+02", "65 -2.315000e+02", "line 3: expected a count of 1 to 64"),
-    ("5 -2.315000e+02", "5 nan", "line 3: expected 6 finite numbers"),
-    ("5 -2.315000e+02", "5 231", "c.txt: ocam camera: expected a0 < 0"),
-    ("3 386.100000", "3", "line 7: expected 4 finite numbers"),
-    ("240.378942 318.540278", "240.378942", "line 11: expected 2 finite numbers"),
-    ("1.000529 0.000053", "1.000529 one", r"line 15: expected 3 finite numbers \(affine c d e\)"),
-    ("480 640", "480.5 640", "line 19: expected the image's height"),
-    ("480 640", "0 640", "line 19"),
-    ("480 640", "", "expected 5 lines of numbers.*found 4"),
-    ("480 640", "480 640\n1", "found 6"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("5 -2.315000e+02", "6 -2.315000e+02", "line 3: expected 7 finite numbers"),
+        ("5 -2.315000e+02", "x -2.315000e+02", "line 3: expected a count"),
+        ("5 -2.315000e+02", "65 -2.315000e+02", "line 3: expected a count of 1 to 64"),
+        ("5 -2.315000e+02", "5 nan", "line 3: expected 6 finite numbers"),
+        ("5 -2.315000e+02", "5 231", "c.txt: ocam camera: expected a0 < 0"),
+        ("3 386.100000", "3", "line 7: expected 4 finite numbers"),
+        ("240.378942 318.540278", "240.378942", "line 11: expected 2 finite numbers"),
+        ("1.000529 0.000053", "1.000529 one", r"line 15: expected 3 finite numbers \(affine c d e\)"),
+        ("480 640", "480.5 640", "line 19: expected the image's height"),
+        ("480 640", "0 640", "line 19"),
+        ("480 640", "", "expected 5 lines of numbers.*found 4"),
+        ("480 640", "480 640\n1", "found 6"),
+    ],
+)
 def test_errors_name_the_line(old: str, new: str, message: str) -> None:
     assert old in TEXT
     with pytest.raises(CalibError, match=message) as caught:
@@ -115,8 +122,9 @@ def test_damaged_text_is_a_calib_error_or_a_camera() -> None:
 def test_imports_a_rig_from_two_files_and_a_transform(tmp_path: Path, view: str) -> None:
     (tmp_path / "lower.txt").write_text(TEXT)
     (tmp_path / "upper.txt").write_text(TEXT.replace("480 640", "481 641"))
-    rig = import_ocam(tmp_path / "lower.txt", tmp_path / "upper.txt", T_LOWER_UPPER,
-                      "mirror" if view == "mirror" else "direct")
+    rig = import_ocam(
+        tmp_path / "lower.txt", tmp_path / "upper.txt", T_LOWER_UPPER, "mirror" if view == "mirror" else "direct"
+    )
     assert (rig.lower.camera.size, rig.upper.camera.size) == ((640, 480), (641, 481))
     np.testing.assert_allclose(rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig), T_LOWER_UPPER, atol=1e-14)
     np.testing.assert_allclose(rig.upper.viewpoint, (0, 0, float(np.linalg.norm(T_LOWER_UPPER[:3, 3]))), atol=1e-14)
@@ -137,24 +145,35 @@ def test_baseline_is_vertical_for_upward_cameras(tmp_path: Path, view: str) -> N
             straight_up(baseline)
 
 
-@pytest.mark.parametrize(("name", "text"), [
-    ("t.toml", transform_toml(T_LOWER_UPPER)),
-    ("t.toml", transform_toml(se3.inverse(T_LOWER_UPPER)).replace("T_lower_upper", "T_upper_lower")),
-    ("t.yaml", f"T_lower_upper: {T_LOWER_UPPER.tolist()}"),
-    ("t.txt", "# rows\n" + "\n".join(" ".join(map(repr, map(float, row))) for row in T_LOWER_UPPER)),
-    ("t.csv", ",".join(map(repr, map(float, T_LOWER_UPPER.ravel())))),
-])
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t.toml", transform_toml(T_LOWER_UPPER)),
+        ("t.toml", transform_toml(se3.inverse(T_LOWER_UPPER)).replace("T_lower_upper", "T_upper_lower")),
+        ("t.yaml", f"T_lower_upper: {T_LOWER_UPPER.tolist()}"),
+        ("t.txt", "# rows\n" + "\n".join(" ".join(map(repr, map(float, row))) for row in T_LOWER_UPPER)),
+        ("t.csv", ",".join(map(repr, map(float, T_LOWER_UPPER.ravel())))),
+    ],
+)
 def test_reads_a_transform_in_every_format(tmp_path: Path, name: str, text: str) -> None:
     (tmp_path / name).write_text(text)
     np.testing.assert_allclose(read_transform(tmp_path / name), T_LOWER_UPPER, atol=1e-15)
 
 
-@pytest.mark.parametrize(("name", "text", "message"), [
-    ("t.toml", "T_x = 3", "T_x: unknown key"), ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
-    ("t.toml", "[", "not a TOML file"), ("t.yml", "T_lower_upper: 3", "4 rows of 4 numbers"), ("t.yml", "[", "YAML"),
-    ("t.txt", "1 0 0 0", "4 rows"), ("t.txt", "one", "expected 16 numbers"),
-    ("t.txt", "1 " * 16, "expected a rotation"), ("t.txt", "nan " * 16, "finite"),
-])
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("t.toml", "T_x = 3", "T_x: unknown key"),
+        ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
+        ("t.toml", "[", "not a TOML file"),
+        ("t.yml", "T_lower_upper: 3", "4 rows of 4 numbers"),
+        ("t.yml", "[", "YAML"),
+        ("t.txt", "1 0 0 0", "4 rows"),
+        ("t.txt", "one", "expected 16 numbers"),
+        ("t.txt", "1 " * 16, "expected a rotation"),
+        ("t.txt", "nan " * 16, "finite"),
+    ],
+)
 def test_refuses_invalid_transform_files(tmp_path: Path, name: str, text: str, message: str) -> None:
     (tmp_path / name).write_text(text)
     with pytest.raises(CalibError, match=message):

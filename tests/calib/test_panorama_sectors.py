@@ -20,13 +20,23 @@ from tests.simulation.rigs import R_RIG_AHEAD, lens, lens_rig
 STEP_DEG, CORNERS_DEG = 3.75, 3.0
 
 
-@pytest.mark.parametrize(("model", "field_deg", "size"), [
-    ("pinhole", 30, (640, 480)), ("pinhole", 90, (640, 360)), ("equidistant", 60, (640, 480)),
-    ("equidistant", 150, (640, 120)), ("ds", 120, (640, 240)), ("eucm", 120, (640, 240)),
-    ("equidistant", 240, (960, 110)), ("equidistant", 280, (1200, 110))])
+@pytest.mark.parametrize(
+    ("model", "field_deg", "size"),
+    [
+        ("pinhole", 30, (640, 480)),
+        ("pinhole", 90, (640, 360)),
+        ("equidistant", 60, (640, 480)),
+        ("equidistant", 150, (640, 120)),
+        ("ds", 120, (640, 240)),
+        ("eucm", 120, (640, 240)),
+        ("equidistant", 240, (960, 110)),
+        ("equidistant", 280, (1200, 110)),
+    ],
+)
 @pytest.mark.parametrize("heading_deg", [20.0, -173.0])
-def test_a_sector_has_the_columns_of_what_both_cameras_see(model: str, field_deg: float, size: tuple[int, int],
-                                                           heading_deg: float) -> None:
+def test_a_sector_has_the_columns_of_what_both_cameras_see(
+    model: str, field_deg: float, size: tuple[int, int], heading_deg: float
+) -> None:
     """Its middle is where the cameras look, also across the seam behind, and its resolution is that of the images."""
     camera = lens(model, field_deg, size)
     rig = lens_rig(camera, heading_deg=heading_deg)
@@ -88,8 +98,10 @@ def test_cameras_that_share_no_view_are_refused() -> None:
 def test_lenses_back_to_back_side_by_side_need_a_shared_ring(field_deg: float, is_enough: bool) -> None:
     """Lenses of 190 degrees share 10 of them about their common axis, those of 230 share 50."""
     camera = lens("equidistant", field_deg, (640, 640))
-    poses = [se3.transform(se3.rotation_exp([0.0, 0.0, turn]) @ R_RIG_AHEAD, np.array([x, 0.0, 0.0]))
-             for turn, x in ((0.0, 0.015), (math.pi, -0.015))]
+    poses = [
+        se3.transform(se3.rotation_exp([0.0, 0.0, turn]) @ R_RIG_AHEAD, np.array([x, 0.0, 0.0]))
+        for turn, x in ((0.0, 0.015), (math.pi, -0.015))
+    ]
     rig = Rig(*(MountedCamera(camera, se3.inverse(T), Mask(camera.center, 0.0, 319.0)) for T in poses))
     if is_enough:
         assert fit_cylinder(rig).width > 500

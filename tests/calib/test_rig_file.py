@@ -19,8 +19,11 @@ from calib.rig_file import parse_rig, read_rig, rig_toml, write_rig
 def with_masks(rig: Rig) -> Rig:
     width, height = rig.upper.camera.size
     image = np.random.default_rng(0).integers(0, 2, (height, width)).astype(np.uint8) * 255
-    return replace(rig, lower=replace(rig.lower, mask=Mask((384.1, 383.2), 0.0, 371.3)),
-                   upper=replace(rig.upper, mask=Mask((383.9, 384.0), 61.5, image=image)))
+    return replace(
+        rig,
+        lower=replace(rig.lower, mask=Mask((384.1, 383.2), 0.0, 371.3)),
+        upper=replace(rig.upper, mask=Mask((383.9, 384.0), 61.5, image=image)),
+    )
 
 
 def assert_same(a: MountedCamera, b: MountedCamera) -> None:
@@ -46,7 +49,7 @@ def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
         assert rig_toml(found) == rig_toml(rig)
         again = parse_rig(rig_toml(found))
         np.testing.assert_array_equal(again.upper.T_cam_rig, found.upper.T_cam_rig)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.toml", "rig.upper.png"][:1 + masks]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.toml", "rig.upper.png"][: 1 + masks]
 
 
 def test_a_pose_on_the_robot_that_is_not_stated_is_left_out_and_one_without_a_height_states_none(rig: Rig) -> None:
@@ -92,35 +95,45 @@ def test_makes_a_rounded_rotation_orthonormal(omni_rig: Rig) -> None:
     assert rig_toml(found) == rig_toml(parse_rig(rig_toml(found)))
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("schema = 1", "schema = 2", "schema: expected version 1, found 2"),
-    ("schema = 1", "schema = true", "schema"),
-    ("schema = 1\n", "", "schema: expected version 1, found nothing"),
-    ("schema = 1", "schema = 1\nspeed = 3", "speed: unknown key"),
-    ("xi = 0.93", "xi = '0.93'", "lower.intrinsics.xi: expected a finite number, found '0.93'"),
-    ("xi = 0.93", "xi = nan", "lower.intrinsics.xi"),
-    ("xi = 0.93", "xi = true", "lower.intrinsics.xi"),
-    ("xi = 0.93", "xi = -1.0", "lower.intrinsics: omni camera: expected xi >= 0"),
-    ("xi = 0.93", "xi = 0.93\nk3 = 0.0", "lower.intrinsics.k3: unknown key"),
-    ("fu = -205.0\n", "", "lower.intrinsics.fu: expected a finite number, found nothing"),
-    ('model = "omni"', 'model = "pinhole"',
-     "lower.model: expected omni or ocam or ds or eucm or equidistant or equirectangular, found 'pinhole'"),
-    ('model = "omni"', 'model = "omni"\nview = "mirror"', "lower.view: unknown key"),
-    ('model = "omni"', "model = 3", "lower.model"),
-    ("size = [768, 770]", "size = [768.0, 770]", "lower.size: expected [width, height]"),
-    ("size = [768, 770]", "size = [768]", "lower.size"),
-    ("size = [768, 770]", "size = [768, 770]\nT_rig_upper = 4", "lower.T_rig_upper: unknown key"),
-    ("T_rig_lower = [", "T_rig_lower = 3\n[lower.x]\ny = [", "lower.x: unknown key"),
-    ("[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]", "[0.0, 0.0, 1.0],\n]\n\n[lower]", "T_base_rig: expected 4 rows of 4"),
-    ("[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]", "[0.0, 0.0, 0.5, 1.0],\n]\n\n[lower]", "T_base_rig: expected a rotation"),
-    ("[upper]", "[higher]", "higher: unknown key"),
-    ("[lower]", "[lower", "not a TOML file"),
-    ("outer_px = 371.3", "outer_px = 371.3\nround = true", "lower.mask.round: unknown key"),
-    ("inner_px = 0.0", "inner_px = 400.0", "lower.mask.inner_px"),
-    ("inner_px = 0.0", "image = 'nowhere.png'", "lower.mask.image"),
-    ("inner_px = 0.0", "image = 'data:image/png;base64,?'", "lower.mask.image: expected base64"),
-    ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected a PNG"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("schema = 1", "schema = 2", "schema: expected version 1, found 2"),
+        ("schema = 1", "schema = true", "schema"),
+        ("schema = 1\n", "", "schema: expected version 1, found nothing"),
+        ("schema = 1", "schema = 1\nspeed = 3", "speed: unknown key"),
+        ("xi = 0.93", "xi = '0.93'", "lower.intrinsics.xi: expected a finite number, found '0.93'"),
+        ("xi = 0.93", "xi = nan", "lower.intrinsics.xi"),
+        ("xi = 0.93", "xi = true", "lower.intrinsics.xi"),
+        ("xi = 0.93", "xi = -1.0", "lower.intrinsics: omni camera: expected xi >= 0"),
+        ("xi = 0.93", "xi = 0.93\nk3 = 0.0", "lower.intrinsics.k3: unknown key"),
+        ("fu = -205.0\n", "", "lower.intrinsics.fu: expected a finite number, found nothing"),
+        (
+            'model = "omni"',
+            'model = "pinhole"',
+            "lower.model: expected omni or ocam or ds or eucm or equidistant or equirectangular, found 'pinhole'",
+        ),
+        ('model = "omni"', 'model = "omni"\nview = "mirror"', "lower.view: unknown key"),
+        ('model = "omni"', "model = 3", "lower.model"),
+        ("size = [768, 770]", "size = [768.0, 770]", "lower.size: expected [width, height]"),
+        ("size = [768, 770]", "size = [768]", "lower.size"),
+        ("size = [768, 770]", "size = [768, 770]\nT_rig_upper = 4", "lower.T_rig_upper: unknown key"),
+        ("T_rig_lower = [", "T_rig_lower = 3\n[lower.x]\ny = [", "lower.x: unknown key"),
+        ("[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]", "[0.0, 0.0, 1.0],\n]\n\n[lower]", "T_base_rig: expected 4 rows of 4"),
+        (
+            "[0.0, 0.0, 0.0, 1.0],\n]\n\n[lower]",
+            "[0.0, 0.0, 0.5, 1.0],\n]\n\n[lower]",
+            "T_base_rig: expected a rotation",
+        ),
+        ("[upper]", "[higher]", "higher: unknown key"),
+        ("[lower]", "[lower", "not a TOML file"),
+        ("outer_px = 371.3", "outer_px = 371.3\nround = true", "lower.mask.round: unknown key"),
+        ("inner_px = 0.0", "inner_px = 400.0", "lower.mask.inner_px"),
+        ("inner_px = 0.0", "image = 'nowhere.png'", "lower.mask.image"),
+        ("inner_px = 0.0", "image = 'data:image/png;base64,?'", "lower.mask.image: expected base64"),
+        ("inner_px = 0.0", "image = 'data:image/png;base64,AAAA'", "lower.mask.image: expected a PNG"),
+    ],
+)
 def test_errors_name_the_key(omni_rig: Rig, old: str, new: str, message: str) -> None:
     text = rig_toml(with_masks(omni_rig))
     assert old in text
@@ -163,7 +176,7 @@ def test_damaged_text_is_a_calib_error_or_a_rig(ocam_rig: Rig) -> None:
         for at in random.integers(0, len(text), 3):
             damaged[at] = random.integers(0, 256)
         try:
-            parse_rig(bytes(damaged[:random.integers(1, len(text) + 400)]))
+            parse_rig(bytes(damaged[: random.integers(1, len(text) + 400)]))
         except CalibError as error:
             assert "\n" not in str(error)
     for deep in ("[" * 5000, "a = " + "[" * 5000, "x = " + "9" * 5000):
@@ -176,9 +189,11 @@ def test_times_of_exposure_are_kept_and_bounded(omni_rig: Rig) -> None:
     assert parse_rig(rig_toml(timed)).times == timed.times
     assert "[times]" not in rig_toml(omni_rig) and parse_rig(rig_toml(omni_rig)).times == ShutterTimes()
     text = rig_toml(timed)
-    for old, new, message in (("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times: times of exposure: expected"),
-                              ("upper_delay_s = 0.00725", "upper_delay_ms = 7.0", "unknown key"),
-                              ("line_time_s = -2.6e-05", "line_time_s = nan", "times.line_time_s: expected a finite")):
+    for old, new, message in (
+        ("upper_delay_s = 0.00725", "upper_delay_s = 2.0", "times: times of exposure: expected"),
+        ("upper_delay_s = 0.00725", "upper_delay_ms = 7.0", "unknown key"),
+        ("line_time_s = -2.6e-05", "line_time_s = nan", "times.line_time_s: expected a finite"),
+    ):
         assert old in text
         with pytest.raises(CalibError, match=message):
             parse_rig(text.replace(old, new))

@@ -89,8 +89,14 @@ def test_a_single_transform_is_that_of_a_stack(scale: float) -> None:
         twist = np.concatenate([[0.3, -0.2, 0.1], scale * axis])
         T = se3.exp(twist)
         R = T[:3, :3]
-        pairs = ((T, se3.exp(twist[None])), (se3.inverse(T), se3.inverse(T[None])), (se3.log(T), se3.log(T[None])),
-                 (se3.quaternion(R), se3.quaternion(R[None])), (se3.rotation_log(R), se3.rotation_log(R[None])),
-                 (se3.hat(twist[:3]), se3.hat(twist[None, :3])), (se3.adjoint(T), se3.adjoint(T[None])))
+        pairs = (
+            (T, se3.exp(twist[None])),
+            (se3.inverse(T), se3.inverse(T[None])),
+            (se3.log(T), se3.log(T[None])),
+            (se3.quaternion(R), se3.quaternion(R[None])),
+            (se3.rotation_log(R), se3.rotation_log(R[None])),
+            (se3.hat(twist[:3]), se3.hat(twist[None, :3])),
+            (se3.adjoint(T), se3.adjoint(T[None])),
+        )
         for one, (of_stack,) in pairs:
             np.testing.assert_allclose(one, of_stack, rtol=0, atol=1e-14)

@@ -25,9 +25,11 @@ def text(numbers: dict[str, Any]) -> str:
     """Return the toolbox's calib_results.txt of these numbers: MATLAB counts from 1, the file from 0."""
     polynomial = " ".join(f"{value:.17e}" for value in numbers["ss"])
     center = f"{numbers['xc_row_1based'] - 1:.15f} {numbers['yc_col_1based'] - 1:.15f}"
-    return (f"#polynomial\n\n{len(numbers['ss'])} {polynomial} \n\n#inverse\n\n2 1.0 1.0 \n\n#center\n\n{center}\n\n"
-            f"#affine\n\n{numbers['c']!r} {numbers['d']!r} {numbers['e']!r}\n\n#image size\n\n"
-            f"{numbers['height']} {numbers['width']}\n\n")
+    return (
+        f"#polynomial\n\n{len(numbers['ss'])} {polynomial} \n\n#inverse\n\n2 1.0 1.0 \n\n#center\n\n{center}\n\n"
+        f"#affine\n\n{numbers['c']!r} {numbers['d']!r} {numbers['e']!r}\n\n#image size\n\n"
+        f"{numbers['height']} {numbers['width']}\n\n"
+    )
 
 
 def board_in_camera(numbers: dict[str, Any], image: dict[str, Any], view: View) -> Array:

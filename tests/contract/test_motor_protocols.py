@@ -61,7 +61,7 @@ def test_drives_the_commanded_distance_and_angle(name: str, drive: DifferentialD
     connection = Connection(name, drive)
     connection.drive(2.0, 0.5, 0.0)
     x_m, y_m, heading_rad = connection.base.pose
-    assert x_m == pytest.approx(1.0 - 0.5 * 0.5 * 0.5 / 2.0, rel=0.01)   # less the loss by accelerating at 2 m/s^2
+    assert x_m == pytest.approx(1.0 - 0.5 * 0.5 * 0.5 / 2.0, rel=0.01)  # less the loss by accelerating at 2 m/s^2
     assert (y_m, heading_rad) == pytest.approx((0.0, 0.0), abs=1e-6)
     connection.drive(0.5, 0.0, 0.0)
     heading_rad = connection.base.pose[2]
@@ -87,9 +87,7 @@ def test_drives_the_commanded_arc_and_reports_it(name: str, drive: DifferentialD
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(("velocity_mps", "yaw_rate_radps"), [(8.0, 4.0), (-3.0, 2.0), (0.9, -4.0), (0.0, 50.0)])
-def test_limiting_the_wheel_speed_keeps_the_curvature(
-    name: str, velocity_mps: float, yaw_rate_radps: float
-) -> None:
+def test_limiting_the_wheel_speed_keeps_the_curvature(name: str, velocity_mps: float, yaw_rate_radps: float) -> None:
     connection = Connection(name)
     connection.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
     received = connection.base.last_command

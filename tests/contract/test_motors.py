@@ -173,7 +173,7 @@ def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path:
         with pytest.raises(DriverError, match=r"no such port|tried again"):
             motor.send(FORWARD)
         with contextlib.closing(SimulatedMotor(controller_of(name))) as second:
-            second.expire()   # from now on a first command other than a stop is an error
+            second.expire()  # from now on a first command other than a stop is an error
             port.symlink_to(second.port)
             assert until(lambda: first_status(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
             assert motor.connections == 2 and second.errors == 0

@@ -34,8 +34,11 @@ def page() -> str:
 
 
 def _sections(settings: Any, path: tuple[str, ...]) -> Iterator[str]:
-    rows = [_row(entry, kind, getattr(settings, entry.name), ".".join((*path, entry.name)))
-            for entry, kind in fields_of(type(settings)) if not is_dataclass(kind)]
+    rows = [
+        _row(entry, kind, getattr(settings, entry.name), ".".join((*path, entry.name)))
+        for entry, kind in fields_of(type(settings))
+        if not is_dataclass(kind)
+    ]
     if path:
         yield f"\n## {'.'.join(path)}"
         yield (inspect.getdoc(type(settings)) or "").splitlines()[0] + _only(".".join(path))

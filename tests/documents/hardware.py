@@ -21,8 +21,13 @@ SIDE_PX: Final = 960  # of the table of baselines
 BASELINES_M: Final = (0.1, 0.15, 0.2, 0.3, 0.4)
 RANGES_M: Final = (1.0, 2.0, 4.0, 6.0)
 FAR_SHARE: Final = 0.1  # of the range: up to here a point counts as located in the last column
-FORMATS: Final = (("640x480", "GREY", 640 * 480), ("1280x720", "GREY", 1280 * 720), ("1280x960", "GREY", 1280 * 960),
-                  ("1280x960", "YUYV", 2 * 1280 * 960), ("1920x1200", "GREY", 1920 * 1200))  # bytes of an image
+FORMATS: Final = (
+    ("640x480", "GREY", 640 * 480),
+    ("1280x720", "GREY", 1280 * 720),
+    ("1280x960", "GREY", 1280 * 960),
+    ("1280x960", "YUYV", 2 * 1280 * 960),
+    ("1920x1200", "GREY", 1920 * 1200),
+)  # bytes of an image
 RATES_HZ: Final = (10, 30)
 # Isochronous transfers of one high-speed endpoint: three packets of 1024 bytes in each of 8000 microframes a second
 # (USB 2.0, 5.6.3), less UVC's header of 12 bytes. A bus has room for little more than one such endpoint beside others.
@@ -66,8 +71,14 @@ def _baseline() -> str:
     rows = []
     for t in BASELINES_M:
         cells = (f"{1e3 * sigma_m(r, dense_px, f, t):.0f} / {1e3 * sigma_m(r, tracked_px, f, t):.0f}" for r in RANGES_M)
-        rows.append((f"{100 * t:.0f}", f"{f * t / config.stereo.matching.disparities:.2f}", *cells,
-                     f"{FAR_SHARE * f * t / dense_px:.0f} / {FAR_SHARE * f * t / tracked_px:.0f}"))
+        rows.append(
+            (
+                f"{100 * t:.0f}",
+                f"{f * t / config.stereo.matching.disparities:.2f}",
+                *cells,
+                f"{FAR_SHARE * f * t / dense_px:.0f} / {FAR_SHARE * f * t / tracked_px:.0f}",
+            )
+        )
     at_ranges = (f"sigma at {r:.0f} m, mm" for r in RANGES_M)
     return _table(("t, cm", "least r, m", *at_ranges, "r with sigma = 10 %, m"), rows)
 
@@ -88,8 +99,10 @@ def _computers() -> str:
     times_ms = {name: float(time_ms) for name, time_ms, *_ in result["rows"]}
     usual_ms, small_ms = times_ms["30 Hz by the stamps"], times_ms["30 Hz by the stamps, profile small"]
     rows = [("2 cores of a shared x86-64 virtual machine", "measured", f"{usual_ms:.0f}", f"{small_ms:.0f}")]
-    rows += [(name, f"estimate, a core at {speed:g} of that", f"{usual_ms / speed:.0f}", f"{small_ms / speed:.0f}")
-             for name, speed in ESTIMATED]
+    rows += [
+        (name, f"estimate, a core at {speed:g} of that", f"{usual_ms / speed:.0f}", f"{small_ms / speed:.0f}")
+        for name, speed in ESTIMATED
+    ]
     return _table(("computer", "", "a pair, ms of processor", "with `--profile small`"), rows)
 
 

@@ -95,27 +95,35 @@ def drive(seconds: float = DRIVE_S, seed: int = 1) -> None:
         run = simulate(world, robot, script, seconds=seconds, seed=seed, config=config)
     print("end:", script.end)
     cameras = SimulatedCameras(with_masks(robot.rig), robot.sensor, world, seed, robot.samples)
-    images = [PillowImage.fromarray(frame).quantize(20, dither=PillowImage.Dither.NONE)
-              for frame in _drive_frames(world, run, script.repeated_s, cameras, robot.rig)]
+    images = [
+        PillowImage.fromarray(frame).quantize(20, dither=PillowImage.Dither.NONE)
+        for frame in _drive_frames(world, run, script.repeated_s, cameras, robot.rig)
+    ]
     durations = [FRAME_MS] * (len(images) - 1) + [PAUSE_MS]
-    images[0].save(FOLDER / "drive.gif", save_all=True, append_images=images[1:], duration=durations, loop=0,
-                   optimize=True)
+    images[0].save(
+        FOLDER / "drive.gif", save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True
+    )
     print(f"drive.gif: {len(images)} images, {(FOLDER / 'drive.gif').stat().st_size / 1e3:.0f} kB")
 
 
-def _drive_frames(world: World, run: SimulatedRun, repeated_s: float, cameras: SimulatedCameras, rig: Rig
-                  ) -> Iterator[Image]:
+def _drive_frames(
+    world: World, run: SimulatedRun, repeated_s: float, cameras: SimulatedCameras, rig: Rig
+) -> Iterator[Image]:
     """Yield an RGB image for each second of the run."""
     tables = remap_tables(rig, rig.lower, fit_cylinder(rig, width_px=GIF_WIDTH_PX))
     last_s = run.ticks[-1].time_s
     for seq, time_s in enumerate(np.arange(1.0, last_s, 1.0)):
         until_ns = START_NS + round(time_s * 1e9)
-        so_far = replace(run, rings=tuple(ring for ring in run.rings if ring.stamp_ns <= until_ns),
-                         ticks=tuple(tick for tick in run.ticks if tick.time_s <= time_s))
+        so_far = replace(
+            run,
+            rings=tuple(ring for ring in run.rings if ring.stamp_ns <= until_ns),
+            ticks=tuple(tick for tick in run.ticks if tick.time_s <= time_s),
+        )
         first, second = both_paths(so_far, repeated_s)
         plan = draw(world, seen_obstacles(so_far), first, second)
-        plan = cv2.resize(plan, (GIF_WIDTH_PX, round(plan.shape[0] * GIF_WIDTH_PX / plan.shape[1])),
-                          interpolation=cv2.INTER_AREA)
+        plan = cv2.resize(
+            plan, (GIF_WIDTH_PX, round(plan.shape[0] * GIF_WIDTH_PX / plan.shape[1])), interpolation=cv2.INTER_AREA
+        )
         nearest = int(np.argmin(np.abs(run.stamps_ns - until_ns)))
         frame = cameras.frame("lower", seq, until_ns, run.T_world_base[nearest] @ rig.T_base_rig, Walkers(world.people))
         panorama = cv2.remap(gray(frame), *tables, cv2.INTER_LINEAR)

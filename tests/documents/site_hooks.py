@@ -40,8 +40,11 @@ def pages() -> dict[str, str]:
         name = path.relative_to(DOCS).as_posix()
         found[f"docs/{name}"] = name
         found |= {source: name for source in INCLUDE.findall(path.read_text("utf-8"))}
-    folders = {PurePosixPath(source).parent.as_posix(): page for source, page in found.items()
-               if source.startswith("docs/") and source.endswith("/README.md")}
+    folders = {
+        PurePosixPath(source).parent.as_posix(): page
+        for source, page in found.items()
+        if source.startswith("docs/") and source.endswith("/README.md")
+    }
     return found | folders
 
 
@@ -100,7 +103,7 @@ def _prose(line: str, source: str, page: str, deeper: bool) -> str:
 
 def _link(match: re.Match[str], source: str, page: str) -> str:
     mark, words, target = match.groups()
-    is_quoted = match.string[:match.start()].count("`") % 2 == 1
+    is_quoted = match.string[: match.start()].count("`") % 2 == 1
     if is_quoted or re.match(r"\w+:|#", target):
         return match.group()
     path, _, anchor = target.partition("#")

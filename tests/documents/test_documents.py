@@ -32,8 +32,11 @@ def documents() -> list[Path]:
 @cache
 def anchors(path: Path) -> set[str]:
     """Return the anchors of the headings of a document."""
-    heads = [re.sub(r"[`*]", "", line.lstrip("# ")) for line, is_code in prose_and_code(path.read_text("utf-8"))
-             if not is_code and line.startswith("#")]
+    heads = [
+        re.sub(r"[`*]", "", line.lstrip("# "))
+        for line, is_code in prose_and_code(path.read_text("utf-8"))
+        if not is_code and line.startswith("#")
+    ]
     return {re.sub(r"[^\w -]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
@@ -48,8 +51,12 @@ def commands() -> Iterator[tuple[str, str, str]]:
 
 def options(parser: argparse.ArgumentParser) -> set[str]:
     """Return the options of a command and of its own commands."""
-    inner = [choice for action in parser._actions if isinstance(action, argparse._SubParsersAction)
-             for choice in action.choices.values()]
+    inner = [
+        choice
+        for action in parser._actions
+        if isinstance(action, argparse._SubParsersAction)
+        for choice in action.choices.values()
+    ]
     return {option for action in parser._actions for option in action.option_strings}.union(*map(options, inner))
 
 
@@ -76,8 +83,12 @@ def test_commands_in_documents_and_their_options_exist() -> None:
     assert len(found) > 50
     assert [(name, command) for name, command, _ in found if command not in COMMANDS] == []
     known = {command: options(_parser([command])) for command in {command for _, command, _ in found}}
-    assert [(name, command, option) for name, command, rest in found for option in re.findall(r"(?<=\s)--[a-z-]+", rest)
-            if option not in known[command]] == []
+    assert [
+        (name, command, option)
+        for name, command, rest in found
+        for option in re.findall(r"(?<=\s)--[a-z-]+", rest)
+        if option not in known[command]
+    ] == []
 
 
 def test_each_page_is_in_the_navigation_once() -> None:

@@ -8,8 +8,14 @@ pytest.importorskip("griffe")
 
 from tests.documents.field_comments import comment_of
 
-LINES = ["class Pose:", "    x_m: float  # forward", "    # Of the body,", "    # in its axes.", "    sigma: float",
-         "    state: str = '#'"]
+LINES = [
+    "class Pose:",
+    "    x_m: float  # forward",
+    "    # Of the body,",
+    "    # in its axes.",
+    "    sigma: float",
+    "    state: str = '#'",
+]
 
 
 @pytest.mark.parametrize(("number", "comment"), [(2, "forward"), (5, "Of the body, in its axes."), (6, "")])

@@ -26,25 +26,29 @@ def test_code_is_included_as_a_block() -> None:
     assert "```python\n" in text and "generate_launch_description" in text
 
 
-@pytest.mark.parametrize(("line", "shown"), [
-    ("[Safety](omnid/controller/SAFETY.md#arming)", "[Safety](safety.md#arming)"),
-    ("[results](docs/results/README.md)", "[results](results/README.md)"),
-    ("![plan](omnid/sample/plan.png)", "![plan](included/omnid/sample/plan.png)"),
-    ("![drive](docs/images/drive.gif)", "![drive](images/drive.gif)"),
-    ("[a module](omnid/api.py)", "a module"),
-    ("[zenoh](https://zenoh.io)", "[zenoh](https://zenoh.io)"),
-    ("see `omnid/core/README.md`", "see [`omnid/core/README.md`](method.md)"),
-    ("see `docs/results`", "see [`docs/results`](results/README.md)"),
-    ("see `omnid/api.py`", "see `omnid/api.py`"),
-    ("write `[x](docs/maps.md)`", "write `[x](docs/maps.md)`"),
-])
+@pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        ("[Safety](omnid/controller/SAFETY.md#arming)", "[Safety](safety.md#arming)"),
+        ("[results](docs/results/README.md)", "[results](results/README.md)"),
+        ("![plan](omnid/sample/plan.png)", "![plan](included/omnid/sample/plan.png)"),
+        ("![drive](docs/images/drive.gif)", "![drive](images/drive.gif)"),
+        ("[a module](omnid/api.py)", "a module"),
+        ("[zenoh](https://zenoh.io)", "[zenoh](https://zenoh.io)"),
+        ("see `omnid/core/README.md`", "see [`omnid/core/README.md`](method.md)"),
+        ("see `docs/results`", "see [`docs/results`](results/README.md)"),
+        ("see `omnid/api.py`", "see `omnid/api.py`"),
+        ("write `[x](docs/maps.md)`", "write `[x](docs/maps.md)`"),
+    ],
+)
 def test_links_and_paths_lead_to_pages(line: str, shown: str) -> None:
     assert linked(line, "README.md", "index.md") == shown
 
 
 def test_links_start_from_the_page_and_not_from_the_file() -> None:
     assert linked("`SITE.md`, [x](../core/README.md)", "omnid/transport/SITE.md", "results/a.md") == (
-        "[`SITE.md`](../bus.md), [x](../method.md)")
+        "[`SITE.md`](../bus.md), [x](../method.md)"
+    )
 
 
 def test_blocks_of_code_stay_as_they_are() -> None:
@@ -54,7 +58,8 @@ def test_blocks_of_code_stay_as_they_are() -> None:
 
 def test_lists_and_tables_get_the_blank_line_that_python_markdown_needs() -> None:
     assert linked("text\n- a\n  - b\n- c\nmore\n| x |\n|---|", "README.md", "index.md") == (
-        "text\n\n- a\n    - b\n- c\nmore\n\n| x |\n|---|")
+        "text\n\n- a\n    - b\n- c\nmore\n\n| x |\n|---|"
+    )
 
 
 def test_every_included_file_exists() -> None:

@@ -30,8 +30,12 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=sorted(EXPERIMENTS))
     parser.add_argument("--seed", type=int, nargs="+", default=[11], help="seeds of textures, path and rig")
     parser.add_argument("--out", type=Path, required=True, help="folder for NAME_sSEED/log.mcap and its truth")
-    parser.add_argument("--renderer", choices=RENDERERS, default="povray",
-                        help="ray_caster: the renderer of tests/simulation, several times faster than POV-Ray")
+    parser.add_argument(
+        "--renderer",
+        choices=RENDERERS,
+        default="povray",
+        help="ray_caster: the renderer of tests/simulation, several times faster than POV-Ray",
+    )
     parser.add_argument("--size", type=int, default=768, help="width and height of the images [px]")
     parser.add_argument("--pairs", type=int, help="number of stereo pairs")
     parser.add_argument("--supersample", type=int, default=2, help="samples per pixel and axis")

@@ -59,8 +59,10 @@ def _floor_and_ceiling(rng: Random, plan: FloorPlan) -> list[Rectangle]:
     along, across = np.array([plan.length_m, 0, 0]), np.array([0, plan.width_m, 0])
     size = (round(plan.length_m * PX_PER_M), round(plan.width_m * PX_PER_M))
     floor, ceiling = (textures.tiles(rng, size, PX_PER_M) for _ in range(2))
-    return [Rectangle(across, along, -across, floor, "floor"),
-            Rectangle(np.array([0, 0, CEILING_M]), along, across, ceiling, "ceiling")]
+    return [
+        Rectangle(across, along, -across, floor, "floor"),
+        Rectangle(np.array([0, 0, CEILING_M]), along, across, ceiling, "ceiling"),
+    ]
 
 
 def _rooms(rng: Random, plan: FloorPlan) -> list[Rectangle]:
@@ -87,8 +89,11 @@ def _with_door(rng: Random, side: Rectangle) -> list[Rectangle]:
     width, height = DOOR_M
     left = rng.uniform(0.3, side.width_m - width - 0.3)
     right = left + width
-    pieces = [cut(side, (0, 0, left, side.height_m)), cut(side, (right, 0, side.width_m - right, side.height_m)),
-              cut(side, (left, 0, width, side.height_m - height))]
+    pieces = [
+        cut(side, (0, 0, left, side.height_m)),
+        cut(side, (right, 0, side.width_m - right, side.height_m)),
+        cut(side, (left, 0, width, side.height_m - height)),
+    ]
     hung = [p for piece in pieces[:2] if piece.width_m > 0.7 for p in posters(rng, _other_side(piece), 1)]
     return pieces + hung
 
@@ -100,8 +105,13 @@ def cut(side: Rectangle, place_m: tuple[float, float, float, float]) -> Rectangl
     left, top = round(place_m[0] * u), round(place_m[1] * v)
     right, bottom = round((place_m[0] + place_m[2]) * u), round((place_m[1] + place_m[3]) * v)
     origin = side.origin + left / width * side.edge_u + top / height * side.edge_v
-    return Rectangle(origin, (right - left) / width * side.edge_u, (bottom - top) / height * side.edge_v,
-                     np.ascontiguousarray(side.texture[top:bottom, left:right]), side.name)
+    return Rectangle(
+        origin,
+        (right - left) / width * side.edge_u,
+        (bottom - top) / height * side.edge_v,
+        np.ascontiguousarray(side.texture[top:bottom, left:right]),
+        side.name,
+    )
 
 
 def _room_centres(plan: FloorPlan) -> list[Point]:
@@ -126,8 +136,12 @@ def _clutter(rng: Random, plan: FloorPlan) -> list[Rectangle]:
     for x in np.arange(1.5, plan.length_m - 1.5, 2.6):
         for y in (0.22, plan.width_m - 0.22):
             size = rng.uniform((0.25, 0.15, 0.2), (0.45, 0.25, 0.8))
-            faces += box(rng, (float(x + rng.uniform(-0.6, 0.6)), y), (float(size[0]), float(size[1]), float(size[2])),
-                         rng.uniform(-0.15, 0.15))
+            faces += box(
+                rng,
+                (float(x + rng.uniform(-0.6, 0.6)), y),
+                (float(size[0]), float(size[1]), float(size[2])),
+                rng.uniform(-0.15, 0.15),
+            )
     return faces
 
 

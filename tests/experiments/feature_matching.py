@@ -53,9 +53,16 @@ def harris(image: Image, usable: Flags) -> FeatureSet:
 
     The distance d of two such patches and their normalised cross-correlation c satisfy d^2 = 2 - 2 c.
     """
-    found = cv2.goodFeaturesToTrack(image, HARRIS_FEATURES, HARRIS_QUALITY, HARRIS_SPACING_PX,
-                                    mask=usable.astype(np.uint8), blockSize=HARRIS_BLOCK_PX, useHarrisDetector=True,
-                                    k=HARRIS_K)
+    found = cv2.goodFeaturesToTrack(
+        image,
+        HARRIS_FEATURES,
+        HARRIS_QUALITY,
+        HARRIS_SPACING_PX,
+        mask=usable.astype(np.uint8),
+        blockSize=HARRIS_BLOCK_PX,
+        useHarrisDetector=True,
+        k=HARRIS_K,
+    )
     if found is None:
         return FeatureSet(np.zeros((0, 2)), np.zeros((0, PATCH_PX**2), np.float32))
     window = (SUBPIXEL_WINDOW_PX, SUBPIXEL_WINDOW_PX)
@@ -94,8 +101,9 @@ def match_pair(panoramas: Panoramas, detect: Detector, *, along_column: bool) ->
 
 def descriptor_distance(a: FeatureSet, b: FeatureSet) -> NDArray[np.float32]:
     """Return the Euclidean distances (N, M) between the descriptors of two sets."""
-    squared = (a.descriptors**2).sum(axis=1)[:, None] + (b.descriptors**2).sum(axis=1) \
-        - 2 * a.descriptors @ b.descriptors.T
+    squared = (
+        (a.descriptors**2).sum(axis=1)[:, None] + (b.descriptors**2).sum(axis=1) - 2 * a.descriptors @ b.descriptors.T
+    )
     return np.asarray(np.sqrt(np.maximum(squared, 0)), np.float32)
 
 
@@ -105,8 +113,7 @@ def _epipolar(lower: Array, upper: Array) -> Flags:
     return np.asarray(same_column & (upper[None, :, 1] - lower[:, None, 1] > MIN_DISPARITY_PX))
 
 
-def mutual_matches(distance: NDArray[np.float32], ratio: float = RATIO
-                   ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def mutual_matches(distance: NDArray[np.float32], ratio: float = RATIO) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return indices (K,) and (K,) of matches by distances (N, M): mutually nearest, and passing the ratio test.
 
     ratio 1: without the ratio test.

@@ -47,8 +47,11 @@ def turns(rows: list[dict[str, Any]], path: Path) -> None:
     for name, (shade, dash) in zip(rows[0]["found"], STYLES, strict=True):
         right = [[row["found"][name]["right"] for row in rows if row["turn_deg"] == a] for a in _angles(rows)]
         axes.plot(_angles(rows), [np.median(r) for r in right], dash, color=shade, marker=".", label=name)
-    axes.set(xlabel="turn between two images, degrees; to the left is positive", ylabel="features tracked correctly",
-             xticks=range(-180, 181, 36))
+    axes.set(
+        xlabel="turn between two images, degrees; to the left is positive",
+        ylabel="features tracked correctly",
+        xticks=range(-180, 181, 36),
+    )
     axes.legend(frameon=False)
     _save(figure, path)
 

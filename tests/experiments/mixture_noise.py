@@ -129,15 +129,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="*", metavar="FOLDER")
     args = parser.parse_args()
-    columns = (Column("views"), Column("kernel"), Column("position", "mm", 3), Column("rotation", "mrad", 3),
-               Column("squared distance, expected 6", "", 3))
+    columns = (
+        Column("views"),
+        Column("kernel"),
+        Column("position", "mm", 3),
+        Column("rotation", "mrad", 3),
+        Column("squared distance, expected 6", "", 3),
+    )
     table = ResultTable("mixture_views", "accuracy", "Noise as a mixture of two Gaussians: simulated views", columns)
     for kind in KINDS:
         for name, weigh in KERNELS.items():
             table.add(kind, name, *errors(kind, weigh))
     if args.folders:
-        table = ResultTable("mixture_logs", "accuracy", "Noise as a mixture of two Gaussians: logs",
-                            (Column("kernel"), *COLUMNS))
+        table = ResultTable(
+            "mixture_logs", "accuracy", "Noise as a mixture of two Gaussians: logs", (Column("kernel"), *COLUMNS)
+        )
     for folder in args.folders:
         for name, weigh in KERNELS.items():
             with kernel(weigh):

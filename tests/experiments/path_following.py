@@ -29,8 +29,11 @@ METHODS: dict[str, Method] = {
     "omnid without the Kalman filter": Method(filtered=False),
 }
 THE_PAPER = METHODS["enhanced SAD, improved KLT, eq. 9 (the paper)"]
-SHOWN = ("enhanced SAD, plain KLT, eq. 9", "enhanced SAD, improved KLT, eq. 9 (the paper)",
-         "bearings, keyframes, semi-global prior (omnid)")
+SHOWN = (
+    "enhanced SAD, plain KLT, eq. 9",
+    "enhanced SAD, improved KLT, eq. 9 (the paper)",
+    "bearings, keyframes, semi-global prior (omnid)",
+)
 
 
 def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
@@ -41,9 +44,16 @@ def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
 def against_truth(trajectory: Trajectory, folder: Path) -> dict[str, Any]:
     """Return the errors of a trajectory, and its path in the frame of the first pose, x y [m]."""
     m = evaluate(trajectory, read_tum(folder / "truth.txt"))
-    return {"length_m": m.length_estimate_m, "true_length_m": m.length_truth_m, "length_error": m.length_error_ratio,
-            "ate_m": m.ate_rmse_m, "end_m": m.end_error_m, "heading_deg": math.degrees(m.heading_max_rad),
-            "coverage": m.coverage, "xy": np.round(trajectory.T[:, :2, 3], 5).tolist()}
+    return {
+        "length_m": m.length_estimate_m,
+        "true_length_m": m.length_truth_m,
+        "length_error": m.length_error_ratio,
+        "ate_m": m.ate_rmse_m,
+        "end_m": m.end_error_m,
+        "heading_deg": math.degrees(m.heading_max_rad),
+        "coverage": m.coverage,
+        "xy": np.round(trajectory.T[:, :2, 3], 5).tolist(),
+    }
 
 
 def draw(values: dict[str, Any], folder: Path, path: Path) -> None:

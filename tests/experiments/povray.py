@@ -51,9 +51,11 @@ def _rectangle(number: int, r: Rectangle) -> str:
     """Return a unit square with its texture; POV-Ray counts the rows of an image from below."""
     axes = (r.edge_u, -r.edge_v, r.normal, r.origin + r.edge_v)
     matrix = ", ".join(f"{x:.12g}" for axis in axes for x in axis)
-    return (f'polygon {{ 5, <0,0>, <1,0>, <1,1>, <0,1>, <0,0> pigment {{ image_map {{ pgm "{number}.pgm" gamma 1.0 '
-            f"interpolate 2 }} }} finish {{ ambient {r.brightness:.6f} diffuse 0 }} matrix <{matrix}> "
-            "transform { View } }")
+    return (
+        f'polygon {{ 5, <0,0>, <1,0>, <1,1>, <0,1>, <0,0> pigment {{ image_map {{ pgm "{number}.pgm" gamma 1.0 '
+        f"interpolate 2 }} }} finish {{ ambient {r.brightness:.6f} diffuse 0 }} matrix <{matrix}> "
+        "transform { View } }"
+    )
 
 
 def shoot(world: Path, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> Floats:
@@ -77,8 +79,9 @@ def _run(text: str, world: Path, options: list[str]) -> bytes:
         file.write(text)
         file.flush()
         try:
-            done = subprocess.run(["povray", *options, f"+I{file.name}"], cwd=world, capture_output=True,
-                                  timeout=TIMEOUT_S)
+            done = subprocess.run(
+                ["povray", *options, f"+I{file.name}"], cwd=world, capture_output=True, timeout=TIMEOUT_S
+            )
         except FileNotFoundError:
             raise PovrayError(f"povray is not installed: {INSTALL}") from None
     if done.returncode:
@@ -92,9 +95,17 @@ def view_text(mounted: MountedCamera, T_world_rig: Array) -> str:
     camera = traceable(mounted.camera)
     T_cam_world = mounted.T_cam_rig @ se3.inverse(T_world_rig)
     columns = ", ".join(f"{x:.15g}" for x in np.concatenate([T_cam_world[:3, :3].T.ravel(), T_cam_world[:3, 3]]))
-    return "\n".join(["#version 3.7;", "global_settings { assumed_gamma 1.0 max_trace_level 2 }", _camera(camera),
-                      _mirror(camera, mounted.visible.outer_px),
-                      f"#declare View = transform {{ matrix <{columns}> }}", '#include "world.inc"', ""])
+    return "\n".join(
+        [
+            "#version 3.7;",
+            "global_settings { assumed_gamma 1.0 max_trace_level 2 }",
+            _camera(camera),
+            _mirror(camera, mounted.visible.outer_px),
+            f"#declare View = transform {{ matrix <{columns}> }}",
+            '#include "world.inc"',
+            "",
+        ]
+    )
 
 
 def traceable(camera: OmniCamera) -> UnifiedCamera:
@@ -119,12 +130,16 @@ def _camera(camera: UnifiedCamera) -> str:
     below = scale * ((height - 1) / 2 - camera.center[1]) / camera.focal[1]
     if camera.xi == 1:
         right, down, aside, below = (MIRROR_M * x for x in (right, down, aside, below))
-        return (f"camera {{ orthographic location <{aside:.15g}, {below:.15g}, {2 * MIRROR_M}> direction <0, 0, -1> "
-                f"right <{right:.15g}, 0, 0> up <0, {-down:.15g}, 0> }}")
+        return (
+            f"camera {{ orthographic location <{aside:.15g}, {below:.15g}, {2 * MIRROR_M}> direction <0, 0, -1> "
+            f"right <{right:.15g}, 0, 0> up <0, {-down:.15g}, 0> }}"
+        )
     e = _eccentricity(camera.xi)
     focus = 2 * e * MIRROR_M / (e**2 - 1)  # the hyperbola's other focus
-    return (f"camera {{ perspective location <0, 0, {focus:.15g}> direction <{aside:.15g}, "
-            f"{below:.15g}, -1> right <{right:.15g}, 0, 0> up <0, {-down:.15g}, 0> }}")
+    return (
+        f"camera {{ perspective location <0, 0, {focus:.15g}> direction <{aside:.15g}, "
+        f"{below:.15g}, -1> right <{right:.15g}, 0, 0> up <0, {-down:.15g}, 0> }}"
+    )
 
 
 def _mirror(camera: UnifiedCamera, rim_px: float) -> str:
@@ -134,9 +149,11 @@ def _mirror(camera: UnifiedCamera, rim_px: float) -> str:
     z = _elevation(m, camera.xi)  # of the ray reflected at the rim
     rim = MIRROR_M / (1 + e * z) * float(np.sqrt(1 - z**2))
     top = MIRROR_M / (1 + e) * 1.01  # just beyond the vertex, before the second sheet of a hyperbola
-    return (f"quadric {{ <1, 1, {1 - e**2:.15g}>, <0, 0, 0>, <0, 0, {2 * MIRROR_M * e:.15g}>, {-MIRROR_M**2:.15g} "
-            f"clipped_by {{ cylinder {{ <0, 0, {-100 * MIRROR_M}>, <0, 0, {top:.15g}>, {rim:.15g} }} }} "
-            "pigment { rgb 0 } finish { ambient 0 diffuse 0 reflection { 1 } } }")
+    return (
+        f"quadric {{ <1, 1, {1 - e**2:.15g}>, <0, 0, 0>, <0, 0, {2 * MIRROR_M * e:.15g}>, {-(MIRROR_M**2):.15g} "
+        f"clipped_by {{ cylinder {{ <0, 0, {-100 * MIRROR_M}>, <0, 0, {top:.15g}>, {rim:.15g} }} }} "
+        "pigment { rgb 0 } finish { ambient 0 diffuse 0 reflection { 1 } } }"
+    )
 
 
 def _elevation(m: float, xi: float) -> float:

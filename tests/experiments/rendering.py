@@ -40,16 +40,30 @@ def render_log(folder: Path, run: SimulatedRun, seed: int, *, supersample: int =
 
     with ThreadPoolExecutor(jobs) as pool:
         _watch(pool.map(draw, missing), len(missing), folder.name)
-    pack_log(folder, run.rig, run.poses, lambda pair, camera: _load(_path(frames, pair, camera)), sensor=run.sensor,
-             seed=seed)
+    pack_log(
+        folder,
+        run.rig,
+        run.poses,
+        lambda pair, camera: _load(_path(frames, pair, camera)),
+        sensor=run.sensor,
+        seed=seed,
+    )
     _remove(frames, folder / "world")
 
 
 def cast_log(folder: Path, run: SimulatedRun, seed: int, *, supersample: int = 2) -> None:
     """Render a run by the ray caster of tests/simulation and write the same files; does nothing if the log exists."""
     if not (folder / "log.mcap").exists():
-        write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=seed, supersample=supersample,
-                  progress=partial(_show_progress, folder.name, time.monotonic()))
+        write_log(
+            folder,
+            run.rig,
+            run.poses,
+            run.scene,
+            sensor=run.sensor,
+            seed=seed,
+            supersample=supersample,
+            progress=partial(_show_progress, folder.name, time.monotonic()),
+        )
 
 
 def _path(frames: Path, pair: int, camera: int) -> Path:

@@ -28,8 +28,10 @@ from tests.experiments.views import DESCRIPTION, RENDERERS, Experiment
 RESULTS = Path(__file__).parent / "results"
 Measure = Callable[[Path, Experiment], Values]
 MEASURES: dict[str, dict[str, Measure]] = {  # by scene: what is measured on it
-    "brick": {"wall": wall_matching.measure}, "control": {"wall": wall_matching.measure},
-    "smooth": {"wall": wall_matching.measure}, "turns": {"turns": turn_tracking.measure},
+    "brick": {"wall": wall_matching.measure},
+    "control": {"wall": wall_matching.measure},
+    "smooth": {"wall": wall_matching.measure},
+    "turns": {"turns": turn_tracking.measure},
     "two_walls": {"paths": path_following.measure, "speed": speed.measure},
     "building": {"building": whole_building.measure},
 }
@@ -56,8 +58,15 @@ def report(logs: Path, results: Path = RESULTS, again: bool = False) -> None:
 
 def about(experiment: Experiment) -> Values:
     """Return the origin of a result: scene, renderer, date and machine."""
-    return {"scene": experiment.name, "seed": experiment.seed, "size": experiment.size, "pairs": experiment.pairs,
-            "renderer": experiment.renderer, "date": datetime.now(UTC).date().isoformat(), "machine": machine()}
+    return {
+        "scene": experiment.name,
+        "seed": experiment.seed,
+        "size": experiment.size,
+        "pairs": experiment.pairs,
+        "renderer": experiment.renderer,
+        "date": datetime.now(UTC).date().isoformat(),
+        "machine": machine(),
+    }
 
 
 def machine() -> str:
@@ -116,14 +125,20 @@ def text(results: Path) -> str:
 
 def _paths(results: Path) -> list[str]:
     found = {renderer: measured(results, "paths", "two_walls", renderer) for renderer in RENDERERS}
-    parts = [f"{RENDERER_NAMES[renderer]}, seeds {', '.join(map(str, sorted(seeds)))}:\n\n{tables.paths_table(seeds)}"
-             for renderer, seeds in found.items() if seeds]
+    parts = [
+        f"{RENDERER_NAMES[renderer]}, seeds {', '.join(map(str, sorted(seeds)))}:\n\n{tables.paths_table(seeds)}"
+        for renderer, seeds in found.items()
+        if seeds
+    ]
     return [report_text.PATHS, *parts, report_text.PATHS_REMARKS] if parts else []
 
 
 def _building(results: Path) -> list[str]:
-    runs = {f"{seed}, {RENDERER_NAMES[renderer]}": values for renderer in RENDERERS
-            for seed, values in sorted(measured(results, "building", "building", renderer).items())}
+    runs = {
+        f"{seed}, {RENDERER_NAMES[renderer]}": values
+        for renderer in RENDERERS
+        for seed, values in sorted(measured(results, "building", "building", renderer).items())
+    }
     if not runs:
         return []
     return [report_text.BUILDING, tables.building_table(runs), report_text.BUILDING_REMARKS]

@@ -48,15 +48,25 @@ def seeded_rig(seed: int, size: int, options: RigOptions) -> Rig:
     turned = misaligned * np.array([tilt * np.cos(axis), tilt * np.sin(axis), yaw])
     # A hyperbolic mirror shows less above the horizon in an image of the same size: a smaller rim keeps all rays valid.
     rim = RIM if options.xi == 1 else min(RIM, 0.45)
-    return make_rig(size=size, scale=options.scale or scale, baseline_m=options.baseline_m or baseline, rim=rim,
-                    xi=options.xi, misaligned_deg=tuple(turned), offset_mm=(misaligned * x, misaligned * y))
+    return make_rig(
+        size=size,
+        scale=options.scale or scale,
+        baseline_m=options.baseline_m or baseline,
+        rim=rim,
+        xi=options.xi,
+        misaligned_deg=tuple(turned),
+        offset_mm=(misaligned * x, misaligned * y),
+    )
 
 
 def _paper_rig(seed: int, size: int, options: RigOptions) -> Rig:
     """Return the paper's rig where the options are None: viewpoints at 1.2 m and 1.4 m, no misalignment."""
     misaligned = 0.0 if options.misaligned is None else options.misaligned
-    return seeded_rig(seed, size, replace(options, scale=options.scale or 1.0, baseline_m=options.baseline_m or 0.2,
-                                          misaligned=misaligned))
+    return seeded_rig(
+        seed,
+        size,
+        replace(options, scale=options.scale or 1.0, baseline_m=options.baseline_m or 0.2, misaligned=misaligned),
+    )
 
 
 def brick(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
@@ -88,8 +98,13 @@ def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) ->
     front = upright(rng, kind, (WALL_M, half), (WALL_M, -half))
     ends = (((-2.5, half), (WALL_M, half)), ((WALL_M, -half), (-2.5, -half)), ((-2.5, -half), (-2.5, half)))
     others = [upright(rng, "plaster", a, b) for a, b in ends]
-    floor = Rectangle(np.array([-2.5, half, 0]), np.array([WALL_M + 2.5, 0, 0]), np.array([0, -2 * half, 0.0]),
-                      PAINTERS["tiles"](rng, (900, 1800), 200.0), "floor")
+    floor = Rectangle(
+        np.array([-2.5, half, 0]),
+        np.array([WALL_M + 2.5, 0, 0]),
+        np.array([0, -2 * half, 0.0]),
+        PAINTERS["tiles"](rng, (900, 1800), 200.0),
+        "floor",
+    )
     scene = Scene((replace(front, name="wall"), *others, floor))
     aside = np.column_stack([np.zeros(pairs), 0.07 * (np.arange(pairs) - (pairs - 1) / 2)])
     return SimulatedRun(_paper_rig(seed, size, options), paths.planar_poses(aside, np.zeros(pairs)), scene)
@@ -108,7 +123,7 @@ def turns(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun
     """
     angles = np.deg2rad([0, *TURNS_DEG, *MOVED_TURNS_DEG])
     xy = np.zeros((len(angles), 2))
-    xy[-len(MOVED_TURNS_DEG):] = MOVED_M
+    xy[-len(MOVED_TURNS_DEG) :] = MOVED_M
     return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
 
 
@@ -120,13 +135,18 @@ def building_run(seed: int, size: int, pairs: int, options: RigOptions) -> Simul
 
 Recipe = Callable[[int, int, int, RigOptions], SimulatedRun]
 EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
-    "brick": (brick, 3), "control": (control, 3), "smooth": (smooth, 3), "two_walls": (two_walls, 99),
-    "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)), "building": (building_run, 349),
+    "brick": (brick, 3),
+    "control": (control, 3),
+    "smooth": (smooth, 3),
+    "two_walls": (two_walls, 99),
+    "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)),
+    "building": (building_run, 349),
 }
 
 
-def build(name: str, seed: int, size: int = 768, pairs: int | None = None, options: RigOptions | None = None
-          ) -> SimulatedRun:
+def build(
+    name: str, seed: int, size: int = 768, pairs: int | None = None, options: RigOptions | None = None
+) -> SimulatedRun:
     """Return the run of a name; pairs None: as many as the paper has."""
     recipe, default_pairs = EXPERIMENTS[name]
     return recipe(seed, size, pairs or default_pairs, options or RigOptions())

@@ -62,8 +62,10 @@ class Times:
 def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
     """Return the median processor time a pair takes [ms] for each task, with one thread of OpenCV."""
     place, times = log_geometry(folder), Times()
-    matchers = {name: stereo(place, method) for name, method in
-                (("original SAD", "sad"), ("enhanced SAD", "enhanced"), ("semi-global prior", "semiglobal"))}
+    matchers = {
+        name: stereo(place, method)
+        for name, method in (("original SAD", "sad"), ("enhanced SAD", "enhanced"), ("semi-global prior", "semiglobal"))
+    }
     computed = {name: DenseDepths(matcher.compute) for name, matcher in matchers.items()}
     default = OdometryStage(place, Config().odometry, computed["semi-global prior"])
     paper = OdometryStage(place, load(Config, overrides=("odometry.method=paper",)).odometry, computed["enhanced SAD"])
@@ -88,8 +90,9 @@ def _values(times: Times) -> dict[str, float]:
     each = times.median_ms()
     rows = {f"depth: {name}": each[f"depth: {name}"] for name in ("original SAD", "enhanced SAD", "semi-global prior")}
     rows["motion, tracking alone: corners, correlation, KLT there and back"] = each["tracking alone"]
-    rows["motion, all of omnid: prediction, tracking, RANSAC, Gauss-Newton, refinement, keyframes"] = (
-        each["motion of omnid"])
+    rows["motion, all of omnid: prediction, tracking, RANSAC, Gauss-Newton, refinement, keyframes"] = each[
+        "motion of omnid"
+    ]
     rows["motion, all of the paper's method"] = each["motion of the paper"]
     rows["**depth and motion, omnid**"] = times.sum_ms("depth: semi-global prior", "motion of omnid")
     rows["**depth and motion, the paper's method**"] = times.sum_ms("depth: enhanced SAD", "motion of the paper")
@@ -159,8 +162,9 @@ class SiftOdometry:
             return stereo_matches, None
         return stereo_matches, mutual_matches(descriptor_distance(self._before.features, lower))
 
-    def _move(self, seq: int, panoramas: tuple[FeatureSet, FeatureSet], stereo_matches: Any, motion_matches: Any
-              ) -> _Located:
+    def _move(
+        self, seq: int, panoramas: tuple[FeatureSet, FeatureSet], stereo_matches: Any, motion_matches: Any
+    ) -> _Located:
         """Triangulate the stereo matches and estimate the motion since the pair before."""
         lower, upper = panoramas
         a, b = stereo_matches

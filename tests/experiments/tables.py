@@ -54,15 +54,33 @@ def _methods(seeds: Seeds) -> list[str]:
 
 def wall_table(walls: dict[str, Seeds]) -> str:
     """Return the table of the walls: bricks, control, smooth texture."""
-    rows = [[wall, method, spread(_column(seeds, method, "matches"), number()),
-             spread(_column(seeds, method, "wrong"), percent(1)),
-             spread(_column(seeds, method, "mismatched"), percent(1)),
-             spread(_column(seeds, method, "completeness"), percent(1)),
-             spread(_column(seeds, method, "coverage"), percent(1)),
-             spread(_column(seeds, method, "rms_of_right_m"), millimetres())]
-            for wall, seeds in walls.items() for method in _methods(seeds)]
-    return table(("wall", "method", "matches a pair", "over 5 cm off", "over 20 cm off", "completeness", "coverage",
-                  "RMS of the right ones"), rows)
+    rows = [
+        [
+            wall,
+            method,
+            spread(_column(seeds, method, "matches"), number()),
+            spread(_column(seeds, method, "wrong"), percent(1)),
+            spread(_column(seeds, method, "mismatched"), percent(1)),
+            spread(_column(seeds, method, "completeness"), percent(1)),
+            spread(_column(seeds, method, "coverage"), percent(1)),
+            spread(_column(seeds, method, "rms_of_right_m"), millimetres()),
+        ]
+        for wall, seeds in walls.items()
+        for method in _methods(seeds)
+    ]
+    return table(
+        (
+            "wall",
+            "method",
+            "matches a pair",
+            "over 5 cm off",
+            "over 20 cm off",
+            "completeness",
+            "coverage",
+            "RMS of the right ones",
+        ),
+        rows,
+    )
 
 
 def turns_table(seeds: Seeds) -> str:
@@ -71,8 +89,10 @@ def turns_table(seeds: Seeds) -> str:
     rows = []
     for row_number, first in enumerate(first_seed):
         at = [values["turns"][row_number] for values in seeds.values()]
-        cells = [f"{_median(at, name, 'right')} / {_median(at, name, 'claimed')} / {_median(at, name, 'ms')} ms"
-                 for name in first["found"]]
+        cells = [
+            f"{_median(at, name, 'right')} / {_median(at, name, 'claimed')} / {_median(at, name, 'ms')} ms"
+            for name in first["found"]
+        ]
         rows.append([f"{angle(first['turn_deg'])}{', moved' if first['moved'] else ''}", *cells])
     return table(("turn", *(f"{name}: right / claimed / time" for name in first_seed[0]["found"])), rows)
 
@@ -101,29 +121,58 @@ def turns_summary(seeds: Seeds) -> str:
 
 def paths_table(seeds: Seeds) -> str:
     """Return the table of the path between two walls, each step from the paper to omnid."""
-    rows = [[method, spread(_column(seeds, method, "length_error"), percent(3, sign=True)),
-             spread(_column(seeds, method, "ate_m"), millimetres(2)),
-             spread(_column(seeds, method, "end_m"), millimetres(2)),
-             spread(_column(seeds, method, "heading_deg"), lambda x: f"{x:.3f}°")] for method in _methods(seeds)]
+    rows = [
+        [
+            method,
+            spread(_column(seeds, method, "length_error"), percent(3, sign=True)),
+            spread(_column(seeds, method, "ate_m"), millimetres(2)),
+            spread(_column(seeds, method, "end_m"), millimetres(2)),
+            spread(_column(seeds, method, "heading_deg"), lambda x: f"{x:.3f}°"),
+        ]
+        for method in _methods(seeds)
+    ]
     return table(("method", "length", "ATE rmse", "end", "heading, max"), rows)
 
 
 def building_table(runs: dict[str, Values]) -> str:
     """Return the table of the round through the building, by run and method."""
     rows = [[run, method, *_building_row(v)] for run, values in runs.items() for method, v in values.items()]
-    return table(("seed, renderer", "method", "path", "length", "ATE rmse", "end to start", "heading, max", "map RMS",
-                  "map median", "map over 5 cm off", "walls mapped"), rows)
+    return table(
+        (
+            "seed, renderer",
+            "method",
+            "path",
+            "length",
+            "ATE rmse",
+            "end to start",
+            "heading, max",
+            "map RMS",
+            "map median",
+            "map over 5 cm off",
+            "walls mapped",
+        ),
+        rows,
+    )
 
 
 def _building_row(v: Values) -> list[str]:
     length_m = v["true_length_m"]
-    path = [f"{length_m:.2f} m", percent(3, True)(v["length_error"]),
-            f"{1e3 * v['ate_m']:.1f} mm = {v['ate_m'] / length_m:.3%}",
-            f"{1e3 * v['end_to_start_m']:.1f} mm = {v['end_to_start_m'] / length_m:.3%}", f"{v['heading_deg']:.3f}°"]
+    path = [
+        f"{length_m:.2f} m",
+        percent(3, True)(v["length_error"]),
+        f"{1e3 * v['ate_m']:.1f} mm = {v['ate_m'] / length_m:.3%}",
+        f"{1e3 * v['end_to_start_m']:.1f} mm = {v['end_to_start_m'] / length_m:.3%}",
+        f"{v['heading_deg']:.3f}°",
+    ]
     if (m := v.get("map")) is None:
         return [*path, *4 * [ABSENT]]
-    return [*path, millimetres()(m["rms_m"]), millimetres()(m["median_m"]), percent()(m["off_by_0.05_m"]),
-            percent(1)(m["completeness"])]
+    return [
+        *path,
+        millimetres()(m["rms_m"]),
+        millimetres()(m["median_m"]),
+        percent()(m["off_by_0.05_m"]),
+        percent(1)(m["completeness"]),
+    ]
 
 
 def speed_table(seeds: Seeds) -> str:

@@ -65,8 +65,10 @@ class Features:
 def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
     """Return for each turn and tracker: features claimed, those right within RIGHT_PX, and the processor time [ms]."""
     run, views = experiment.run, load_views(folder)
-    frames = [StereoFrame(p.seq, p.lower, p.upper, np.full(p.visible.shape, np.nan, np.float32), p.visible)
-              for p in views.panoramas]
+    frames = [
+        StereoFrame(p.seq, p.lower, p.upper, np.full(p.visible.shape, np.nan, np.float32), p.visible)
+        for p in views.panoramas
+    ]
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -86,8 +88,10 @@ def turns(pairs: int) -> Iterator[Turn]:
 
 def _row(run: SimulatedRun, views: Views, frames: list[StereoFrame], turn: Turn) -> dict[str, Any]:
     features = _features(run, views, frames[turn.before], run.poses[turn.before])
-    found = {name: _count(run, views, (frames[turn.before], frames[turn.after]), features, run.poses[turn.after],
-                          tracker) for name, tracker in TRACKERS.items()}
+    found = {
+        name: _count(run, views, (frames[turn.before], frames[turn.after]), features, run.poses[turn.after], tracker)
+        for name, tracker in TRACKERS.items()
+    }
     return {"turn_deg": turn.angle_deg, "moved": turn.moved, "features": len(features.pixels), "found": found}
 
 
@@ -99,8 +103,14 @@ def _features(run: SimulatedRun, views: Views, frame: StereoFrame, T_world_rig: 
     return Features(pixels[hit], origin + distance[hit, None] * rays[hit])
 
 
-def _count(run: SimulatedRun, views: Views, frames: tuple[StereoFrame, StereoFrame], features: Features,
-           T_world_rig: Array, tracker: Tracker) -> dict[str, float]:
+def _count(
+    run: SimulatedRun,
+    views: Views,
+    frames: tuple[StereoFrame, StereoFrame],
+    features: Features,
+    T_world_rig: Array,
+    tracker: Tracker,
+) -> dict[str, float]:
     """Track features from the first frame into the second, whose true pose is T_world_rig, and count the right ones."""
     started_s = time.process_time()
     pixels, claimed = tracker(frames[0], frames[1], features.pixels)

@@ -61,8 +61,9 @@ def measure(folder: Path, experiment: Experiment) -> dict[str, Any]:
 def methods(place: Geometry) -> dict[str, Matching]:
     """Return all methods by their names in the table."""
     dense = {name: partial(_located, stereo(place, method)) for name, method in SAD_METHODS.items()}
-    sparse = {name: partial(_located_features, place, detect, along)
-              for name, (detect, along) in FEATURE_METHODS.items()}
+    sparse = {
+        name: partial(_located_features, place, detect, along) for name, (detect, along) in FEATURE_METHODS.items()
+    }
     return {**dense, **sparse}
 
 
@@ -77,8 +78,9 @@ def _located(dense: DenseStereo, panoramas: Panoramas) -> tuple[Array, Array]:
     return depth.pixels, depth.points
 
 
-def _located_features(place: Geometry, detect: Detector, along_column: bool, panoramas: Panoramas
-                      ) -> tuple[Array, Array]:
+def _located_features(
+    place: Geometry, detect: Detector, along_column: bool, panoramas: Panoramas
+) -> tuple[Array, Array]:
     views = match_pair(panoramas, detect, along_column=along_column)
     points = triangulate(views, place.cylinder, place.rig.baseline_m)
     finite = np.isfinite(points).all(axis=1)
@@ -118,9 +120,13 @@ def _errors(run: SimulatedRun, pairs: list[WallMatches], *, is_dense: bool) -> d
     """Return the errors over all pairs; completeness only for methods that match every edge pixel."""
     error_m = np.concatenate([p.points[:, 0] for p in pairs]) - WALL_M
     right = np.abs(error_m) <= WRONG_M
-    values = {"matches": len(error_m) / len(pairs), "right": float(right.sum()) / len(pairs),
-              "wrong": _share(~right), "mismatched": _share(np.abs(error_m) > MISMATCHED_M),
-              "coverage": _coverage(run, pairs)}
+    values = {
+        "matches": len(error_m) / len(pairs),
+        "right": float(right.sum()) / len(pairs),
+        "wrong": _share(~right),
+        "mismatched": _share(np.abs(error_m) > MISMATCHED_M),
+        "coverage": _coverage(run, pairs),
+    }
     if len(error_m):
         values["rms_m"] = _rms(error_m)
     if right.any():

@@ -21,8 +21,10 @@ from tests.experiments.views import Experiment
 from tests.simulation.recipes import SimulatedRun
 
 METHODS: dict[str, Method] = {
-    "the paper": THE_PAPER, "the paper without its Kalman filter": PATH_METHODS["the paper without its Kalman filter"],
-    "omnid": Method(), "omnid without the Kalman filter": PATH_METHODS["omnid without the Kalman filter"],
+    "the paper": THE_PAPER,
+    "the paper without its Kalman filter": PATH_METHODS["the paper without its Kalman filter"],
+    "omnid": Method(),
+    "omnid without the Kalman filter": PATH_METHODS["omnid without the Kalman filter"],
 }
 NEAR_M = 4.0  # the map is judged within this distance from the path
 SEEN_M = 0.1  # a spot of a wall counts as mapped with a point this close
@@ -60,8 +62,13 @@ def map_errors(run: SimulatedRun, points: MapPoints) -> dict[str, float]:
     near = _distance_from_path(run, in_world[:, :2]) < NEAR_M
     error = surface_distance_m(run.scene, in_world[near])
     off = {f"off_by_{limit:g}_m": float((error > limit).mean()) for limit in OFF_M}
-    return {"points": int(near.sum()), "rms_m": float(np.sqrt((error**2).mean())), "median_m": float(np.median(error)),
-            "completeness": _completeness(run, in_world[near]), **off}
+    return {
+        "points": int(near.sum()),
+        "rms_m": float(np.sqrt((error**2).mean())),
+        "median_m": float(np.median(error)),
+        "completeness": _completeness(run, in_world[near]),
+        **off,
+    }
 
 
 def _distance_from_path(run: SimulatedRun, xy: Array) -> Array:

@@ -51,8 +51,13 @@ def parser() -> argparse.ArgumentParser:
     result = argparse.ArgumentParser(prog="python -m tests.faults", description=__doc__)
     parts = ("trials", "stops", "routes", "commands", "files", "crowds", "floods", "images")
     result.add_argument("parts", nargs="*", choices=[*parts, []], default=parts, metavar="PART", help=", ".join(parts))
-    result.add_argument("--only", action="append", default=[], metavar="WORD",
-                        help="of trials, stops and images, those whose name has the word; may be given several times")
+    result.add_argument(
+        "--only",
+        action="append",
+        default=[],
+        metavar="WORD",
+        help="of trials, stops and images, those whose name has the word; may be given several times",
+    )
     result.add_argument("--seed", type=int, default=1)
     result.add_argument("--stops", type=int, default=200, help="stops to measure for each cause")
     result.add_argument("--commands", type=int, default=30_000, help="mutated commands to send")

@@ -68,8 +68,9 @@ while True:
 @contextmanager
 def crowd(text: str, *words: object) -> Iterator[int]:
     """Run a crowd until the end of the block; yield its number when it is there."""
-    with subprocess.Popen([sys.executable, "-P", "-c", text, *map(str, words)], stdout=subprocess.PIPE, text=True,
-                          cwd=ROOT) as process:
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", text, *map(str, words)], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
         try:
             assert process.stdout is not None
             yield int(process.stdout.readline())
@@ -89,8 +90,18 @@ class Page:
 
     def __init__(self, ends: ExitStack, robot_port: int, tls: tuple[Path, Path] | None) -> None:
         words = [] if tls is None else ["--tls-certificate", str(tls[0]), "--tls-key", str(tls[1])]
-        command = [sys.executable, "-P", "-m", "omnid", "web", "--listen", "127.0.0.1:0", "--connect",
-                   f"tcp/127.0.0.1:{robot_port}", *words]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "omnid",
+            "web",
+            "--listen",
+            "127.0.0.1:0",
+            "--connect",
+            f"tcp/127.0.0.1:{robot_port}",
+            *words,
+        ]
         process = ends.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT))
         ends.callback(process.kill)
         assert process.stdout is not None
@@ -100,8 +111,11 @@ class Page:
     def timed_stop(self) -> float:
         """Return how long POST /stop takes until it is answered with "done", s; 99 for any other answer."""
         begin_s = time.monotonic()
-        connection = HTTPSConnection("127.0.0.1", self.port, timeout=30, context=ssl._create_unverified_context()) \
-            if self._tls else HTTPConnection("127.0.0.1", self.port, timeout=30)
+        connection = (
+            HTTPSConnection("127.0.0.1", self.port, timeout=30, context=ssl._create_unverified_context())
+            if self._tls
+            else HTTPConnection("127.0.0.1", self.port, timeout=30)
+        )
         try:
             connection.request("POST", "/stop", headers={"Authorization": f"Bearer {self._token}"})
             answer = connection.getresponse()
@@ -116,8 +130,26 @@ class Page:
 def certificate(folder: Path) -> tuple[Path, Path]:
     """Return a certificate and its key for 127.0.0.1, made by openssl."""
     pem, key = folder / "cert.pem", folder / "key.pem"
-    subprocess.run(["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-subj", "/CN=127.0.0.1", "-days", "2",
-                    "-keyout", str(key), "-out", str(pem)], check=True, capture_output=True)
+    subprocess.run(
+        [
+            "openssl",
+            "req",
+            "-x509",
+            "-newkey",
+            "rsa:2048",
+            "-nodes",
+            "-subj",
+            "/CN=127.0.0.1",
+            "-days",
+            "2",
+            "-keyout",
+            str(key),
+            "-out",
+            str(pem),
+        ],
+        check=True,
+        capture_output=True,
+    )
     return pem, key
 
 
@@ -139,11 +171,26 @@ def run(recorded: Path, folder: Path, report: Callable[[str], None]) -> int:
         for page in (plain, secure):  # each has connected to the robot
             assert page.timed_stop() < 30
         bus = f"tcp/127.0.0.1:{daemon.port}"
-        row("zenoh sessions without any right", SESSION_CROWD, (bus, SESSIONS), "`omnid stop`",
-            lambda: timed_stop(daemon.port))
-        row("silent connections to the bus", SILENT_CROWD, (daemon.port, SILENT), "`omnid stop`",
-            lambda: timed_stop(daemon.port))
+        row(
+            "zenoh sessions without any right",
+            SESSION_CROWD,
+            (bus, SESSIONS),
+            "`omnid stop`",
+            lambda: timed_stop(daemon.port),
+        )
+        row(
+            "silent connections to the bus",
+            SILENT_CROWD,
+            (daemon.port, SILENT),
+            "`omnid stop`",
+            lambda: timed_stop(daemon.port),
+        )
         row("silent connections to the page", SILENT_CROWD, (plain.port, SILENT), "POST /stop", plain.timed_stop)
-        row("TLS connections without a handshake", SILENT_CROWD, (secure.port, SILENT), "POST /stop, TLS",
-            secure.timed_stop)
+        row(
+            "TLS connections without a handshake",
+            SILENT_CROWD,
+            (secure.port, SILENT),
+            "POST /stop, TLS",
+            secure.timed_stop,
+        )
     return failed

@@ -65,8 +65,9 @@ with zenoh.open(config) as session:
 @contextmanager
 def started(text: str, *words: str) -> Iterator[subprocess.Popen[str]]:
     """Run a program until the end of the block; yield when it is ready."""
-    with subprocess.Popen([sys.executable, "-P", "-c", text, *words], stdout=subprocess.PIPE, text=True, cwd=ROOT
-                          ) as process:
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", text, *words], stdout=subprocess.PIPE, text=True, cwd=ROOT
+    ) as process:
         try:
             assert process.stdout is not None and process.stdout.readline() == "ready\n"
             yield process
@@ -80,8 +81,9 @@ def flood(port: int, key: str, rate_hz: float) -> Iterator[None]:
     payload = twist_stamped_cdr(1, "base_link", 0.1, 0.0)
     with ExitStack() as ends:
         for _ in range(SENDERS):
-            ends.enter_context(started(FLOODER, f"tcp/127.0.0.1:{port}", f"omnid/{key}", str(rate_hz / SENDERS),
-                                       payload.hex()))
+            ends.enter_context(
+                started(FLOODER, f"tcp/127.0.0.1:{port}", f"omnid/{key}", str(rate_hz / SENDERS), payload.hex())
+            )
         yield
 
 
@@ -94,8 +96,11 @@ def received_hz(port: int, key: str, rate_hz: float) -> float:
         count += 1
 
     config = zenoh.Config()
-    for name, value in (("mode", "peer"), ("listen/endpoints", [f"tcp/127.0.0.1:{port}"]),
-                        ("scouting/multicast/enabled", False)):
+    for name, value in (
+        ("mode", "peer"),
+        ("listen/endpoints", [f"tcp/127.0.0.1:{port}"]),
+        ("scouting/multicast/enabled", False),
+    ):
         config.insert_json5(name, json.dumps(value))
     with zenoh.open(config) as session:
         held = session.declare_subscriber("omnid/cmd/**", zenoh.handlers.Callback(add, indirect=False))
@@ -120,10 +125,14 @@ def run(recorded: Path, folder: Path, rate_hz: float, only: list[str], report: C
     failed, own = 0, folder / "floods"
     own.mkdir()
     sink_port = free_port()
-    report(f"reached by {SENDERS} senders asked for {rate_hz:.0f}/s, at a listener that only counts: "
-           f"{received_hz(free_port(), 'cmd/imu', rate_hz):.0f}/s\n")
-    report("| flood on | poses/s before | poses/s, the flood at another process | poses/s, the flood here | share | "
-           "stop, s |")
+    report(
+        f"reached by {SENDERS} senders asked for {rate_hz:.0f}/s, at a listener that only counts: "
+        f"{received_hz(free_port(), 'cmd/imu', rate_hz):.0f}/s\n"
+    )
+    report(
+        "| flood on | poses/s before | poses/s, the flood at another process | poses/s, the flood here | share | "
+        "stop, s |"
+    )
     report("|---|---|---|---|---|---|")
     with robot(recorded, own) as (daemon, operator, _), started(SINK, f"tcp/127.0.0.1:{sink_port}"):
         for key in (key for key in KEYS if not only or any(word in key for word in only)):

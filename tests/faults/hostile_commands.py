@@ -23,9 +23,13 @@ SETTLE_S: Final = 1.0
 def command(rng: random.Random, topics: Sequence[str], age_s: float) -> tuple[str, bytes]:
     """Return topic and payload of a mutated command whose stamp is so old before the mutation."""
     stamp_ns = time.time_ns() - round(age_s * 1e9)
-    payload = rng.choice((codec.heading_cdr(stamp_ns, rng.uniform(-3, 3), rng.uniform(-9, 9)),
-                          codec.twist_stamped_cdr(stamp_ns, "base_link", rng.uniform(-3, 3), rng.uniform(-9, 9)),
-                          codec.header_cdr(stamp_ns)))
+    payload = rng.choice(
+        (
+            codec.heading_cdr(stamp_ns, rng.uniform(-3, 3), rng.uniform(-9, 9)),
+            codec.twist_stamped_cdr(stamp_ns, "base_link", rng.uniform(-3, 3), rng.uniform(-9, 9)),
+            codec.header_cdr(stamp_ns),
+        )
+    )
     return rng.choice(topics), mutated(rng, payload)
 
 
@@ -64,8 +68,10 @@ def run(recorded: Path, folder: Path, count: int, seed: int, report: Callable[[s
             wait_until(lambda: not base.drives, "the stop")
             time.sleep(SETTLE_S)
             assert not base.drives, "the wheels turn without a command"
-            report(f"| of now, armed, the operator silent | {count // 2} | at most {fastest:.2f} m/s, stood afterwards "
-                   "| alive, all counted |")
+            report(
+                f"| of now, armed, the operator silent | {count // 2} | at most {fastest:.2f} m/s, stood afterwards "
+                "| alive, all counted |"
+            )
             code, err = daemon.end()
             assert code == 0 and "Traceback" not in err, (code, err)
         except AssertionError as error:

@@ -84,8 +84,10 @@ def read_frames(path: Path) -> None:
 def messages() -> Mapping[str, bytes]:
     """Return a message of each kind that clients decode."""
     status = DiagnosticStatus("omnid: wheels", 1, "no command", {"commands": "4", "armed": "1"})
-    return {"odom": codec.odometry_cdr(10**18, np.eye(4), np.eye(6), np.arange(6.0), np.eye(6)),
-            "status": codec.diagnostics_cdr(10**18, [status] * 5)}
+    return {
+        "odom": codec.odometry_cdr(10**18, np.eye(4), np.eye(6), np.arange(6.0), np.eye(6)),
+        "status": codec.diagnostics_cdr(10**18, [status] * 5),
+    }
 
 
 def map_bytes(folder: Path) -> bytes:
@@ -103,8 +105,10 @@ def camera_text(folder: Path) -> bytes:
 FORMATS: Final = {
     "rig.toml": Format(lambda folder: (folder / "rig.toml").read_bytes(), lambda path: parse_rig(path.read_bytes())),
     "camera.toml": Format(camera_text, lambda path: parse_camera(path.read_bytes())),
-    "camchain.yaml": Format(lambda folder: export_kalibr(read_rig(folder / "rig.toml")).encode(),
-                            lambda path: parse_kalibr(path.read_bytes())),
+    "camchain.yaml": Format(
+        lambda folder: export_kalibr(read_rig(folder / "rig.toml")).encode(),
+        lambda path: parse_kalibr(path.read_bytes()),
+    ),
     "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_bytes())),
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
     "place.omap": Format(map_bytes, read_places),
@@ -114,8 +118,10 @@ FORMATS: Final = {
     "log.bag": Format(lambda folder: write_bag(folder / "log.bag", pairs(4), "LZ4").read_bytes(), read_frames),
     "odom.cdr": Format(lambda _: messages()["odom"], lambda path: decode_pose(path.read_bytes(), b"")),
     "status.cdr": Format(lambda _: messages()["status"], lambda path: decode_diagnostics(path.read_bytes())),
-    "attachment.json": Format(lambda _: PoseAttachment(7, "tracking", 0, 50, 60, 10**18).to_bytes(),
-                              lambda path: PoseAttachment.from_bytes(path.read_bytes())),
+    "attachment.json": Format(
+        lambda _: PoseAttachment(7, "tracking", 0, 50, 60, 10**18).to_bytes(),
+        lambda path: PoseAttachment.from_bytes(path.read_bytes()),
+    ),
 }
 
 
@@ -163,8 +169,14 @@ def limited_main(name: str, folder: str, count: str, seed: str) -> int:
 def attack(name: str, folder: Path, count: int, seed: int) -> tuple[int, list[str]]:
     """Attack one parser in a process of its own; return its largest memory [MB] and the failures."""
     command = [sys.executable, "-m", __name__, name, str(folder), str(count), str(seed)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False,
-                          env={"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    done = subprocess.run(
+        command,
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+    )
     first, *found = done.stdout.splitlines() or ["0"]
     if done.returncode not in (0, 1) or (done.returncode == 1 and not found):
         found.append(f"{name}: the process ended with {done.returncode}: {done.stderr[-300:]}")

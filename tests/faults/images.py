@@ -129,8 +129,9 @@ CASES: Final[dict[str, Case]] = {
     "half frozen, one camera": Case("box", lambda: Frozen(sector(SIZE_PX, 0.0, 180.0), ("upper",))),
     "quarter frozen": Case("box", lambda: Frozen(sector(SIZE_PX, 0.0, 90.0))),
     "sector frozen": Case("box", lambda: Frozen(sector(SIZE_PX, 0.0, SECTOR_DEG))),
-    "sector blurred": Case("box", lambda: lambda time_s, frame: blurred(
-        time_s, frame, sector(SIZE_PX, 0.0, SECTOR_DEG))),
+    "sector blurred": Case(
+        "box", lambda: lambda time_s, frame: blurred(time_s, frame, sector(SIZE_PX, 0.0, SECTOR_DEG))
+    ),
     "dark, a person steps in": Case("person at 0.8 m", lambda: None, (Fault("dark", STARTS_S, SECONDS),)),
     "late by 0.5 s": Case("box", lambda: Late(0.5), since_s=0.0),
     "late by 1 s": Case("box", lambda: Late(1.0), since_s=0.0),
@@ -167,17 +168,25 @@ def run(name: str, seed: int, overrides: tuple[str, ...] = ()) -> Outcome:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
         path.write_text(world_text(case.world, random.Random(seed)))
-        done = simulate(load_world(str(path), seed), replace(make_robot(SIZE_PX), samples=1), watched,
-                        seconds=SECONDS, seed=seed, faults=case.faults, tamper=case.tamper(),
-                        config=load_config(None, ["places.enabled=false", *overrides]))
+        done = simulate(
+            load_world(str(path), seed),
+            replace(make_robot(SIZE_PX), samples=1),
+            watched,
+            seconds=SECONDS,
+            seed=seed,
+            faults=case.faults,
+            tamper=case.tamper(),
+            config=load_config(None, ["places.enabled=false", *overrides]),
+        )
     ticks = done.ticks
     steps = list(pairwise(ticks))
     speeds = {two.time_s: math.dist(one.pose[:2], two.pose[:2]) / (two.time_s - one.time_s) for one, two in steps}
     contact_mps = speeds[done.contacts[0].time_s] if done.contacts else math.nan
     rest_s = next((at_s for at_s, speed in speeds.items() if at_s > moving_s and speed < REST_MPS), math.nan)
     began_s = max(case.since_s, moving_s)
-    return Outcome(contact_mps, done.clearance_m, first[0] - began_s if first[1] else math.nan, first[1],
-                   rest_s - began_s)
+    return Outcome(
+        contact_mps, done.clearance_m, first[0] - began_s if first[1] else math.nan, first[1], rest_s - began_s
+    )
 
 
 def named(moment: Moment) -> str:
@@ -195,11 +204,25 @@ def run_all(words: list[str], count: int, seed: int) -> int:
 
     Repeated images are left out, and `none` is no fault: these need not be named.
     """
-    columns = (Column("images"), Column("runs"), Column("contacts"), Column("fastest contact", "m/s", 2),
-               Column("least clearance", "m", 2), Column("named"), Column("named after, longest", "s", 2),
-               Column("at rest after, longest", "s", 2), Column("as"))
-    table = ResultTable("faults_images", "faults", "Tampered images, in lock-step", columns, continued=True,
-                        remarks=(f"{SIZE_PX} px, 10 Hz, operator ahead at 0.5 m/s, {SECONDS:g} s",))
+    columns = (
+        Column("images"),
+        Column("runs"),
+        Column("contacts"),
+        Column("fastest contact", "m/s", 2),
+        Column("least clearance", "m", 2),
+        Column("named"),
+        Column("named after, longest", "s", 2),
+        Column("at rest after, longest", "s", 2),
+        Column("as"),
+    )
+    table = ResultTable(
+        "faults_images",
+        "faults",
+        "Tampered images, in lock-step",
+        columns,
+        continued=True,
+        remarks=(f"{SIZE_PX} px, 10 Hz, operator ahead at 0.5 m/s, {SECONDS:g} s",),
+    )
     failed = 0
     for name in (name for name in CASES if not words or any(word in name for word in words)):
         seeds = range(seed, seed + count)
@@ -210,7 +233,16 @@ def run_all(words: list[str], count: int, seed: int) -> int:
         times = [outcome.named_s for outcome in outcomes if outcome.text]
         rests = [outcome.rest_s for outcome in outcomes if math.isfinite(outcome.rest_s)]
         texts = Counter(outcome.text for outcome in outcomes if outcome.text)
-        table.add(name, count, len(hits), max(hits, default=None), min(outcome.clearance_m for outcome in outcomes),
-                  len(times), max(times, default=None), max(rests, default=None), "; ".join(texts))
+        table.add(
+            name,
+            count,
+            len(hits),
+            max(hits, default=None),
+            min(outcome.clearance_m for outcome in outcomes),
+            len(times),
+            max(times, default=None),
+            max(rests, default=None),
+            "; ".join(texts),
+        )
         failed += bool(hits)
     return failed

@@ -42,8 +42,7 @@ class Reached:
     calls: dict[str, list[tuple[int, int, list[str]]]]  # of a file: first and last line of a function, its tests
 
     def calls_all(self, path: str, functions: Iterable[CodeType]) -> bool:
-        """True if tests call all these functions: those that only the import calls have done their work before a fork.
-        """
+        """True if tests call all these functions: those that only the import calls have done their work by then."""
         called = {first for first, *_ in self.calls.get(path, [])}
         return all(function.co_firstlineno in called for function in functions)
 
@@ -65,8 +64,9 @@ class Reached:
 class MutantRunner:
     """A plugin of pytest that tries mutants in the place of running the collected tests."""
 
-    def __init__(self, copy: Path, mutants: Sequence[Mutant], limit_s: float,
-                 report: Callable[[Mutant, str], None]) -> None:
+    def __init__(
+        self, copy: Path, mutants: Sequence[Mutant], limit_s: float, report: Callable[[Mutant, str], None]
+    ) -> None:
         """copy: folder of the repository that may be changed; limit_s: for the tests of one mutant."""
         self._copy, self._mutants, self._limit_s, self._report = copy, mutants, limit_s, report
         self._sources = {mutant.path: (copy / mutant.path).read_text("utf-8") for mutant in mutants}
@@ -86,8 +86,11 @@ class MutantRunner:
                 # A test that has begun within the limit is given the time to end.
                 times_s = [reached.tests[name] for name in names]
                 patience_s = 10.0 + 5.0 * (min(self._limit_s, sum(times_s)) + max(times_s))
-                outcome = self._in_a_fork([items[name] for name in names], changed, patience_s) if changed else (
-                    self._in_a_new_python(names, patience_s))
+                outcome = (
+                    self._in_a_fork([items[name] for name in names], changed, patience_s)
+                    if changed
+                    else (self._in_a_new_python(names, patience_s))
+                )
             finally:
                 path.write_text(self._sources[mutant.path], "utf-8")
             self._report(mutant, outcome)
@@ -107,8 +110,9 @@ class MutantRunner:
         listed = self._copy / "mutant-tests.txt"
         listed.write_text("\n".join(names))
         command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"@{listed}"]
-        process = subprocess.Popen(command, cwd=self._copy, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-                                   start_new_session=True)
+        process = subprocess.Popen(
+            command, cwd=self._copy, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+        )
         return _outcome(_waited(process.pid, patience_s + 30.0))
 
     def _unchanged(self, items: dict[str, pytest.Item]) -> Reached:
@@ -132,8 +136,10 @@ def changed_functions(source: str, path: Path) -> dict[CodeType, CodeType]:
 def _changed(before: CodeType, after: CodeType) -> dict[CodeType, CodeType] | None:
     """Return the changed functions within a module or class; None where its own statements changed."""
     inner = [[const for const in code.co_consts if isinstance(const, CodeType)] for code in (before, after)]
-    own = [(code.co_code, code.co_names, [const for const in code.co_consts if not isinstance(const, CodeType)])
-           for code in (before, after)]
+    own = [
+        (code.co_code, code.co_names, [const for const in code.co_consts if not isinstance(const, CodeType)])
+        for code in (before, after)
+    ]
     if repr(own[0]) != repr(own[1]) or len(inner[0]) != len(inner[1]):
         return None
     found: dict[CodeType, CodeType] = {}
@@ -231,8 +237,9 @@ def main() -> int:
     results, names = Results(Path(asked["results"])), {Mutant(*row): name for name, row in asked["mutants"].items()}
     # None of these folders calls a compiled function: not to prepare them all saves minutes in a new folder.
     kernel_cache._state["ready"] = True
-    runner = MutantRunner(Path.cwd(), list(names), asked["limit_s"],
-                          lambda mutant, outcome: results.add(names[mutant], outcome))
+    runner = MutantRunner(
+        Path.cwd(), list(names), asked["limit_s"], lambda mutant, outcome: results.add(names[mutant], outcome)
+    )
     code = pytest.main(["-p", "no:cacheprovider", "-p", "no:terminal", *asked["tests"]], plugins=[runner])
     return int(code)
 

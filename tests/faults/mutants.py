@@ -23,22 +23,45 @@ ROOT: Final = Path(__file__).parents[2]
 COPIED: Final = ("omnid", "drivers", "calib", "tests", "systemd", "pyproject.toml")
 SURVIVED: Final = "survived"
 UNFINISHED: Final = "unfinished"  # the limit of time was over before the last test: no test has failed so far
-CONTROL_TESTS: Final = ("tests/omnid/core/control", "tests/omnid/controller",
-                        "tests/omnid/stages/test_lockstep_drive.py", "tests/omnid/transport/test_commands.py")
+CONTROL_TESTS: Final = (
+    "tests/omnid/core/control",
+    "tests/omnid/controller",
+    "tests/omnid/stages/test_lockstep_drive.py",
+    "tests/omnid/transport/test_commands.py",
+)
 MOTOR_TESTS: Final = ("tests/drivers/motors", "tests/contract", "tests/omnid/controller/test_motor.py")
 # The tests of each folder; those that show a page in a browser, and those that are slow, are not among them.
 TESTS: Final[dict[str, tuple[str, ...]]] = {
-    "omnid/core/control": CONTROL_TESTS, "omnid/controller": CONTROL_TESTS,
-    "omnid/core/navigation": ("tests/omnid/core/navigation", "tests/omnid/stages/test_navigation_stage.py",
-                              "tests/omnid/stages/test_navigation_random_walk.py"),
-    "omnid/transport/access.py": ("tests/omnid/transport",), "omnid/web": ("tests/omnid/web",),
+    "omnid/core/control": CONTROL_TESTS,
+    "omnid/controller": CONTROL_TESTS,
+    "omnid/core/navigation": (
+        "tests/omnid/core/navigation",
+        "tests/omnid/stages/test_navigation_stage.py",
+        "tests/omnid/stages/test_navigation_random_walk.py",
+    ),
+    "omnid/transport/access.py": ("tests/omnid/transport",),
+    "omnid/web": ("tests/omnid/web",),
     "drivers/motors": MOTOR_TESTS,
 }
 SWAPS: Final[dict[type[ast.AST], tuple[str, str]]] = {
-    ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"), ast.Eq: ("==", "!="),
-    ast.NotEq: ("!=", "=="), ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"),
-    ast.And: ("and", "or"), ast.Or: ("or", "and"), ast.Is: ("is", "is not"), ast.IsNot: ("is not", "is"),
-    ast.In: ("in", "not in"), ast.NotIn: ("not in", "in"), ast.BitOr: ("|", "&"), ast.BitAnd: ("&", "|"),
+    ast.Lt: ("<", "<="),
+    ast.LtE: ("<=", "<"),
+    ast.Gt: (">", ">="),
+    ast.GtE: (">=", ">"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+    ast.Add: ("+", "-"),
+    ast.Sub: ("-", "+"),
+    ast.Mult: ("*", "/"),
+    ast.Div: ("/", "*"),
+    ast.And: ("and", "or"),
+    ast.Or: ("or", "and"),
+    ast.Is: ("is", "is not"),
+    ast.IsNot: ("is not", "is"),
+    ast.In: ("in", "not in"),
+    ast.NotIn: ("not in", "in"),
+    ast.BitOr: ("|", "&"),
+    ast.BitAnd: ("&", "|"),
 }
 NAMES: Final = {"min": "max", "max": "min", "any": "all", "all": "any", "abs": "", "wrap_angle": ""}
 
@@ -54,7 +77,7 @@ class Mutant(NamedTuple):
 
     def apply(self, source: str) -> str:
         """Return the changed source."""
-        return source[: self.start] + self.text + source[self.end:]
+        return source[: self.start] + self.text + source[self.end :]
 
     def described(self, source: str) -> str:
         """Return place and change in one line."""
@@ -197,8 +220,13 @@ def try_mutants(folder: str, mutants: Mapping[str, Mutant], limit_s: float, resu
         for entry in COPIED:
             (shutil.copytree if (ROOT / entry).is_dir() else shutil.copy2)(ROOT / entry, copy / entry)
         asked = {"mutants": mutants, "tests": TESTS[folder], "limit_s": limit_s, "results": str(results)}
-        subprocess.run([sys.executable, "-m", "tests.faults.mutant_runner"], cwd=copy, input=json.dumps(asked),
-                       text=True, check=True)
+        subprocess.run(
+            [sys.executable, "-m", "tests.faults.mutant_runner"],
+            cwd=copy,
+            input=json.dumps(asked),
+            text=True,
+            check=True,
+        )
     finally:
         shutil.rmtree(copy, ignore_errors=True)
 
@@ -210,24 +238,36 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=0, help="mutants of each folder to try; default: all")
     parser.add_argument("--limit-s", type=float, default=30.0, help="of the tests of one mutant; default: %(default)s")
-    parser.add_argument("--results", type=Path, default=Path("mutants.jsonl"), metavar="FILE",
-                        help="the outcomes so far; mutants in it are not tried again; default: %(default)s")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=Path("mutants.jsonl"),
+        metavar="FILE",
+        help="the outcomes so far; mutants in it are not tried again; default: %(default)s",
+    )
     args = parser.parse_args()
     path = args.results.absolute()
     for folder in args.folders:
         everything = list(all_mutants([folder]))
         count = min(args.count or len(everything), len(everything))
-        chosen = {mutant.described((ROOT / mutant.path).read_text("utf-8")): mutant
-                  for mutant in random.Random(args.seed).sample(everything, count)}
+        chosen = {
+            mutant.described((ROOT / mutant.path).read_text("utf-8")): mutant
+            for mutant in random.Random(args.seed).sample(everything, count)
+        }
         known = Results(path).outcomes
         if missing := {name: mutant for name, mutant in chosen.items() if name not in known}:
             try_mutants(folder, missing, args.limit_s, path)
         outcomes = Results(path).outcomes
         numbers = Counter(outcomes.get(name, "not tried") for name in chosen)
-        print(f"{folder}: {count} of {len(everything)} mutants, seed {args.seed}: "
-              f"{', '.join(f'{number} {outcome}' for outcome, number in sorted(numbers.items()))}")
-        print("".join(f"  {outcomes[name]}: {name}\n" for name in chosen
-                      if outcomes.get(name) in (SURVIVED, UNFINISHED)), end="", flush=True)
+        print(
+            f"{folder}: {count} of {len(everything)} mutants, seed {args.seed}: "
+            f"{', '.join(f'{number} {outcome}' for outcome, number in sorted(numbers.items()))}"
+        )
+        print(
+            "".join(f"  {outcomes[name]}: {name}\n" for name in chosen if outcomes.get(name) in (SURVIVED, UNFINISHED)),
+            end="",
+            flush=True,
+        )
     return 0
 
 

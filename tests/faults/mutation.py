@@ -25,7 +25,7 @@ def _mutated_once(rng: random.Random, data: bytes) -> bytes:
     to = min(len(data), at + rng.choice((1, 4, 8, 64, 1024)))
     match rng.randrange(7):
         case 0:  # a bit
-            return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1:]
+            return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
         case 1:  # noise
             return data[:at] + rng.randbytes(to - at) + data[to:]
         case 2:  # a part left out
@@ -34,7 +34,7 @@ def _mutated_once(rng: random.Random, data: bytes) -> bytes:
             return data[:at]
         case 4:  # another part copied here
             other = rng.randrange(len(data))
-            return data[:at] + data[other:other + to - at] + data[at:]
+            return data[:at] + data[other : other + to - at] + data[at:]
         case 5:  # an extreme number
             return data[:at] + struct.pack("<Q", rng.choice(EXTREMES))[: rng.choice((2, 4, 8))] + data[to:]
         case _:  # an extreme word

@@ -35,10 +35,20 @@ TEACH_S: Final = 60.0
 LOOPS: Final = 1000
 
 ROUTE_CAUSES: Final[dict[str, Cause]] = {
-    **{name: CAUSES[name] for name in (
-        "cmd/stop, the operator goes on sending", "no images of one camera", "no images at all",
-        "the daemon does not run (SIGSTOP)", "nothing of it runs (SIGSTOP)", "the motor controller hears nothing",
-        "SIGTERM", "the daemon killed (SIGKILL)", "its controller process killed")},
+    **{
+        name: CAUSES[name]
+        for name in (
+            "cmd/stop, the operator goes on sending",
+            "no images of one camera",
+            "no images at all",
+            "the daemon does not run (SIGSTOP)",
+            "nothing of it runs (SIGSTOP)",
+            "the motor controller hears nothing",
+            "SIGTERM",
+            "the daemon killed (SIGKILL)",
+            "its controller process killed",
+        )
+    },
     "the plug of the motor controller pulled": Cause(lambda robot: robot.base.twin.unplug(), None),
 }
 RENAMED: Final = {"cmd/stop, the operator goes on sending": "cmd/stop"}
@@ -65,10 +75,23 @@ def started_robot(site: Path, folder: Path) -> Iterator[Robot]:
         wheels.traction = traction(made.wheels, SEED)
         poses = PoseFile(folder / "poses")
         ends.callback(PoseWriter(base.twin, poses).close)
-        settings = [f'bus.listen=["tcp/127.0.0.1:{port}"]', "live.status_s=0.2", f"places.map={folder / 'site.omap'}",
-                    f"navigation.routes={folder / 'routes'}", "places.localize_only=true"]
-        command = [sys.executable, "-m", "tests.faults.simulated_daemon", "--motor", str(base.port), "--poses",
-                   str(folder / "poses"), *(word for setting in settings for word in ("--set", setting))]
+        settings = [
+            f'bus.listen=["tcp/127.0.0.1:{port}"]',
+            "live.status_s=0.2",
+            f"places.map={folder / 'site.omap'}",
+            f"navigation.routes={folder / 'routes'}",
+            "places.localize_only=true",
+        ]
+        command = [
+            sys.executable,
+            "-m",
+            "tests.faults.simulated_daemon",
+            "--motor",
+            str(base.port),
+            "--poses",
+            str(folder / "poses"),
+            *(word for setting in settings for word in ("--set", setting)),
+        ]
         daemon = ends.enter_context(started(command, port))
         wait_until(lambda: answers(port) or not daemon.alive, "the bus", PATIENCE_S)
         assert daemon.alive, daemon.process.communicate()[1]

@@ -128,8 +128,9 @@ def main() -> int:
 
     config = load_config(None, [*args.settings, f"motor.port={args.motor}"])
     connected = ConnectedRobot(open_camera)
-    return LiveRun(config, connected, lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True),
-                   robot.rig).run()
+    return LiveRun(
+        config, connected, lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), robot.rig
+    ).run()
 
 
 if __name__ == "__main__":

@@ -87,10 +87,12 @@ CAUSES: Final[dict[str, Cause]] = {
     "no images at all": Cause(_images("both mute"), _images("both ok")),
     "images frozen": Cause(_images("both frozen"), _images("both ok")),
     "darkness": Cause(_images("both black"), _images("both ok")),
-    "the daemon does not run (SIGSTOP)": Cause(_signals(signal.SIGSTOP, daemon=True, controller=False),
-                                               _signals(signal.SIGCONT, daemon=True, controller=False)),
-    "nothing of it runs (SIGSTOP)": Cause(_signals(signal.SIGSTOP, daemon=True, controller=True),
-                                          _signals(signal.SIGCONT, daemon=True, controller=True)),
+    "the daemon does not run (SIGSTOP)": Cause(
+        _signals(signal.SIGSTOP, daemon=True, controller=False), _signals(signal.SIGCONT, daemon=True, controller=False)
+    ),
+    "nothing of it runs (SIGSTOP)": Cause(
+        _signals(signal.SIGSTOP, daemon=True, controller=True), _signals(signal.SIGCONT, daemon=True, controller=True)
+    ),
     "the motor controller hears nothing": Cause(_hears_nothing(True), _hears_nothing(False)),
     "SIGTERM": Cause(_signals(signal.SIGTERM, daemon=True, controller=False), None),
     "the daemon killed (SIGKILL)": Cause(_signals(signal.SIGKILL, daemon=True, controller=False), None),
@@ -112,8 +114,7 @@ def begin_motion(robot: Robot) -> None:
     wait_until(moves, "motion")
 
 
-def measured(robot: Robot, cause: Cause, rng: random.Random, begin: Callable[[Robot], None] = begin_motion
-             ) -> StopTime:
+def measured(robot: Robot, cause: Cause, rng: random.Random, begin: Callable[[Robot], None] = begin_motion) -> StopTime:
     """Drive, bring the cause about, and return the times until the wheels rest."""
     base = robot.base
     begin(robot)
@@ -164,15 +165,20 @@ def started(recorded: Path, folder: Path) -> Iterator[Robot]:
 
 def row(name: str, times: list[StopTime]) -> str:
     """Return the row of a table, in ms."""
-    cells = [f"{value:.0f}" for column in zip(*times, strict=True)
-             for value in (*np.percentile(1000 * np.array(column), (50, 99)), 1000 * max(column))]
+    cells = [
+        f"{value:.0f}"
+        for column in zip(*times, strict=True)
+        for value in (*np.percentile(1000 * np.array(column), (50, 99)), 1000 * max(column))
+    ]
     return f"| {name} | {len(times)} | {' | '.join(cells)} |"
 
 
 def run(recorded: Path, folder: Path, words: list[str], count: int, seed: int, report: Callable[[str], None]) -> int:
     """Print a row for each cause whose name has one of the words; return the number of causes that did not stop."""
-    report("| cause | stops | last command to move, p50 | p99 | max | at rest, p50 | p99 | max, ms |\n"
-           "|---|---|---|---|---|---|---|---|")
+    report(
+        "| cause | stops | last command to move, p50 | p99 | max | at rest, p50 | p99 | max, ms |\n"
+        "|---|---|---|---|---|---|---|---|"
+    )
     failed = 0
     for number, name in enumerate(name for name in CAUSES if not words or any(word in name for word in words)):
         try:

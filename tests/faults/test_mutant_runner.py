@@ -63,8 +63,11 @@ def test_a_function_that_only_the_import_calls_needs_a_new_python() -> None:
 def test_the_tests_of_the_own_module_run_first() -> None:
     names = {"tests/test_b.py::fast": 0.1, "tests/test_a.py::slow": 2.0, "tests/test_a.py::quick": 1.0}
     reached = Reached(names, {"a.py": [(1, 9, list(names))]})
-    assert reached.of(Mutant("a.py", 2, 0, 1, "")) == ["tests/test_a.py::quick", "tests/test_a.py::slow",
-                                                       "tests/test_b.py::fast"]
+    assert reached.of(Mutant("a.py", 2, 0, 1, "")) == [
+        "tests/test_a.py::quick",
+        "tests/test_a.py::slow",
+        "tests/test_b.py::fast",
+    ]
 
 
 def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
@@ -75,11 +78,18 @@ def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_
     (copy / "test_gate.py").write_text(TESTS)
     mutants = {mutant.apply(SOURCE): mutant for mutant in mutants_of("small/gate.py", SOURCE)}
     asked = {"mutants": mutants, "tests": ["test_gate.py"], "limit_s": 20.0, "results": str(results)}
-    code = ("import sys; sys.path.insert(0, sys.argv[1]); from tests.faults.mutant_runner import main; "
-            "sys.exit(main())")
-    subprocess.run([sys.executable, "-c", code, str(ROOT)], cwd=copy, input=json.dumps(asked), text=True, check=True,
-                   timeout=120, env={"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"})
+    code = "import sys; sys.path.insert(0, sys.argv[1]); from tests.faults.mutant_runner import main; sys.exit(main())"
+    subprocess.run(
+        [sys.executable, "-c", code, str(ROOT)],
+        cwd=copy,
+        input=json.dumps(asked),
+        text=True,
+        check=True,
+        timeout=120,
+        env={"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
+    )
     outcomes = Results(results).outcomes
-    assert outcomes == {after: "survived" if "value < LIMIT" in after and "LIMIT = 3" in after else "noticed"
-                        for after in mutants}
+    assert outcomes == {
+        after: "survived" if "value < LIMIT" in after and "LIMIT = 3" in after else "noticed" for after in mutants
+    }
     assert (copy / "small" / "gate.py").read_text() == SOURCE, "left as it was"

@@ -20,17 +20,19 @@ def changed(mutant: Mutant) -> str:
 
 
 def test_each_place_is_changed_once() -> None:
-    assert sorted(changed(mutant) for mutant in mutants_of("x.py", SOURCE)) == sorted([
-        "LIMIT: int = (5 + 1)",
-        "def low(x: int, y: int = (2 + 1)) -> bool:",
-        "return abs(x) < LIMIT and y == -3",
-        "return not (x) < LIMIT and y == -3",
-        "return not abs(x) <= LIMIT and y == -3",
-        "return not abs(x) < LIMIT or y == -3",
-        "return not abs(x) < LIMIT and y != -3",
-        "return not abs(x) < LIMIT and y == 3",
-        "return not abs(x) < LIMIT and y == -(3 + 1)",
-    ])
+    assert sorted(changed(mutant) for mutant in mutants_of("x.py", SOURCE)) == sorted(
+        [
+            "LIMIT: int = (5 + 1)",
+            "def low(x: int, y: int = (2 + 1)) -> bool:",
+            "return abs(x) < LIMIT and y == -3",
+            "return not (x) < LIMIT and y == -3",
+            "return not abs(x) <= LIMIT and y == -3",
+            "return not abs(x) < LIMIT or y == -3",
+            "return not abs(x) < LIMIT and y != -3",
+            "return not abs(x) < LIMIT and y == 3",
+            "return not abs(x) < LIMIT and y == -(3 + 1)",
+        ]
+    )
 
 
 @pytest.mark.parametrize("folder", TESTS)

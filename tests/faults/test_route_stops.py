@@ -14,6 +14,7 @@ def test_the_wheels_rest_after_faults_in_the_midst_of_a_route(tmp_path: Path) ->
     site = tmp_path / "site"
     site.mkdir()
     teach(site)
-    for number, cause in enumerate(("no images at all", "the daemon killed (SIGKILL)",
-                                    "the plug of the motor controller pulled")):
+    for number, cause in enumerate(
+        ("no images at all", "the daemon killed (SIGKILL)", "the plug of the motor controller pulled")
+    ):
         assert len(stop_times(site, tmp_path / f"{number}", cause, 1, seed=1)) == 1

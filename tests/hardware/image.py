@@ -25,19 +25,51 @@ ROOT = Path(__file__).parents[2]
 ROOTFS = Path(__file__).with_name("rootfs")
 RECIPE = 1  # raise it when the functions below build another image from the same constants
 SUITE = "bookworm"
-PACKAGES = ("systemd", "systemd-sysv", "udev", "dbus", "libnss-systemd", "python3", "v4l-utils", "kmod", "procps",
-            "busybox-static")
+PACKAGES = (
+    "systemd",
+    "systemd-sysv",
+    "udev",
+    "dbus",
+    "libnss-systemd",
+    "python3",
+    "v4l-utils",
+    "kmod",
+    "procps",
+    "busybox-static",
+)
 GUEST_MODULES = ("v4l2loopback", "vivid", "uvcvideo", "vhci-hcd", "softdog", "9p", "9pnet_virtio", "autofs4")
 BOOT_MODULES = ("virtio_pci", "virtio_blk", "ext4", "crc32c_generic", "9pnet_virtio", "9p")
 # units that only delay a guest without a screen, a time server or a second boot
-MASKED = ("systemd-timesyncd.service", "systemd-logind.service", "systemd-random-seed.service",
-          "systemd-update-utmp.service", "systemd-update-utmp-runlevel.service", "systemd-remount-fs.service",
-          "systemd-pcrphase.service", "systemd-pcrphase-sysinit.service", "apt-daily.timer", "apt-daily-upgrade.timer",
-          "dpkg-db-backup.timer", "e2scrub_all.timer", "e2scrub_reap.service", "fstrim.timer", "getty.target",
-          "getty@tty1.service", "serial-getty@ttyS0.service")
+MASKED = (
+    "systemd-timesyncd.service",
+    "systemd-logind.service",
+    "systemd-random-seed.service",
+    "systemd-update-utmp.service",
+    "systemd-update-utmp-runlevel.service",
+    "systemd-remount-fs.service",
+    "systemd-pcrphase.service",
+    "systemd-pcrphase-sysinit.service",
+    "apt-daily.timer",
+    "apt-daily-upgrade.timer",
+    "dpkg-db-backup.timer",
+    "e2scrub_all.timer",
+    "e2scrub_reap.service",
+    "fstrim.timer",
+    "getty.target",
+    "getty@tty1.service",
+    "serial-getty@ttyS0.service",
+)
 TOOLS = {"qemu-system-x86_64": "qemu-system-x86"}
-BUILD_TOOLS = {"mmdebstrap": "mmdebstrap", "mke2fs": "e2fsprogs", "depmod": "kmod", "cpio": "cpio", "make": "make",
-               "busybox": "busybox-static", "gcc-12": "gcc-12", "xz": "xz-utils"}
+BUILD_TOOLS = {
+    "mmdebstrap": "mmdebstrap",
+    "mke2fs": "e2fsprogs",
+    "depmod": "kmod",
+    "cpio": "cpio",
+    "make": "make",
+    "busybox": "busybox-static",
+    "gcc-12": "gcc-12",
+    "xz": "xz-utils",
+}
 
 
 class ImageUnavailableError(Exception):
@@ -124,8 +156,9 @@ def _require(tools: dict[str, str]) -> None:
 def _require_build() -> None:
     _require(BUILD_TOOLS)
     if os.geteuid() != 0:
-        raise ImageUnavailableError(f"no image in {cache_folder()}: build it once by "
-                                    f"`sudo {sys.executable} -m tests.hardware.image`")
+        raise ImageUnavailableError(
+            f"no image in {cache_folder()}: build it once by `sudo {sys.executable} -m tests.hardware.image`"
+        )
 
 
 def _build(folder: Path, kernel: str, pins: list[str]) -> None:
@@ -150,8 +183,18 @@ def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
     debs.mkdir()
     common = release.rsplit("-", 1)[0]
     major_minor = ".".join(release.split(".")[:2])
-    _run("apt-get", "-q", "download", kernel, f"linux-headers-{release}", f"linux-headers-{common}-common",
-         f"linux-kbuild-{major_minor}", "linux-compiler-gcc-12-x86", "v4l2loopback-dkms", cwd=debs)
+    _run(
+        "apt-get",
+        "-q",
+        "download",
+        kernel,
+        f"linux-headers-{release}",
+        f"linux-headers-{common}-common",
+        f"linux-kbuild-{major_minor}",
+        "linux-compiler-gcc-12-x86",
+        "v4l2loopback-dkms",
+        cwd=debs,
+    )
     for deb in debs.iterdir():
         _run("dpkg", "-x", deb, tree)
     headers = tree / f"usr/src/linux-headers-{release}"
@@ -170,8 +213,21 @@ def _kernel_tree(work: Path, kernel: str, release: str) -> Path:
 def _write_root(root: Path, tree: Path, release: str, pins: list[str]) -> None:
     _run("mmdebstrap", "-q", "--variant=minbase", f"--include={','.join(PACKAGES)}", SUITE, root, _apt_sources())
     packages = root / "usr/local/lib/python3.11/dist-packages"
-    _run(sys.executable, "-m", "pip", "install", "-q", "--only-binary=:all:", "--python-version", "3.11",
-         "--no-compile", "--root-user-action=ignore", "--target", packages, *pins)
+    _run(
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--only-binary=:all:",
+        "--python-version",
+        "3.11",
+        "--no-compile",
+        "--root-user-action=ignore",
+        "--target",
+        packages,
+        *pins,
+    )
     _run("chroot", root, "python3", "-m", "compileall", "-q", packages.relative_to(root), check=False)
     for module in _with_needed(tree, release, GUEST_MODULES):
         target = root / module.relative_to(tree)
@@ -202,8 +258,9 @@ def _write_initramfs(work: Path, tree: Path, release: str) -> None:
     (initramfs / "modules/order").write_text("".join(f"{module.name}\n" for module in modules), "ascii")
     names = "\n".join(str(path.relative_to(initramfs)) for path in [initramfs, *sorted(initramfs.rglob("*"))])
     with open(work / "image/initramfs.cpio", "wb") as archive:
-        subprocess.run(["cpio", "-o", "-H", "newc", "--quiet"], cwd=initramfs, input=names.encode(), stdout=archive,
-                       check=True)
+        subprocess.run(
+            ["cpio", "-o", "-H", "newc", "--quiet"], cwd=initramfs, input=names.encode(), stdout=archive, check=True
+        )
 
 
 def _with_needed(tree: Path, release: str, names: Iterable[str]) -> Iterator[Path]:

@@ -14,8 +14,10 @@ from pathlib import Path
 from tests.hardware.image import ROOT, Image, image
 
 TREE = ("omnid", "drivers", "calib", "systemd", "tests", "pyproject.toml", "README.md")
-KERNEL_OPTIONS = ("console=ttyS0 quiet panic=-1 tsc=reliable no_timer_check mitigations=off random.trust_cpu=on "
-                  "systemd.unit=guest-job.target systemd.show_status=0")
+KERNEL_OPTIONS = (
+    "console=ttyS0 quiet panic=-1 tsc=reliable no_timer_check mitigations=off random.trust_cpu=on "
+    "systemd.unit=guest-job.target systemd.show_status=0"
+)
 PANIC = "Kernel panic - not syncing"
 
 
@@ -102,8 +104,14 @@ def _qemu(image: Image, job: Path, guest: Guest) -> list[str]:
 def _emulate(words: list[str], timeout_s: float) -> str:
     """Run the machine for at most timeout_s and return the output of its console."""
     try:
-        done = subprocess.run(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                              timeout=timeout_s, check=False)
+        done = subprocess.run(
+            words,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            timeout=timeout_s,
+            check=False,
+        )
         return done.stdout.decode("utf-8", "replace")
     except subprocess.TimeoutExpired as error:
         return (error.stdout or b"").decode("utf-8", "replace")

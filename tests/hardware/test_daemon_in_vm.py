@@ -82,9 +82,12 @@ class SimulatedBoard:
         if b"\n" not in data:
             return b""
         base = self._line.base
-        state = {"commanded_mps": max(map(abs, base.commanded_mps)), "fastest_mps": self._fastest_mps,
-                 "way_m": base.travel_m[0],
-                 **{name: getattr(base, name) for name in ("commands", "errors", "expiries", "unsafe_resumes")}}
+        state = {
+            "commanded_mps": max(map(abs, base.commanded_mps)),
+            "fastest_mps": self._fastest_mps,
+            "way_m": base.travel_m[0],
+            **{name: getattr(base, name) for name in ("commands", "errors", "expiries", "unsafe_resumes")},
+        }
         self._fastest_mps = state["commanded_mps"]
         return json.dumps(state).encode() + b"\n"
 

@@ -65,40 +65,90 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, st
     T, twist = se3.exp(numbers.normal(size=6)), numbers.normal(size=6)
     covariances = [0.01 * factor @ factor.T for factor in numbers.normal(size=(2, 6, 6))]
     return [
-        ("/omnid/odom", codec.ODOMETRY_SCHEMA, codec.odometry_cdr(stamp_ns, T, covariances[0], twist, covariances[1]),
-         {"header": _header(stamp_ns, "odom"), "child_frame_id": "base_link",
-          "pose": {"pose": _pose(T), "covariance": covariances[0].ravel().tolist()},
-          "twist": {"twist": {"linear": _xyz(twist[:3]), "angular": _xyz(twist[3:])},
-                    "covariance": covariances[1].ravel().tolist()}}),
-        ("/omnid/pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T),
-         {"header": _header(stamp_ns, "odom"), "pose": _pose(T)}),
-        ("/tf", codec.TRANSFORM_SCHEMA,
-         codec.transform_cdr(stamp_ns, [codec.FrameTransform("odom", "base_link", T)]),
-         {"transforms": [{"header": _header(stamp_ns, "odom"), "child_frame_id": "base_link", "transform":
-                          {"translation": _pose(T)["position"], "rotation": _pose(T)["orientation"]}}]}),
-        ("/omnid/drive", codec.TWIST_SCHEMA, codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5]),
-         {"header": _header(stamp_ns, "base_link"),
-          "twist": {"linear": _xyz((twist[0], 0.0, 0.0)), "angular": _xyz((0.0, 0.0, twist[5]))}}),
-        _status(stamp_ns), _cloud(stamp_ns, numbers),
+        (
+            "/omnid/odom",
+            codec.ODOMETRY_SCHEMA,
+            codec.odometry_cdr(stamp_ns, T, covariances[0], twist, covariances[1]),
+            {
+                "header": _header(stamp_ns, "odom"),
+                "child_frame_id": "base_link",
+                "pose": {"pose": _pose(T), "covariance": covariances[0].ravel().tolist()},
+                "twist": {
+                    "twist": {"linear": _xyz(twist[:3]), "angular": _xyz(twist[3:])},
+                    "covariance": covariances[1].ravel().tolist(),
+                },
+            },
+        ),
+        (
+            "/omnid/pose",
+            codec.POSE_SCHEMA,
+            codec.pose_stamped_cdr(stamp_ns, T),
+            {"header": _header(stamp_ns, "odom"), "pose": _pose(T)},
+        ),
+        (
+            "/tf",
+            codec.TRANSFORM_SCHEMA,
+            codec.transform_cdr(stamp_ns, [codec.FrameTransform("odom", "base_link", T)]),
+            {
+                "transforms": [
+                    {
+                        "header": _header(stamp_ns, "odom"),
+                        "child_frame_id": "base_link",
+                        "transform": {"translation": _pose(T)["position"], "rotation": _pose(T)["orientation"]},
+                    }
+                ]
+            },
+        ),
+        (
+            "/omnid/drive",
+            codec.TWIST_SCHEMA,
+            codec.twist_stamped_cdr(stamp_ns, "base_link", twist[0], twist[5]),
+            {
+                "header": _header(stamp_ns, "base_link"),
+                "twist": {"linear": _xyz((twist[0], 0.0, 0.0)), "angular": _xyz((0.0, 0.0, twist[5]))},
+            },
+        ),
+        _status(stamp_ns),
+        _cloud(stamp_ns, numbers),
         *(_image(frame) for frame in _frames(stamp_ns, numbers)),
     ]
 
 
 def _status(stamp_ns: int) -> tuple[str, str, bytes, dict[str, Any]]:
     status = codec.DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
-    message = {"header": _header(stamp_ns, ""),
-               "status": [{"level": 1, "name": ODOMETRY, "message": "über 90 °C", "hardware_id": "",
-                           "values": [{"key": "inliers", "value": "3"}]}]}
+    message = {
+        "header": _header(stamp_ns, ""),
+        "status": [
+            {
+                "level": 1,
+                "name": ODOMETRY,
+                "message": "über 90 °C",
+                "hardware_id": "",
+                "values": [{"key": "inliers", "value": "3"}],
+            }
+        ],
+    }
     return "/omnid/status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, [status]), message
 
 
 def _cloud(stamp_ns: int, numbers: np.random.Generator) -> tuple[str, str, bytes, dict[str, Any]]:
     packed = numbers.normal(size=(50, 4)).astype("<f4")
-    fields = [{"name": name, "offset": 4 * i, "datatype": 7, "count": 1}
-              for i, name in enumerate(("x", "y", "z", "confidence"))]
-    message = {"header": _header(stamp_ns, "odom"), "height": 1, "width": 50, "fields": fields, "is_bigendian": False,
-               "point_step": 16, "row_step": 800, "data": digest(packed.tobytes()), "is_dense": True,
-               "points": packed.astype(float).tolist()}
+    fields = [
+        {"name": name, "offset": 4 * i, "datatype": 7, "count": 1}
+        for i, name in enumerate(("x", "y", "z", "confidence"))
+    ]
+    message = {
+        "header": _header(stamp_ns, "odom"),
+        "height": 1,
+        "width": 50,
+        "fields": fields,
+        "is_bigendian": False,
+        "point_step": 16,
+        "row_step": 800,
+        "data": digest(packed.tobytes()),
+        "is_dense": True,
+        "points": packed.astype(float).tolist(),
+    }
     data = map_codec.point_cloud_cdr(stamp_ns, "odom", packed[:, :3], packed[:, 3])
     return "/omnid/cloud", CLOUD, data, message
 
@@ -129,5 +179,7 @@ def _xyz(values: Any) -> dict[str, float]:
 
 
 def _pose(T: np.ndarray) -> dict[str, Any]:
-    return {"position": _xyz(T[:3, 3]),
-            "orientation": dict(zip("xyzw", map(float, se3.quaternion(T[:3, :3])), strict=True))}
+    return {
+        "position": _xyz(T[:3, 3]),
+        "orientation": dict(zip("xyzw", map(float, se3.quaternion(T[:3, :3])), strict=True)),
+    }

@@ -20,8 +20,14 @@ NPM = ("package.json", "read_log.mjs")
 
 def run(words: Sequence[object], folder: Path) -> str:
     """Return the stdout of a program; raise AssertionError with its stderr where it fails."""
-    done = subprocess.run([str(word) for word in words], cwd=folder, capture_output=True, text=True, timeout=TIMEOUT_S,
-                          env=os.environ | NO_ANALYTICS)
+    done = subprocess.run(
+        [str(word) for word in words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+        env=os.environ | NO_ANALYTICS,
+    )
     assert done.returncode == 0, f"{words}: {done.stderr[-2000:]}"
     return done.stdout
 
@@ -35,8 +41,10 @@ def program(name: str, package: str) -> Path:
     """Return the path of a program on the PATH."""
     found = shutil.which(name)
     if found is None:
-        pytest.skip(f"{name} is not on the PATH: python3 -m venv VENV && VENV/bin/pip install {package}, then "
-                    "PATH=VENV/bin:$PATH")
+        pytest.skip(
+            f"{name} is not on the PATH: python3 -m venv VENV && VENV/bin/pip install {package}, then "
+            "PATH=VENV/bin:$PATH"
+        )
     return Path(found)
 
 

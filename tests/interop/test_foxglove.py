@@ -13,14 +13,29 @@ import pytest
 layouts = pytest.importorskip("foxglove.layouts", reason="needs foxglove-sdk")
 pytestmark = pytest.mark.interop
 
-PANELS = {"3D": "ThreeDeeConfig", "Image": "ImageConfig", "DiagnosticSummary": "DiagnosticsSummaryConfig",
-          "Plot": "PlotConfig"}
-TOPICS = {"map": "RosOccupancyGrid", "cloud": "PointCloud", "odom": "Pose", "path": "Poses", "plan": "Poses",
-          "scan": "LaserScan"}
+PANELS = {
+    "3D": "ThreeDeeConfig",
+    "Image": "ImageConfig",
+    "DiagnosticSummary": "DiagnosticsSummaryConfig",
+    "Plot": "PlotConfig",
+}
+TOPICS = {
+    "map": "RosOccupancyGrid",
+    "cloud": "PointCloud",
+    "odom": "Pose",
+    "path": "Poses",
+    "plan": "Poses",
+    "scan": "LaserScan",
+}
 OF_THE_APP = {"foxglovePanelTitle"}  # in its exported files, beside the settings of every panel
-PARTS = {"cameraState": "ThreeDeeCameraState", "scene": "BaseRendererSceneSettings",
-         "transforms": "BaseRendererTransforms", "imageMode": "ImageModeConfig", "paths": "PlotSeries",
-         "grid": "BaseRendererGridLayerSettings"}
+PARTS = {
+    "cameraState": "ThreeDeeCameraState",
+    "scene": "BaseRendererSceneSettings",
+    "transforms": "BaseRendererTransforms",
+    "imageMode": "ImageModeConfig",
+    "paths": "PlotSeries",
+    "grid": "BaseRendererGridLayerSettings",
+}
 
 
 def names(kind: str) -> dict[str, str]:
@@ -57,6 +72,9 @@ def check(where: str, settings: dict[str, Any], kind: str) -> list[str]:
 def test_all_settings_of_the_layout_are_known_to_foxglove() -> None:
     layout = json.loads((files("omnid.viewer") / "foxglove.json").read_text())
     assert set(layout) == {"configById", "globalVariables", "userNodes", "playbackConfig", "layout"}
-    wrong = [text for panel, settings in layout["configById"].items()
-             for text in check(panel, settings, PANELS[panel.partition("!")[0]])]
+    wrong = [
+        text
+        for panel, settings in layout["configById"].items()
+        for text in check(panel, settings, PANELS[panel.partition("!")[0]])
+    ]
     assert wrong == []

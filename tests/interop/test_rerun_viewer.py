@@ -16,8 +16,11 @@ from tests.interop.programs import HERE, lines, program, run
 
 pytestmark = pytest.mark.interop
 
-FIELDS = {"/omnid/odom": "nav_msgs.msg.Odometry", "/omnid/status": "diagnostic_msgs.msg.DiagnosticArray",
-          "/omnid/drive": "geometry_msgs.msg.TwistStamped"}
+FIELDS = {
+    "/omnid/odom": "nav_msgs.msg.Odometry",
+    "/omnid/status": "diagnostic_msgs.msg.DiagnosticArray",
+    "/omnid/drive": "geometry_msgs.msg.TwistStamped",
+}
 FLOAT32 = 1e-6  # of numbers around 1
 
 Parts = dict[str, list[dict[str, Any]]]  # topic -> components of each message, in order
@@ -40,13 +43,15 @@ def read(log: Path) -> Parts:
 
 def test_reads_every_message(known: Known, parts: Parts) -> None:
     assert {topic: len(messages) for topic, messages in parts.items()} == {
-        topic: len(messages) for topic, messages in known.expected.items()}
+        topic: len(messages) for topic, messages in known.expected.items()
+    }
 
 
 @pytest.mark.parametrize("topic", FIELDS)
 def test_reads_the_fields_that_were_written(known: Known, parts: Parts, topic: str) -> None:
     assert [message[f"{FIELDS[topic]}:message"] for message in parts[topic]] == [
-        [message] for message in known.expected[topic]]
+        [message] for message in known.expected[topic]
+    ]
 
 
 def test_reads_the_poses_and_transforms_that_were_written(known: Known, parts: Parts) -> None:

@@ -105,12 +105,18 @@ def test_the_result_holds_arrays_counters_and_timings(result: omnid.RunResult) -
 
 def test_a_result_and_a_pose_print_as_one_line(result: omnid.RunResult, scene: Path, pairs: list[Pair]) -> None:
     length_m = result.counters.length_m
-    assert repr(result) == str(result) == (
-        f"<RunResult: {PAIRS} poses ({PAIRS} tracking), {1e-9 * np.ptp(result.stamps_ns):.1f} s, {length_m:.2f} m, "
-        f"{len(result.map.xyz) if result.map is not None else 0} map points, 1 warnings>")
+    assert (
+        repr(result)
+        == str(result)
+        == (
+            f"<RunResult: {PAIRS} poses ({PAIRS} tracking), {1e-9 * np.ptp(result.stamps_ns):.1f} s, {length_m:.2f} m, "
+            f"{len(result.map.xyz) if result.map is not None else 0} map points, 1 warnings>"
+        )
+    )
     pose = omnid.Odometry(scene / "rig.toml").process(*pairs[0])
-    assert re.fullmatch(r"<pose 0: tracking, x \+0\.000 y \+0\.000 z \+0\.000 m, heading [+-]0\.00 deg, sigma .* mm>",
-                        str(pose))
+    assert re.fullmatch(
+        r"<pose 0: tracking, x \+0\.000 y \+0\.000 z \+0\.000 m, heading [+-]0\.00 deg, sigma .* mm>", str(pose)
+    )
     assert np.array_equal(pose.position, pose.T_odom_rig[:3, 3])
 
 
@@ -216,8 +222,11 @@ def test_images_may_be_views(scene: Path, pairs: list[Pair]) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "named"),
-    [(("absent.mcap", "rig.toml"), "absent.mcap"), (("log.mcap", "absent.toml"), "absent.toml"),
-     (("log.mcap",), "rig")],
+    [
+        (("absent.mcap", "rig.toml"), "absent.mcap"),
+        (("log.mcap", "absent.toml"), "absent.toml"),
+        (("log.mcap",), "rig"),
+    ],
 )
 def test_one_error_class_for_all_wrong_input(scene: Path, arguments: tuple[str, ...], named: str) -> None:
     with pytest.raises(OmnidError, match=named):
@@ -252,9 +261,7 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, result: omnid.Ru
             save(tmp_path / "absent" / "x")
 
 
-def test_a_late_error_holds_the_result_so_far(
-    scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_late_error_holds_the_result_so_far(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fails_at_the_tenth(self: Synchronise, frame: object, process: object = Synchronise.process) -> object:
         if self.counts["pairs"] == 10:
             raise OmnidError("the disk is gone")

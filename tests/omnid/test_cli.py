@@ -35,8 +35,9 @@ def test_every_command_has_a_description_and_an_example() -> None:
 
 
 @pytest.mark.parametrize("words", EXAMPLES)
-def test_help_is_wrapped_and_examples_can_be_copied(words: str, capsys: pytest.CaptureFixture[str],
-                                                    monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_is_wrapped_and_examples_can_be_copied(
+    words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("COLUMNS", "60")
     with pytest.raises(SystemExit):
         main([*words.split(), "--help"])
@@ -55,8 +56,15 @@ def test_every_example_is_accepted(example: str) -> None:
 def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
     def completions(line: str) -> set[str]:
         found = tmp_path / "found"
-        environment = {**os.environ, "_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": "\n", "COMP_LINE": line,
-                       "COMP_POINT": str(len(line)), "COMP_TYPE": "9", "_ARGCOMPLETE_STDOUT_FILENAME": str(found)}
+        environment = {
+            **os.environ,
+            "_ARGCOMPLETE": "1",
+            "_ARGCOMPLETE_IFS": "\n",
+            "COMP_LINE": line,
+            "COMP_POINT": str(len(line)),
+            "COMP_TYPE": "9",
+            "_ARGCOMPLETE_STDOUT_FILENAME": str(found),
+        }
         subprocess.run([sys.executable, "-m", "omnid"], env=environment, check=True)
         return {word.strip() for word in found.read_text().splitlines()}
 
@@ -72,15 +80,22 @@ def test_the_list_of_commands_loads_no_opencv() -> None:
     assert lines[-1] == "False" and all(any(line.strip().startswith(name) for line in lines) for name in COMMANDS)
 
 
-@pytest.mark.parametrize(("words", "line"), [
-    (["repaly"], "unknown command 'repaly': did you mean replay? see omnid --help"),
-    (["calibrate", "rg"], "unknown command 'rg': did you mean rig? see omnid calibrate --help"),
-    (["replay", "x", "--metod", "paper"], "unknown argument --metod: did you mean --method? see omnid replay --help"),
-    (["replay", "x", "--method", "papr"], "--method 'papr': did you mean paper? see omnid replay --help"),
-    (["eval", "a", "b", "c"], "unknown argument c: see omnid eval --help"),
-])
-def test_a_mistyped_word_is_named_with_the_nearest_one(words: list[str], line: str,
-                                                       capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["repaly"], "unknown command 'repaly': did you mean replay? see omnid --help"),
+        (["calibrate", "rg"], "unknown command 'rg': did you mean rig? see omnid calibrate --help"),
+        (
+            ["replay", "x", "--metod", "paper"],
+            "unknown argument --metod: did you mean --method? see omnid replay --help",
+        ),
+        (["replay", "x", "--method", "papr"], "--method 'papr': did you mean paper? see omnid replay --help"),
+        (["eval", "a", "b", "c"], "unknown argument c: see omnid eval --help"),
+    ],
+)
+def test_a_mistyped_word_is_named_with_the_nearest_one(
+    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(words)
     assert ended.value.code == 2 and capsys.readouterr().err == f"omnid: {line}\n"
@@ -89,9 +104,16 @@ def test_a_mistyped_word_is_named_with_the_nearest_one(words: list[str], line: s
 @pytest.mark.parametrize(("wanted", "found"), [(None, "1"), ("2", "2")])
 def test_commands_use_one_thread_of_blas_unless_more_are_wanted(wanted: str | None, found: str) -> None:
     """Set before numpy is loaded, which reads it."""
-    script = ("import os, sys\nfrom omnid.cli import main\nassert 'numpy' not in sys.modules\nmain(['config'])\n"
-              "print(os.environ['OPENBLAS_NUM_THREADS'], file=sys.stderr)")
+    script = (
+        "import os, sys\nfrom omnid.cli import main\nassert 'numpy' not in sys.modules\nmain(['config'])\n"
+        "print(os.environ['OPENBLAS_NUM_THREADS'], file=sys.stderr)"
+    )
     environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"}
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True,
-                          env=environment | ({} if wanted is None else {"OPENBLAS_NUM_THREADS": wanted}))
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment | ({} if wanted is None else {"OPENBLAS_NUM_THREADS": wanted}),
+    )
     assert done.stderr.split() == [found]

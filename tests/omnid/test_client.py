@@ -81,13 +81,20 @@ def test_decodes_diagnostics_clouds_and_maps() -> None:
     np.testing.assert_array_equal(grid.cells, cells)
 
 
-@pytest.mark.parametrize(("kind", "topic", "payload", "decode"), [
-    (Pose, "odom", odometry(3), lambda data: decode_pose(data, b"")),
-    (Diagnostics, "status", codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]),
-     decode_diagnostics),
-    (Cloud, "cloud", map_codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
-    (Map, "map", map_codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
-])
+@pytest.mark.parametrize(
+    ("kind", "topic", "payload", "decode"),
+    [
+        (Pose, "odom", odometry(3), lambda data: decode_pose(data, b"")),
+        (
+            Diagnostics,
+            "status",
+            codec.diagnostics_cdr(5, [DiagnosticStatus("a", 1, "so so", {"k": "v"})]),
+            decode_diagnostics,
+        ),
+        (Cloud, "cloud", map_codec.point_cloud_cdr(6, "odom", np.ones((4, 3)), np.ones(4)), decode_cloud),
+        (Map, "map", map_codec.grid_cdr(6, "odom", np.zeros((4, 3), np.int8), 0.1, (0.0, 0.0)), decode_map),
+    ],
+)
 def test_any_bytes_are_decoded_or_refused(kind: type, topic: str, payload: bytes, decode) -> None:
     rng = random.Random(2)
     for _ in range(1500):
@@ -99,8 +106,9 @@ def test_any_bytes_are_decoded_or_refused(kind: type, topic: str, payload: bytes
             assert isinstance(decode(bytes(damaged)), kind)
     with robot() as (bus, endpoint), Robot(connect=(endpoint,)) as connection:
         messages = connection.subscribe(kind)
-        wait_until(lambda: bus.publish(topic, payload[:9]) is None and messages.newest() is None
-                   and messages.broken > 0)
+        wait_until(
+            lambda: bus.publish(topic, payload[:9]) is None and messages.newest() is None and messages.broken > 0
+        )
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"\xff", b"{", b"[" * 3000, b"1", bytes(5000)])
@@ -129,8 +137,9 @@ def test_the_subscriber_example_prints_poses() -> None:
         with script(f"print('ready', flush=True)\n{code}") as process:
             numbers = count()
             attachment = PoseAttachment(1, "tracking").to_bytes()
-            wait_until(lambda: bus.publish("odom", odometry(next(numbers)), attachment) is None
-                       and process.poll() is not None)
+            wait_until(
+                lambda: bus.publish("odom", odometry(next(numbers)), attachment) is None and process.poll() is not None
+            )
             assert process.returncode == 0 and process.stdout is not None
             assert process.stdout.read().startswith("tracking: ")
 
@@ -154,11 +163,16 @@ def test_the_waypoint_example_drives_a_robot_to_the_last_waypoint() -> None:
         bus.subscribe_commands(execute, {})
         code = example(Driver.__doc__).replace('Robot("omnid")', f'Robot("omnid", connect=("{endpoint}",))')
         with script(f"print('ready', flush=True)\n{code}") as process:
+
             def run() -> bool:
                 T = se3.transform(np.eye(3), [state["x"], state["y"], 0.0])
-                bus.publish("odom", codec.odometry_cdr(time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6)),
-                            PoseAttachment(1, "tracking").to_bytes())
+                bus.publish(
+                    "odom",
+                    codec.odometry_cdr(time.time_ns(), T, np.eye(6), np.zeros(6), np.eye(6)),
+                    PoseAttachment(1, "tracking").to_bytes(),
+                )
                 return process.poll() is not None
+
             wait_until(run, pause_s=0.005)
             assert process.returncode == 0
         wait_until(lambda: bool(stops))

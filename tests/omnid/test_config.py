@@ -28,19 +28,28 @@ def test_refuses_every_renamed_key_with_a_name_that_exists(old: str) -> None:
         assert str(caught.value).endswith(f"is now called {RENAMED[old]}")
 
 
-@pytest.mark.parametrize(("overrides", "matching"), [
-    ([], "auto"), (["odometry.method=paper"], "enhanced"),
-    (["odometry.method=paper", "stereo.matching.method=sad"], "sad"),
-    (["odometry.method=paper", "stereo.matching.method=enhanced"], "enhanced")])
-def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(overrides: list[str], matching: str
-                                                                                ) -> None:
+@pytest.mark.parametrize(
+    ("overrides", "matching"),
+    [
+        ([], "auto"),
+        (["odometry.method=paper"], "enhanced"),
+        (["odometry.method=paper", "stereo.matching.method=sad"], "sad"),
+        (["odometry.method=paper", "stereo.matching.method=enhanced"], "enhanced"),
+    ],
+)
+def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
+    overrides: list[str], matching: str
+) -> None:
     assert load_config(None, overrides).stereo_settings().matching.method == matching
 
 
-@pytest.mark.parametrize(("key", "proposed"), [
-    ("controller.max_velocity", "did you mean controller.limits.velocity_mps or "),
-    ("mapping.voxel_mm", "did you mean mapping.voxel_m?"),
-])
+@pytest.mark.parametrize(
+    ("key", "proposed"),
+    [
+        ("controller.max_velocity", "did you mean controller.limits.velocity_mps or "),
+        ("mapping.voxel_mm", "did you mean mapping.voxel_m?"),
+    ],
+)
 def test_a_wrong_key_is_answered_by_keys_of_its_own_section(key: str, proposed: str) -> None:
     with pytest.raises(OmnidError, match=re.escape(f"unknown key {key}: {proposed}")):
         load_config(None, [f"{key}=1"])

@@ -17,8 +17,14 @@ def test_the_table_of_unused_settings_names_keys_that_exist(path: str) -> None:
 
 @pytest.mark.parametrize(
     ("command", "override"),
-    [("run", "graph.depth=3"), ("run", " controller.setpoint . velocity_mps=0.0"), ("run", "log.reorder_frames=8"),
-     ("replay", "cameras.width_px=640"), ("replay", "live.cloud_s=1"), ("replay", "record.enabled=true")],
+    [
+        ("run", "graph.depth=3"),
+        ("run", " controller.setpoint . velocity_mps=0.0"),
+        ("run", "log.reorder_frames=8"),
+        ("replay", "cameras.width_px=640"),
+        ("replay", "live.cloud_s=1"),
+        ("replay", "record.enabled=true"),
+    ],
 )
 def test_refuses_an_override_that_the_command_ignores(command: str, override: str) -> None:
     config = load_config(None, [override])

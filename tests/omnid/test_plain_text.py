@@ -9,10 +9,16 @@ import pytest
 from omnid.plain_text import MOST_CHARACTERS, one_line, plain
 
 
-@pytest.mark.parametrize(("text", "shown"), [
-    ("room 1/größe.mcap", "room 1/größe.mcap"), ("\x1b[2J\n\t\0\x9b", r"\x1b[2J\n\t\x00\x9b"),
-    (os.fsdecode(b"a\xff\x80"), r"a\xff\x80"), ("\ud800\u202e\u2028", r"\ud800\u202e\u2028"), ("", ""),
-])
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("room 1/größe.mcap", "room 1/größe.mcap"),
+        ("\x1b[2J\n\t\0\x9b", r"\x1b[2J\n\t\x00\x9b"),
+        (os.fsdecode(b"a\xff\x80"), r"a\xff\x80"),
+        ("\ud800\u202e\u2028", r"\ud800\u202e\u2028"),
+        ("", ""),
+    ],
+)
 def test_what_is_not_printable_is_escaped(text: str, shown: str) -> None:
     assert plain(text) == shown and shown.isprintable()
 

@@ -77,8 +77,10 @@ def test_the_unit_of_the_page_is_taken_without_a_word_and_locked_up(tmp_path: Pa
     unit = tmp_path / "omnid-web.service"
     unit.write_text((SYSTEMD / unit.name).read_text().replace("/opt/omnid/bin/omnid", sys.executable))
     assert verify(unit) == (0, "")
-    found = re.search(r"Overall exposure level for omnid-web.service: (\S+)",
-                      analyze("security", "--offline=true", "--no-pager", unit).stdout)
+    found = re.search(
+        r"Overall exposure level for omnid-web.service: (\S+)",
+        analyze("security", "--offline=true", "--no-pager", unit).stdout,
+    )
     assert found and float(found[1]) <= WORST_EXPOSURE
 
 
@@ -120,8 +122,13 @@ def rules(text: str, commented: bool) -> Iterator[list[tuple[str, str, str, str]
             line = line[1:]
         if line and not line.startswith("#"):
             parts = PART.findall(line)
-            if ", ".join(f'{key}{"{" + attribute + "}" if attribute else ""}{operator}"{value}"'
-                         for key, attribute, operator, value in parts) != line:
+            if (
+                ", ".join(
+                    f'{key}{"{" + attribute + "}" if attribute else ""}{operator}"{value}"'
+                    for key, attribute, operator, value in parts
+                )
+                != line
+            ):
                 raise ValueError(f"no udev rule: {line}")
             yield parts
 
@@ -140,7 +147,10 @@ def test_the_examples_are_rules() -> None:
     for parts in found:
         check(parts)
     assert [value for parts in found for key, _, operator, value in parts if (key, operator) == ("SYMLINK", "+=")] == [
-        "omnid/lower", "omnid/upper", "omnid/motor"]
+        "omnid/lower",
+        "omnid/upper",
+        "omnid/motor",
+    ]
 
 
 def test_nothing_is_renamed_before_somebody_puts_in_his_ports() -> None:
@@ -150,8 +160,10 @@ def test_nothing_is_renamed_before_somebody_puts_in_his_ports() -> None:
 def test_the_examples_of_the_cameras_are_what_omnid_cameras_prints() -> None:
     examples = [line[1:] for line in RULES.read_text().splitlines() if line.startswith('#SUBSYSTEM=="video4linux"')]
     ports = [re.search(r'ID_PATH}=="(.*?)"', line)[1] for line in examples]  # type: ignore[index]
-    devices = [CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "", "", "", port)
-               for number, port in enumerate(ports)]
+    devices = [
+        CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "", "", "", port)
+        for number, port in enumerate(ports)
+    ]
     assert list(udev_rules(devices)) == examples
 
 

@@ -102,8 +102,15 @@ def hostile(tmp_path: Path) -> Iterator[Path]:
 
 def run(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
     """Run Python in the folder without its modules, as the installed program does."""
-    return subprocess.run([sys.executable, "-P", *map(str, words)], cwd=folder, capture_output=True, text=True,
-                          timeout=240, stdin=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    return subprocess.run(
+        [sys.executable, "-P", *map(str, words)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=240,
+        stdin=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
 
 
 def test_no_command_runs_it(hostile: Path) -> None:
@@ -112,8 +119,11 @@ def test_no_command_runs_it(hostile: Path) -> None:
     done = run(hostile, "-c", IN_ONE_PROCESS, json.dumps(calls))
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(answers) == len(calls), (answers[-1:], done.stderr)
-    wrong = {words: answer for (words, (_, expected)), answer in zip(COMMANDS.items(), answers, strict=True)
-             if expected not in answer[1] or "Traceback" in answer[1]}
+    wrong = {
+        words: answer
+        for (words, (_, expected)), answer in zip(COMMANDS.items(), answers, strict=True)
+        if expected not in answer[1] or "Traceback" in answer[1]
+    }
     assert not wrong
 
 
@@ -122,30 +132,35 @@ def test_the_controller_and_the_program_of_a_report_do_not_run_it(hostile: Path,
     recordings.mkdir()
     done = run(hostile, "-m", "omnid", "replay", log, "--motor", "simulated", "--record", recordings / "a.mcap")
     assert done.returncode == 0, done.stderr
-    report = ("import asyncio, sys\nfrom pathlib import Path\nfrom omnid.web.recordings import Recordings\n"
-              "found = Recordings(Path(sys.argv[1]), Path(sys.argv[2]))\n"
-              "print(asyncio.run(found.report(found.list()[0].key)).read_text()[:15])")
+    report = (
+        "import asyncio, sys\nfrom pathlib import Path\nfrom omnid.web.recordings import Recordings\n"
+        "found = Recordings(Path(sys.argv[1]), Path(sys.argv[2]))\n"
+        "print(asyncio.run(found.report(found.list()[0].key)).read_text()[:15])"
+    )
     done = run(hostile, "-c", report, recordings, tmp_path)
     assert done.stdout == "<!DOCTYPE html>\n", done
 
 
 def test_the_process_of_the_refinement_does_not_run_it(hostile: Path) -> None:
     """It fails for a request that is none, after it has loaded what it needs to read one."""
-    ask = ("from omnid.refinement.rig_refinement import _Estimate\n"
-           "asked = _Estimate(None)\nasked.wait()\nprint(asked.answer())")
+    ask = (
+        "from omnid.refinement.rig_refinement import _Estimate\n"
+        "asked = _Estimate(None)\nasked.wait()\nprint(asked.answer())"
+    )
     assert run(hostile, "-c", ask).stdout == "the estimate ended with exit code 1\n"
 
 
 def test_the_viewer_does_not_run_it(hostile: Path) -> None:
     pytest.importorskip("rerun")
-    ask = ("import subprocess\nfrom omnid.viewer.targets import _rerun\n"
-           "print(subprocess.run(_rerun(['--version']), capture_output=True, text=True).stdout)")
+    ask = (
+        "import subprocess\nfrom omnid.viewer.targets import _rerun\n"
+        "print(subprocess.run(_rerun(['--version']), capture_output=True, text=True).stdout)"
+    )
     assert "rerun" in run(hostile, "-c", ask).stdout
 
 
 def test_a_batch_runs_no_object_that_it_fetches(hostile: Path, tmp_path: Path) -> None:
-    """The objects of an address have names that strangers chose; programs run in the folder to which they are fetched.
-    """
+    """The objects of an address have names that strangers chose; programs run in the folder they are fetched to."""
     pytest.importorskip("fsspec")
     bucket = tmp_path / "bucket"
     short_log(bucket / "drive.mcap")
@@ -160,6 +175,10 @@ def test_a_batch_runs_no_object_that_it_fetches(hostile: Path, tmp_path: Path) -
 def test_each_program_is_started_by_one_function() -> None:
     """Code that starts a Python names the interpreter in one file only; the others name it in a message."""
     starts = re.compile(r"\[\s*sys\.executable|exec\w*\(\s*sys\.executable|^\s+sys\.executable,|multiprocessing", re.M)
-    found = [path.relative_to(ROOT).as_posix() for layer in ("calib", "drivers", "omnid")
-             for path in sorted((ROOT / layer).rglob("*.py")) if starts.search(path.read_text("utf-8"))]
+    found = [
+        path.relative_to(ROOT).as_posix()
+        for layer in ("calib", "drivers", "omnid")
+        for path in sorted((ROOT / layer).rglob("*.py"))
+        if starts.search(path.read_text("utf-8"))
+    ]
     assert found == ["omnid/engine/python_program.py"]

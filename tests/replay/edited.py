@@ -28,8 +28,9 @@ class Image:
     def later(self, pairs: int) -> Image:
         """Return the same image so many pairs later."""
         shift_ns = pairs * PERIOD_NS
-        return replace(self, pair=self.pair + pairs, stamp_ns=self.stamp_ns + shift_ns,
-                       written_ns=self.written_ns + shift_ns)
+        return replace(
+            self, pair=self.pair + pairs, stamp_ns=self.stamp_ns + shift_ns, written_ns=self.written_ns + shift_ns
+        )
 
 
 def images(log: Path) -> list[Image]:

@@ -1,9 +1,9 @@
 """`omnid run` on a log whose cameras are made faulty by lines on the standard input.
 
-    upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
-    lower cut       halves of JPEGs           both frozen     the same image again and again
-    lower glitch    every fourth image is the one before      both ok         no fault
-    clock 3600      the system clock is that many seconds ahead
+upper mute      no more images          lower garbage   JPEGs of noise        both black   dark ones
+lower cut       halves of JPEGs           both frozen     the same image again and again
+lower glitch    every fourth image is the one before      both ok         no fault
+clock 3600      the system clock is that many seconds ahead
 """
 
 from __future__ import annotations
@@ -96,8 +96,12 @@ def main() -> int:
     threading.Thread(target=read_faults, args=(faults,), daemon=True).start()
     images, clock = LogImages.load(args.log), LogClock(time.monotonic_ns())
     config = load_config(None, ["controller.motion.check=false", *args.settings, f"motor.port={args.motor}"])
-    live = LiveRun(config, ConnectedRobot(lambda camera: FaultyCamera(images, camera, clock, faults)),
-                lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True), read_rig(args.rig))
+    live = LiveRun(
+        config,
+        ConnectedRobot(lambda camera: FaultyCamera(images, camera, clock, faults)),
+        lambda _, text: print(f"omnid: {text}", file=sys.stderr, flush=True),
+        read_rig(args.rig),
+    )
     return live.run()
 
 

@@ -109,8 +109,12 @@ class Operator:
 
     def __init__(self, port: int) -> None:
         config = zenoh.Config()
-        settings = {"mode": "peer", "connect/endpoints": [f"tcp/127.0.0.1:{port}"], "listen/endpoints": [],
-                    "scouting/multicast/enabled": False}
+        settings = {
+            "mode": "peer",
+            "connect/endpoints": [f"tcp/127.0.0.1:{port}"],
+            "listen/endpoints": [],
+            "scouting/multicast/enabled": False,
+        }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
         self.poses: list[codec.OdometryRecord] = []
@@ -209,8 +213,12 @@ def command_line(scene: Path, port: int, motor: Path | None, *words: object, mod
     run = [] if module != "omnid" else ["run"]
     log = ["--log", scene / "log.mcap", "--rig", scene / "rig.toml"]
     wheels = [] if motor is None else ["--motor", motor]
-    settings = [f'bus.listen=["tcp/127.0.0.1:{port}"]', "live.status_s=0.2", "live.cloud_s=0.5",
-                'controller.arming="automatic"']
+    settings = [
+        f'bus.listen=["tcp/127.0.0.1:{port}"]',
+        "live.status_s=0.2",
+        "live.cloud_s=0.5",
+        'controller.arming="automatic"',
+    ]
     sets = [word for setting in settings for word in ("--set", setting)]
     return [sys.executable, "-m", module, *map(str, [*run, *log, *wheels, *sets, *words])]
 

@@ -1,6 +1,6 @@
 """Make the log that `omnid demo` replays: two_walls at 512x512, grey, with its rig attached.
 
-    python -m tests.replay.make_sample ../shared/data/two_walls omnid/sample
+python -m tests.replay.make_sample ../shared/data/two_walls omnid/sample
 """
 
 from __future__ import annotations

@@ -10,8 +10,16 @@ from tests.replay.live import Base, Operator, answers, command_line, free_port, 
 def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
     """Return a recording of at least so many poses, at half speed so that an idle machine drops no image."""
     port, base, kept = free_port(), Base(folder), folder / "kept"
-    more = ("--pace", "0.5", "--set", "record.enabled=true", "--set", f"record.folder={kept}", "--set",
-            "record.free_mb=0")
+    more = (
+        "--pace",
+        "0.5",
+        "--set",
+        "record.enabled=true",
+        "--set",
+        f"record.folder={kept}",
+        "--set",
+        "record.free_mb=0",
+    )
     with started(command_line(scene, port, base.port, *more), port) as daemon:
         wait_until(lambda: answers(port) or not daemon.alive, "the bus")
         operator = Operator(port)

@@ -18,10 +18,17 @@ from omnid.core.control.safety_rules import FAILED
 from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, robot, wait_until
 
 # A busy machine is late with everything: each fault would disarm, and another sender would take over.
-PATIENT = ("controller.arming=manual", "controller.deadlines.pose_s=8", "controller.deadlines.command_s=8",
-           "controller.deadlines.tick_s=8", "motor.watchdog_ms=8000", "controller.trust.velocity_sigma_mps=0",
-           "controller.trust.yaw_rate_sigma_radps=0", "controller.trust.odometry_reset=ignore",
-           "controller.sources.hold_s=8")
+PATIENT = (
+    "controller.arming=manual",
+    "controller.deadlines.pose_s=8",
+    "controller.deadlines.command_s=8",
+    "controller.deadlines.tick_s=8",
+    "motor.watchdog_ms=8000",
+    "controller.trust.velocity_sigma_mps=0",
+    "controller.trust.yaw_rate_sigma_radps=0",
+    "controller.trust.odometry_reset=ignore",
+    "controller.sources.hold_s=8",
+)
 MANUAL = tuple(word for setting in PATIENT for word in ("--set", setting))
 WATCH_S = 0.5  # during which nothing may move
 HUNG_S = 4.0  # until the queues of subscribers that do not read are full; after 10 s zenoh drops them
@@ -73,13 +80,20 @@ def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, c
 
 def expect_the_operator_drives(daemon: Daemon, operator: Operator, base: Base) -> None:
     """Let a second program command as the operator, and a planner: backwards, at once with the operator."""
+
     def ignored(reason: str) -> int:
         return int(operator.values("wheels").get(f"ignored, {reason}", "0"))
 
     with Robot(connect=(f"tcp/127.0.0.1:{daemon.port}",)) as second:
         others, since_s = (second.driver(), second.driver(PLANNER)), time.monotonic()
-        wait_until(lambda: not any(driver.twist(-0.2, 0.5) for driver in others)
-                   and ignored(OTHER_SENDER) > 5 and ignored(LOWER_PRIORITY) > 5, "ignored commands")
+        wait_until(
+            lambda: (
+                not any(driver.twist(-0.2, 0.5) for driver in others)
+                and ignored(OTHER_SENDER) > 5
+                and ignored(LOWER_PRIORITY) > 5
+            ),
+            "ignored commands",
+        )
     assert operator.values("wheels")["source"] == OPERATOR
     assert all(note.wheels_mps[0] > 0.25 for note in list(base.line.notes) if note.at_s > since_s)
 

@@ -158,8 +158,12 @@ def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Pa
     shutil.copy(scene / "rig.toml", rig)
     settings.write_text(omnid("config").out)
     before = {path: path.read_bytes() for path in (bag / "bag_0.mcap", rig, settings)}
-    for path, what in ((bag / "bag_0.mcap", "log"), (tmp_path / "link.mcap", "log"), (rig, "rig"),
-                       (settings, "configuration")):
+    for path, what in (
+        (bag / "bag_0.mcap", "log"),
+        (tmp_path / "link.mcap", "log"),
+        (rig, "rig"),
+        (settings, "configuration"),
+    ):
         error = omnid.refused("replay", bag, "--rig", rig, "--config", settings, "--quiet", "--record", path)
         assert f"the {what} that is read" in error
     assert {path: path.read_bytes() for path in before} == before
@@ -203,8 +207,9 @@ def test_does_not_replace_a_device_by_a_map(omnid: Command, scene: Path) -> None
 
 @pytest.mark.parametrize("setting", ["panorama.margin_px=100", "panorama.width_px=64"])
 def test_refuses_a_panorama_that_is_too_small(omnid: Command, scene: Path, setting: str) -> None:
-    assert "panorama" in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--set",
-                                       setting)
+    assert "panorama" in omnid.refused(
+        "replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--set", setting
+    )
 
 
 def test_limits_the_disparities_to_the_image(omnid: Command, scene: Path) -> None:
@@ -214,8 +219,13 @@ def test_limits_the_disparities_to_the_image(omnid: Command, scene: Path) -> Non
 
 @pytest.mark.parametrize(
     ("setting", "named"),
-    [("stereo.matching.window=9", "stereo.matching.window_px"), ("odometry.noise_px=fine", "odometry.noise_px"),
-     ("pair.tolerance_ms=-1", "pair.tolerance_ms"), ("nonsense", "="), ("odometry.method=magic", "'paper'")],
+    [
+        ("stereo.matching.window=9", "stereo.matching.window_px"),
+        ("odometry.noise_px=fine", "odometry.noise_px"),
+        ("pair.tolerance_ms=-1", "pair.tolerance_ms"),
+        ("nonsense", "="),
+        ("odometry.method=magic", "'paper'"),
+    ],
 )
 def test_names_a_wrong_setting(omnid: Command, scene: Path, setting: str, named: str) -> None:
     assert named in omnid.refused("replay", scene / "log.mcap", "--set", setting)

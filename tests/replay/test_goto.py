@@ -31,9 +31,24 @@ def takes_requests(port: int) -> bool:
 def test_goals_in_odom_and_in_the_saved_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port, truth = free_port(), tmp_path / "truth.tum"
     connect = ["--connect", f"tcp/127.0.0.1:{port}"]
-    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320", "--truth", str(truth),
-               "--map", str(tmp_path / "site.omap"), "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]',
-               "--set", "controller.collision.unknown=slow"]  # such small images show little of the floor
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "simulate",
+        "room",
+        "--no-people",
+        "--size",
+        "320",
+        "--truth",
+        str(truth),
+        "--map",
+        str(tmp_path / "site.omap"),
+        "--set",
+        f'bus.listen=["tcp/127.0.0.1:{port}"]',
+        "--set",
+        "controller.collision.unknown=slow",
+    ]  # such small images show little of the floor
     goals: dict[str, list[tuple[str, ...]]] = {"odom": [("0.8", "0"), ("0", "0", "0")], "map": [tuple(map(str, GOAL))]}
     for frame, poses in goals.items():
         with started(command, port) as daemon:
@@ -46,8 +61,12 @@ def test_goals_in_odom_and_in_the_saved_map(tmp_path: Path, capsys: pytest.Captu
                 assert "not localised in a map" in capsys.readouterr().err
             for pose in poses:
                 # A busy computer may stop the simulated motor controller for a moment, which disarms.
-                wait_until(lambda pose=pose: main(["arm", *connect]) == 0
-                           and main(["goto", *pose, "--frame", frame, *connect]) == 0, "the goal")  # noqa: B023
+                wait_until(
+                    lambda pose=pose: (
+                        main(["arm", *connect]) == 0 and main(["goto", *pose, "--frame", frame, *connect]) == 0  # noqa: B023
+                    ),
+                    "the goal",
+                )
             assert "reached" in capsys.readouterr().out
             assert daemon.end()[0] == 0
     end = read_tum(truth).T[-1]

@@ -68,8 +68,9 @@ def test_a_refused_rig_may_be_a_warning(omnid: Command, scene: Path) -> None:
 def test_a_rig_that_cannot_be_checked_is_a_warning(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """Darkness decides nothing; light later does."""
     taken = images(scene / "log.mcap")
-    assert "could not be checked" in omnid.replay(save(tmp_path / "a.mcap", map(dark, taken)),
-                                                  rig=scene / "rig.toml").err
+    assert (
+        "could not be checked" in omnid.replay(save(tmp_path / "a.mcap", map(dark, taken)), rig=scene / "rig.toml").err
+    )
     later = save(tmp_path / "b.mcap", (dark(p) if p.pair < PAIRS // 2 else p for p in taken))
     assert "could not be checked" not in omnid.replay(later, rig=scene / "rig.toml").err
     wrong = omnid.replay(later, *EXCHANGED, rig=scene / "rig.toml")
@@ -95,8 +96,9 @@ def test_pairs_of_a_frozen_camera_give_no_pose(
     last = {image.camera: image.jpeg for image in taken if image.pair == 7}
     frozen = [replace(p, jpeg=last[p.camera]) if p.camera in dead and 8 <= p.pair < 18 else p for p in taken]
     for words in ((), ("--inline",)):
-        result = omnid.replay(save(tmp_path / "log.mcap", frozen), "--tum", tmp_path / "tum", *words,
-                              rig=scene / "rig.toml")
+        result = omnid.replay(
+            save(tmp_path / "log.mcap", frozen), "--tum", tmp_path / "tum", *words, rig=scene / "rig.toml"
+        )
         assert result.code == 0 and result.count("poses") == result.count("pairs") == PAIRS - 10
         assert result.count("repeated_lower") == 10 and "the lower camera was frozen" in result.err
         assert ("the upper camera was frozen" in result.err) == ("upper" in dead)
@@ -126,8 +128,10 @@ def test_warns_of_stamps_that_are_apart(
 
 
 def test_warns_if_most_images_have_no_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = [replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
-             for p in images(scene / "log.mcap")]
+    taken = [
+        replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
+        for p in images(scene / "log.mcap")
+    ]
     result = omnid.replay(save(tmp_path / "log.mcap", taken), "--set", "pair.tolerance_ms=10", rig=scene / "rig.toml")
     assert result.code == 0 and result.count("pairs") == PAIRS // 3 and "pair.tolerance_ms" in result.err
 

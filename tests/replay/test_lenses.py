@@ -50,8 +50,10 @@ def command(capsys: pytest.CaptureFixture[str]) -> Command:
 def sector(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a log of two pinhole cameras that see 90 degrees behind the robot, 0.6 m above the floor."""
     folder = tmp_path_factory.mktemp("sector")
-    rig = replace(lens_rig(lens("pinhole", 90, (480, 360)), heading_deg=-173.0),
-                  T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, 0.6]))
+    rig = replace(
+        lens_rig(lens("pinhole", 90, (480, 360)), heading_deg=-173.0),
+        T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, 0.6]),
+    )
     poses = paths.spline_path(5, 40, 0.05, sway_m=0.02)  # what was seen before stays in view
     poses[:, 2, 3] = 0.6
     write_log(folder, rig, poses, corridor(5), seed=5)
@@ -60,8 +62,7 @@ def sector(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_sector_gives_poses(sector: Path, command: Command) -> None:
     """A pair that looks back across azimuth 180: the command line replays and evaluates it."""
-    done = command("replay", sector / "log.mcap", "--rig", sector / "rig.toml", "--quiet", "--tum",
-                         sector / "out.txt")
+    done = command("replay", sector / "log.mcap", "--rig", sector / "rig.toml", "--quiet", "--tum", sector / "out.txt")
     assert done.code == 0 and "tracking 100.0%" in done.out and "rim" not in done.err + done.out, done
     shown = command("eval", sector / "out.txt", sector / "truth.txt", "--json")
     found = json.loads(shown.out)

@@ -60,9 +60,7 @@ def printed(process: subprocess.Popen[str], count: int) -> list[int]:
     return [int(process.stdout.readline().split()[1]) for _ in range(count)]
 
 
-def test_a_kill_costs_at_most_a_second_and_the_rest_is_recovered(
-    tmp_path: Path, scene: Path, omnid: Command
-) -> None:
+def test_a_kill_costs_at_most_a_second_and_the_rest_is_recovered(tmp_path: Path, scene: Path, omnid: Command) -> None:
     folder = tmp_path / "log"
     with recording(scene, folder) as process:
         stamps = printed(process, 150)  # 2.5 s
@@ -86,8 +84,9 @@ def test_a_kill_costs_at_most_a_second_and_the_rest_is_recovered(
     replayed = omnid.replay(path, "--inline")
     assert replayed.code == 0, replayed.err
     # Images whose partner was dropped on a busy machine, and those at which the log turns back: they come twice.
-    alone = sum(replayed.count(f"{reason}_{camera}") for reason in ("unpaired", "repeated")
-                for camera in ("lower", "upper"))
+    alone = sum(
+        replayed.count(f"{reason}_{camera}") for reason in ("unpaired", "repeated") for camera in ("lower", "upper")
+    )
     assert 2 * replayed.count("pairs") + alone == saved and replayed.count("poses") == replayed.count("pairs") > 50
 
 

@@ -27,8 +27,10 @@ def built(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     from omnid.cli import main
 
     path = tmp_path_factory.mktemp("map") / "scene.omap"
-    assert main(["map", "build", str(scene / "log.mcap"), "-o", str(path), "--rig", str(scene / "rig.toml"),
-                 "--quiet"]) == 0
+    assert (
+        main(["map", "build", str(scene / "log.mcap"), "-o", str(path), "--rig", str(scene / "rig.toml"), "--quiet"])
+        == 0
+    )
     return path
 
 
@@ -124,8 +126,17 @@ def test_maps_of_one_place_are_merged_and_of_two_places_refused(
 
 
 def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Path) -> None:
-    error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--map", omap, "--set",
-                          "panorama.width_px=400")
+    error = omnid.refused(
+        "replay",
+        scene / "log.mcap",
+        "--rig",
+        scene / "rig.toml",
+        "--quiet",
+        "--map",
+        omap,
+        "--set",
+        "panorama.width_px=400",
+    )
     assert "panoramas of 432 columns, not 400" in error
 
 

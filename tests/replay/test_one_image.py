@@ -39,8 +39,10 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sensors = [MountedSensor.of(Sensor(), m.visible, m.camera.size) for m in (apart.lower, apart.upper)]
     entries = []
     for stamp, T in zip(stamps.tolist(), poses, strict=True):
-        views = [sensor.expose(render_grey(scene, m, T, 2), rng)
-                 for sensor, m in zip(sensors, (apart.lower, apart.upper), strict=True)]
+        views = [
+            sensor.expose(render_grey(scene, m, T, 2), rng)
+            for sensor, m in zip(sensors, (apart.lower, apart.upper), strict=True)
+        ]
         entries.append(Entry(TOPIC, COMPRESSED, compressed(stamp, sensors[0].jpeg(np.hstack(views))), stamp))
     write_log(folder / "log.mcap", entries)
     (folder / "truth.txt").write_text(tum(stamps, poses))

@@ -45,9 +45,7 @@ def test_inline_and_threaded_give_the_same_bytes(
 
 def test_trajectory_and_map_are_right(omnid: Command, tmp_path: Path, scene: Path) -> None:
     tum, ply, plan = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "plan.png"
-    result = omnid.replay(
-        scene / "log.mcap", "--tum", tum, "--cloud", ply, "--plan", plan, rig=scene / "rig.toml"
-    )
+    result = omnid.replay(scene / "log.mcap", "--tum", tum, "--cloud", ply, "--plan", plan, rig=scene / "rig.toml")
     assert (result.count("pairs"), result.count("poses"), len(rows(tum))) == (PAIRS, PAIRS, PAIRS)
     estimate, truth = read_tum(tum), read_tum(scene / "truth.txt")
     np.testing.assert_allclose(estimate.T[0], np.eye(4), atol=1e-9)
@@ -113,12 +111,25 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
         last = [decode_diagnostics(m.data) for _, _, m in reader.iter_messages(["/rover/status"])][-1]
         attachments = {a.name: a.data for a in reader.iter_attachments()}
-        assert [index.offset < chunk.chunk_start_offset for index in summary.attachment_indexes
-                for chunk in summary.chunk_indexes[:1]] == [True, True]
-    assert counts == {"/rover/odom": PAIRS, "/rover/pose": PAIRS, "/rover/map_pose": PAIRS, "/tf": 2 * PAIRS,
-                      "/rover/drive": PAIRS, "/rover/cloud": 1, "/rover/map": 1, "/rover/status": 3,
-                      "/rover/scan": counts["/rover/scan"], "/rover/moving": counts["/rover/scan"],
-                      "/tf_static": 1, "/rover/path": counts["/rover/path"]}
+        assert [
+            index.offset < chunk.chunk_start_offset
+            for index in summary.attachment_indexes
+            for chunk in summary.chunk_indexes[:1]
+        ] == [True, True]
+    assert counts == {
+        "/rover/odom": PAIRS,
+        "/rover/pose": PAIRS,
+        "/rover/map_pose": PAIRS,
+        "/tf": 2 * PAIRS,
+        "/rover/drive": PAIRS,
+        "/rover/cloud": 1,
+        "/rover/map": 1,
+        "/rover/status": 3,
+        "/rover/scan": counts["/rover/scan"],
+        "/rover/moving": counts["/rover/scan"],
+        "/tf_static": 1,
+        "/rover/path": counts["/rover/path"],
+    }
     assert counts["/rover/scan"] == PAIRS  # ten a second, as the pairs are
     assert last.value(SUMMARY, "poses") == last.value(stage_name("odometry"), "processed") == str(PAIRS)
     assert float(last.value(stage_name("odometry"), "work_p50_ms")) > 0.1
@@ -130,8 +141,10 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
 def test_uses_the_rig_that_is_attached_to_the_log(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """A log with an attached rig needs no --rig, as the sample."""
     topics = {"lower": LOWER, "upper": UPPER}
-    entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
-               for p in images(scene / "log.mcap")]
+    entries = [
+        Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
+        for p in images(scene / "log.mcap")
+    ]
     log = write_log(tmp_path / "log.mcap", entries, [("rig.toml", (scene / "rig.toml").read_bytes())])
     for name, source, rig in (("a", log, None), ("b", scene / "log.mcap", scene / "rig.toml")):
         assert omnid.replay(source, "--tum", tmp_path / name, rig=rig).code == 0
@@ -141,8 +154,10 @@ def test_uses_the_rig_that_is_attached_to_the_log(omnid: Command, tmp_path: Path
 def test_topics_by_option_or_by_the_rig(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """Options or the rig tell which camera is which, if the names of the topics do not."""
     topics = {"lower": "/cam0", "upper": "/cam1"}
-    entries = [Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
-               for p in images(scene / "log.mcap")]
+    entries = [
+        Entry(topics[p.camera], COMPRESSED, compressed(p.stamp_ns, p.jpeg), p.stamp_ns)
+        for p in images(scene / "log.mcap")
+    ]
     log = write_log(tmp_path / "log.mcap", entries)
     assert "--lower" in omnid.refused("replay", log, "--rig", scene / "rig.toml")
     write_rig(tmp_path / "rig.toml", replace(read_rig(scene / "rig.toml"), topics=("/cam0", "/cam1")))
@@ -184,8 +199,16 @@ def test_opens_no_bus_without_publish(omnid: Command, scene: Path) -> None:
     """A replay on a robot must not publish in the place of its daemon: without --publish it opens no bus."""
     result = omnid.replay(scene / "log.mcap", "--set", 'bus.listen=["tcp/256.0.0.1:1"]', rig=scene / "rig.toml")
     assert result.code == 0
-    assert "bus" in omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--publish",
-                                  "--set", 'bus.listen=["tcp/256.0.0.1:1"]')
+    assert "bus" in omnid.refused(
+        "replay",
+        scene / "log.mcap",
+        "--rig",
+        scene / "rig.toml",
+        "--quiet",
+        "--publish",
+        "--set",
+        'bus.listen=["tcp/256.0.0.1:1"]',
+    )
 
 
 def test_reads_the_printed_configuration(omnid: Command, tmp_path: Path, scene: Path) -> None:
@@ -210,8 +233,11 @@ def test_the_papers_method_selects_the_enhanced_sad_unless_the_matching_is_set(
     """By option and by a file; a matching method that is set explicitly wins."""
     settings = tmp_path / "omnid.toml"
     settings.write_text(omnid("config").out.replace('method = "default"', 'method = "paper"'))
-    cases = {"option": ("--method", "paper"), "file": ("--config", settings),
-             "other": ("--method", "paper", "--set", "stereo.matching.method=sad")}
+    cases = {
+        "option": ("--method", "paper"),
+        "file": ("--config", settings),
+        "other": ("--method", "paper", "--set", "stereo.matching.method=sad"),
+    }
     for name, words in cases.items():
         result = omnid.replay(scene / "log.mcap", *words, "--tum", tmp_path / name, rig=scene / "rig.toml")
         assert result.code == 0, result.err
@@ -229,7 +255,11 @@ def test_a_log_of_two_pairs_gives_its_points(omnid: Command, tmp_path: Path, sce
 
 def test_a_truth_of_another_drive_is_asked_about(omnid: Command, tmp_path: Path, scene: Path) -> None:
     other = tmp_path / "other.txt"
-    other.write_text("".join(f"{line.split()[0]} {0.5 * row:.3f} 0 0 0 0 0 1\n"
-                             for row, line in enumerate((scene / "truth.txt").read_text().splitlines())))
+    other.write_text(
+        "".join(
+            f"{line.split()[0]} {0.5 * row:.3f} 0 0 0 0 0 1\n"
+            for row, line in enumerate((scene / "truth.txt").read_text().splitlines())
+        )
+    )
     assert "is this the truth of the same drive" in omnid("eval", scene / "truth.txt", other).err
     assert omnid("eval", scene / "truth.txt", scene / "truth.txt").err == ""

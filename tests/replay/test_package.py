@@ -66,8 +66,9 @@ def tracked(*folders: str) -> set[str]:
 
 def test_wheel_and_sdist_are_complete_and_the_wheel_runs_by_itself(tmp_path: Path) -> None:
     pytest.importorskip("hatchling", reason="needs hatchling, the build backend")
-    subprocess.run([sys.executable, "-m", "hatchling", "build", "-d", str(tmp_path)], cwd=ROOT, check=True,
-                   capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-d", str(tmp_path)], cwd=ROOT, check=True, capture_output=True
+    )
     (wheel,), (sdist,) = tmp_path.glob("*.whl"), tmp_path.glob("*.tar.gz")
     # 1. The wheel has each file of the three packages and the units of systemd; the sdist all of the repository.
     with zipfile.ZipFile(wheel) as packed:
@@ -79,10 +80,24 @@ def test_wheel_and_sdist_are_complete_and_the_wheel_runs_by_itself(tmp_path: Pat
         assert tracked() - {name.partition("/")[2] for name in source.getnames()} == set()
     # 2. Away from the repository, with nothing but the wheel, the sample is replayed.
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "installed"), "PYTHONSAFEPATH": "1"}
-    found = subprocess.run([sys.executable, "-c", "import omnid; print(omnid.__file__)"], cwd=tmp_path, env=environment,
-                           capture_output=True, text=True, check=True).stdout
+    found = subprocess.run(
+        [sys.executable, "-c", "import omnid; print(omnid.__file__)"],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
     assert found.startswith(str(tmp_path / "installed"))
-    replay = [sys.executable, "-m", "omnid", "replay", str(tmp_path / "installed/omnid/sample/log.mcap"), "--quiet",
-              "--tum", str(tmp_path / "path.tum")]
+    replay = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "replay",
+        str(tmp_path / "installed/omnid/sample/log.mcap"),
+        "--quiet",
+        "--tum",
+        str(tmp_path / "path.tum"),
+    ]
     subprocess.run(replay, cwd=tmp_path, env=environment, check=True, capture_output=True)
     assert len((tmp_path / "path.tum").read_text().splitlines()) >= 99

@@ -57,8 +57,11 @@ def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
         reader = make_reader(file)
         found: dict[str, list] = {"/tf": [], "/omnid/map_pose": [], "/omnid/status": [], "/omnid/map": []}
         for schema, channel, message in reader.iter_messages(list(found)):
-            found[channel.topic].append(STORE.deserialize_cdr(message.data, schema.name)
-                                        if channel.topic != "/omnid/status" else decode_diagnostics(message.data))
+            found[channel.topic].append(
+                STORE.deserialize_cdr(message.data, schema.name)
+                if channel.topic != "/omnid/status"
+                else decode_diagnostics(message.data)
+            )
     edges = [edge for message in found["/tf"] for edge in message.transforms if edge.header.frame_id == "map"]
     assert {edge.child_frame_id for edge in edges} == {"odom"} and len(edges) == len(T_odom_rig)
     for edge, pose, T in zip(edges, found["/omnid/map_pose"], T_odom_rig, strict=True):
@@ -68,8 +71,12 @@ def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
         assert pose.header.frame_id == "map" and pose.pose.covariance[0] >= 0
     first, last = edges[0].transform.translation, edges[-1].transform.translation
     assert (first.x, first.y, first.z) == (0, 0, 0) and abs(last.x) + abs(last.y) > 0.005
-    states = [status.values["state"] for statuses in found["/omnid/status"] for status in statuses.statuses
-              if status.name == PLACES]
+    states = [
+        status.values["state"]
+        for statuses in found["/omnid/status"]
+        for status in statuses.statuses
+        if status.name == PLACES
+    ]
     assert states == ["odometry only", "localized"]
     # The map is that of the keyframes, in their frame: it moves when a loop closes.
     [grid] = found["/omnid/map"]
@@ -95,6 +102,15 @@ def test_a_run_begins_in_a_known_map(scene: Path, elsewhere: Path) -> None:
 
 
 def test_without_places_there_is_no_trajectory_in_the_map(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    error = omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", "--quiet", "--map-tum",
-                          tmp_path / "map.txt", "--set", "places.enabled=false")
+    error = omnid.refused(
+        "replay",
+        scene / "log.mcap",
+        "--rig",
+        scene / "rig.toml",
+        "--quiet",
+        "--map-tum",
+        tmp_path / "map.txt",
+        "--set",
+        "places.enabled=false",
+    )
     assert "places.enabled" in error

@@ -34,8 +34,16 @@ PAUSE_PAIRS = 36_000  # an hour
 
 
 def replaying(scene: Path, *words: object) -> list[str]:
-    return [sys.executable, "-m", "omnid", "replay", str(scene / "log.mcap"), "--rig", str(scene / "rig.toml"),
-            *map(str, words)]
+    return [
+        sys.executable,
+        "-m",
+        "omnid",
+        "replay",
+        str(scene / "log.mcap"),
+        "--rig",
+        str(scene / "rig.toml"),
+        *map(str, words),
+    ]
 
 
 @contextmanager
@@ -62,15 +70,24 @@ def paused(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene with a pause of an hour before its last pairs: a replay in real time does not end by itself."""
     folder = tmp_path_factory.mktemp("paused")
     shutil.copy(scene / "rig.toml", folder / "rig.toml")
-    save(folder / "log.mcap", (image.later(PAUSE_PAIRS) if image.pair >= PAIRS - 4 else image
-                               for image in images(scene / "log.mcap")))
+    save(
+        folder / "log.mcap",
+        (image.later(PAUSE_PAIRS) if image.pair >= PAIRS - 4 else image for image in images(scene / "log.mcap")),
+    )
     return folder
 
 
-@pytest.mark.parametrize(("number", "code", "manner"), [
-    (signal.SIGINT, 130, []), (signal.SIGINT, 130, ["--inline"]), (signal.SIGTERM, 143, []),
-    (signal.SIGHUP, 129, ["--inline"]), pytest.param(signal.SIGTERM, 143, ["--inline"], marks=pytest.mark.slow),
-    pytest.param(signal.SIGHUP, 129, [], marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("number", "code", "manner"),
+    [
+        (signal.SIGINT, 130, []),
+        (signal.SIGINT, 130, ["--inline"]),
+        (signal.SIGTERM, 143, []),
+        (signal.SIGHUP, 129, ["--inline"]),
+        pytest.param(signal.SIGTERM, 143, ["--inline"], marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, 129, [], marks=pytest.mark.slow),
+    ],
+)
 def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, code: int, manner: list[str]) -> None:
     tum, ply, log = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "out.mcap"
     command = replaying(paused, "--realtime", "--tum", tum, "--cloud", ply, "--record", log, "--verbose", *manner)

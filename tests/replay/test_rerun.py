@@ -19,8 +19,17 @@ from tests.replay.recorded import recorded_run
 
 POSES = 18
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
-PUBLISHED = {"/omnid/odom", "/omnid/pose", "/omnid/map_pose", "/tf", "/omnid/cloud", "/omnid/map", "/omnid/status",
-             "/omnid/drive", *IMAGES}
+PUBLISHED = {
+    "/omnid/odom",
+    "/omnid/pose",
+    "/omnid/map_pose",
+    "/tf",
+    "/omnid/cloud",
+    "/omnid/map",
+    "/omnid/status",
+    "/omnid/drive",
+    *IMAGES,
+}
 AGREE = "the runs agree: no difference is larger than 20 mm or 0.5 deg"
 COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
@@ -49,8 +58,9 @@ def recording(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def messages(recording: Path) -> list[Message]:
     """Return all messages, as another program reads them."""
     with AnyReader([recording]) as bag:
-        return [Message(place.topic, at_ns, bag.deserialize(data, place.msgtype)) for place, at_ns, data
-                in bag.messages()]
+        return [
+            Message(place.topic, at_ns, bag.deserialize(data, place.msgtype)) for place, at_ns, data in bag.messages()
+        ]
 
 
 def of(messages: list[Message], topic: str) -> list[Message]:
@@ -59,13 +69,14 @@ def of(messages: list[Message], topic: str) -> list[Message]:
 
 def transforms(messages: list[Message], child: str) -> list[Message]:
     """The messages of /tf with an edge to a frame: places publish theirs beside those of odometry."""
-    return [message for message in of(messages, "/tf")
-            if any(edge.child_frame_id == child for edge in message.content.transforms)]
+    return [
+        message
+        for message in of(messages, "/tf")
+        if any(edge.child_frame_id == child for edge in message.content.transforms)
+    ]
 
 
-def test_a_recording_holds_all_messages_rig_and_settings(
-    recording: Path, messages: list[Message], scene: Path
-) -> None:
+def test_a_recording_holds_all_messages_rig_and_settings(recording: Path, messages: list[Message], scene: Path) -> None:
     assert {message.topic for message in messages} >= {*PUBLISHED, "/omnid/cmd/heading"}
     reader = LogReader(recording)
     attached = reader.attachments()
@@ -94,8 +105,9 @@ def test_log_times_are_the_stamps(messages: list[Message]) -> None:
 
 def test_all_messages_of_a_pose_agree(messages: list[Message]) -> None:
     """Odometry, PoseStamped and the transform hold the same pose."""
-    pose_messages = zip(of(messages, "/omnid/odom"), of(messages, "/omnid/pose"), transforms(messages, "base_link"),
-                        strict=True)
+    pose_messages = zip(
+        of(messages, "/omnid/odom"), of(messages, "/omnid/pose"), transforms(messages, "base_link"), strict=True
+    )
     for odom, pose, tf in (tuple(message.content for message in three) for three in pose_messages):
         assert odom.pose.pose == pose.pose
         edge = next(edge for edge in tf.transforms if edge.child_frame_id == "base_link")

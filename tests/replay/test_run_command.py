@@ -25,7 +25,6 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 
-
 def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, course: Path) -> None:
     with robot(course, tmp_path) as (daemon, operator, base):
         time.sleep(0.5)
@@ -111,21 +110,46 @@ def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
 
 def test_uses_the_attached_rig_and_ends_with_the_log() -> None:
     port = free_port()
-    command = [sys.executable, "-m", "omnid", "run", "--log", str(SAMPLE), "--once", "--pace", "5",
-               "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        str(SAMPLE),
+        "--once",
+        "--pace",
+        "5",
+        "--motor",
+        "simulated",
+        "--set",
+        f'bus.listen=["tcp/127.0.0.1:{port}"]',
+    ]
     with started(command, port) as daemon:
         _, err = daemon.process.communicate(timeout=PATIENCE_S)
     assert daemon.process.returncode == 0 and "Traceback" not in err, err
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT,
-                                    pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, pytest.param(signal.SIGHUP, marks=pytest.mark.slow)])
 def test_signals_end_it_without_output_at_any_time(scene: Path, number: int) -> None:
     """Also while it starts."""
     port = free_port()
-    command = [sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
-               str(scene / "rig.toml"), "--motor", "simulated", "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]',
-               "--set", "obstacles.ring.floor_m=-1.2"]
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        str(scene / "log.mcap"),
+        "--rig",
+        str(scene / "rig.toml"),
+        "--motor",
+        "simulated",
+        "--set",
+        f'bus.listen=["tcp/127.0.0.1:{port}"]',
+        "--set",
+        "obstacles.ring.floor_m=-1.2",
+    ]
     with started(command, port) as daemon:
         wait_until(lambda: answers(port), "the bus")  # opened after cameras and motor, before anything runs
         code, err = daemon.end(number)
@@ -157,16 +181,36 @@ def test_wrong_options_give_one_line(omnid: Command, scene: Path, case: str) -> 
 
 
 def test_a_taken_port_gives_one_line(omnid: Command, scene: Path, taken_port: int) -> None:
-    line = omnid.refused("run", "--log", scene / "log.mcap", "--rig", scene / "rig.toml", "--motor", "simulated",
-                         "--set", f'bus.listen=["tcp/127.0.0.1:{taken_port}"]')
+    line = omnid.refused(
+        "run",
+        "--log",
+        scene / "log.mcap",
+        "--rig",
+        scene / "rig.toml",
+        "--motor",
+        "simulated",
+        "--set",
+        f'bus.listen=["tcp/127.0.0.1:{taken_port}"]',
+    )
     assert "bus.listen" in line
 
 
 def test_nohup_is_respected(scene: Path) -> None:
     """A daemon that ignores SIGHUP goes on after it."""
     port = free_port()
-    command = ["nohup", sys.executable, "-m", "omnid", "run", "--log", str(scene / "log.mcap"), "--rig",
-               str(scene / "rig.toml"), "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]']
+    command = [
+        "nohup",
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        str(scene / "log.mcap"),
+        "--rig",
+        str(scene / "rig.toml"),
+        "--set",
+        f'bus.listen=["tcp/127.0.0.1:{port}"]',
+    ]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         try:
             wait_until(lambda: answers(port), "the bus")

@@ -35,11 +35,13 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_helvipad_is_imported_replayed_and_right_to_a_thousandth(recording: Path, tmp_path: Path, omnid: Command
-                                                                ) -> None:
+def test_helvipad_is_imported_replayed_and_right_to_a_thousandth(
+    recording: Path, tmp_path: Path, omnid: Command
+) -> None:
     rig, found = tmp_path / "rig.toml", tmp_path / "out.txt"
-    made = omnid("calibrate", "import", recording / "calibration.json", "--lower", recording / "images_bottom", "-o",
-                 rig)
+    made = omnid(
+        "calibrate", "import", recording / "calibration.json", "--lower", recording / "images_bottom", "-o", rig
+    )
     assert made.code == 0 and "equirectangular 1920x512" in made.out and "baseline 191.0 mm" in made.out
     done = omnid("replay", recording, "--rig", rig, "--quiet", "--tum", found)
     assert done.code == 0 and "tracking 100.0%" in done.out and "rim" not in done.out + done.err, done
@@ -50,8 +52,9 @@ def test_helvipad_is_imported_replayed_and_right_to_a_thousandth(recording: Path
 def test_the_size_of_the_images_is_asked_for(recording: Path, tmp_path: Path, omnid: Command) -> None:
     rig = tmp_path / "rig.toml"
     assert "--lower FOLDER" in omnid.refused("calibrate", "import", recording / "calibration.json", "-o", rig)
-    assert "WIDTHxHEIGHT" in omnid.refused("calibrate", "import", "--equirectangular", "big", "--baseline", "0.2", "-o",
-                                           rig)
+    assert "WIDTHxHEIGHT" in omnid.refused(
+        "calibrate", "import", "--equirectangular", "big", "--baseline", "0.2", "-o", rig
+    )
     assert "--baseline METRES" in omnid.refused("calibrate", "import", "--equirectangular", "1920x960", "-o", rig)
     assert not rig.exists()
     made = omnid("calibrate", "import", "--equirectangular", "1920x960", "--baseline", "0.2", "-o", rig)

@@ -35,8 +35,20 @@ def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_tag_is_located_in_the_map(omnid: Command, tagged: Path, tmp_path: Path) -> None:
-    code, out, err = omnid("map", "tags", tagged / "log.mcap", "--rig", tagged / "rig.toml", "--tag", f"5={EDGE_M}",
-                           "--tag", "6=0.2", "--json", "--write", tmp_path / "tags.toml")
+    code, out, err = omnid(
+        "map",
+        "tags",
+        tagged / "log.mcap",
+        "--rig",
+        tagged / "rig.toml",
+        "--tag",
+        f"5={EDGE_M}",
+        "--tag",
+        "6=0.2",
+        "--json",
+        "--write",
+        tmp_path / "tags.toml",
+    )
     assert code == 1 and "not found: 6;" in err
     [found] = json.loads(out)["tags"]
     assert found["id"] == 5 and found["views"] >= 2 and found["rejected"] == 0
@@ -54,8 +66,9 @@ TAGS = f'schema = 1\n[tag."door 5"]\nid = 5\nsize_m = {EDGE_M}\n'
 def test_a_map_keeps_its_tags_and_is_aligned_by_them(omnid: Command, tagged: Path, tmp_path: Path) -> None:
     (tmp_path / "tags.toml").write_text(TAGS)
     omap, rig = tmp_path / "a.omap", tagged / "rig.toml"
-    code, out, err = omnid("map", "build", tagged / "log.mcap", "-o", omap, "--rig", rig, "--tags",
-                           tmp_path / "tags.toml", "--quiet")
+    code, out, err = omnid(
+        "map", "build", tagged / "log.mcap", "-o", omap, "--rig", rig, "--tags", tmp_path / "tags.toml", "--quiet"
+    )
     assert code == 0 and "tags         1, of which 1 were seen" in out and err.count("\n") == 1, err  # of the height
     code, out, _ = omnid("map", "tags", omap, "--json")
     [found] = json.loads(out)["tags"]
@@ -72,15 +85,21 @@ def test_a_map_keeps_its_tags_and_is_aligned_by_them(omnid: Command, tagged: Pat
     result = omnid.replay(tagged / "log.mcap", "--map", omap, "--localize-only", rig=rig)
     assert result.code == 0 and result.count("tags_seen") == 1
     (tmp_path / "tags.toml").write_text(TAGS.replace(f"= {EDGE_M}", "= 0.5"))
-    error = omnid.refused("replay", tagged / "log.mcap", "--rig", rig, "--quiet", "--map", omap, "--tags",
-                          tmp_path / "tags.toml")
+    error = omnid.refused(
+        "replay", tagged / "log.mcap", "--rig", rig, "--quiet", "--map", omap, "--tags", tmp_path / "tags.toml"
+    )
     assert "tag 5 (door 5) has an edge of 0.5 m, but 0.6 m in the map" in error
     assert "belong to a log" in omnid.refused("map", "tags", omap, "--tag", "5=0.6")
     assert "expected --tag ID=SIZE" in omnid.refused("map", "tags", tagged / "log.mcap")
 
 
 def test_wrong_sizes_are_one_line(omnid: Command, tagged: Path) -> None:
-    for word, message in (("5", "expected ID=SIZE"), ("5=x", "expected ID=SIZE"), ("900=0.2", "0 to 586"),
-                          ("5=0", "0.005 to 10 m"), ("5=nan", "0.005 to 10 m")):
+    for word, message in (
+        ("5", "expected ID=SIZE"),
+        ("5=x", "expected ID=SIZE"),
+        ("900=0.2", "0 to 586"),
+        ("5=0", "0.005 to 10 m"),
+        ("5=nan", "0.005 to 10 m"),
+    ):
         error = omnid.refused("map", "tags", tagged / "log.mcap", "--rig", tagged / "rig.toml", "--tag", word)
         assert message in error

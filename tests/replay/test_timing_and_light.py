@@ -22,8 +22,16 @@ LINE_TIME_US = 40.0  # 20 ms for 512 rows
 def driven(folder: Path, *overrides: str, readout: Readout | None = None, sensor: Sensor | None = None) -> Metrics:
     """Render the first metre of two_walls, and return the errors of a replay in which no pair was lost."""
     run = build("two_walls", SEED, SIZE, 99)
-    write_log(folder, run.rig, run.poses[:PAIRS], run.scene, sensor=sensor or run.sensor, seed=SEED, supersample=2,
-              readout=readout or Readout())
+    write_log(
+        folder,
+        run.rig,
+        run.poses[:PAIRS],
+        run.scene,
+        sensor=sensor or run.sensor,
+        seed=SEED,
+        supersample=2,
+        readout=readout or Readout(),
+    )
     result = omnid.replay(folder / "log.mcap", read_rig(folder / "rig.toml"), overrides=overrides)
     states = result.counters.states
     assert result.counters.pairs == PAIRS and states[TrackingState.LOST] == 0

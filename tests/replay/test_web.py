@@ -28,8 +28,10 @@ def state(server: WebServer, holds: Callable[[dict[str, Any]], object]) -> dict[
 
 def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Path, course: Path) -> None:
     folder = tmp_path / "recordings"
-    with robot(course, tmp_path, *MANUAL, *RECORDED, f"record.folder={folder}") as (daemon, operator, base), \
-            served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", folder) as server:
+    with (
+        robot(course, tmp_path, *MANUAL, *RECORDED, f"record.folder={folder}") as (daemon, operator, base),
+        served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", folder) as server,
+    ):
         operator.drive(0.3)
         assert not state(server, lambda found: found["wheels"] and found["pose"])["wheels"]["armed"]
         assert not base.line.moved_since(0.0)

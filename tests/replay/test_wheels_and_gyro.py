@@ -85,8 +85,9 @@ def saved(path: Path, scene: Path, more: Sequence[Entry]) -> Path:
     return write_log(path, sorted([*entries, *more], key=lambda each: each.log_time_ns))
 
 
-def test_darkness_is_bridged_and_the_bytes_are_the_same_threaded_and_inline(log: Path, scene: Path, tmp_path: Path
-                                                                            ) -> None:
+def test_darkness_is_bridged_and_the_bytes_are_the_same_threaded_and_inline(
+    log: Path, scene: Path, tmp_path: Path
+) -> None:
     record = tmp_path / "out.mcap"
     result = run(log, scene, inline=True, record=record)
     assert result.states.count(TrackingState.LOST) == 0
@@ -113,11 +114,15 @@ def test_samples_are_read_in_the_order_of_their_stamps(log: Path, samples: list[
     assert len(list(reader.frames())) == 2 * PAIRS and not reader.warnings
 
 
-def test_broken_messages_and_topics_that_are_not_clear_are_reported(scene: Path, samples: list[MotionSample],
-                                                                    tmp_path: Path) -> None:
+def test_broken_messages_and_topics_that_are_not_clear_are_reported(
+    scene: Path, samples: list[MotionSample], tmp_path: Path
+) -> None:
     sample = samples[0]
-    wrong = [entry(sample)._replace(data=entry(sample).data[:40]), Entry(GYRO, IMU, b"", sample.stamp_ns),
-             entry(next(each for each in samples if isinstance(each, GyroSample)))._replace(topic="/imu/other")]
+    wrong = [
+        entry(sample)._replace(data=entry(sample).data[:40]),
+        Entry(GYRO, IMU, b"", sample.stamp_ns),
+        entry(next(each for each in samples if isinstance(each, GyroSample)))._replace(topic="/imu/other"),
+    ]
     log = saved(tmp_path / "log.mcap", scene, wrong)
     reader = LogReader(log, motion=MotionTopics(imu=GYRO))
     assert len(list(reader.messages())) == 2 * PAIRS and reader.counts["broken_motion"] == 2
@@ -138,8 +143,9 @@ def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[Moti
         half_mps = sample.yaw_rate_radps * track_m / 2
         speeds = np.array([sample.velocity_mps - half_mps, 0.0, sample.velocity_mps + half_mps]) / radius_m
         stamp = t["builtin_interfaces/msg/Time"](*divmod(sample.stamp_ns, 10**9))
-        message = t[JOINT_STATE](t["std_msgs/msg/Header"](stamp, ""), ["left", "arm", "right"], np.zeros(3), speeds,
-                                 np.zeros(0))
+        message = t[JOINT_STATE](
+            t["std_msgs/msg/Header"](stamp, ""), ["left", "arm", "right"], np.zeros(3), speeds, np.zeros(0)
+        )
         return Entry("/joint_states", JOINT_STATE, bytes(store.serialize_cdr(message, JOINT_STATE)), sample.stamp_ns)
 
     log = saved(tmp_path / "log.mcap", scene, [*(joint_entry(each) for each in wheels), entry(wheels[0])])
@@ -150,7 +156,8 @@ def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[Moti
     for sample, expected in zip(read, wheels, strict=False):
         assert sample.stamp_ns == expected.stamp_ns
         assert (sample.velocity_mps, sample.yaw_rate_radps) == pytest.approx(
-            (expected.velocity_mps, expected.yaw_rate_radps), abs=1e-9)
+            (expected.velocity_mps, expected.yaw_rate_radps), abs=1e-9
+        )
     reader = LogReader(log, motion=motion_topics(load_config(None, ["motion.left_joint=l", "motion.right_joint=r"])))
     assert len(list(reader.messages())) == 2 * PAIRS
     assert reader.warnings[0].startswith("none of ") and "motion.left_joint" in reader.warnings[0]
@@ -171,8 +178,12 @@ def test_messages_of_ros_1_and_2_are_read(aligned: bool) -> None:
     vector, quaternion = t["geometry_msgs/msg/Vector3"], t["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
     pose = t["geometry_msgs/msg/Pose"](t["geometry_msgs/msg/Point"](9.0, 9.0, 9.0), quaternion)
     twist = t["geometry_msgs/msg/Twist"](vector(0.5, 9.0, 9.0), vector(9.0, 9.0, -0.25))
-    odometry = t[ODOMETRY](header, "base", t["geometry_msgs/msg/PoseWithCovariance"](pose, np.ones(36)),
-                           t["geometry_msgs/msg/TwistWithCovariance"](twist, np.ones(36)))
+    odometry = t[ODOMETRY](
+        header,
+        "base",
+        t["geometry_msgs/msg/PoseWithCovariance"](pose, np.ones(36)),
+        t["geometry_msgs/msg/TwistWithCovariance"](twist, np.ones(36)),
+    )
     imu = t[IMU](header, quaternion, np.ones(9), vector(0.1, -0.2, 0.3), np.ones(9), vector(9.0, 9.0, 9.0), np.ones(9))
     serialize = store.serialize_cdr if aligned else store.serialize_ros1
     for message, kind, rates in ((odometry, ODOMETRY, (0.5, -0.25)), (imu, IMU, (0.1, -0.2, 0.3))):
@@ -184,17 +195,19 @@ def test_messages_of_ros_1_and_2_are_read(aligned: bool) -> None:
                 parse_motion(kind, data[:size], aligned=aligned)
 
 
-def test_wheels_that_contradict_the_cameras_are_reported(scene: Path, samples: list[MotionSample], tmp_path: Path
-                                                         ) -> None:
+def test_wheels_that_contradict_the_cameras_are_reported(
+    scene: Path, samples: list[MotionSample], tmp_path: Path
+) -> None:
     """Their sign is wrong: they are left out, the poses stay right, and a line says what to check."""
-    backwards = [replace(sample, velocity_mps=-sample.velocity_mps) if isinstance(sample, WheelSample) else sample
-                 for sample in samples]
+    backwards = [
+        replace(sample, velocity_mps=-sample.velocity_mps) if isinstance(sample, WheelSample) else sample
+        for sample in samples
+    ]
     log = saved(tmp_path / "log.mcap", scene, [entry(sample) for sample in backwards])
     result = run(log, scene)
     assert any("wheels" in warning for warning in result.warnings)
-    assert offsets_m(result, scene)[:DARK.start].max() < 0.01
+    assert offsets_m(result, scene)[: DARK.start].max() < 0.01
     assert TrackingState.LOST in result.states  # no wheels to be trusted in the dark
-
 
 
 def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, scene: Path, tmp_path: Path) -> None:

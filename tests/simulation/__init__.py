@@ -9,5 +9,23 @@ from tests.simulation.builders import corridor, room
 from tests.simulation.logs import camchain, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
 
-__all__ = ["RECIPES", "MountedSensor", "Rectangle", "Scene", "Sensor", "SimulatedRun", "box", "build", "camchain",
-           "corridor", "make_rig", "posters", "render", "render_grey", "room", "tum", "wall", "write_log"]
+__all__ = [
+    "RECIPES",
+    "MountedSensor",
+    "Rectangle",
+    "Scene",
+    "Sensor",
+    "SimulatedRun",
+    "box",
+    "build",
+    "camchain",
+    "corridor",
+    "make_rig",
+    "posters",
+    "render",
+    "render_grey",
+    "room",
+    "tum",
+    "wall",
+    "write_log",
+]

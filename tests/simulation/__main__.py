@@ -20,25 +20,50 @@ from tests.simulation.rigs import with_real_mirrors
 
 def main() -> None:
     """Render one recipe into a folder."""
-    parser = argparse.ArgumentParser(prog="python -m tests.simulation",
-                                     description="Render a log with exact ground truth.")
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.simulation", description="Render a log with exact ground truth."
+    )
     parser.add_argument("name", choices=sorted(RECIPES))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder for log.mcap, camchain.yaml and truth.txt")
     parser.add_argument("--size", type=int, default=768, help="width and height of the images [px]")
     parser.add_argument("--pairs", type=int, help="number of stereo pairs")
     parser.add_argument("--supersample", type=int, default=3, help="samples per pixel and axis")
-    parser.add_argument("--mirrors", type=float, nargs="?", const=1.0, default=0.0, metavar="AMOUNT",
-                        help="tilted cameras below ray-traced mirrors that are off shape; 1: 0.7 deg, 1.5 %%, 3 px")
-    parser.add_argument("--speed", type=float, default=1.0, help="factor on the speed; at 1 two_walls has 0.5 m/s and "
-                        "rooms about 0.57 m/s and 36 deg/s")
-    parser.add_argument("--skew-ms", type=float, nargs="+", default=[0.0], metavar="MS",
-                        help="upper minus lower exposure and stamp, of all pairs or of the first and the last one")
-    parser.add_argument("--stamp-offset-ms", type=float, default=0.0, metavar="MS",
-                        help="upper exposure later than its stamp says")
-    parser.add_argument("--line-time-us", type=float, nargs="+", default=[0.0], metavar="US",
-                        help="rolling shutter: time from row to row, of both cameras or of lower and upper; a stamp is "
-                             "that of the first row")
+    parser.add_argument(
+        "--mirrors",
+        type=float,
+        nargs="?",
+        const=1.0,
+        default=0.0,
+        metavar="AMOUNT",
+        help="tilted cameras below ray-traced mirrors that are off shape; 1: 0.7 deg, 1.5 %%, 3 px",
+    )
+    parser.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        help="factor on the speed; at 1 two_walls has 0.5 m/s and rooms about 0.57 m/s and 36 deg/s",
+    )
+    parser.add_argument(
+        "--skew-ms",
+        type=float,
+        nargs="+",
+        default=[0.0],
+        metavar="MS",
+        help="upper minus lower exposure and stamp, of all pairs or of the first and the last one",
+    )
+    parser.add_argument(
+        "--stamp-offset-ms", type=float, default=0.0, metavar="MS", help="upper exposure later than its stamp says"
+    )
+    parser.add_argument(
+        "--line-time-us",
+        type=float,
+        nargs="+",
+        default=[0.0],
+        metavar="US",
+        help="rolling shutter: time from row to row, of both cameras or of lower and upper; a stamp is "
+        "that of the first row",
+    )
     parser.add_argument("--dim", action="store_true", help="dim images with much noise, whose brightness changes")
     arguments = parser.parse_args()
     run = build(arguments.name, arguments.seed, arguments.size, arguments.pairs)
@@ -52,8 +77,17 @@ def main() -> None:
         sys.stderr.write(f"\r{arguments.name} {done}/{total} pairs, {left_s:.0f} s left  ")
 
     sensor = DIM if arguments.dim else run.sensor
-    write_log(arguments.out, rig, run.poses, run.scene, sensor=sensor, seed=arguments.seed,
-              supersample=arguments.supersample, readout=readout, progress=progress)
+    write_log(
+        arguments.out,
+        rig,
+        run.poses,
+        run.scene,
+        sensor=sensor,
+        seed=arguments.seed,
+        supersample=arguments.supersample,
+        readout=readout,
+        progress=progress,
+    )
     sys.stderr.write("\n")
 
 

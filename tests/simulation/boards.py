@@ -47,8 +47,9 @@ def board_rectangle(board: Board, T_rig_board: Array, texture: NDArray[np.uint8]
     """Return the print as a rectangle in the rig's frame; the board's origin is its first inner corner."""
     edge = (1 + MARGIN_SQUARES) * board.square_m
     width, height = ((side + 1 + 2 * MARGIN_SQUARES) * board.square_m for side in (board.columns, board.rows))
-    origin, right, below = se3.apply(T_rig_board, np.array([[-edge, -edge, 0], [width - edge, -edge, 0],
-                                                            [-edge, height - edge, 0]]))
+    origin, right, below = se3.apply(
+        T_rig_board, np.array([[-edge, -edge, 0], [width - edge, -edge, 0], [-edge, height - edge, 0]])
+    )
     return Rectangle(origin, right - origin, below - origin, texture, "board")
 
 
@@ -89,9 +90,18 @@ class BoardRenderer:
         """Return the renderer of a camera at the origin."""
         return BoardRenderer(board, MountedCamera(camera, np.eye(4), mask))
 
-    def render_board(self, T_rig_board: Array, *, seed: int = 0, sensor: Sensor | None = None, supersample: int = 2,
-                   contrast: tuple[float, float] = (25.0, 225.0), shadow: float = 1.0,
-                   walls: Sequence[Rectangle] | None = None, frame: Frame | None = None) -> BoardImage:
+    def render_board(
+        self,
+        T_rig_board: Array,
+        *,
+        seed: int = 0,
+        sensor: Sensor | None = None,
+        supersample: int = 2,
+        contrast: tuple[float, float] = (25.0, 225.0),
+        shadow: float = 1.0,
+        walls: Sequence[Rectangle] | None = None,
+        frame: Frame | None = None,
+    ) -> BoardImage:
         """Render the board among walls (noisy ones if None).
 
         shadow: brightness factor of a part of the board; frame: paints what covers the edge of the print.
@@ -100,7 +110,7 @@ class BoardRenderer:
         texture = board_texture(self.board, *contrast).astype(float)
         if frame is not None:
             texture = frame(texture)
-        texture[:, :round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
+        texture[:, : round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
         board_poses_around_camera = clutter(rng) if walls is None else walls
         scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *board_poses_around_camera))
         ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
@@ -112,15 +122,31 @@ class BoardRenderer:
 
 def in_view(camera: OmniCamera, T_cam_board: Array, board: Board, mask: Mask) -> bool:
     """True if the print without its margin lies inside the mask and faces the camera."""
-    outline = np.array([[x, y, 0] for x in np.linspace(-1.3, board.columns + 0.3, 12)
-                        for y in np.linspace(-1.3, board.rows + 0.3, 12)]) * board.square_m
+    outline = (
+        np.array(
+            [
+                [x, y, 0]
+                for x in np.linspace(-1.3, board.columns + 0.3, 12)
+                for y in np.linspace(-1.3, board.rows + 0.3, 12)
+            ]
+        )
+        * board.square_m
+    )
     pixels = camera.project(se3.apply(T_cam_board, outline))
     return bool(np.isfinite(pixels).all() and mask.contains(pixels, 2.0).all())
 
 
-def board_poses_around_camera(camera: OmniCamera, board: Board, mask: Mask, count: int, *, seed: int = 0,
-                              distance_m: tuple[float, float] = (0.2, 0.5), tilt_deg: float = 30.0,
-                              elevation_deg: Sequence[float] = (35.0, 100.0)) -> list[Array]:
+def board_poses_around_camera(
+    camera: OmniCamera,
+    board: Board,
+    mask: Mask,
+    count: int,
+    *,
+    seed: int = 0,
+    distance_m: tuple[float, float] = (0.2, 0.5),
+    tilt_deg: float = 30.0,
+    elevation_deg: Sequence[float] = (35.0, 100.0),
+) -> list[Array]:
     """Return poses T_cam_board on all sides of a camera, entirely in view; elevation from the ray of the centre."""
     rng, poses = np.random.default_rng(seed), list[Array]()
     for _ in range(200 * count):
@@ -136,17 +162,32 @@ def board_poses_around_camera(camera: OmniCamera, board: Board, mask: Mask, coun
     raise AssertionError(f"only {len(poses)} of {count} boards fit into the view")
 
 
-def board_poses_around_rig(rig: Rig, board: Board, count: int, *, seed: int = 0,
-                           distance_m: tuple[float, float] = (0.25, 0.5),
-                           elevation_deg: Sequence[float] = (50.0, 110.0)) -> list[Array]:
+def board_poses_around_rig(
+    rig: Rig,
+    board: Board,
+    count: int,
+    *,
+    seed: int = 0,
+    distance_m: tuple[float, float] = (0.25, 0.5),
+    elevation_deg: Sequence[float] = (50.0, 110.0),
+) -> list[Array]:
     """Return poses T_rig_board on all sides of a rig whose frame is its lower camera's, entirely in view of both."""
     poses: list[Array] = []
     for turn in range(20 * count):
-        tried = board_poses_around_camera(rig.lower.camera, board, rig.lower.visible, 1, seed=100 * seed + turn,
-                                          distance_m=distance_m, elevation_deg=elevation_deg)[0]
+        tried = board_poses_around_camera(
+            rig.lower.camera,
+            board,
+            rig.lower.visible,
+            1,
+            seed=100 * seed + turn,
+            distance_m=distance_m,
+            elevation_deg=elevation_deg,
+        )[0]
         T = _about_axis(2 * np.pi * len(poses) / count) @ tried
-        if all(in_view(m.camera, m.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig) @ T, board, m.visible)
-               for m in (rig.lower, rig.upper)):
+        if all(
+            in_view(m.camera, m.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig) @ T, board, m.visible)
+            for m in (rig.lower, rig.upper)
+        ):
             poses.append(se3.inverse(rig.lower.T_cam_rig) @ T)
         if len(poses) == count:
             return poses

@@ -14,8 +14,9 @@ def _flat(rng: Random, kind: str, low: Point, high: Point) -> tuple[Rectangle, R
     size = (x1 - x0, y1 - y0)
     along = np.array([x1 - x0, 0.0, 0])
     floor = Rectangle(np.array([x0, y1, 0]), along, np.array([0, y0 - y1, 0.0]), painted(rng, kind, size), "floor")
-    ceiling = Rectangle(np.array([x0, y0, CEILING_M]), along, np.array([0, y1 - y0, 0.0]),
-                        painted(rng, "tiles", size), "ceiling")
+    ceiling = Rectangle(
+        np.array([x0, y0, CEILING_M]), along, np.array([0, y1 - y0, 0.0]), painted(rng, "tiles", size), "ceiling"
+    )
     return floor, ceiling
 
 

@@ -27,12 +27,23 @@ def ring(seed: int) -> Scene:
     (length, width), c = RING_M, CORRIDOR_M
     outer = [(0.0, width), (length, width), (length, 0.0), (0.0, 0.0)]
     inner = [(c, c), (length - c, c), (length - c, width - c), (c, width - c)]
-    walls = [wall(rng, str(rng.choice(KINDS)), a, b)
-             for corners in (outer, inner) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)]
+    walls = [
+        wall(rng, str(rng.choice(KINDS)), a, b)
+        for corners in (outer, inner)
+        for a, b in zip(corners, corners[1:] + corners[:1], strict=True)
+    ]
     hung = [p for n, side in enumerate(walls) for p in posters(rng, side, round(side.width_m / 1.3), 100 * n)]
-    low = [face for x in np.arange(1.2, length - 1.0, 2.4) for y in (0.2, width - 0.2)
-           for face in box(rng, (float(x + rng.uniform(-0.5, 0.5)), y),
-                           (0.3, float(rng.uniform(0.15, 0.25)), float(rng.uniform(0.3, 0.9))), 0.0)]
+    low = [
+        face
+        for x in np.arange(1.2, length - 1.0, 2.4)
+        for y in (0.2, width - 0.2)
+        for face in box(
+            rng,
+            (float(x + rng.uniform(-0.5, 0.5)), y),
+            (0.3, float(rng.uniform(0.15, 0.25)), float(rng.uniform(0.3, 0.9))),
+            0.0,
+        )
+    ]
     return Scene((*walls, *_floor_and_ceiling(rng, RING_M), *hung, *low))
 
 
@@ -40,8 +51,10 @@ def _floor_and_ceiling(rng: Random, size_m: Point) -> list[Rectangle]:
     along, across = np.array([size_m[0], 0, 0]), np.array([0, size_m[1], 0])
     size = (round(size_m[0] * FLAT_PX_PER_M), round(size_m[1] * FLAT_PX_PER_M))
     floor, ceiling = (textures.tiles(rng, size, FLAT_PX_PER_M) for _ in range(2))
-    return [Rectangle(across, along, -across, floor, "floor"),
-            Rectangle(np.array([0, 0, CEILING_M]), along, across, ceiling, "ceiling")]
+    return [
+        Rectangle(across, along, -across, floor, "floor"),
+        Rectangle(np.array([0, 0, CEILING_M]), along, across, ceiling, "ceiling"),
+    ]
 
 
 def two_laps_path(seed: int, pairs: int) -> Array:
@@ -82,8 +95,10 @@ def _centre_line(share: Array) -> tuple[Array, Array]:
     low, high = np.array([half, half]) + BEND_M, np.array(RING_M) - half - BEND_M
     centres = [(high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1])]
     angles = [np.linspace(-np.pi / 2, 0, 60) + number * np.pi / 2 for number in range(4)]
-    arcs = [centre + BEND_M * np.column_stack([np.cos(angle), np.sin(angle)])
-            for centre, angle in zip(centres, angles, strict=True)]
+    arcs = [
+        centre + BEND_M * np.column_stack([np.cos(angle), np.sin(angle)])
+        for centre, angle in zip(centres, angles, strict=True)
+    ]
     start = np.array([[(low[0] + high[0]) / 2, half]])
     line = np.vstack([start, *arcs, start])
     outward = np.concatenate([[-np.pi / 2], *angles, [3 * np.pi / 2]])
@@ -97,11 +112,18 @@ def _centre_line(share: Array) -> tuple[Array, Array]:
 def twin_corridor(seed: int, period_m: float = 6.0) -> Scene:
     """Return a corridor whose second half repeats the first one in every texture, poster and box."""
     first = corridor(seed, period_m)
-    again = tuple(replace(r, origin=r.origin + np.array([period_m, 0, 0])) for r in first.rectangles
-                  if not _is_end(r))
-    return Scene((*(r for r in first.rectangles if not _is_end(r) or r.origin[0] < 0), *again,
-                  *(replace(r, origin=r.origin + np.array([period_m, 0, 0])) for r in first.rectangles
-                    if _is_end(r) and r.origin[0] > 0)))
+    again = tuple(replace(r, origin=r.origin + np.array([period_m, 0, 0])) for r in first.rectangles if not _is_end(r))
+    return Scene(
+        (
+            *(r for r in first.rectangles if not _is_end(r) or r.origin[0] < 0),
+            *again,
+            *(
+                replace(r, origin=r.origin + np.array([period_m, 0, 0]))
+                for r in first.rectangles
+                if _is_end(r) and r.origin[0] > 0
+            ),
+        )
+    )
 
 
 def _is_end(rectangle: Rectangle) -> bool:
@@ -133,9 +155,14 @@ def symmetric_room(seed: int, size_m: Point = (6.0, 5.0)) -> Scene:
 
 def with_other_posters(scene: Scene, rng: Random, share: float) -> Scene:
     """Return the scene in which so many of the posters have been exchanged."""
-    return Scene(tuple(
-        replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
-        if r.name.startswith("poster") and rng.random() < share else r for r in scene.rectangles))
+    return Scene(
+        tuple(
+            replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
+            if r.name.startswith("poster") and rng.random() < share
+            else r
+            for r in scene.rectangles
+        )
+    )
 
 
 def with_people(scene: Scene, rng: Random, around: Array, count: int = 3) -> Scene:

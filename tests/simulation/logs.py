@@ -37,9 +37,18 @@ Images = Iterator[tuple[int, bytes, bytes]]
 ImageSource = Callable[[int, int], Floats]
 
 
-def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sensor | None = None, seed: int = 0,
-              supersample: int = 2, readout: Readout | None = None,
-              progress: Callable[[int, int], None] | None = None) -> None:
+def write_log(
+    folder: Path,
+    rig: Rig,
+    poses: Array,
+    scene: Scene,
+    *,
+    sensor: Sensor | None = None,
+    seed: int = 0,
+    supersample: int = 2,
+    readout: Readout | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
     """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder."""
     readout = readout or Readout()
     cameras, delay_s = (rig.lower, rig.upper), readout.delay_s(len(poses))
@@ -53,9 +62,17 @@ def write_log(folder: Path, rig: Rig, poses: Array, scene: Scene, *, sensor: Sen
     pack_log(folder, rig, poses, ideal_image, sensor=sensor, seed=seed, readout=readout, progress=progress)
 
 
-def pack_log(folder: Path, rig: Rig, poses: Array, ideal_image: ImageSource, *, sensor: Sensor | None = None,
-             seed: int = 0, readout: Readout | None = None,
-             progress: Callable[[int, int], None] | None = None) -> None:
+def pack_log(
+    folder: Path,
+    rig: Rig,
+    poses: Array,
+    ideal_image: ImageSource,
+    *,
+    sensor: Sensor | None = None,
+    seed: int = 0,
+    readout: Readout | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
     """Write the log of a run at poses T_world_rig (N, 4, 4), and its ground truth, from ideal images.
 
     rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. A rig
@@ -140,11 +157,13 @@ def _kalibr(name: str, mounted: MountedCamera, topic: str) -> list[str]:
     camera = _unified(mounted.camera)
     numbers = (camera.xi, *camera.focal, *camera.center)
     has_distortion = any(camera.distortion)
-    return [f"{name}:\n  camera_model: omni\n  intrinsics: [{', '.join(map(_number, numbers))}]\n",
-            f"  distortion_model: {'radtan' if has_distortion else 'none'}\n",
-            f"  distortion_coeffs: [{', '.join(map(_number, camera.distortion)) if has_distortion else ''}]\n",
-            f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n  rostopic: {topic}\n",
-            *_matrix("T_cam_imu", mounted.T_cam_rig)]
+    return [
+        f"{name}:\n  camera_model: omni\n  intrinsics: [{', '.join(map(_number, numbers))}]\n",
+        f"  distortion_model: {'radtan' if has_distortion else 'none'}\n",
+        f"  distortion_coeffs: [{', '.join(map(_number, camera.distortion)) if has_distortion else ''}]\n",
+        f"  resolution: [{camera.size[0]}, {camera.size[1]}]\n  rostopic: {topic}\n",
+        *_matrix("T_cam_imu", mounted.T_cam_rig),
+    ]
 
 
 def _matrix(name: str, T: Array) -> list[str]:

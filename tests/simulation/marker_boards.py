@@ -32,18 +32,26 @@ def frame_board(board: MarkerBoard) -> Board:
     return Board(6, max(3, round(1 + 5 * float(np.ptp(board.points[:, 1])) / width)), width / 5)
 
 
-def render_marker_board(mounted: MountedCamera, board: MarkerBoard, T_rig_frame: Array, *, seed: int = 0,
-                        sensor: Sensor | None = None, hidden: float = 0.0) -> BoardImage:
+def render_marker_board(
+    mounted: MountedCamera,
+    board: MarkerBoard,
+    T_rig_frame: Array,
+    *,
+    seed: int = 0,
+    sensor: Sensor | None = None,
+    hidden: float = 0.0,
+) -> BoardImage:
     """Render a board at the pose of its frame_board, with a grey card in front of a part of it (from the left).
 
     The corners of the result are all of the board's points, hidden or not; T_cam_board is that of the board.
     """
     rng, print_ = np.random.default_rng(seed), _print(board).astype(float) * (200 / 255) + 25
-    print_[:, :round(hidden * print_.shape[1])] = 120
+    print_[:, : round(hidden * print_.shape[1])] = 120
     height = float(np.ptp(board.points[:, 1]))
     # Kalibr's y points up on the print, z to the viewer.
-    T_frame_board = np.eye(4) if isinstance(board, CharucoBoard) else se3.transform(np.diag([1.0, -1, -1]),
-                                                                                    [0.0, height, 0.0])
+    T_frame_board = (
+        np.eye(4) if isinstance(board, CharucoBoard) else se3.transform(np.diag([1.0, -1, -1]), [0.0, height, 0.0])
+    )
     edge = MARGIN * board.square_m + (board.square_m if isinstance(board, CharucoBoard) else 0.0)
     width = float(np.ptp(board.points[:, 0]))
     ends = np.array([[-edge, -edge, 0], [width + edge, -edge, 0], [-edge, height + edge, 0]])
@@ -53,8 +61,9 @@ def render_marker_board(mounted: MountedCamera, board: MarkerBoard, T_rig_frame:
     ideal = render_grey(scene, mounted, np.eye(4), 2)
     exposure = MountedSensor.of(sensor or Sensor(), mounted.visible, mounted.camera.size)
     T_cam_board = mounted.T_cam_rig @ T_rig_frame @ T_frame_board
-    return BoardImage(exposure.expose(ideal, rng), mounted.camera.project(se3.apply(T_cam_board, board.points)),
-                      T_cam_board)
+    return BoardImage(
+        exposure.expose(ideal, rng), mounted.camera.project(se3.apply(T_cam_board, board.points)), T_cam_board
+    )
 
 
 def print_of(board: MarkerBoard) -> tuple[NDArray[np.uint8], Array]:
@@ -87,8 +96,8 @@ def _april_print(board: AprilGrid) -> NDArray[np.uint8]:
         left, bottom = margin + column * (tag_px + gap), height - margin - row * (tag_px + gap)
         for x in (left - gap, left + tag_px):
             for y in (bottom, bottom - tag_px - gap):
-                sheet[y:y + gap, x:x + gap] = 0
-        sheet[bottom - tag_px:bottom, left:left + tag_px] = np.kron(_tag(number), np.ones((BIT_PX, BIT_PX)))
+                sheet[y : y + gap, x : x + gap] = 0
+        sheet[bottom - tag_px : bottom, left : left + tag_px] = np.kron(_tag(number), np.ones((BIT_PX, BIT_PX)))
     return sheet
 
 

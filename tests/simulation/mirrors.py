@@ -62,8 +62,10 @@ class MirrorCamera:
         pixels = np.asarray(self.center) + self.horizon_px * nominal * (-1, 1)
         for _ in range(PROJECT_STEPS):
             error = self._miss(pixels, points)
-            columns = [(self._miss(pixels + step, points) - self._miss(pixels - step, points)) / (2 * DIFFERENCE_PX)
-                       for step in DIFFERENCE_PX * np.eye(2)]
+            columns = [
+                (self._miss(pixels + step, points) - self._miss(pixels - step, points)) / (2 * DIFFERENCE_PX)
+                for step in DIFFERENCE_PX * np.eye(2)
+            ]
             J = np.stack(columns, axis=-1)
             step = np.einsum("nij,nj->ni", np.linalg.pinv(np.nan_to_num(J)), error)
             pixels = pixels - step
@@ -91,6 +93,7 @@ class MirrorCamera:
     def _normal(self, origin: Array) -> Array:
         """Return the unit normals (N, 3) of the mirror."""
         w = self.parameter_m / 2 - origin[:, 2]
-        gradient = np.column_stack([(1 + self.ellipticity) ** 2 * origin[:, 0], origin[:, 1],
-                                    self.parameter_m - self.conic * w])
+        gradient = np.column_stack(
+            [(1 + self.ellipticity) ** 2 * origin[:, 0], origin[:, 1], self.parameter_m - self.conic * w]
+        )
         return np.asarray(gradient / np.linalg.norm(gradient, axis=1, keepdims=True))

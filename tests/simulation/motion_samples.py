@@ -29,10 +29,10 @@ class SensorErrors:
     gyro_period_s: float = 0.01
 
 
-def motion_samples(stamps_ns: NDArray[np.int64], T_odom_base: Array, errors: SensorErrors, seed: int
-                   ) -> list[MotionSample]:
-    """Return the samples, in the order of their stamps, of a base with poses (N, 4, 4); between two it moves steadily.
-    """
+def motion_samples(
+    stamps_ns: NDArray[np.int64], T_odom_base: Array, errors: SensorErrors, seed: int
+) -> list[MotionSample]:
+    """Return the samples, in the order of their stamps, of a base with poses (N, 4, 4); between them it is steady."""
     rng, times_s = np.random.default_rng(seed), (stamps_ns - stamps_ns[0]) * 1e-9
     twists = se3.log(se3.inverse(T_odom_base[:-1]) @ T_odom_base[1:]) / np.diff(times_s)[:, None]
 
@@ -43,8 +43,13 @@ def motion_samples(stamps_ns: NDArray[np.int64], T_odom_base: Array, errors: Sen
 
     found: list[MotionSample] = []
     for stamp_ns, rates in at(errors.wheel_period_s, errors.wheel_offset_s):
-        found.append(WheelSample(stamp_ns, rates[0] / errors.distance + rng.normal(0, errors.wheel_sigma[0]),
-                                 rates[5] / errors.turn + rng.normal(0, errors.wheel_sigma[1])))
+        found.append(
+            WheelSample(
+                stamp_ns,
+                rates[0] / errors.distance + rng.normal(0, errors.wheel_sigma[0]),
+                rates[5] / errors.turn + rng.normal(0, errors.wheel_sigma[1]),
+            )
+        )
     for stamp_ns, rates in at(errors.gyro_period_s, errors.gyro_offset_s):
         turn = rates[3:] + errors.bias_radps + rng.normal(0, errors.gyro_sigma_radps, 3)
         found.append(GyroSample(stamp_ns, *turn.tolist()))

@@ -22,7 +22,7 @@ def _natural_spline(y: Array, s: Array) -> tuple[Array, Array]:
     count = len(y)
     A = np.eye(count)
     for i in range(1, count - 1):
-        A[i, i - 1:i + 2] = 1, 4, 1
+        A[i, i - 1 : i + 2] = 1, 4, 1
     bend = np.linalg.solve(A, np.concatenate([[0], 6 * np.diff(y, 2), [0]]))
     k = np.clip(s.astype(int), 0, count - 2)
     a, b, h = bend[k], bend[k + 1], s - k
@@ -30,8 +30,9 @@ def _natural_spline(y: Array, s: Array) -> tuple[Array, Array]:
     return y[k] + h * (rise + h * (a / 2 + h * (b - a) / 6)), rise + h * (a + h * (b - a) / 2)
 
 
-def spline_path(seed: int, pairs: int, step_m: float, *, sway_m: float = 0.3,
-                turn: tuple[int, float] | None = None) -> Array:
+def spline_path(
+    seed: int, pairs: int, step_m: float, *, sway_m: float = 0.3, turn: tuple[int, float] | None = None
+) -> Array:
     """Return a swaying path along +x from the origin, step_m of arc between pairs, heading along the path.
 
     turn = (pair, degrees): from that pair on the rig is rotated to the left, after half a step of motion.
@@ -44,10 +45,10 @@ def spline_path(seed: int, pairs: int, step_m: float, *, sway_m: float = 0.3,
     arc = np.concatenate([[0], np.cumsum(np.hypot(np.diff(x), np.diff(lateral)))])
     wanted = step_m * np.arange(pairs)
     if turn is not None:
-        wanted[turn[0]:] -= step_m / 2
+        wanted[turn[0] :] -= step_m / 2
     heading = np.interp(wanted, arc, np.arctan(slope))
     if turn is not None:
-        heading[turn[0]:] += np.deg2rad(turn[1])
+        heading[turn[0] :] += np.deg2rad(turn[1])
     return planar_poses(np.column_stack([np.interp(wanted, arc, x), np.interp(wanted, arc, lateral)]), heading)
 
 

@@ -39,9 +39,14 @@ def mild_rig(seed: int, size: int) -> Rig:
     scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
     rotation_deg, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)
     x, y = rng.uniform(-4, 4, 2)
-    return make_rig(size=size, scale=float(scale), baseline_m=float(baseline), offset_mm=(x, y),
-                    misaligned_deg=(rotation_deg[0], rotation_deg[1], rotation_deg[2]),
-                    lower_misaligned_deg=(lower[0], lower[1], 0.0))
+    return make_rig(
+        size=size,
+        scale=float(scale),
+        baseline_m=float(baseline),
+        offset_mm=(x, y),
+        misaligned_deg=(rotation_deg[0], rotation_deg[1], rotation_deg[2]),
+        lower_misaligned_deg=(lower[0], lower[1], 0.0),
+    )
 
 
 def two_walls(seed: int, size: int, pairs: int) -> SimulatedRun:
@@ -58,8 +63,16 @@ def slow(seed: int, size: int, pairs: int) -> SimulatedRun:
 
 def misaligned(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return 15 cm steps with cameras rotated about every axis; the rig frame is neither camera's."""
-    rig = make_rig(size=size, scale=0.95, baseline_m=0.16, misaligned_deg=(1.1, -0.9, 24.0), offset_mm=(4.0, -3.0),
-                   lower_misaligned_deg=(-0.7, 0.6, 25.0), lower_offset_mm=(30.0, -20.0), centre_px=(1.7, -2.4))
+    rig = make_rig(
+        size=size,
+        scale=0.95,
+        baseline_m=0.16,
+        misaligned_deg=(1.1, -0.9, 24.0),
+        offset_mm=(4.0, -3.0),
+        lower_misaligned_deg=(-0.7, 0.6, 25.0),
+        lower_offset_mm=(30.0, -20.0),
+        centre_px=(1.7, -2.4),
+    )
     poses = paths.spline_path(seed, pairs, 0.15)
     return SimulatedRun(rig, poses, corridor(seed, max(8.0, 0.15 * pairs + 3.2)))
 
@@ -68,7 +81,7 @@ def turns(seed: int, size: int, pairs: int) -> SimulatedRun:
     """Return turns of 9 to 30 degrees between pairs, to both sides, with a few centimetres of motion."""
     rng = np.random.default_rng([seed, 8])
     angles = np.linspace(9, 30, max(1, pairs - 1)) * rng.choice([-1, 1], max(1, pairs - 1))
-    return SimulatedRun(mild_rig(seed, size), paths.turns([float(a) for a in angles[:pairs - 1]]), corridor(seed))
+    return SimulatedRun(mild_rig(seed, size), paths.turns([float(a) for a in angles[: pairs - 1]]), corridor(seed))
 
 
 def struts(seed: int, size: int, pairs: int) -> SimulatedRun:
@@ -143,11 +156,22 @@ def symmetric(seed: int, size: int, pairs: int) -> SimulatedRun:
 
 # By name, with the default number of pairs.
 RECIPES: dict[str, tuple[Recipe, int]] = {
-    "two_walls": (two_walls, 99), "misaligned": (misaligned, 33), "turns": (turns, 11), "struts": (struts, 99),
-    "still": (still, 30), "slow": (slow, 60), "fast": (fast, 33), "rooms": (rooms, 100),
-    "back": (back, 80), "plain": (plain, 60), "spin": (spin, 31),
-    "two_laps": (two_laps, 384), "there_and_back": (there_and_back, 60), "twin": (twin, 72),
-    "brick_corridor": (brick_corridor, 120), "symmetric": (symmetric, 110),
+    "two_walls": (two_walls, 99),
+    "misaligned": (misaligned, 33),
+    "turns": (turns, 11),
+    "struts": (struts, 99),
+    "still": (still, 30),
+    "slow": (slow, 60),
+    "fast": (fast, 33),
+    "rooms": (rooms, 100),
+    "back": (back, 80),
+    "plain": (plain, 60),
+    "spin": (spin, 31),
+    "two_laps": (two_laps, 384),
+    "there_and_back": (there_and_back, 60),
+    "twin": (twin, 72),
+    "brick_corridor": (brick_corridor, 120),
+    "symmetric": (symmetric, 110),
 }
 
 

@@ -35,8 +35,9 @@ def _real_mirror(mounted: MountedCamera, rng: np.random.Generator, amount: float
     tilt = amount * TILT_RAD * np.array([np.cos(direction), np.sin(direction)])
     conic, ellipticity = amount * SHAPE * rng.uniform(-1, 1, 2)
     u, v = np.array(camera.center) + amount * rng.uniform(-CENTRE_PX, CENTRE_PX, 2)
-    mirror = MirrorCamera(abs(camera.focal[0]), (u, v), camera.size, tilt_rad=(tilt[0], tilt[1]), conic=conic,
-                          ellipticity=ellipticity)
+    mirror = MirrorCamera(
+        abs(camera.focal[0]), (u, v), camera.size, tilt_rad=(tilt[0], tilt[1]), conic=conic, ellipticity=ellipticity
+    )
     return MountedCamera(mirror, mounted.T_cam_rig, replace(mounted.mask, center=(u, v)))
 
 
@@ -54,8 +55,10 @@ def nominal_rig(rig: Rig) -> Rig:
         centre = ((mirror.size[0] - 1) / 2, (mirror.size[1] - 1) / 2)
         cameras.append(UnifiedCamera(1.0, (-focal, focal), centre, mirror.size))
     ruler_mm = round(2e3 * rig.baseline_m) / 2
-    lower, upper = (MountedCamera(camera, camera_pose((0, 0, 0), (0, 0, height_mm)))
-                    for camera, height_mm in zip(cameras, (0.0, ruler_mm), strict=True))
+    lower, upper = (
+        MountedCamera(camera, camera_pose((0, 0, 0), (0, 0, height_mm)))
+        for camera, height_mm in zip(cameras, (0.0, ruler_mm), strict=True)
+    )
     return Rig(lower, upper, rig.T_base_rig, rig.topics)
 
 
@@ -90,11 +93,18 @@ def lens(model: str, field_deg: float, size: tuple[int, int] = (640, 480)) -> Om
     return made(half_px / float(made(1.0).project(edge)[0, 0] - centre[0]))
 
 
-def lens_rig(camera: OmniCamera, *, baseline_m: float = 0.2, heading_deg: float = 0.0,
-             misaligned_deg: tuple[float, float, float] = (0.4, -0.3, 0.5)) -> Rig:
+def lens_rig(
+    camera: OmniCamera,
+    *,
+    baseline_m: float = 0.2,
+    heading_deg: float = 0.0,
+    misaligned_deg: tuple[float, float, float] = (0.4, -0.3, 0.5),
+) -> Rig:
     """Return two equal lenses one above the other that look at heading_deg; the upper one is misaligned."""
     R = se3.rotation_exp(np.deg2rad([0.0, 0.0, heading_deg])) @ R_RIG_AHEAD
     R_upper = se3.rotation_exp(np.deg2rad(misaligned_deg)) @ R
-    lower, upper = (MountedCamera(camera, se3.inverse(se3.transform(turned, np.array([0.0, 0.0, height_m]))))
-                    for turned, height_m in ((R, 0.0), (R_upper, baseline_m)))
+    lower, upper = (
+        MountedCamera(camera, se3.inverse(se3.transform(turned, np.array([0.0, 0.0, height_m]))))
+        for turned, height_m in ((R, 0.0), (R_upper, baseline_m))
+    )
     return Rig(lower, upper, topics=TOPICS)

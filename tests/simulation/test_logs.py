@@ -52,8 +52,10 @@ def test_same_seed_gives_same_bytes(tmp_path: Path) -> None:
 
 def test_log_has_both_cameras_and_the_stamps_of_the_ground_truth(tmp_path: Path) -> None:
     read = messages(write(tmp_path, pairs=15) / "log.mcap")
-    stamps = {side: np.array([t for topic, t, _ in read if topic == f"/{side}/image_raw/compressed"])
-              for side in ("lower", "upper")}
+    stamps = {
+        side: np.array([t for topic, t, _ in read if topic == f"/{side}/image_raw/compressed"])
+        for side in ("lower", "upper")
+    }
     truth = (tmp_path / "truth.txt").read_text().splitlines()
     assert [line.split()[0] for line in truth] == [f"{t // 10**9}.{t % 10**9:09d}" for t in stamps["lower"]]
     assert (np.diff(stamps["lower"]) == 100_000_000).all()
@@ -125,5 +127,5 @@ def test_only_the_masked_rig_excludes_struts(tmp_path: Path) -> None:
 def test_noise_differs_in_every_image_of_a_standing_rig(tmp_path: Path) -> None:
     read = messages(write(tmp_path, "still") / "log.mcap")
     lower = [decoded(m).astype(float) for topic, _, m in read if "lower" in topic]
-    difference = (lower[1] - lower[0])[SIZE // 3:-SIZE // 3, SIZE // 3:-SIZE // 3]
+    difference = (lower[1] - lower[0])[SIZE // 3 : -SIZE // 3, SIZE // 3 : -SIZE // 3]
     assert 0.5 < difference.std() < 4

@@ -25,8 +25,9 @@ def test_every_row_of_a_rolling_shutter_has_its_own_pose(amount: float) -> None:
     rolled = render_grey(run.scene, upper, run.poses[1], 3, ROW_TWIST)
     for row in (0, 20, 48, 90):
         there = render_grey(run.scene, upper, run.poses[1] @ se3.exp(row * ROW_TWIST), 3)
-        apart, moved = (np.abs(image[row] - there[row])
-                        for image in (rolled, render_grey(run.scene, upper, run.poses[1], 3)))
+        apart, moved = (
+            np.abs(image[row] - there[row]) for image in (rolled, render_grey(run.scene, upper, run.poses[1], 3))
+        )
         assert np.percentile(apart, 90) < 2
         assert row == 0 or apart.mean() < 0.2 * moved.mean()
 
@@ -47,8 +48,13 @@ def test_the_upper_image_is_exposed_after_skew_and_stamp_offset(tmp_path: Path) 
     read = messages(tmp_path / "log.mcap")
     lower, upper = ([m for m in read if side in m[0]] for side in ("lower", "upper"))
     assert [t - lower[0][1] for _, t, _ in lower] == [0, 50_000_000, 100_000_000, 150_000_000, 200_000_000]
-    assert [u[1] - m[1] for u, m in zip(upper, lower, strict=True)] == [10_000_000, 11_000_000, 12_000_000, 13_000_000,
-                                                                      14_000_000]
+    assert [u[1] - m[1] for u, m in zip(upper, lower, strict=True)] == [
+        10_000_000,
+        11_000_000,
+        12_000_000,
+        13_000_000,
+        14_000_000,
+    ]
     T = run.poses[2] @ se3.exp(0.017 * body_twists(run.poses, 0.05)[2])
     image, expected = decoded(upper[2][2]).astype(float), render_grey(run.scene, run.rig.upper, T)
     unmoved = render_grey(run.scene, run.rig.upper, run.poses[2])

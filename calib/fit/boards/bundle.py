@@ -98,8 +98,15 @@ def residuals(camera: Projection, T_cam_board: Array, observed: Observations) ->
     return np.where(lost, LOST_PX, observed.pixels - cast)
 
 
-def adjust_bundle(camera_of: CameraFactory, parameters: Array, T_cam_board: Array, observed: Observations, *,
-                  kernel_rounds: int = KERNEL_ROUNDS, prior: Prior | None = None) -> BundleResult:
+def adjust_bundle(
+    camera_of: CameraFactory,
+    parameters: Array,
+    T_cam_board: Array,
+    observed: Observations,
+    *,
+    kernel_rounds: int = KERNEL_ROUNDS,
+    prior: Prior | None = None,
+) -> BundleResult:
     """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
 
     kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
@@ -170,13 +177,15 @@ class _BoardProblem:
             prior, to_prior = (np.pad(part, (0, fields.shape[3])) for part in (prior, to_prior))
         between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
         return ArrowSystem(
-            A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior), B=between,
-            C=J_pose.swapaxes(1, 2) @ J_pose, a=np.einsum("kri,kr->i", J_in, r) - to_prior,
-            c=np.einsum("kri,kr->ki", J_pose, r).ravel())
+            A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior),
+            B=between,
+            C=J_pose.swapaxes(1, 2) @ J_pose,
+            a=np.einsum("kri,kr->i", J_in, r) - to_prior,
+            c=np.einsum("kri,kr->ki", J_pose, r).ravel(),
+        )
 
     def _jacobians(self, state: _State) -> tuple[Array, Array]:
-        """Return derivatives of the modelled pixels by parameters (K, N, 2, P) and left twists of poses (K, N, 2, 6).
-        """
+        """Return derivatives of modelled pixels by parameters (K, N, 2, P) and left twists of poses (K, N, 2, 6)."""
         points = se3.apply(state.poses, self.observed.points)
         flat = points.reshape(-1, 3)
         columns = []

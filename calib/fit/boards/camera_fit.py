@@ -63,8 +63,13 @@ class CameraCalibration:
         return np.asarray(np.nanmean(self.fit.errors_px, axis=1))
 
 
-def fit_camera(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int], model: Model = "ocam",
-                     view: View = "mirror") -> CameraCalibration:
+def fit_camera(
+    views: Sequence[BoardView],
+    board: CalibrationBoard,
+    size: tuple[int, int],
+    model: Model = "ocam",
+    view: View = "mirror",
+) -> CameraCalibration:
     """Fit a camera to board views; outlier views are rejected.
 
     size (width, height) [px]. Raises CalibError if fewer than MIN_VIEWS remain.
@@ -73,9 +78,15 @@ def fit_camera(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[
     return calibrate_consistent(good, rejected, board, size, model, view)
 
 
-def calibrate_consistent(views: Sequence[BoardView], rejected: Sequence[RejectedView], board: CalibrationBoard,
-                         size: tuple[int, int], model: Model, view: View, ocam: FittedModel | None = None
-                         ) -> CameraCalibration:
+def calibrate_consistent(
+    views: Sequence[BoardView],
+    rejected: Sequence[RejectedView],
+    board: CalibrationBoard,
+    size: tuple[int, int],
+    model: Model,
+    view: View,
+    ocam: FittedModel | None = None,
+) -> CameraCalibration:
     """Fit a camera to views of which the inconsistent ones have been rejected; see fit_camera.
 
     ocam: the ocam camera fitted to the same views, if it is known, as the start of the other models.
@@ -91,15 +102,19 @@ def calibrate_consistent(views: Sequence[BoardView], rejected: Sequence[Rejected
         _require(len(good), "consistent views", rejected)
         solved = fit_model(model, observations(good, board), size, view)
     warnings = _warnings(solved, observations(good, board))
-    return CameraCalibration(solved.camera, board, tuple(good), solved.fit, solved.parameters, tuple(rejected),
-                             warnings)
+    return CameraCalibration(
+        solved.camera, board, tuple(good), solved.fit, solved.parameters, tuple(rejected), warnings
+    )
 
 
-def refine_camera_calibration(found: CameraCalibration, images: Mapping[str, NDArray[np.uint8]], model: Model,
-                              view: View) -> CameraCalibration:
+def refine_camera_calibration(
+    found: CameraCalibration, images: Mapping[str, NDArray[np.uint8]], model: Model, view: View
+) -> CameraCalibration:
     """Refine the corners with the calibrated camera, and calibrate it again; images by the views' names."""
-    views = [replace(seen, pixels=refine_with_camera(images[seen.name], found.camera, T, (found.board, seen.pixels)))
-             for seen, T in zip(found.views, found.fit.T_cam_board, strict=True)]
+    views = [
+        replace(seen, pixels=refine_with_camera(images[seen.name], found.camera, T, (found.board, seen.pixels)))
+        for seen, T in zip(found.views, found.fit.T_cam_board, strict=True)
+    ]
     again = fit_camera(views, found.board, found.camera.size, model, view)
     return replace(again, rejected=found.rejected + again.rejected)
 
@@ -112,12 +127,15 @@ def observations(views: Sequence[BoardView], board: CalibrationBoard) -> Observa
 def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:
     if count < MIN_VIEWS:
         left_out = "".join(f"; left out {bad.name}: {bad.reason}" for bad in rejected[:3])
-        raise CalibError(f"calibrate: expected at least {MIN_VIEWS} {what}, found {count}{left_out}; take more images, "
-                         "with the board all around the camera, near, and tilted")
+        raise CalibError(
+            f"calibrate: expected at least {MIN_VIEWS} {what}, found {count}{left_out}; take more images, "
+            "with the board all around the camera, near, and tilted"
+        )
 
 
-def consistent_views(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int],
-                     view: View) -> tuple[list[BoardView], list[RejectedView]]:
+def consistent_views(
+    views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int], view: View
+) -> tuple[list[BoardView], list[RejectedView]]:
     """Reject views with large errors in the linear solution, the worst first, because it affects the others."""
     _require(len(views), "views of the board")
     good, rejected = list(views), list[RejectedView]()
@@ -127,8 +145,10 @@ def consistent_views(views: Sequence[BoardView], board: CalibrationBoard, size: 
         worst, usual = int(np.argmax(errors)), float(np.median(errors))
         if errors[worst] <= max(BAD_LINEAR_RATIO * min(usual, BAD_LINEAR_RAD), BAD_LINEAR_RAD):
             return good, rejected
-        reason = (f"its corners lie {np.rad2deg(errors[worst]):.1f} deg or more off any board, the others "
-                  f"{np.rad2deg(usual):.2f}")
+        reason = (
+            f"its corners lie {np.rad2deg(errors[worst]):.1f} deg or more off any board, the others "
+            f"{np.rad2deg(usual):.2f}"
+        )
         rejected.append(RejectedView(good.pop(worst).name, reason))
 
 
@@ -136,7 +156,7 @@ def outlier_views(fit: BundleResult) -> NDArray[np.bool_]:
     """Return the mask (K,) of views whose median error is far above that of the others; at most the worst third."""
     errors = np.nanmedian(fit.errors_px, axis=1)
     bad = errors > max(BAD_RATIO * float(np.median(errors)), BAD_PX)
-    bad[np.argsort(-errors)[max(1, len(errors) // 3):]] = False
+    bad[np.argsort(-errors)[max(1, len(errors) // 3) :]] = False
     return np.asarray(bad)
 
 
@@ -152,13 +172,16 @@ def _warnings(solved: FittedModel, observed: Observations) -> tuple[str, ...]:
     if sectors < MIN_SECTORS:
         warnings.append(f"corners were seen in {sectors} of {SECTORS} directions only: hold the board on all sides")
     if solved.fit.mean_px > MAX_MEAN_PX:
-        warnings.append(f"the error of {solved.fit.mean_px:.2f} px is large: check that the board is flat, the images "
-                        "are sharp, and --view is right")
+        warnings.append(
+            f"the error of {solved.fit.mean_px:.2f} px is large: check that the board is flat, the images "
+            "are sharp, and --view is right"
+        )
     values = {name: (value, sigma) for name, value, sigma in solved.parameters}
     scale, sigma = values["a0" if "a0" in values else "fu"]
     if sigma > MAX_SCALE_SIGMA * abs(scale):
-        warnings.append(f"the scale has a standard deviation of {100 * sigma / abs(scale):.1f} %: tilt the board, "
-                        "bring it nearer")
+        warnings.append(
+            f"the scale has a standard deviation of {100 * sigma / abs(scale):.1f} %: tilt the board, bring it nearer"
+        )
     if max(values[name][1] for name in CENTER_NAMES if name in values) > MAX_CENTER_SIGMA_PX:
         warnings.append("the centre has a standard deviation above a pixel: hold the board on all sides of the camera")
     return tuple(warnings)

@@ -41,8 +41,9 @@ class FittedModel:
     parameters: tuple[tuple[str, float, float], ...]  # name, value, standard deviation
 
 
-def fit_model(model: Model, observed: Observations, size: tuple[int, int], view: View,
-              ocam: FittedModel | None = None) -> FittedModel:
+def fit_model(
+    model: Model, observed: Observations, size: tuple[int, int], view: View, ocam: FittedModel | None = None
+) -> FittedModel:
     """Fit the camera of a model.
 
     All models start from an ocam camera, which has a linear initialisation; ocam: the one fitted to the same

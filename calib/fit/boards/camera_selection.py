@@ -43,8 +43,10 @@ class ModelScore:
     structure: ResidualStructure
 
     def __str__(self) -> str:
-        return (f"{self.model}: {self.parameters} parameters, mean {self.mean_px:.3f} px, held out "
-                f"{self.held_out_px:.3f} px, {self.structure}")
+        return (
+            f"{self.model}: {self.parameters} parameters, mean {self.mean_px:.3f} px, held out "
+            f"{self.held_out_px:.3f} px, {self.structure}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +64,13 @@ class SelectedCalibration:
         return next(score for score in self.scores if score.model == self.model)
 
 
-def select_calibration(views: Sequence[BoardView], board: CalibrationBoard, size: tuple[int, int],
-                       choice: ModelChoice = "auto", view: View = "mirror") -> SelectedCalibration:
+def select_calibration(
+    views: Sequence[BoardView],
+    board: CalibrationBoard,
+    size: tuple[int, int],
+    choice: ModelChoice = "auto",
+    view: View = "mirror",
+) -> SelectedCalibration:
     """Calibrate a camera with every model of the choice, and select the one with the least held-out error.
 
     Models are compared on the views that all of them accept. Raises CalibError if no model can be fitted.
@@ -90,8 +97,9 @@ def select_calibration(views: Sequence[BoardView], board: CalibrationBoard, size
     return SelectedCalibration(fitted[best], best, scores, polynomials[-1] if polynomials else None)
 
 
-def refine_selection(found: SelectedCalibration, images: Mapping[str, NDArray[np.uint8]], view: View
-                     ) -> SelectedCalibration:
+def refine_selection(
+    found: SelectedCalibration, images: Mapping[str, NDArray[np.uint8]], view: View
+) -> SelectedCalibration:
     """Refine the corners with the selected camera, and fit its model again; images by the views' names.
 
     The scores of all models remain those of the selection, before the refinement.

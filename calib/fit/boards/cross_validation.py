@@ -26,18 +26,24 @@ def held_out_error_px(camera: OmniCamera, T_cam_board: Array, observed: Observat
     return cross_validated_px(parameters.camera_at, len(parameters.names), T_cam_board, observed)
 
 
-def cross_validated_px(camera_of: CameraFactory, count: int, T_cam_board: Array, observed: Observations,
-                       prior: Prior | None = None) -> float:
-    """Return the mean error [px] of views left out, for cameras of count parameters that are 0 at the fit to all views.
-    """
+def cross_validated_px(
+    camera_of: CameraFactory, count: int, T_cam_board: Array, observed: Observations, prior: Prior | None = None
+) -> float:
+    """Return the mean error [px] of views left out, for cameras of count parameters, 0 at the fit to all views."""
     numbers, errors = np.arange(len(observed.pixels)), list[Array]()
     for fold in range(FOLDS):
         held_out = numbers % FOLDS == fold
         if (~held_out).sum() < MIN_TRAINING_VIEWS or not held_out.any():
             continue
         try:
-            trained = adjust_bundle(camera_of, np.zeros(count), T_cam_board[~held_out], observed.select(~held_out),
-                                    kernel_rounds=1, prior=prior)
+            trained = adjust_bundle(
+                camera_of,
+                np.zeros(count),
+                T_cam_board[~held_out],
+                observed.select(~held_out),
+                kernel_rounds=1,
+                prior=prior,
+            )
             fitted = camera_of(trained.parameters)
         except (CalibError, np.linalg.LinAlgError):
             return float("inf")

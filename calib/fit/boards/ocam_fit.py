@@ -26,8 +26,10 @@ def fit_ocam(observed: Observations, size: tuple[int, int], view: View = "mirror
     """
     linear = solve_linear(observed, size, DEGREE, view)
     if linear.coefficients[0] >= 0:
-        raise CalibError("calibrate: no mirror or lens shows boards as in these views; leave out those whose corners "
-                         "are wrong, and check --corners")
+        raise CalibError(
+            "calibrate: no mirror or lens shows boards as in these views; leave out those whose corners "
+            "are wrong, and check --corners"
+        )
     start = np.concatenate([linear.coefficients, linear.center, (0.0, 0.0)])
     return adjust_bundle(ocam_factory(size, view, DEGREE), start, linear.T_cam_board, observed)
 
@@ -54,16 +56,17 @@ def ocam_structure(camera: OcamCamera) -> tuple[int, bool]:
     return len(camera.polynomial) - 1, any(camera.tangential)
 
 
-def ocam_factory(size: tuple[int, int], view: View, degree: int = DEGREE, *, tangential: bool = False
-                 ) -> Callable[[Array], OcamCamera]:
+def ocam_factory(
+    size: tuple[int, int], view: View, degree: int = DEGREE, *, tangential: bool = False
+) -> Callable[[Array], OcamCamera]:
     """Return the function that makes a camera of a vector of parameters."""
     conversion, count = _conversion(size, degree, tangential), len(powers(degree))
 
     def make(parameters: Array) -> OcamCamera:
         values = parameters * conversion
         a0, *others = values[:count]
-        row, column, stretch, skew = values[count:count + 4]
-        p1, p2 = (float(value) for value in values[count + 4:]) if tangential else (0.0, 0.0)
+        row, column, stretch, skew = values[count : count + 4]
+        p1, p2 = (float(value) for value in values[count + 4 :]) if tangential else (0.0, 0.0)
         return OcamCamera((a0, 0.0, *others), (row, column), (1 + stretch, skew, skew), size, view, (p1, p2))
 
     return make
@@ -76,8 +79,9 @@ def _conversion(size: tuple[int, int], degree: int, tangential: bool) -> Array:
     return np.concatenate([scale ** -powers(degree).astype(float), (1, 1), (1 / scale, 1 / scale), decentring])
 
 
-def ocam_parameters(fit: BundleResult, size: tuple[int, int], degree: int = DEGREE, *, tangential: bool = False
-                    ) -> list[tuple[str, float, float]]:
+def ocam_parameters(
+    fit: BundleResult, size: tuple[int, int], degree: int = DEGREE, *, tangential: bool = False
+) -> list[tuple[str, float, float]]:
     """Return name, value and standard deviation of every parameter, in the units of the model's file."""
     conversion = _conversion(size, degree, tangential)
     names = [f"a{power}" for power in powers(degree)] + ["center_row", "center_column", "c", "d = e"]

@@ -63,8 +63,9 @@ def _with_proper_poses(solution: LinearCamera, view: View) -> LinearCamera:
     left, _, right = np.linalg.svd(T[:, :3, :2], full_matrices=False)
     first = left @ right
     R = np.concatenate([first, np.cross(first[..., 0], first[..., 1])[..., None]], axis=-1)
-    return LinearCamera(solution.coefficients, solution.scale_px, solution.center,
-                        se3.transform(R, T[:, :3, 3]), solution.errors_rad)
+    return LinearCamera(
+        solution.coefficients, solution.scale_px, solution.center, se3.transform(R, T[:, :3, 3]), solution.errors_rad
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +86,9 @@ class _LinearProblem:
         coefficients, T[:, 2, 3] = _polynomial(rho, across, height, self.basis(rho))
         f = self.basis(rho) @ coefficients
         errors = np.minimum(_angles(np.dstack([xy, f]), se3.apply(T, self.observed.points)), CAP_RAD)
-        return LinearCamera(coefficients, self.scale_px, (float(center[0]), float(center[1])), T,
-                            np.nanmean(errors, axis=1))
+        return LinearCamera(
+            coefficients, self.scale_px, (float(center[0]), float(center[1])), T, np.nanmean(errors, axis=1)
+        )
 
     def basis(self, rho: Array) -> Array:
         """Return the powers (..., D) of the scaled radius."""
@@ -136,8 +138,9 @@ def _polynomial(rho: Array, across: Array, height: Array, basis: Array) -> tuple
     return coefficients, shifts(coefficients)
 
 
-def _eliminate_depths(rho: Array, across: Array, height: Array, basis: Array
-                    ) -> tuple[Array, Array, Callable[[Array], Array]]:
+def _eliminate_depths(
+    rho: Array, across: Array, height: Array, basis: Array
+) -> tuple[Array, Array, Callable[[Array], Array]]:
     """Eliminate t3: return equations (K, N, D), right sides (K, N), and a function from coefficients to t3 (K,).
 
     Every t3 occurs in its own image's equations only: these are projected onto the complement of its column.

@@ -40,8 +40,9 @@ class RelativePoseInitialisation:
     rejected: tuple[tuple[int, str], ...]  # view and reason
 
 
-def initialise_relative_pose(views: Sequence[ViewPair], board: CalibrationBoard, cameras: tuple[OmniCamera, OmniCamera]
-                             ) -> RelativePoseInitialisation:
+def initialise_relative_pose(
+    views: Sequence[ViewPair], board: CalibrationBoard, cameras: tuple[OmniCamera, OmniCamera]
+) -> RelativePoseInitialisation:
     """Find the transform with the most consistent pairs, and the board's pose in every view.
 
     Raises CalibError if no board fits both cameras or the order of the corners is ambiguous.
@@ -52,8 +53,10 @@ def initialise_relative_pose(views: Sequence[ViewPair], board: CalibrationBoard,
     upper = _poses_of(cameras[1], [seen for _, seen in views], board, orders)
     both = sorted(lower.keys() & upper.keys())
     if not both:
-        raise CalibError("calibrate rig: no board fits both cameras; check --corners, and that the camera files are "
-                         "those of these cameras, lower and upper")
+        raise CalibError(
+            "calibrate rig: no board fits both cameras; check --corners, and that the camera files are "
+            "those of these cameras, lower and upper"
+        )
     # 2. Consensus of the transforms of all pairs.
     best, apart = _consensus(np.array([upper[k] @ se3.inverse(lower[k]) for k in both]))
     gap = apart.min(axis=1)
@@ -65,13 +68,20 @@ def initialise_relative_pose(views: Sequence[ViewPair], board: CalibrationBoard,
     orders_of = {k: orders[int(apart[i].argmin())] for i, k in enumerate(both) if k not in outliers}
     # 4. Outlier pairs and views without a pose are rejected.
     rejected = [(k, "no board fits its corners") for k in range(len(views)) if k not in placed and k not in outliers]
-    rejected += [(k, f"its relative pose of the cameras is {np.rad2deg(distance):.1f} deg or more off that of the "
-                  "others: was the board moving?") for k, distance in outliers.items()]
+    rejected += [
+        (
+            k,
+            f"its relative pose of the cameras is {np.rad2deg(distance):.1f} deg or more off that of the "
+            "others: was the board moving?",
+        )
+        for k, distance in outliers.items()
+    ]
     return RelativePoseInitialisation(best, dict(sorted(placed.items())), orders_of, tuple(rejected))
 
 
-def _poses_of(camera: OmniCamera, views: Sequence[BoardView | None], board: CalibrationBoard,
-              orders: Sequence[NDArray[np.intp]]) -> dict[int, Array]:
+def _poses_of(
+    camera: OmniCamera, views: Sequence[BoardView | None], board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
+) -> dict[int, Array]:
     """Return by view the board's poses (S, 4, 4) for each order of its corners; views that do not fit are left out."""
     found = {k: _pose_hypotheses(camera, seen, board, orders) for k, seen in enumerate(views) if seen is not None}
     return {k: poses for k, poses in found.items() if poses is not None}
@@ -82,8 +92,9 @@ def _checked_pose(camera: OmniCamera, pixels: Array, board: CalibrationBoard) ->
     return T if T is not None and pose_error_rad(camera, T, pixels, board) < MAX_POSE_ERROR_RAD else None
 
 
-def _pose_hypotheses(camera: OmniCamera, seen: BoardView, board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
-                     ) -> Array | None:
+def _pose_hypotheses(
+    camera: OmniCamera, seen: BoardView, board: CalibrationBoard, orders: Sequence[NDArray[np.intp]]
+) -> Array | None:
     """Return the board's poses (S, 4, 4), one for every order of its corners; None if one does not fit."""
     poses = [_checked_pose(camera, seen.pixels[order], board) for order in orders]
     fitting = [T for T in poses if T is not None]
@@ -99,9 +110,11 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
     best = int(cost.argmin())
     others = cost[apart[best].ravel() > DISTINCT_DISTANCE]
     if candidates.shape[1] > 1 and others.size and others.min() < max(MIN_COST_RATIO * cost[best], MIN_INLIER_DISTANCE):
-        raise CalibError("calibrate rig: a board with two even or two odd sides looks the same upside down, and its "
-                         "orientation is ambiguous in these pairs; hold it at more places, or use a board with one odd "
-                         "and one even side")
+        raise CalibError(
+            "calibrate rig: a board with two even or two odd sides looks the same upside down, and its "
+            "orientation is ambiguous in these pairs; hold it at more places, or use a board with one odd "
+            "and one even side"
+        )
     return flat[best], apart[best]
 
 

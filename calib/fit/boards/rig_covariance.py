@@ -16,12 +16,14 @@ TWIST_STEP = 1e-6
 
 
 def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
-    """Return the covariance of a calibration's parameters for its rig; of the transform alone if the cameras are fixed.
-    """
-    names = [f"{side} {name}" for side, values in zip(("lower", "upper"), found.parameters, strict=True)
-             for name, _, _ in values]
+    """Return the covariance of a calibration's parameters for its rig; of the transform alone if cameras are fixed."""
+    names = [
+        f"{side} {name}"
+        for side, values in zip(("lower", "upper"), found.parameters, strict=True)
+        for name, _, _ in values
+    ]
     J = np.eye(len(found.covariance))
-    J[len(names):, len(names):] = _transform_by_twist(found.T_upper_lower, rig)
+    J[len(names) :, len(names) :] = _transform_by_twist(found.T_upper_lower, rig)
     return RigCovariance.of_matrix([*names, *TRANSFORM_NAMES], J @ found.covariance @ J.T)
 
 

@@ -135,12 +135,12 @@ class _RigParameterisation:
         T_upper_lower = se3.exp(steps[upper_end:] * self.units) @ self.T_upper_lower
         if not self.refined:
             return _PairCamera(lower.base, upper.base, T_upper_lower, self.corners)
-        return _PairCamera(lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]),
-                           T_upper_lower, self.corners)
+        return _PairCamera(
+            lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]), T_upper_lower, self.corners
+        )
 
 
-def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, refined: bool = True
-                  ) -> RigCalibration:
+def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, refined: bool = True) -> RigCalibration:
     """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
 
     cameras: start values, or the fixed cameras if not refined. The terms of real mirrors (MIRROR_NAMES) are fitted if a
@@ -162,16 +162,23 @@ def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, 
         good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
         _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
         found = unknowns.camera(fit.parameters)
-        fit, unknowns = _solve(good, board, ((found.lower, found.upper) if refined else cameras, refined),
-                               (found.T_upper_lower, fit.T_cam_board[~bad]))
+        fit, unknowns = _solve(
+            good,
+            board,
+            ((found.lower, found.upper) if refined else cameras, refined),
+            (found.T_upper_lower, fit.T_cam_board[~bad]),
+        )
     if fit.mean_px > MAX_MEAN_PX:
-        raise CalibError(f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
-                         "at most; did the cameras see the board at the same time, are their files the right ones?")
+        raise CalibError(
+            f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
+            "at most; did the cameras see the board at the same time, are their files the right ones?"
+        )
     return _rig_calibration(good, board, (fit, unknowns), rejected)
 
 
-def refine_rig_calibration(found: RigCalibration, images: tuple[Images, Images], refined: bool = True
-                           ) -> RigCalibration:
+def refine_rig_calibration(
+    found: RigCalibration, images: tuple[Images, Images], refined: bool = True
+) -> RigCalibration:
     """Refine the corners with the calibrated cameras, and calibrate the rig again; images by the views' names.
 
     An instant that only one camera saw needs no image of the other.
@@ -182,14 +189,16 @@ def refine_rig_calibration(found: RigCalibration, images: tuple[Images, Images],
     for k, view in enumerate(found.views):
         lower, upper = (
             seen and _refined_view(seen, images[side][view.name], cameras[side], (poses[side][k], found.board))
-            for side, seen in enumerate(view.seen))
+            for side, seen in enumerate(view.seen)
+        )
         views.append(PairView(view.name, (lower, upper)))
     again = fit_rig(views, found.board, cameras, refined)
     return replace(again, rejected=found.rejected + again.rejected)
 
 
-def _refined_view(seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera,
-                  posed_board: tuple[Array, CalibrationBoard]) -> BoardView:
+def _refined_view(
+    seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera, posed_board: tuple[Array, CalibrationBoard]
+) -> BoardView:
     T_cam_board, board = posed_board
     return replace(seen, pixels=refine_with_camera(image, camera, T_cam_board, (board, seen.pixels)))
 
@@ -201,20 +210,26 @@ def _is_pair(view: PairView) -> bool:
 def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:
     if count < MIN_PAIRS:
         left_out = "".join(f"; left out {bad.name}: {bad.reason}" for bad in rejected[:3])
-        raise CalibError(f"calibrate rig: expected at least {MIN_PAIRS} {what}, found {count}{left_out}; hold the "
-                         "board where both cameras see it whole, on all sides and tilted")
+        raise CalibError(
+            f"calibrate rig: expected at least {MIN_PAIRS} {what}, found {count}{left_out}; hold the "
+            "board where both cameras see it whole, on all sides and tilted"
+        )
 
 
-def _reordered_views(views: Sequence[PairView], initial: RelativePoseInitialisation, refined: bool
-                     ) -> tuple[list[PairView], Array]:
+def _reordered_views(
+    views: Sequence[PairView], initial: RelativePoseInitialisation, refined: bool
+) -> tuple[list[PairView], Array]:
     """Return the consistent views, upper corners in the order of the lower ones, and the board poses (K, 4, 4).
 
     Views by one camera alone are kept only if the cameras are refined: they do not depend on the relative pose.
     """
     kept = [k for k in initial.T_lower_board if refined or _is_pair(views[k])]
     good = [_with_reordered_upper(views[k], initial.orders.get(k)) for k in kept]
-    _require(sum(map(_is_pair, good)), "consistent pairs of views",
-             [RejectedView(views[k].name, reason) for k, reason in initial.rejected])
+    _require(
+        sum(map(_is_pair, good)),
+        "consistent pairs of views",
+        [RejectedView(views[k].name, reason) for k, reason in initial.rejected],
+    )
     return good, np.array([initial.T_lower_board[k] for k in kept])
 
 
@@ -225,18 +240,21 @@ def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> Pai
     return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
 
 
-def _solve(good: Sequence[PairView], board: CalibrationBoard, given: tuple[Sides, bool], start: tuple[Array, Array]
-           ) -> tuple[BundleResult, _RigParameterisation]:
+def _solve(
+    good: Sequence[PairView], board: CalibrationBoard, given: tuple[Sides, bool], start: tuple[Array, Array]
+) -> tuple[BundleResult, _RigParameterisation]:
     """Adjust both cameras, the transform between them, and one pose of the board for every view."""
     T_upper_lower, T_lower_board = start
     unknowns = _unknowns(board, given, T_upper_lower, T_lower_board)
-    fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, _observations(good, board),
-                        prior=unknowns.prior)
+    fit = adjust_bundle(
+        unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, _observations(good, board), prior=unknowns.prior
+    )
     return fit, unknowns
 
 
-def _unknowns(board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
-              ) -> _RigParameterisation:
+def _unknowns(
+    board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
+) -> _RigParameterisation:
     (lower, upper), refined = given
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
     # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
@@ -248,16 +266,20 @@ def _unknowns(board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower:
 def _observations(good: Sequence[PairView], board: CalibrationBoard) -> Observations:
     """Return the corners (K, 2N, 2) of both cameras, the lower one's first."""
     none = np.full((len(board.points), 2), np.nan)
-    pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen])
-                       for view in good])
+    pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen]) for view in good])
     return Observations(pixels, np.tile(board.points, (2, 1)), cameras=2)
 
 
 def rig_held_out_px(found: RigCalibration) -> float:
     """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
     unknowns = _unknowns(found.board, ((found.lower, found.upper), True), found.T_upper_lower, found.fit.T_cam_board)
-    return cross_validated_px(unknowns.camera, unknowns.ends[-1], found.fit.T_cam_board,
-                              _observations(found.views, found.board), unknowns.prior)
+    return cross_validated_px(
+        unknowns.camera,
+        unknowns.ends[-1],
+        found.fit.T_cam_board,
+        _observations(found.views, found.board),
+        unknowns.prior,
+    )
 
 
 def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:
@@ -265,19 +287,34 @@ def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:
     return RejectedView(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
 
 
-def _rig_calibration(good: Sequence[PairView], board: CalibrationBoard,
-                     solved: tuple[BundleResult, _RigParameterisation], rejected: Sequence[RejectedView]
-                     ) -> RigCalibration:
+def _rig_calibration(
+    good: Sequence[PairView],
+    board: CalibrationBoard,
+    solved: tuple[BundleResult, _RigParameterisation],
+    rejected: Sequence[RejectedView],
+) -> RigCalibration:
     fit, unknowns = solved
     found, (lower, upper, _) = unknowns.camera(fit.parameters), unknowns.ends
     sigma = np.sqrt(np.maximum(0, np.diag(fit.covariance)))
     parts = ((0, lower), (lower, upper))
-    parameters = tuple(tuple(side.values(fit.parameters[a:b], sigma[a:b])) if unknowns.refined else ()
-                       for side, (a, b) in zip(unknowns.parameterisations, parts, strict=True))
+    parameters = tuple(
+        tuple(side.values(fit.parameters[a:b], sigma[a:b])) if unknowns.refined else ()
+        for side, (a, b) in zip(unknowns.parameterisations, parts, strict=True)
+    )
     units = np.concatenate([*(side.units for side in unknowns.parameterisations if unknowns.refined), unknowns.units])
     covariance = fit.covariance * np.outer(units, units)
     motion = covariance[upper:, upper:]
     along = found.T_upper_lower[:3, 3] / np.linalg.norm(found.T_upper_lower[:3, 3])
-    return RigCalibration(found.lower, found.upper, found.T_upper_lower, board, tuple(good), fit, parameters,
-                          np.sqrt(np.maximum(0, np.diag(motion))), float(np.sqrt(along @ motion[:3, :3] @ along)),
-                          covariance, tuple(rejected))
+    return RigCalibration(
+        found.lower,
+        found.upper,
+        found.T_upper_lower,
+        board,
+        tuple(good),
+        fit,
+        parameters,
+        np.sqrt(np.maximum(0, np.diag(motion))),
+        float(np.sqrt(along @ motion[:3, :3] @ along)),
+        covariance,
+        tuple(rejected),
+    )

@@ -48,8 +48,9 @@ class SelectedRig:
     scores: tuple[RigScore, ...]
 
 
-def select_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides,
-               mirrors: tuple[OcamCamera, OcamCamera] | None) -> SelectedRig:
+def select_rig(
+    views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, mirrors: tuple[OcamCamera, OcamCamera] | None
+) -> SelectedRig:
     """Calibrate a rig with central cameras, and with the terms of real mirrors; select by the held-out error.
 
     mirrors: ocam cameras from which the terms of real mirrors are fitted, None: central cameras only. Raises CalibError
@@ -65,8 +66,10 @@ def select_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Side
     if not _may_be_better(central, general):
         scores = (_score("central cameras", central, np.nan), _score("real mirrors", general, np.nan))
         return SelectedRig(central, scores)
-    scores = (_score("central cameras", central, rig_held_out_px(central)),
-              _score("real mirrors", general, rig_held_out_px(general)))
+    scores = (
+        _score("central cameras", central, rig_held_out_px(central)),
+        _score("real mirrors", general, rig_held_out_px(general)),
+    )
     if scores[1].held_out_px < (1 - MIN_IMPROVEMENT) * scores[0].held_out_px:
         return SelectedRig(replace(general, rejected=(*central.rejected, *general.rejected)), scores[::-1])
     return SelectedRig(central, scores)
@@ -83,14 +86,17 @@ def mirror_start(camera: OcamCamera) -> OcamCamera:
     even = np.zeros(POWERS[-1] + 1)
     even[list(POWERS)] = found / float(min(camera.size)) ** np.array(POWERS)
     tangential = camera.tangential if any(camera.tangential) else START_TANGENTIAL
-    return replace(camera, polynomial=tuple(even.tolist()), tangential=tangential,
-                   wavefront=(START_M,) * len(camera.wavefront))
+    return replace(
+        camera, polynomial=tuple(even.tolist()), tangential=tangential, wavefront=(START_M,) * len(camera.wavefront)
+    )
 
 
 def _may_be_better(central: RigCalibration, general: RigCalibration) -> bool:
     """False if the further parameters explain no more of the squared residuals than they would of pure noise."""
-    squares = [float(np.nansum(np.minimum(found.fit.errors_px, 5 * np.nanmedian(found.fit.errors_px)) ** 2))
-               for found in (central, general)]
+    squares = [
+        float(np.nansum(np.minimum(found.fit.errors_px, 5 * np.nanmedian(found.fit.errors_px)) ** 2))
+        for found in (central, general)
+    ]
     more = len(general.fit.parameters) - len(central.fit.parameters)
     count = 2 * int(np.isfinite(general.fit.errors_px).sum())
     return len(general.views) >= len(central.views) and squares[1] < squares[0] * (1 - 2 * max(0, more) / count)

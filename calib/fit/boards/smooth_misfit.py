@@ -48,7 +48,7 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
     fields = np.zeros((K, N, 2, sum(counts)))
     first, size = 0, N // cameras
     for camera, values in enumerate(own):
-        fields[:, camera * size:(camera + 1) * size, :, first:first + counts[camera]] = values
+        fields[:, camera * size : (camera + 1) * size, :, first : first + counts[camera]] = values
         first += counts[camera]
     return fields
 

@@ -81,5 +81,7 @@ def unified_parameters(fit: BundleResult, size: tuple[int, int], terms: int = 0)
     """Return name, value and standard deviation of every solved parameter, in the units of the model's file."""
     conversion = _conversion(size, terms)
     sigmas = np.sqrt(np.maximum(0, np.diag(fit.covariance))) * conversion
-    return [(name, float(value), float(sigma))
-            for name, value, sigma in zip(NAMES[:5 + terms], fit.parameters * conversion, sigmas, strict=True)]
+    return [
+        (name, float(value), float(sigma))
+        for name, value, sigma in zip(NAMES[: 5 + terms], fit.parameters * conversion, sigmas, strict=True)
+    ]

@@ -68,8 +68,15 @@ class DriveAdjustment:
         return np.asarray(self.sigmas < np.sqrt(np.diag(np.linalg.inv(self.prior))) / 2)
 
 
-def adjust_drive(parameters: RigParameters, state: DriveState, observations: DriveObservations, prior: Array,
-                 fixed: Sequence[int] = (0,), *, alike: float = 1.0) -> DriveAdjustment:
+def adjust_drive(
+    parameters: RigParameters,
+    state: DriveState,
+    observations: DriveObservations,
+    prior: Array,
+    fixed: Sequence[int] = (0,),
+    *,
+    alike: float = 1.0,
+) -> DriveAdjustment:
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
     prior: information (P, P) of the steps about zero. fixed: keyframes whose pose stays, one for each drive. alike:
@@ -81,11 +88,15 @@ def adjust_drive(parameters: RigParameters, state: DriveState, observations: Dri
     for number in range(SELECTIONS):
         kept, used = observations.only(_consistent(problem, state, sigma_px))
         if sigma_px > MAX_SIGMA_PX:
-            raise CalibError(f"calibrate drive: the landmarks are {sigma_px:.1f} px off any rig and path, expected "
-                             f"{MAX_SIGMA_PX:.0f} px at most; is the rig that of these cameras?")
+            raise CalibError(
+                f"calibrate drive: the landmarks are {sigma_px:.1f} px off any rig and path, expected "
+                f"{MAX_SIGMA_PX:.0f} px at most; is the rig that of these cameras?"
+            )
         if len(used) < MIN_LANDMARKS:
-            raise CalibError(f"calibrate drive: only {len(used)} landmarks agree with a rigid world, {MIN_LANDMARKS} "
-                             "are needed; is the rig that of these cameras, is there enough to see?")
+            raise CalibError(
+                f"calibrate drive: only {len(used)} landmarks agree with a rigid world, {MIN_LANDMARKS} "
+                "are needed; is the rig that of these cameras, is there enough to see?"
+            )
         observations, state = kept, replace(state, points=state.points[used])
         problem = replace(problem, observations=observations)
         state, sigma_px = _minimised(problem, state, FINE_GAIN if number == SELECTIONS - 1 else ROUGH_GAIN)
@@ -102,8 +113,9 @@ def adjust_pairs(parameters: RigParameters, state: DriveState, observations: Dri
     return _minimised(DriveProblem(parameters, observations, prior, everything), state, ROUGH_GAIN)[0].steps
 
 
-def held_out_error(parameters: RigParameters, found: DriveAdjustment, prior: Array, fixed: Sequence[int] = (0,)
-                   ) -> float:
+def held_out_error(
+    parameters: RigParameters, found: DriveAdjustment, prior: Array, fixed: Sequence[int] = (0,)
+) -> float:
     """Return the error [px] of landmarks that another model of the rig was not fitted to; robust (Cauchy's function).
 
     Rig and poses are fitted to the other landmarks of an adjustment; then only the points of those held out are.

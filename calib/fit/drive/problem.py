@@ -86,8 +86,7 @@ class DriveProblem:
         return robust_sigma(self.residuals(state), MIN_SIGMA_PX)
 
     def moved(self, state: DriveState, common: Array, blocks: Array) -> DriveState | None:
-        """Return the state after steps of poses and rig (C,) and of landmarks (L, 3); None if there is no such camera.
-        """
+        """Return the state after steps of poses and rig (C,) and of landmarks (L, 3); None without such a camera."""
         P = len(self.prior)
         T = state.T_rig_odom.copy()
         free = np.setdiff1d(np.arange(len(T)), self.fixed)
@@ -103,8 +102,9 @@ class DriveProblem:
         """Return the normal equations of poses and rig, with one block for each landmark."""
         J, seen = self._jacobians(state, scale), self.observations
         between = J.by_pose.T @ J.by_steps
-        A = np.block([[(J.by_pose.T @ J.by_pose).toarray(), between],
-                      [between.T, J.by_steps.T @ J.by_steps + self.prior]])
+        A = np.block(
+            [[(J.by_pose.T @ J.by_pose).toarray(), between], [between.T, J.by_steps.T @ J.by_steps + self.prior]]
+        )
         blocks = np.zeros((len(state.points), 3, 3))
         np.add.at(blocks, seen.landmark, np.swapaxes(J.of_landmarks, 1, 2) @ J.of_landmarks)
         by_point = _scattered(J.of_landmarks, seen.landmark, len(state.points))
@@ -147,14 +147,21 @@ class DriveProblem:
         by_steps = (self._by_steps(state) * root[:, :, None]).reshape(-1, len(self.prior))
         J_poses = _scattered(by_pose, seen.keyframe, len(state.T_rig_odom))
         is_free = np.repeat(~np.isin(np.arange(len(state.T_rig_odom)), self.fixed), 6)
-        return _Jacobians((residual * root).ravel(), J_poses[:, is_free], by_steps,
-                          by_rig_point @ state.T_rig_odom[seen.keyframe][:, :3, :3])
+        return _Jacobians(
+            (residual * root).ravel(),
+            J_poses[:, is_free],
+            by_steps,
+            by_rig_point @ state.T_rig_odom[seen.keyframe][:, :3, :3],
+        )
 
     def _by_point(self, steps: Array, points: Array) -> Array:
         """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
         camera, reach = self.observations.camera, STEP * np.linalg.norm(points, axis=1, keepdims=True)
-        columns = [(self.cast(steps, camera, points + reach * axis) - self.cast(steps, camera, points - reach * axis))
-                   / (2 * reach) for axis in np.eye(3)]
+        columns = [
+            (self.cast(steps, camera, points + reach * axis) - self.cast(steps, camera, points - reach * axis))
+            / (2 * reach)
+            for axis in np.eye(3)
+        ]
         return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
 
     def _by_steps(self, state: DriveState) -> Array:
@@ -167,8 +174,10 @@ class DriveProblem:
         for k, step in enumerate(STEP * np.eye(len(state.steps))):
             moved = [side for side in (0, 1) if parameters.moves_camera(side)[k]]
             at, is_time = np.flatnonzero(np.isin(camera, moved)), parameters.names[k] in parameters.times
-            ahead, behind = (self.cast(steps, camera[at], self.in_rig(state, steps)[at] if is_time else in_rig[at])
-                             for steps in (state.steps + step, state.steps - step))
+            ahead, behind = (
+                self.cast(steps, camera[at], self.in_rig(state, steps)[at] if is_time else in_rig[at])
+                for steps in (state.steps + step, state.steps - step)
+            )
             J[at, :, k] = np.nan_to_num((ahead - behind) / (2 * STEP))
         return J
 

@@ -43,8 +43,9 @@ class RigParameters:
     waves: tuple[str, ...] = ()  # all of WAVE_NAMES, or none
 
     @staticmethod
-    def about(rig: Rig, distortion: Collection[str] = (), times: tuple[str, ...] = (), *, waves: bool = False
-              ) -> RigParameters:
+    def about(
+        rig: Rig, distortion: Collection[str] = (), times: tuple[str, ...] = (), *, waves: bool = False
+    ) -> RigParameters:
         """Return the parameters of the cameras' own models about a rig; distortion: terms of omni cameras, if 0.
 
         waves: with wavefronts of both cameras, about those of the file.
@@ -55,28 +56,46 @@ class RigParameters:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the steps."""
-        return (*(f"lower {name}" for name in self.lower.names), *(f"upper {name}" for name in self.upper.names),
-                *TRANSFORM_NAMES, *self.waves, *self.times)
+        return (
+            *(f"lower {name}" for name in self.lower.names),
+            *(f"upper {name}" for name in self.upper.names),
+            *TRANSFORM_NAMES,
+            *self.waves,
+            *self.times,
+        )
 
     @property
     def rig_names(self) -> tuple[str, ...]:
         """Names of the steps of the rig, which come first."""
-        return self.names[:len(self.names) - len(self.waves) - len(self.times)]
+        return self.names[: len(self.names) - len(self.waves) - len(self.times)]
 
     @property
     def values(self) -> Array:
         """Values (P,) at no step, in the parameters' own units; the transform's are zero, in radians."""
         times = self.rig.times
         of_rig = {UPPER_DELAY: times.upper_delay_s / S_PER_MS, LINE_TIME: times.line_time_s / S_PER_US}
-        return np.concatenate([self.lower.start, self.upper.start, np.zeros(len(TRANSFORM_NAMES)),
-                               *([self.wavefronts_at(np.zeros(len(self.names))).ravel()] if self.waves else []),
-                               [of_rig[name] for name in self.times]])
+        return np.concatenate(
+            [
+                self.lower.start,
+                self.upper.start,
+                np.zeros(len(TRANSFORM_NAMES)),
+                *([self.wavefronts_at(np.zeros(len(self.names))).ravel()] if self.waves else []),
+                [of_rig[name] for name in self.times],
+            ]
+        )
 
     @property
     def units(self) -> Array:
         """One step (P,) in the parameters' own units."""
-        return np.concatenate([self.lower.units, self.upper.units, np.full(len(TRANSFORM_NAMES), ANGLE_UNIT_RAD),
-                               np.full(len(self.waves), WAVEFRONT_UNIT_M), [TIME_UNITS[name] for name in self.times]])
+        return np.concatenate(
+            [
+                self.lower.units,
+                self.upper.units,
+                np.full(len(TRANSFORM_NAMES), ANGLE_UNIT_RAD),
+                np.full(len(self.waves), WAVEFRONT_UNIT_M),
+                [TIME_UNITS[name] for name in self.times],
+            ]
+        )
 
     def moves_camera(self, camera: int) -> Array:
         """Return flags (P,) of the steps that change the image of the lower (0) or the upper (1) camera."""
@@ -86,10 +105,14 @@ class RigParameters:
     def at(self, steps: Array) -> Rig:
         """Return the rig after steps (P,); CalibError where there is no such camera."""
         first, second = len(self.lower.names), len(self.lower.names) + len(self.upper.names)
-        turn = steps[second:second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
+        turn = steps[second : second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
         rig = self.rig.with_upper_moved(turn[:3], turn[3:])
-        cameras = [_with_wavefront(own.camera_at(part), wavefront) for own, part, wavefront in zip(
-            (self.lower, self.upper), (steps[:first], steps[first:second]), self.wavefronts_at(steps), strict=True)]
+        cameras = [
+            _with_wavefront(own.camera_at(part), wavefront)
+            for own, part, wavefront in zip(
+                (self.lower, self.upper), (steps[:first], steps[first:second]), self.wavefronts_at(steps), strict=True
+            )
+        ]
         lower, upper = replace(rig.lower, camera=cameras[0]), replace(rig.upper, camera=cameras[1])
         return replace(rig, lower=lower, upper=upper, covariance=None, times=self.times_at(steps))
 
@@ -101,7 +124,7 @@ class RigParameters:
         x, y, z = R_rect_rig @ (rig.upper.viewpoint - rig.lower.viewpoint)
         steps = np.zeros(len(self.names))
         first = len(self.rig_names) - len(TRANSFORM_NAMES)
-        steps[first:len(self.rig_names)] = np.array([*turn, x / z, y / z]) / ANGLE_UNIT_RAD
+        steps[first : len(self.rig_names)] = np.array([*turn, x / z, y / z]) / ANGLE_UNIT_RAD
         return steps
 
     def wavefronts_at(self, steps: Array) -> Array:
@@ -110,12 +133,13 @@ class RigParameters:
         if not self.waves:
             return start
         first = len(self.rig_names)
-        return start + WAVEFRONT_UNIT_M * steps[first:first + len(self.waves)].reshape(start.shape)
+        return start + WAVEFRONT_UNIT_M * steps[first : first + len(self.waves)].reshape(start.shape)
 
     def times_at(self, steps: Array) -> ShutterTimes:
         """Return the times of exposure after steps (P,); a time that is no parameter stays that of the rig."""
-        values = dict(zip(self.times, steps[len(self.names) - len(self.times):].tolist(), strict=True))
+        values = dict(zip(self.times, steps[len(self.names) - len(self.times) :].tolist(), strict=True))
         start = self.rig.times
         return ShutterTimes(
             start.upper_delay_s + S_PER_MS * TIME_UNITS[UPPER_DELAY] * values.get(UPPER_DELAY, 0.0),
-            start.line_time_s + S_PER_US * TIME_UNITS[LINE_TIME] * values.get(LINE_TIME, 0.0))
+            start.line_time_s + S_PER_US * TIME_UNITS[LINE_TIME] * values.get(LINE_TIME, 0.0),
+        )

@@ -196,8 +196,17 @@ def _message(kind: str, numbers: list[int]) -> LineMessage:
     contact = numbers[7] if len(numbers) > 7 else 0
     battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
     return StatusMessage(
-        seq, MotorStatus(velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v,
-                         bool(contact & _BUMPER), bool(contact & _CLIFF))
+        seq,
+        MotorStatus(
+            velocity_mps,
+            heading_rad,
+            yaw_rate_radps,
+            bool(expired),
+            fault,
+            battery_v,
+            bool(contact & _BUMPER),
+            bool(contact & _CLIFF),
+        ),
     )
 
 

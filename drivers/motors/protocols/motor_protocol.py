@@ -67,8 +67,9 @@ def request(data: bytes, parse: Callable[[bytes], T | None]) -> Transaction[T]:
 def require_watchdog(requested_ms: int, in_force_ms: float) -> None:
     """Raise DriverError unless the requested watchdog time is in force."""
     if round(in_force_ms) != requested_ms:
-        raise DriverError(f"watchdog of {requested_ms} ms requested, {in_force_ms:g} ms in force; "
-                          "set another motor.watchdog_ms")
+        raise DriverError(
+            f"watchdog of {requested_ms} ms requested, {in_force_ms:g} ms in force; set another motor.watchdog_ms"
+        )
 
 
 class TextFramer:

@@ -83,8 +83,9 @@ class ODriveAscii:
         flags = int(first_error[0]) | int(second_error[0])
         self._disarmed = bool(flags & WATCHDOG_EXPIRED) or (self._disarmed and not arming)
         (_, first_turns_per_s), (_, second_turns_per_s) = first, second  # position, velocity
-        velocity_mps, yaw_rate_radps = self._drive.motion(first_turns_per_s / self._drive.turns_per_m,
-                                                          second_turns_per_s / self._drive.turns_per_m)
+        velocity_mps, yaw_rate_radps = self._drive.motion(
+            first_turns_per_s / self._drive.turns_per_m, second_turns_per_s / self._drive.turns_per_m
+        )
         return MotorStatus(velocity_mps, math.nan, yaw_rate_radps, self._disarmed, flags & ~WATCHDOG_EXPIRED,
                            battery[0])  # fmt: skip
 

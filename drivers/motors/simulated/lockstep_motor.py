@@ -13,8 +13,9 @@ from drivers.motors.simulated.simulated_motor import SimulatedController
 class LockstepMotor:
     """A MotorDriver whose bytes reach the controller at once; like the serial driver it begins with a stop."""
 
-    def __init__(self, protocol: MotorProtocol, controller: SimulatedController, watchdog_ms: int,
-                 clock_ns: Callable[[], int]) -> None:
+    def __init__(
+        self, protocol: MotorProtocol, controller: SimulatedController, watchdog_ms: int, clock_ns: Callable[[], int]
+    ) -> None:
         """Connect; DriverError where the controller does not take the watchdog's time."""
         self._protocol, self._controller, self._clock_ns = protocol, controller, clock_ns
         self._framer = protocol.framer()

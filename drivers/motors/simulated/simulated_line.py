@@ -72,6 +72,12 @@ class SimulatedLine:
         base = self.base
         heading_rad = math.remainder(base.pose[2] - self._zero_rad, math.tau)
         return MotorStatus(
-            base.velocity_mps, heading_rad, base.yaw_rate_radps, base.watchdog_expired, base.fault, base.battery_v,
-            base.bumper, base.cliff
+            base.velocity_mps,
+            heading_rad,
+            base.yaw_rate_radps,
+            base.watchdog_expired,
+            base.fault,
+            base.battery_v,
+            base.bumper,
+            base.cliff,
         )

@@ -19,9 +19,12 @@ TOO_LATE: Final = "it was not handled in time"
 
 def arming_knob() -> str:
     """Return the declaration of `controller.arming`."""
-    return knob(MANUAL, "manual: the wheels turn only after cmd/arm (`omnid arm`), again after each stop and each "
-                "fault; automatic: for service without an operator, faults that have passed need no cmd/arm, stops do",
-                choices=(MANUAL, AUTOMATIC))
+    return knob(
+        MANUAL,
+        "manual: the wheels turn only after cmd/arm (`omnid arm`), again after each stop and each "
+        "fault; automatic: for service without an operator, faults that have passed need no cmd/arm, stops do",
+        choices=(MANUAL, AUTOMATIC),
+    )
 
 
 class ArmRequest(NamedTuple):

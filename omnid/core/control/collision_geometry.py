@@ -47,8 +47,12 @@ class Outline(NamedTuple):
         dx = max(x_m - self.front_m, 0.0) - max(-self.rear_m - x_m, 0.0)
         dy = math.copysign(max(abs(y_m) - self.half_width_m, 0.0), y_m)
         if dx == 0.0 and dy == 0.0:  # inside: the way out is over the nearest edge
-            edges = ((self.front_m - x_m, 1.0, 0.0), (self.rear_m + x_m, -1.0, 0.0),
-                     (self.half_width_m - y_m, 0.0, 1.0), (self.half_width_m + y_m, 0.0, -1.0))
+            edges = (
+                (self.front_m - x_m, 1.0, 0.0),
+                (self.rear_m + x_m, -1.0, 0.0),
+                (self.half_width_m - y_m, 0.0, 1.0),
+                (self.half_width_m + y_m, 0.0, -1.0),
+            )
             _, dx, dy = min(edges)
         # A speed, not its product with the distance: a point at the edge is approached as any other.
         return dx * vx + dy * vy < -TINY * math.hypot(dx, dy)

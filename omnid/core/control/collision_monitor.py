@@ -80,8 +80,7 @@ def remedy(reason: str) -> str:
 
 
 class CollisionMonitor:
-    """Follows rings and commanded motions; not thread-safe. Memory and work of a tick are bounded by the ring's size.
-    """
+    """Follows rings and commands; not thread-safe. Memory and work of a tick are bounded by the ring's size."""
 
     def __init__(self, settings: CollisionSettings, deceleration_mps2: float) -> None:
         """deceleration_mps2: with which the base can brake."""
@@ -108,8 +107,11 @@ class CollisionMonitor:
         self._stamp_ns, self._moving = ring.stamp_ns, ring.moving[:MOST_MOVING]
         count = len(ring.ranges_m)
         step = math.tau / count
-        self._points = [(r * math.cos((k + 0.5) * step - math.pi), r * math.sin((k + 0.5) * step - math.pi))
-                        for k, r in enumerate(ring.ranges_m) if math.isfinite(r)]
+        self._points = [
+            (r * math.cos((k + 0.5) * step - math.pi), r * math.sin((k + 0.5) * step - math.pi))
+            for k, r in enumerate(ring.ranges_m)
+            if math.isfinite(r)
+        ]
         free = ring.free_m if len(ring.free_m) == count else (0.0,) * count
         self._unknown, self._unwatched = [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
@@ -151,8 +153,9 @@ class CollisionMonitor:
         if is_stale and settings.stale == IGNORE:
             return FREE
         if is_stale or (self._is_blind and settings.stale != IGNORE):
-            return self._capped(motion, 0.0 if settings.stale == STOP else settings.slow_mps,
-                                RING_STALE if is_stale else UNSEEN)
+            return self._capped(
+                motion, 0.0 if settings.stale == STOP else settings.slow_mps, RING_STALE if is_stale else UNSEEN
+            )
         moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
         speed_mps = abs(motion.velocity_mps)
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
@@ -233,8 +236,10 @@ class CollisionMonitor:
             ahead_s = step * MOVING_STEP_S
             pose = composed(moved, along_arc(motion.velocity_mps, motion.yaw_rate_radps, ahead_s))
             at_s = age_s + ahead_s
-            places = [(obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)
-                      for obstacle in self._moving]
+            places = [
+                (obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)
+                for obstacle in self._moving
+            ]
             for obstacle, (x, y) in zip(self._moving, seen_from(pose, places), strict=True):
                 if stop.gap_m(x, y) <= obstacle.radius_m and (step or self._outline.is_approached(x, y, motion)):
                     return Allowance(0.0 if ahead_s <= MOVING_STOP_S else ahead_s / settings.time_s, MOVING)

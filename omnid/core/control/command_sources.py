@@ -28,20 +28,31 @@ OTHER_SENDER: Final = "another sender drives"
 class SourceSettings:
     """Sources of commands in the order of their priority."""
 
-    names: tuple[str, ...] = knob((OPERATOR, PLANNER), "sources of commands, highest priority first: topics "
-                                  "cmd/NAME/twist and cmd/NAME/heading; cmd/twist and cmd/heading are the first one's")
-    hold_s: float = knob(0.5, "a source keeps out those of lower priority, and its sender all others, for so long "
-                         "after its newest command, s", low=0.05, high=60)
+    names: tuple[str, ...] = knob(
+        (OPERATOR, PLANNER),
+        "sources of commands, highest priority first: topics "
+        "cmd/NAME/twist and cmd/NAME/heading; cmd/twist and cmd/heading are the first one's",
+    )
+    hold_s: float = knob(
+        0.5,
+        "a source keeps out those of lower priority, and its sender all others, for so long "
+        "after its newest command, s",
+        low=0.05,
+        high=60,
+    )
 
     def __post_init__(self) -> None:
         """Raise OmnidError for names that cannot be part of a topic, stand twice, or are too many."""
         if not 1 <= len(self.names) <= MOST_SOURCES or len(set(self.names)) < len(self.names):
-            raise OmnidError(f"controller.sources.names has {len(self.names)} names; give 1 to {MOST_SOURCES}, each "
-                             "once")
+            raise OmnidError(
+                f"controller.sources.names has {len(self.names)} names; give 1 to {MOST_SOURCES}, each once"
+            )
         for name in self.names:
             if not _NAME.fullmatch(name) or name in _RESERVED:
-                raise OmnidError(f"controller.sources.names has {name!r}; use small letters, digits and '_', a letter "
-                                 f"first, at most 32, and none of {', '.join(_RESERVED)}")
+                raise OmnidError(
+                    f"controller.sources.names has {name!r}; use small letters, digits and '_', a letter "
+                    f"first, at most 32, and none of {', '.join(_RESERVED)}"
+                )
 
 
 class TimedSetpoint(NamedTuple):
@@ -85,8 +96,10 @@ class CommandSelector:
         if command.source == current.source:
             if command.sender == current.sender:
                 return ""
-            self.conflict = (f"two programs send commands as {command.source!r}: {current.sender or 'without a name'} "
-                             f"drives, those of {command.sender or 'one without a name'} are refused")
+            self.conflict = (
+                f"two programs send commands as {command.source!r}: {current.sender or 'without a name'} "
+                f"drives, those of {command.sender or 'one without a name'} are refused"
+            )
             return OTHER_SENDER
         higher = self._priorities[command.source] < self._priorities[current.source]
         return "" if higher else LOWER_PRIORITY

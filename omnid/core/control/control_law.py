@@ -171,8 +171,9 @@ class ControlLaw:
         """Stop the wheels until the process ends."""
         self._ending = True
 
-    def step(self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False,
-             motor_stopped: bool = False) -> ControlOutput:
+    def step(
+        self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False, motor_stopped: bool = False
+    ) -> ControlOutput:
         """Return the motion dt_s after the one that the base follows now, and take it for the one it follows next."""
         # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
         inputs = self.plausibility.added_to(self._inputs(now_ns, late_s, motor_failed, motor_stopped))
@@ -181,8 +182,15 @@ class ControlLaw:
         if accepted is not None:
             self._void_ns = max(self._void_ns, accepted.arrival_ns)
         # 2. The reason to stop, of all rules; it voids the setpoints that have arrived so far.
-        self.reason = stop_reason(replace(inputs, stop_asked=self.arming.stop_asked, armed=self.arming.armed,
-                                          command_age_s=self._command_age_s(now_ns)), deadlines)
+        self.reason = stop_reason(
+            replace(
+                inputs,
+                stop_asked=self.arming.stop_asked,
+                armed=self.arming.armed,
+                command_age_s=self._command_age_s(now_ns),
+            ),
+            deadlines,
+        )
         self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns
@@ -219,8 +227,10 @@ class ControlLaw:
         limits, passed_s = self._settings.limits, abs(pose.stamp_ns - before.stamp_ns) * S_PER_NS
         turned_rad = abs(wrap_angle(pose.heading_rad - before.heading_rad))
         unpredicted_rad = abs(wrap_angle(pose.heading_rad - before.heading_at(pose.stamp_ns)))
-        return (turned_rad > JUMP_RAD + limits.yaw_rate_radps * passed_s
-                and unpredicted_rad > JUMP_RAD + limits.yaw_acceleration_radps2 * passed_s**2 / 2)
+        return (
+            turned_rad > JUMP_RAD + limits.yaw_rate_radps * passed_s
+            and unpredicted_rad > JUMP_RAD + limits.yaw_acceleration_radps2 * passed_s**2 / 2
+        )
 
     def _command_age_s(self, now_ns: int) -> float:
         """Return the age of the setpoint; inf where there is none, or a void one."""

@@ -123,8 +123,10 @@ class MotionMonitor:
     @property
     def doubtful(self) -> bool:
         """True if some motion is unexplained: the base is to slow down."""
-        return any(metres > self._settings.slow_m or radians > self._settings.slow_rad
-                   for metres, radians in self._unexplained.values())
+        return any(
+            metres > self._settings.slow_m or radians > self._settings.slow_rad
+            for metres, radians in self._unexplained.values()
+        )
 
     def add_command(self, now_ns: int, motion: Twist) -> None:
         """Add the motion that was commanded at this tick."""
@@ -172,17 +174,22 @@ class MotionMonitor:
     def _recent(self, accounts: deque[_Account], at_ns: int) -> list[_Account]:
         """Return the accounts within the delay before a time, the newest first."""
         since_ns = at_ns - self._settings.delay_s / S_PER_NS
-        return [entry for entry in takewhile(lambda entry: entry.at_ns >= since_ns, reversed(accounts))
-                if entry.at_ns <= at_ns]
+        return [
+            entry
+            for entry in takewhile(lambda entry: entry.at_ns >= since_ns, reversed(accounts))
+            if entry.at_ns <= at_ns
+        ]
 
     def _bands(self, explained: list[_Account], found: Motion) -> tuple[_Band, _Band]:
         """Return the plausible velocities and yaw rates."""
         limits = self._settings
         speeds, rates = [one.velocity_mps for one in explained], [one.yaw_rate_radps for one in explained]
-        return (_Band(min(speeds), max(speeds)).widened(limits.slip, limits.speed_mps
-                                                        + SIGMAS * found.velocity_sigma_mps),
-                _Band(min(rates), max(rates)).widened(limits.slip, limits.yaw_rate_radps
-                                                      + SIGMAS * found.yaw_rate_sigma_radps))
+        return (
+            _Band(min(speeds), max(speeds)).widened(limits.slip, limits.speed_mps + SIGMAS * found.velocity_sigma_mps),
+            _Band(min(rates), max(rates)).widened(
+                limits.slip, limits.yaw_rate_radps + SIGMAS * found.yaw_rate_sigma_radps
+            ),
+        )
 
     def _add_beyond(self, axis: int, band: _Band, value: float, dt_s: float) -> None:
         """Add the unexplained part of what was seen: too little of what was commanded, or too much; none of NaN."""

@@ -60,17 +60,24 @@ class Plausibility:
 
     def added_to(self, inputs: SafetyInputs) -> SafetyInputs:
         """Return the inputs of the safety rules with these; a reset counts for one step."""
-        return replace(inputs, pose_reset=self._pose.take_reset(), pose_unsure=self._pose.unsure,
-                       motor_faulty=self._motor.faulty, battery_empty=self._motor.battery_empty,
-                       disagreement=self._monitor.reason or (self.witness.reason if self.witness.is_fault else ""))
+        return replace(
+            inputs,
+            pose_reset=self._pose.take_reset(),
+            pose_unsure=self._pose.unsure,
+            motor_faulty=self._motor.faulty,
+            battery_empty=self._motor.battery_empty,
+            disagreement=self._monitor.reason or (self.witness.reason if self.witness.is_fault else ""),
+        )
 
     def slowed(self, wanted: Twist, limits: VelocityLimits) -> Twist:
         """Return the wanted motion within the limits, which are lower where there is a reason to drive slowly."""
         if not self.slowed_by:
             return wanted
         share = self._settings.degraded_speed
-        return Twist(_clamp(wanted.velocity_mps, share * limits.velocity_mps),
-                     _clamp(wanted.yaw_rate_radps, share * limits.yaw_rate_radps))
+        return Twist(
+            _clamp(wanted.velocity_mps, share * limits.velocity_mps),
+            _clamp(wanted.yaw_rate_radps, share * limits.yaw_rate_radps),
+        )
 
 
 def _clamp(value: float, magnitude: float) -> float:

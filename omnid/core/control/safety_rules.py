@@ -23,8 +23,9 @@ class Deadlines:
 
     pose_s: float = knob(0.5, "the wheels stop when the newest pose's images are older, s", low=0.05, high=10)
     command_s: float = knob(0.5, "the wheels stop when the newest setpoint arrived longer ago, s", low=0.05, high=10)
-    tick_s: float = knob(0.25, "the wheels stop when a tick is later, because the host is overloaded, s", low=0.01,
-                         high=10)
+    tick_s: float = knob(
+        0.25, "the wheels stop when a tick is later, because the host is overloaded, s", low=0.01, high=10
+    )
 
 
 @dataclass(frozen=True, slots=True)

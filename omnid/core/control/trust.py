@@ -17,16 +17,26 @@ OFF: Final = 0.0  # exact: the value of a setting that switches its rule off
 class TrustSettings:
     """Levels at which the base slows down or stops."""
 
-    degraded_speed: float = knob(0.5, "share of the speed and yaw rate of controller.limits while the pose is degraded "
-                                 "or some motion is unexplained; 1: no slowing", low=0.05, high=1)
-    velocity_sigma_mps: float = knob(0.2, "the wheels stop when the standard deviation of the seen velocity stays "
-                                     "higher, m/s; 0: never", low=0, high=10)
+    degraded_speed: float = knob(
+        0.5,
+        "share of the speed and yaw rate of controller.limits while the pose is degraded "
+        "or some motion is unexplained; 1: no slowing",
+        low=0.05,
+        high=1,
+    )
+    velocity_sigma_mps: float = knob(
+        0.2,
+        "the wheels stop when the standard deviation of the seen velocity stays higher, m/s; 0: never",
+        low=0,
+        high=10,
+    )
     yaw_rate_sigma_radps: float = knob(0.4, "the same of the yaw rate, rad/s; 0: never", low=0, high=20)
     sigma_s: float = knob(0.3, "time for which a standard deviation may be higher, s", low=0, high=10)
     odometry_reset: str = knob("stop", "when odometry has lost its map and begins again", choices=("stop", "ignore"))
     motor_fault: str = knob("stop", "when the motor controller reports a fault", choices=("stop", "ignore"))
-    battery_v: float = knob(0.0, "the wheels stop when the battery's voltage stays below, V; 0: never", low=0,
-                            high=1000)
+    battery_v: float = knob(
+        0.0, "the wheels stop when the battery's voltage stays below, V; 0: never", low=0, high=1000
+    )
 
 
 class PoseTrust:

@@ -44,8 +44,10 @@ class KeyframeGrid:
     def draw(self, keyframes: KeyframeScans, T_base_rect: Array) -> Grid:
         """Return the known part of the grid, in the axes of the base at the start of the map."""
         poses = T_base_rect @ keyframes.T_map_rect.reshape(-1, 4, 4)
-        planar = {id: (float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0]))
-                  for id, T in zip(keyframes.scans, poses, strict=True)}
+        planar = {
+            id: (float(T[0, 3]), float(T[1, 3]), math.atan2(T[1, 0], T[0, 0]))
+            for id, T in zip(keyframes.scans, poses, strict=True)
+        }
         needed = _area(keyframes, planar)
         fits = bool((needed[0] >= self._area[0]).all() and (needed[1] <= self._area[1]).all())
         if self._grid is None or not fits or any(self._has_moved(id, planar.get(id)) for id in self._drawn):
@@ -63,8 +65,10 @@ class KeyframeGrid:
         if now is None:
             return True
         x, y, yaw = self._drawn[id]
-        return (math.hypot(now[0] - x, now[1] - y) > MOVED_CELLS * self._cell_m
-                or abs(math.remainder(now[2] - yaw, 2 * math.pi)) > MOVED_RAD)
+        return (
+            math.hypot(now[0] - x, now[1] - y) > MOVED_CELLS * self._cell_m
+            or abs(math.remainder(now[2] - yaw, 2 * math.pi)) > MOVED_RAD
+        )
 
 
 def _area(keyframes: KeyframeScans, planar: Mapping[int, tuple[float, float, float]]) -> Array:

@@ -32,8 +32,7 @@ class ScanLimits(NamedTuple):
     min_points: int  # that make an obstacle
 
 
-def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float = 0.0
-               ) -> RangeScan:
+def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float = 0.0) -> RangeScan:
     """Return the scan (SECTORS,) of points (N, 3) [m] in the level frame of the base; z is the height above the floor.
 
     A range is that of the nearest obstacle, m; inf: something beyond the longest range was seen; NaN: unknown.
@@ -50,8 +49,9 @@ def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, f
     return np.where(~np.isfinite(found) & seen_beyond, np.inf, found).astype(np.float32)
 
 
-def _is_obstacle(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float
-                 ) -> NDArray[np.bool_]:
+def _is_obstacle(
+    points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float
+) -> NDArray[np.bool_]:
     """Return which of points (N, 3) are within the band of heights; the arguments are those of `point_scan`."""
     low, high = limits.heights_m
     away = points - view

@@ -18,8 +18,13 @@ class ThinnedPath(Generic[T]):
     Dropping every second vertex always halves their number, also where the robot turns at one place.
     """
 
-    def __init__(self, most: int, step_m: float, is_step: Callable[[T, T, float], bool],
-                 inherit: Callable[[T, T], T] = _unchanged) -> None:
+    def __init__(
+        self,
+        most: int,
+        step_m: float,
+        is_step: Callable[[T, T, float], bool],
+        inherit: Callable[[T, T], T] = _unchanged,
+    ) -> None:
         """most: largest number of vertices, at least 2. step_m: spacing at first.
 
         is_step(last, vertex, step_m): True if a vertex is a step away from the last one that was kept.
@@ -56,6 +61,7 @@ class ThinnedPath(Generic[T]):
         vertices, self.step_m = self.vertices, 2 * self.step_m
         self.thinned += 1
         # Each vertex takes over from the dropped one before it; a dropped last one waits for the next vertex.
-        self.vertices = vertices[:1] + [self._inherit(dropped, vertex)
-                                        for dropped, vertex in zip(vertices[1::2], vertices[2::2], strict=False)]
+        self.vertices = vertices[:1] + [
+            self._inherit(dropped, vertex) for dropped, vertex in zip(vertices[1::2], vertices[2::2], strict=False)
+        ]
         self._pending = vertices[-1] if len(vertices) % 2 == 0 else None

@@ -82,8 +82,12 @@ class VoxelMap:
         slots = np.flatnonzero(self._frames >= max(1, min_frames))  # empty slots have none
         slots = slots[np.argsort(self._keys[slots])]
         count = len(slots)
-        points = MapPoints(np.empty((count, 3), np.float32), np.empty(count, np.float32), self._frames[slots],
-                           np.empty(count, np.int32))
+        points = MapPoints(
+            np.empty((count, 3), np.float32),
+            np.empty(count, np.float32),
+            self._frames[slots],
+            np.empty(count, np.int32),
+        )
         for start in range(0, count, _BLOCK_POINTS):
             at = slice(start, start + _BLOCK_POINTS)
             self._describe(slots[at], points.xyz[at], points.confidence[at], points.age[at])

@@ -66,7 +66,7 @@ class Follower:
         s_m = self._pursuit.s_m
         pieces = [leg.at(s_m)[None, :2], leg.xy[(leg.s > s_m) & (leg.s <= s_m + way_m)]]
         left_m = leg.length_m - s_m
-        for leg in self._legs[self._number + 1:]:
+        for leg in self._legs[self._number + 1 :]:
             if left_m >= way_m:
                 break
             pieces.append(leg.xy[(leg.s > 0) & (leg.s <= way_m)])
@@ -90,8 +90,9 @@ class Follower:
             self._number += 1
             self._pursuit = Pursuit(leg, self._settings.pursuit, float(leg.s[k]))
 
-    def step(self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
-             ) -> Following:
+    def step(
+        self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
+    ) -> Following:
         """Return the motion at a pose (3,) with its measured speeds."""
         at_effect = predicted(pose, speed_mps, yaw_rate_radps, self._settings.pursuit.delay_s)
         if self._pursuit is not None:
@@ -100,21 +101,22 @@ class Follower:
                 return following
         return self._align(pose, speed_mps, yaw_rate_radps)
 
-    def _follow(self, pursuit: Pursuit, stamp_ns: int, pose: Array, speed_mps: float, obstacle_m: float
-                ) -> Following | None:
+    def _follow(
+        self, pursuit: Pursuit, stamp_ns: int, pose: Array, speed_mps: float, obstacle_m: float
+    ) -> Following | None:
         """Follow the leg; None at the end of the last one."""
         approach = pursuit.step(stamp_ns, pose, speed_mps, obstacle_m=obstacle_m)
         is_last = self._number == len(self._legs) - 1
         end_m = 0.25 * self._settings.goal_cm * 0.01 if is_last else CORNER_M
         if approach.left_m > end_m or approach.turning:
-            left_m = approach.left_m + sum(leg.length_m for leg in self._legs[self._number + 1:])
+            left_m = approach.left_m + sum(leg.length_m for leg in self._legs[self._number + 1 :])
             return Following(approach.setpoint, left_m, approach.offset_m, approach.turning)
         if is_last:
             self._pursuit = None
             return None
         self._number += 1
         self._pursuit = Pursuit(self._legs[self._number], self._settings.pursuit)
-        left_m = sum(leg.length_m for leg in self._legs[self._number:])
+        left_m = sum(leg.length_m for leg in self._legs[self._number :])
         return Following(STAND, left_m, approach.offset_m, True)
 
     def _align(self, pose: Array, speed_mps: float, yaw_rate_radps: float) -> Following:

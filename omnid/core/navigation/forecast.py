@@ -79,8 +79,9 @@ def forecast(moving: Iterable[MovingObstacle], age_s: float) -> Forecast | None:
     velocity = np.array([(each.vx_mps, each.vy_mps) for each in found])
     P = np.array([each.covariance for each in found])
     of_place, shared, of_velocity = (np.maximum(P[:, a, b], P[:, a + 1, b + 1]) for a, b in ((0, 0), (0, 2), (2, 2)))
-    variance = np.column_stack([of_place + 2 * age_s * shared + age_s**2 * of_velocity, shared + age_s * of_velocity,
-                                of_velocity])
+    variance = np.column_stack(
+        [of_place + 2 * age_s * shared + age_s**2 * of_velocity, shared + age_s * of_velocity, of_velocity]
+    )
     xy = np.array([(each.x_m, each.y_m) for each in found]) + age_s * velocity
     return Forecast(xy, velocity, np.array([each.radius_m for each in found]), variance)
 

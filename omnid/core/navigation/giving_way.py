@@ -125,10 +125,10 @@ class GivingWay:
     def _driving(self, start: int, end: int) -> Follower:
         """Return what drives from a point of the way back to another one."""
         if start < end:
-            xy, backwards = self._xy[start: end + 1], self._backwards[start: end + 1]
+            xy, backwards = self._xy[start : end + 1], self._backwards[start : end + 1]
         else:  # each point is left in the direction opposite to that in which the way back came from it
-            xy = self._xy[end: start + 1][::-1]
-            backwards = ~np.append(self._backwards[end + 1: start + 1], self._backwards[start])[::-1]
+            xy = self._xy[end : start + 1][::-1]
+            backwards = ~np.append(self._backwards[end + 1 : start + 1], self._backwards[start])[::-1]
         speeds = np.full(len(xy), BACK_MPS)
         return Follower(drive_path(xy, speeds=speeds, backwards=list(map(bool, backwards))), self._settings)
 
@@ -137,8 +137,9 @@ class GivingWay:
         return int(np.argmin(np.hypot(*(self._xy - pose[:2]).T)))
 
 
-def give_way(trail: Trail, settings: NavigationSettings, pose: Array, stamp_ns: int, obstacles: Array,
-             half_width_m: float) -> GivingWay | None:
+def give_way(
+    trail: Trail, settings: NavigationSettings, pose: Array, stamp_ns: int, obstacles: Array, half_width_m: float
+) -> GivingWay | None:
     """Return the way back from a pose (3,), up to where others can pass; None where there is none.
 
     obstacles (M, 2): in odom. half_width_m: of the room that the base needs.

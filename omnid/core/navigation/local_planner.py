@@ -95,8 +95,17 @@ class LocalPlanner:
         """Forget the detour of the last drive."""
         self._avoiding = False
 
-    def plan(self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, *, leg_left_m: float = math.inf,
-             moving: Forecast | None = None, speed_mps: float = 0.0) -> Detour:
+    def plan(
+        self,
+        pose: Array,
+        path: Array,
+        obstacles: Array,
+        wanted: Setpoint,
+        *,
+        leg_left_m: float = math.inf,
+        moving: Forecast | None = None,
+        speed_mps: float = 0.0,
+    ) -> Detour:
         """Return the motion: that of the path where it is free.
 
         pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2), with those of
@@ -106,8 +115,13 @@ class LocalPlanner:
         if moving is None or not (self._avoiding or wanted.velocity_mps > 0):
             return self._around_standing(pose, path, obstacles, wanted, leg_left_m, None)
         pursuit = self._settings.pursuit
-        pace = Pace(max(speed_mps, 0.0), pursuit.velocity_mps, pursuit.acceleration_mps2, self._moving_room_m,
-                    self._standing_room_m)
+        pace = Pace(
+            max(speed_mps, 0.0),
+            pursuit.velocity_mps,
+            pursuit.acceleration_mps2,
+            self._moving_room_m,
+            self._standing_room_m,
+        )
         share, coming = yielding(path, leg_left_m, moving, pace)
         # The base goes around those that come to where it would stand.
         outlines = moving.outlines(coming, pose[:2], SHARE * pursuit.velocity_mps)
@@ -117,8 +131,9 @@ class LocalPlanner:
             return detour
         return Detour(_slower(detour.setpoint, share * pursuit.velocity_mps) if share else None, False, CROSSES)
 
-    def _around_standing(self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, leg_left_m: float,
-                         moving: Forecast | None) -> Detour:
+    def _around_standing(
+        self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, leg_left_m: float, moving: Forecast | None
+    ) -> Detour:
         """Return the motion along the path, or around what stands on it, or up to it."""
         settings = self._settings
         offset_m = float(np.hypot(*(path[0] - pose[:2])))
@@ -148,8 +163,9 @@ class LocalPlanner:
             return Detour(None, self._avoiding, STANDS)
         return Detour(_slower(wanted, math.sqrt(2 * WAIT_MPS2 * left_m)), False)
 
-    def _around(self, pose: Array, path: Array, obstacles: Array, goal: Array, moving: Forecast | None
-                ) -> Setpoint | None:
+    def _around(
+        self, pose: Array, path: Array, obstacles: Array, goal: Array, moving: Forecast | None
+    ) -> Setpoint | None:
         """Return the best arc; None without one."""
         settings = self._settings
         corner = pose[:2] - HALF_CELLS * CELL_M
@@ -192,15 +208,19 @@ class LocalPlanner:
         cos, sin = np.cos(self._turned)[..., None], np.sin(self._turned)[..., None]
         along, aside = cos * dx + sin * dy, np.abs(cos * dy - sin * dx)
         reach = np.array([self._turning if v == 0 else self._ahead if v > 0 else self._behind for v in self._v])
-        inside = ((along < reach[:, 0, None, None] + MARGIN_M) & (along > -reach[:, 1, None, None] - MARGIN_M)
-                  & (aside < self._half_m + MARGIN_M))
+        inside = (
+            (along < reach[:, 0, None, None] + MARGIN_M)
+            & (along > -reach[:, 1, None, None] - MARGIN_M)
+            & (aside < self._half_m + MARGIN_M)
+        )
         # What is within that room already: it must not come nearer to the outline.
-        gap_m = np.hypot(np.maximum(np.maximum(along - self._turning[0], -self._turning[1] - along), 0.0),
-                         np.maximum(aside - self._width_m, 0.0))
+        gap_m = np.hypot(
+            np.maximum(np.maximum(along - self._turning[0], -self._turning[1] - along), 0.0),
+            np.maximum(aside - self._width_m, 0.0),
+        )
         nearer = (gap_m < gap_m[:, :1] - NEARER_M).any(axis=1)
         hits = np.where(inside[:, 0], nearer, inside.any(axis=1))
         return np.asarray(~hits.any(axis=1))
-
 
     def _lets_pass(self, places: Array, moving: Forecast) -> NDArray[np.bool_]:
         """Return which arcs, with their places (A, T, 2), meet none of what moves, or lead away from it."""
@@ -237,7 +257,7 @@ def _distances(points: Array, obstacles: Array) -> Array:
 def _gets_farther(room_m: Array) -> bool:
     """True if a path leads away from the obstacle that is too near at its beginning."""
     k = min(len(room_m) - 1, 6)
-    return bool((np.diff(room_m[:k + 1]) >= -1e-9).all())
+    return bool((np.diff(room_m[: k + 1]) >= -1e-9).all())
 
 
 def _rejoin(ways: Array, is_blocked: NDArray[np.bool_], first_m: float) -> int | None:
@@ -245,7 +265,7 @@ def _rejoin(ways: Array, is_blocked: NDArray[np.bool_], first_m: float) -> int |
     behind = (ways > first_m) & ~is_blocked & (ways < REJOIN_WITHIN_M)
     span = max(1, round(REJOIN_M / CELL_M))
     for k in np.flatnonzero(behind):
-        if not is_blocked[k:k + span].any() and (ways[k] - first_m >= REJOIN_M or k == len(ways) - 1):
+        if not is_blocked[k : k + span].any() and (ways[k] - first_m >= REJOIN_M or k == len(ways) - 1):
             return min(int(k) + span // 2, len(ways) - 1)
     return None
 
@@ -288,8 +308,7 @@ def _neighbours() -> _Neighbours:
 
 
 def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], weight: Array, goal: NDArray[np.intp]) -> Array | None:
-    """Return the weighted way from each free cell to the goal [m], FAR_M without one; None where the goal is not free.
-    """
+    """Return the weighted way from each free cell to the goal [m], FAR_M without one; None if the goal is not free."""
     column, row = int(goal[0]), int(goal[1])
     if not is_free[row, column]:
         return None
@@ -297,8 +316,9 @@ def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], weight: Array, g
     usable = free[edges.first] & free[edges.second]
     counts = np.bincount(edges.first[usable], minlength=free.size)
     lengths = edges.length_m[usable] * weight.ravel()[edges.first[usable]]
-    graph = csr_matrix((lengths, edges.second[usable], np.concatenate([[0], np.cumsum(counts)])),
-                       shape=(free.size, free.size))
+    graph = csr_matrix(
+        (lengths, edges.second[usable], np.concatenate([[0], np.cumsum(counts)])), shape=(free.size, free.size)
+    )
     found = dijkstra(graph, indices=row * len(is_free) + column)
     return np.asarray(np.where(np.isfinite(found), found, FAR_M).reshape(is_free.shape))
 

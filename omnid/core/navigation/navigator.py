@@ -66,13 +66,21 @@ class Navigator:
         """True if a stop is to be sent."""
         return self._stops > 0 or (self.drive is not None and bool(self.drive.paused))
 
-    def start(self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
-              ) -> None:
+    def start(
+        self, task: str, frame: NavigationFrame, paths: list[DrivePath], now: Situation, command_ns: int = 0
+    ) -> None:
         """Begin a drive, which replaces the one before."""
         self._planner.restart()
         self._trail.restart()
-        self.drive = Drive(task, frame, paths, Follower(paths[0], self._settings), now.resets, command_ns,
-                           heading_rad=float(now.pose[2]))
+        self.drive = Drive(
+            task,
+            frame,
+            paths,
+            Follower(paths[0], self._settings),
+            now.resets,
+            command_ns,
+            heading_rad=float(now.pose[2]),
+        )
         self.task, self.command_ns, self._stops = task, command_ns, 0
         self.state, self.reason = NavigationState.DRIVING, ""
 
@@ -171,8 +179,11 @@ class Navigator:
             drive.resets, drive.unlocalised_m = now.resets, math.inf
             if drive.frame is NavigationFrame.ODOM:
                 self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
-        if now.in_map is not None and now.in_map.state is MapState.LOCALIZED \
-                and now.in_map.sigma_m <= self._settings.map_sigma_m:
+        if (
+            now.in_map is not None
+            and now.in_map.state is MapState.LOCALIZED
+            and now.in_map.sigma_m <= self._settings.map_sigma_m
+        ):
             drive.unlocalised_m = 0.0
 
     def _halt(self, drive: Drive, now: Situation) -> tuple[NavigationState, str] | None:
@@ -217,8 +228,9 @@ class Navigator:
         drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
         if now.obstacles is None or not self._settings.give_way_m:
             return False
-        drive.giving_way = give_way(self._trail, self._settings, now.pose, now.stamp_ns, now.obstacles,
-                                    self._half_width_m)
+        drive.giving_way = give_way(
+            self._trail, self._settings, now.pose, now.stamp_ns, now.obstacles, self._half_width_m
+        )
         if drive.giving_way is not None:
             drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
         return drive.giving_way is not None
@@ -248,8 +260,9 @@ class Navigator:
                 return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
         # 3. To the place where it was blocked.
         elif following is not None:
-            plan = self._around_obstacles(giving.follower, giving.follower.path_ahead(PLANNED_M), now,
-                                          following.setpoint)
+            plan = self._around_obstacles(
+                giving.follower, giving.follower.path_ahead(PLANNED_M), now, following.setpoint
+            )
             if plan.setpoint is None or now.wheels.held_by:
                 giving.rest()
                 drive.nearest_m = math.inf
@@ -274,8 +287,15 @@ class Navigator:
         """Return the motion, by way of a detour where the path (N, 2) in odom is blocked."""
         if now.obstacles is None:
             return Detour(setpoint, False)
-        return self._planner.plan(now.pose, path, now.obstacles, setpoint, moving=now.moving,
-                                  leg_left_m=follower.leg_left_m, speed_mps=now.speed_mps)
+        return self._planner.plan(
+            now.pose,
+            path,
+            now.obstacles,
+            setpoint,
+            moving=now.moving,
+            leg_left_m=follower.leg_left_m,
+            speed_mps=now.speed_mps,
+        )
 
     def _in_odom(self, setpoint: Setpoint, drive: Drive, now: Situation) -> Setpoint:
         if setpoint.heading_rad is None:

@@ -98,8 +98,13 @@ class DrivePath:
         return np.asarray(self.legs[-1].xy[-1])
 
 
-def drive_path(points: ArrayLike, final_heading_rad: float | None = None, *, speeds: ArrayLike | None = None,
-               backwards: Sequence[bool] | None = None) -> DrivePath:
+def drive_path(
+    points: ArrayLike,
+    final_heading_rad: float | None = None,
+    *,
+    speeds: ArrayLike | None = None,
+    backwards: Sequence[bool] | None = None,
+) -> DrivePath:
     """Return the path through points (N, 2) [m], in legs that end at corners and where the direction changes.
 
     speeds: (N,) highest speeds, m/s. backwards: of N points, True where the base came there with its back ahead.
@@ -119,14 +124,15 @@ def drive_path(points: ArrayLike, final_heading_rad: float | None = None, *, spe
     if len(given) < 2:
         raise OmnidError(f"a path is shorter than {SHORTEST_M:g} m")
     ends = [0, *_corners(given, back), len(given) - 1]
-    legs = tuple(_leg(given[a:b + 1], limits[a:b + 1], bool(back[b])) for a, b in itertools.pairwise(ends))
+    legs = tuple(_leg(given[a : b + 1], limits[a : b + 1], bool(back[b])) for a, b in itertools.pairwise(ends))
     return DrivePath(legs, None if final_heading_rad is None else wrap_angle(final_heading_rad))
 
 
 def straight_leg(start: ArrayLike, goal: ArrayLike, *, backwards: bool = False) -> PathLeg:
     """Return the straight way between two positions (2,), however near they are."""
-    return _leg(np.array([np.asarray(start, np.float64)[:2], np.asarray(goal, np.float64)[:2]]),
-                np.full(2, math.inf), backwards)
+    return _leg(
+        np.array([np.asarray(start, np.float64)[:2], np.asarray(goal, np.float64)[:2]]), np.full(2, math.inf), backwards
+    )
 
 
 def _spaced(xy: Array, back: NDArray[np.bool_]) -> list[int]:

@@ -48,8 +48,9 @@ class Pursuit:
         self._speed_mps = 0.0
         self._last_ns: int | None = None
 
-    def step(self, stamp_ns: int, pose: Array, speed_mps: float, *, obstacle_m: float = math.inf,
-             stops_at_end: bool = True) -> Approach:
+    def step(
+        self, stamp_ns: int, pose: Array, speed_mps: float, *, obstacle_m: float = math.inf, stops_at_end: bool = True
+    ) -> Approach:
         """Return the motion at a pose x, y, yaw (3,).
 
         speed_mps: measured, forwards. obstacle_m: from the outline of the base to the nearest obstacle.

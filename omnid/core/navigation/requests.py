@@ -116,8 +116,10 @@ def navigation_verb(text: str) -> NavigationVerb:
 def route_name(text: str) -> str:
     """Return a name that is one, so that it can be a part of a file name. Raise OmnidError for any other text."""
     if not _NAME.fullmatch(text):
-        raise OmnidError(f"{_shown(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "
-                         f"digit first, at most {LONGEST_NAME}")
+        raise OmnidError(
+            f"{_shown(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "
+            f"digit first, at most {LONGEST_NAME}"
+        )
     return text
 
 

@@ -92,8 +92,13 @@ class Route:
         """Return the route from its end to its start; the base turns round and drives it the same way ahead."""
         half_turn = np.array([0.0, 0.0, math.pi])
         speeds = np.concatenate([self.speeds[1:], self.speeds[-1:]])[::-1]  # a speed belongs to the step before it
-        return replace(self, poses=composed(self.poses[::-1], half_turn), speeds=speeds,
-                       keyframes=self.keyframes[::-1], in_keyframe=composed(self.in_keyframe[::-1], half_turn))
+        return replace(
+            self,
+            poses=composed(self.poses[::-1], half_turn),
+            speeds=speeds,
+            keyframes=self.keyframes[::-1],
+            in_keyframe=composed(self.in_keyframe[::-1], half_turn),
+        )
 
 
 class RouteRecorder:
@@ -129,18 +134,29 @@ class RouteRecorder:
         Raise OmnidError for one that is too short.
         """
         if self.length_m < SHORTEST_ROUTE_M:
-            raise OmnidError(f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
-                             "and more: drive it, then finish")
+            raise OmnidError(
+                f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
+                "and more: drive it, then finish"
+            )
         poses, speeds, keyframes, in_keyframe = zip(*self._to_its_end(), strict=True)
         stamps = dict(noted)
         for id in set(keyframes):
             found = keyframe(id) if id != NO_KEYFRAME else None
             if found is not None:
                 stamps[id] = found.stamp_ns
-        route = Route(self.name, np.array(poses), np.array(speeds).round(DECIMALS), np.array(keyframes, np.int64),
-                      np.array(in_keyframe), stamps, created_s, map_name)
-        return replace(route, poses=route.in_map(keyframe).round(DECIMALS),
-                       in_keyframe=route.in_keyframe.round(DECIMALS))
+        route = Route(
+            self.name,
+            np.array(poses),
+            np.array(speeds).round(DECIMALS),
+            np.array(keyframes, np.int64),
+            np.array(in_keyframe),
+            stamps,
+            created_s,
+            map_name,
+        )
+        return replace(
+            route, poses=route.in_map(keyframe).round(DECIMALS), in_keyframe=route.in_keyframe.round(DECIMALS)
+        )
 
     def _to_its_end(self) -> list[tuple[Array, float, int, Array]]:
         """Return the points; the last one is where the recording ends, however near to that before it."""
@@ -154,8 +170,9 @@ class RouteRecorder:
         return [*self._points, (pose, math.copysign(speed_mps, step[0]), keyframe, in_keyframe)]
 
 
-def repeated_paths(route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool,
-                   from_start: bool = False) -> list[DrivePath]:
+def repeated_paths(
+    route: Route, keyframe: FarKeyframe, pose: Array, *, loops: int, reverse: bool, from_start: bool = False
+) -> list[DrivePath]:
     """Return the paths that repeat a route from the nearest point on it to a pose (3,) of the base in the map.
 
     A closed route is driven in rounds, any other there and back, `loops` times in all. from_start: the whole route.
@@ -180,8 +197,10 @@ def _entry(poses: Array, pose: Array) -> int:
     cost = away_m + ENTRY_M_PER_RAD * np.abs(wrapped(poses[:, 2] - pose[2]))
     near = away_m <= ENTRY_M
     if not near.any():
-        raise OmnidError(f"the robot is {away_m.min():.1f} m away from the route: drive it there, to within "
-                         f"{ENTRY_M:g} m, anywhere on it")
+        raise OmnidError(
+            f"the robot is {away_m.min():.1f} m away from the route: drive it there, to within "
+            f"{ENTRY_M:g} m, anywhere on it"
+        )
     if math.dist(poses[0, :2], poses[-1, :2]) <= CLOSED_M:
         way_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         before_end = near & (way_m < way_m[-1] - CLOSED_M)
@@ -193,8 +212,10 @@ def _start(poses: Array, pose: Array) -> int:
     """Return the first point of a route. Raise OmnidError where the robot is not near it."""
     away_m = math.dist(poses[0, :2], pose[:2])
     if away_m > ENTRY_M:
-        raise OmnidError(f"the robot is {away_m:.1f} m away from the start of the route: drive it there, to within "
-                         f"{ENTRY_M:g} m, or begin where it is on the route (from=here)")
+        raise OmnidError(
+            f"the robot is {away_m:.1f} m away from the start of the route: drive it there, to within "
+            f"{ENTRY_M:g} m, or begin where it is on the route (from=here)"
+        )
     return 0
 
 
@@ -204,8 +225,11 @@ def _joined(poses: Array, speeds: Array, first: int, pose: Array) -> int:
     if away_m <= BESIDE_M:
         return first
     ways_m = np.cumsum(np.hypot(*np.diff(poses[first:, :2], axis=0).T))
-    goes_on = ((ways_m <= JOIN * away_m) & (np.abs(wrapped(poses[first + 1:, 2] - poses[first, 2])) < CORNER_RAD)
-               & (speeds[first + 1:] * speeds[first] > 0))
+    goes_on = (
+        (ways_m <= JOIN * away_m)
+        & (np.abs(wrapped(poses[first + 1 :, 2] - poses[first, 2])) < CORNER_RAD)
+        & (speeds[first + 1 :] * speeds[first] > 0)
+    )
     return first + int(np.argmin(np.append(goes_on, False)))
 
 

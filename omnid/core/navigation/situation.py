@@ -83,9 +83,13 @@ def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:
     """Return why the pose in the map cannot be used, with the remedy; empty if it can."""
     in_map = situation.in_map
     if in_map is None or in_map.state is not MapState.LOCALIZED:
-        return ("not localised in a map: start it with one (`omnid run --map`) and drive it a little where the map "
-                "was made, or use the frame odom")
+        return (
+            "not localised in a map: start it with one (`omnid run --map`) and drive it a little where the map "
+            "was made, or use the frame odom"
+        )
     if not in_map.sigma_m <= map_sigma_m:
-        return (f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than navigation.map_sigma_m = "
-                f"{map_sigma_m:g}: drive it a little where the map was made")
+        return (
+            f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than navigation.map_sigma_m = "
+            f"{map_sigma_m:g}: drive it a little where the map was made"
+        )
     return ""

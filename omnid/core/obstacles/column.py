@@ -87,15 +87,23 @@ def floor_plane(T_rect_floor: Array) -> FloorPlane:
 class Columns:
     """Computes the evidence of pairs; tables are computed once for a plane of the floor."""
 
-    def __init__(self, cylinder: Cylinder, baseline_m: float, plane: FloorPlane, heights_m: tuple[float, float],
-                 ranges_m: tuple[float, float], visible: Flags) -> None:
+    def __init__(
+        self,
+        cylinder: Cylinder,
+        baseline_m: float,
+        plane: FloorPlane,
+        heights_m: tuple[float, float],
+        ranges_m: tuple[float, float],
+        visible: Flags,
+    ) -> None:
         """heights_m: of surfaces over the floor: lower ones are floor, higher ones are passed below. ranges_m: nearest
         and farthest; visible (H, W): pixels of a panorama that both cameras see."""
         self._baseline_m, self._plane, self._heights_m = baseline_m, plane, heights_m
         self._floor_slope = baseline_m / plane.height_m
         # A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others nothing is seen.
-        self._shown = (np.arange(DIRECTIONS * cylinder.width // cylinder.turn_px)
-                       + DIRECTIONS * cylinder.first // cylinder.turn_px) % DIRECTIONS
+        self._shown = (
+            np.arange(DIRECTIONS * cylinder.width // cylinder.turn_px) + DIRECTIONS * cylinder.first // cylinder.turn_px
+        ) % DIRECTIONS
         self._height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
         self._row0 = (cylinder.row0 + 0.5) * self._height / cylinder.height - 0.5
         self.at_1m = FOCAL_PX * baseline_m  # disparity
@@ -104,7 +112,7 @@ class Columns:
         self._visible = self._working(visible * np.uint8(255)) > 127
         in_view = self._visible[:, self._shown].mean(axis=1)
         self._first_row, self._last_row = (int(row) for row in np.flatnonzero(in_view > 0.5)[[0, -1]])
-        self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)):].any(axis=0)))
+        self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
         self._warps = self._made_warps()
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         rows = np.arange(self._height)
@@ -128,11 +136,32 @@ class Columns:
         # 2. Likelihoods.
         scale = np.float32(DIFFERENCE_RATIO / UNITS)
         others = np.empty((self.bins, DIRECTIONS), np.float32)
-        kernels.floor_evidence(one, upright, plane, mask, self._floor_bins, OUTLIER, scale,
-                                np.float32(NEAR_SHARE) * scale, self._prior, others)
+        kernels.floor_evidence(
+            one,
+            upright,
+            plane,
+            mask,
+            self._floor_bins,
+            OUTLIER,
+            scale,
+            np.float32(NEAR_SHARE) * scale,
+            self._prior,
+            others,
+        )
         surface = np.empty((self.bins, DIRECTIONS), np.float32)
-        kernels.surface_evidence(one, upright, plane, mask, self._strips, OUTLIER, scale, np.float32(FLOOR_WEIGHT),
-                                 np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR), surface)
+        kernels.surface_evidence(
+            one,
+            upright,
+            plane,
+            mask,
+            self._strips,
+            OUTLIER,
+            scale,
+            np.float32(FLOOR_WEIGHT),
+            np.float32(STRIP_BOUND),
+            np.float32(STRIP_PRIOR),
+            surface,
+        )
         # A surface fits a little at the disparities beside its own.
         peak = np.ones_like(surface, bool)
         peak[1:] &= surface[1:] >= surface[:-1]
@@ -140,8 +169,17 @@ class Columns:
         surface[~peak] = 0.0
         floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
         level = np.empty((2, self.bins, DIRECTIONS), np.float32)
-        kernels.level_evidence(one, two, self._plane_rows, mask, self._floor_bins, self._offsets, OUTLIER,
-                               np.float32(LEVEL_RATIO / 64 / UNITS), level)
+        kernels.level_evidence(
+            one,
+            two,
+            self._plane_rows,
+            mask,
+            self._floor_bins,
+            self._offsets,
+            OUTLIER,
+            np.float32(LEVEL_RATIO / 64 / UNITS),
+            level,
+        )
         floor[~self._tested] = np.nan
         floor[:, self._unseen] = np.nan
         return ColumnEvidence(floor, surface, level, self.nearest_floor_m)
@@ -167,8 +205,9 @@ class Columns:
         return np.asarray(np.clip(found, 0, 255), np.uint8)
 
     def _warped(self, image: Bytes, number: int) -> Bytes:
-        return np.asarray(cv2.remap(image, *self._warps[number], cv2.INTER_LINEAR,
-                                    borderMode=cv2.BORDER_REPLICATE), np.uint8)
+        return np.asarray(
+            cv2.remap(image, *self._warps[number], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
+        )
 
     def _made_warps(self) -> list[tuple[NDArray[np.int16], NDArray[np.uint16]]]:
         """Return the maps to a panorama in which the floor's horizon is level, and from that to the floor's plane."""
@@ -192,8 +231,15 @@ class Columns:
             if first < 0 or end + self._floor_slope * (end - self._row0) > self._last_row:
                 continue
             begin, last = max(0, k - OTHERS_PX[0]), min(self.bins, self._last_row - end, k + OTHERS_PX[1])
-            table[k] = (first, end, begin, math.floor(middle - FLOOR_PX), math.ceil(middle + FLOOR_PX), last,
-                        self.at_1m / (k + 0.5) < NEAR_M)
+            table[k] = (
+                first,
+                end,
+                begin,
+                math.floor(middle - FLOOR_PX),
+                math.ceil(middle + FLOOR_PX),
+                last,
+                self.at_1m / (k + 0.5) < NEAR_M,
+            )
         return table
 
     def _made_offsets(self) -> Floats:

@@ -40,8 +40,9 @@ def add_differences(lower: Bytes, least: Bytes, most: Bytes, live: Bytes, outlie
 
 
 @inner
-def add_between(lower: Bytes, first: Bytes, second: Bytes, share: np.uint16, live: Bytes, outlier: np.uint8,
-                sums: Words) -> None:
+def add_between(
+    lower: Bytes, first: Bytes, second: Bytes, share: np.uint16, live: Bytes, outlier: np.uint8, sums: Words
+) -> None:
     """Add to sums (W,) by how much a row differs from a place between two others; share: of the second one, of 256."""
     rest = np.uint16(np.uint16(256) - share)
     for u in range(len(sums)):
@@ -90,8 +91,17 @@ def lower_to(values: Words, into: Words) -> None:
 
 
 @inner
-def add_run(before: Floats, mine: Floats, after: Floats, total: Floats, blank: np.float32, bound: np.float32,
-            prior: np.float32, run: Floats, best: Floats) -> None:
+def add_run(
+    before: Floats,
+    mine: Floats,
+    after: Floats,
+    total: Floats,
+    blank: np.float32,
+    bound: np.float32,
+    prior: np.float32,
+    run: Floats,
+    best: Floats,
+) -> None:
     """Go on with the maximum-sum runs (W,) by a strip (Kadane), and raise `best` to them.
 
     before, mine, after: likelihoods of three neighbouring disparities; total: of all of them. The logarithm is taken as
@@ -114,10 +124,21 @@ def add_run(before: Floats, mine: Floats, after: Floats, total: Floats, blank: n
         best[u] = value if value > best[u] else best[u]
 
 
-@compiled("(u1[:, ::1], u1[:, ::1], f4[::1], u1[:, ::1], i4[:, ::1], f4[:, :, ::1], u1, f4, f4[:, :, ::1])",
-          writes=("ratios",))
-def level_evidence(lower: Bytes, upper: Bytes, plane: Floats, live: Bytes, bins: Numbers, offsets: Floats,
-                   outlier: np.uint8, scale: np.float32, ratios: Floats) -> None:
+@compiled(
+    "(u1[:, ::1], u1[:, ::1], f4[::1], u1[:, ::1], i4[:, ::1], f4[:, :, ::1], u1, f4, f4[:, :, ::1])",
+    writes=("ratios",),
+)
+def level_evidence(
+    lower: Bytes,
+    upper: Bytes,
+    plane: Floats,
+    live: Bytes,
+    bins: Numbers,
+    offsets: Floats,
+    outlier: np.uint8,
+    scale: np.float32,
+    ratios: Floats,
+) -> None:
     """Write the log-likelihood ratios (2, K, W) of the floor to the best level patch above it, and to one below it.
 
     lower, upper (H, W): normalised panoramas; plane (H,): row of the upper one that shows the floor of a row. live,
@@ -151,10 +172,22 @@ def level_evidence(lower: Bytes, upper: Bytes, plane: Floats, live: Bytes, bins:
                 ratios[kind, k, u] = scale * (np.float32(best[kind + 1, u]) - np.float32(best[0, u]))
 
 
-@compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4[::1], f4[:, ::1])",
-          writes=("others",))
-def floor_evidence(lower: Bytes, upright: Bytes, plane: Bytes, live: Bytes, bins: Numbers, outlier: np.uint8,
-                   scale: np.float32, near_scale: np.float32, prior: Floats, others: Floats) -> None:
+@compiled(
+    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4[::1], f4[:, ::1])",
+    writes=("others",),
+)
+def floor_evidence(
+    lower: Bytes,
+    upright: Bytes,
+    plane: Bytes,
+    live: Bytes,
+    bins: Numbers,
+    outlier: np.uint8,
+    scale: np.float32,
+    near_scale: np.float32,
+    prior: Floats,
+    others: Floats,
+) -> None:
     """Write the mean likelihood (K, W) of all disparities but the floor's, by that of the floor.
 
     lower (H, W): normalised lower panorama; upright, plane (2, H, W): least and most of the upper one about each pixel,
@@ -197,11 +230,23 @@ def floor_evidence(lower: Bytes, upright: Bytes, plane: Bytes, live: Bytes, bins
         others[k] /= weights
 
 
-@compiled("(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4[:, ::1])",
-          writes=("surface",))
-def surface_evidence(lower: Bytes, upright: Bytes, plane: Bytes, live: Bytes, strips: Numbers, outlier: np.uint8,
-                     scale: np.float32, floor_weight: np.float32, bound: np.float32, prior: np.float32, surface: Floats
-                     ) -> None:
+@compiled(
+    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4[:, ::1])",
+    writes=("surface",),
+)
+def surface_evidence(
+    lower: Bytes,
+    upright: Bytes,
+    plane: Bytes,
+    live: Bytes,
+    strips: Numbers,
+    outlier: np.uint8,
+    scale: np.float32,
+    floor_weight: np.float32,
+    bound: np.float32,
+    prior: np.float32,
+    surface: Floats,
+) -> None:
     """Write the best run (K, W) of strips of rows that are a surface at a disparity, as a log-likelihood ratio.
 
     Images as for floor_evidence. strips (N, 5), from above: first row and end; first disparity that is a surface within

@@ -171,8 +171,17 @@ class ObstacleGrid:
         cells = np.empty((len(PRIOR), 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
         floor, level = np.full_like(evidence.floor, np.nan), np.zeros_like(evidence.level)
         floor[END_BINS:], level[:, END_BINS:] = evidence.floor[:-END_BINS], evidence.level[:, :-END_BINS]
-        kernels.gather(floor, evidence.surface, level, np.array([x, y, c / norm, s / norm]), self._at_1m, CELL_M,
-                       VIEW_CELLS * CELL_M, THIN_M, cells)
+        kernels.gather(
+            floor,
+            evidence.surface,
+            level,
+            np.array([x, y, c / norm, s / norm]),
+            self._at_1m,
+            CELL_M,
+            VIEW_CELLS * CELL_M,
+            THIN_M,
+            cells,
+        )
         return cells
 
     def _weight(self, stamp_ns: int, place_m: Array) -> np.float32:
@@ -252,9 +261,22 @@ class ObstacleGrid:
     def _ring(self, T_odom_base: Array, place: Array) -> GridRing:
         """Return the ring about a place (2,) [cells] of the square."""
         hit, free = np.empty(SECTORS), np.empty(SECTORS)
-        kernels.march(self.state(), np.array([*place, CELL_M / 2, self._max_range_m, CELL_M, self._gap_share,
-                                              CELL_M + self._gap_share * self._nearest_m]),
-                      self._azimuths + float(se3.yaw(T_odom_base)), hit, free)
+        kernels.march(
+            self.state(),
+            np.array(
+                [
+                    *place,
+                    CELL_M / 2,
+                    self._max_range_m,
+                    CELL_M,
+                    self._gap_share,
+                    CELL_M + self._gap_share * self._nearest_m,
+                ]
+            ),
+            self._azimuths + float(se3.yaw(T_odom_base)),
+            hit,
+            free,
+        )
         # A direction between cells may belong to either side.
         free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
         is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)

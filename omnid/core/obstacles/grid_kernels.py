@@ -15,8 +15,17 @@ Bytes = NDArray[np.uint8]
 
 
 @compiled("(f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
-def gather(floor: Floats, surface: Floats, level: Floats, origin: Doubles, at_1m: float, cell_m: float, reach_m: float,
-           thin_m: float, cells: Floats) -> None:
+def gather(
+    floor: Floats,
+    surface: Floats,
+    level: Floats,
+    origin: Doubles,
+    at_1m: float,
+    cell_m: float,
+    reach_m: float,
+    thin_m: float,
+    cells: Floats,
+) -> None:
     """Write the evidence (4, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
     floor against planes above and below it; a surface that stands anywhere in it.
 

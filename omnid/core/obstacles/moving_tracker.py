@@ -102,8 +102,9 @@ class MovingTracker:
         self._rings.clear()
         self._tracks.clear()
 
-    def update(self, stamp_ns: int, T_odom_base: Array, ranges_m: RangeScan, sigma_m: RangeScan
-               ) -> tuple[MovingObstacle, ...]:
+    def update(
+        self, stamp_ns: int, T_odom_base: Array, ranges_m: RangeScan, sigma_m: RangeScan
+    ) -> tuple[MovingObstacle, ...]:
         """Return the moving obstacles after a pair, of which the ring's ranges and their sigmas are given."""
         for track in self._tracks:
             track.predict(stamp_ns)

@@ -60,5 +60,8 @@ def without(ring: GridRing, unwatched: Flags) -> GridRing:
     if not unwatched.any():
         return ring
     nan = np.float32(np.nan)
-    return GridRing(np.where(unwatched, nan, ring.ranges_m), np.where(unwatched, nan, ring.sigma_m),
-                    np.where(unwatched, np.float32(0), ring.free_m))
+    return GridRing(
+        np.where(unwatched, nan, ring.ranges_m),
+        np.where(unwatched, nan, ring.sigma_m),
+        np.where(unwatched, np.float32(0), ring.free_m),
+    )

@@ -30,8 +30,11 @@ class Bridge:
     def carries(self, sensed: SensedMotion, dt_s: float) -> bool:
         """True if the pose may go on by a sensed step of dt_s, within the limits of time and uncertainty."""
         limits = self._limits
-        return (sensed.is_complete and self._time_s + dt_s <= limits.bridge_s
-                and self._variance_m2 + self._largest_m2(self._growth(sensed)) <= limits.bridge_sigma_m**2)
+        return (
+            sensed.is_complete
+            and self._time_s + dt_s <= limits.bridge_s
+            and self._variance_m2 + self._largest_m2(self._growth(sensed)) <= limits.bridge_sigma_m**2
+        )
 
     def step(self, sensed: SensedMotion, dt_s: float) -> Array:
         """Take a step; return the covariance (6, 6) that it adds to the pose, in the axes of the frame."""

@@ -64,8 +64,15 @@ def clear_around(usable: Flags, points: Array, radius_px: int) -> Flags:
     return free.astype(bool)
 
 
-def pixels_in_upper(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, guess: Array, klt: KltSettings,
-                    spread_px: Array | float = 0.0, *, checked: bool = True) -> Array:
+def pixels_in_upper(
+    pair: tuple[PaddedPanorama, PaddedPanorama],
+    points: Array,
+    guess: Array,
+    klt: KltSettings,
+    spread_px: Array | float = 0.0,
+    *,
+    checked: bool = True,
+) -> Array:
     """Return pixels (N, 2) in the upper panorama of points (N, 2) of the lower one; NaN without a match.
 
     guess (N, 2) pixels. A match passes the forward-backward check, if checked, and lies in the guessed column within

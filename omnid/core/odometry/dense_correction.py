@@ -54,8 +54,12 @@ class DenseCorrection:
         coarse = np.nan_to_num(both).astype(np.float32).reshape(len(rows), len(columns), 5, 2)
         whole = (len(columns) * GRID_PX, len(rows) * GRID_PX)
         fields = [_resized(coarse[:, :, k], whole)[: shape[0], : shape[1]] for k in range(5)]
-        return DenseCorrection((fields[0], fields[1], fields[2]), fields[3], fields[4],
-                               exposure.model.cylinder.width == exposure.model.cylinder.turn_px)
+        return DenseCorrection(
+            (fields[0], fields[1], fields[2]),
+            fields[3],
+            fields[4],
+            exposure.model.cylinder.width == exposure.model.cylinder.turn_px,
+        )
 
     def column_shift(self, pad_px: int) -> ColumnShift:
         """Return the shift of the upper column for padded panoramas."""

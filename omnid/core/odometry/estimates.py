@@ -42,8 +42,14 @@ class PoseEstimate:
     @property
     def without_landmarks(self) -> PoseEstimate:
         """The pose alone, where its landmarks are no longer in the map."""
-        return replace(self, landmarks=self.landmarks[:0], views=self.views[:0], pixels=self.pixels[:0],
-                       variance=self.variance[:0], assumed=NOTHING_ASSUMED)
+        return replace(
+            self,
+            landmarks=self.landmarks[:0],
+            views=self.views[:0],
+            pixels=self.pixels[:0],
+            variance=self.variance[:0],
+            assumed=NOTHING_ASSUMED,
+        )
 
     @property
     def inlier_ratio(self) -> float:
@@ -101,4 +107,3 @@ class GapStep:
 def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
     """Return the estimate with more inliers, the first one of two equal ones."""
     return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
-

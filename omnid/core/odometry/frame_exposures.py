@@ -41,8 +41,16 @@ class RequestAtPose(Protocol):
 class FrameExposures:
     """Exposures of frames by the velocity of a motion model."""
 
-    def __init__(self, motion: MotionModel, model: StereoModel, *, max_gap_s: float, local_map: LocalMap,
-                 keyframes: Keyframes, frame_to_map: FrameToMap) -> None:
+    def __init__(
+        self,
+        motion: MotionModel,
+        model: StereoModel,
+        *,
+        max_gap_s: float,
+        local_map: LocalMap,
+        keyframes: Keyframes,
+        frame_to_map: FrameToMap,
+    ) -> None:
         """max_gap_s: a longer step shows no velocity."""
         self._motion, self._model, self._max_gap_s = motion, model, max_gap_s
         self._map, self._keyframes, self._frame_to_map = local_map, keyframes, frame_to_map
@@ -56,8 +64,9 @@ class FrameExposures:
         """Return the exposure of a frame by the velocity that the filter has now."""
         return Exposure.of(frame.times, self._motion.now(), self._model)
 
-    def refine(self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure, T_odom_prev: Array, dt_s: float
-               ) -> PoseEstimate | None:
+    def refine(
+        self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure, T_odom_prev: Array, dt_s: float
+    ) -> PoseEstimate | None:
         """Refine a pose; where the velocity matters, once more with that which the pose implies.
 
         T_odom_prev (4, 4): pose dt_s [s] before. A sudden motion implies no velocity.
@@ -76,8 +85,16 @@ class FrameExposures:
         """Note that a frame started the map; where its velocity matters, the map starts again with the next pose."""
         self._first = None if frame.times.is_at_once else frame
 
-    def start_again(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, dt_s: float, *,
-                    request: RequestAtPose, tracked: int) -> PoseEstimate:
+    def start_again(
+        self,
+        frame: StereoFrame,
+        usable: Flags,
+        estimate: PoseEstimate,
+        dt_s: float,
+        *,
+        request: RequestAtPose,
+        tracked: int,
+    ) -> PoseEstimate:
         """Start the map again at its first frame, if its velocity was not known; return the pose of the second frame.
 
         estimate: of the second frame, dt_s [s] after the last accepted pose. tracked: landmarks tracked at most.

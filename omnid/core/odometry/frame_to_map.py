@@ -63,8 +63,9 @@ class FrameToMap:
         self._coarse_model = replace(model, sigma_px=COARSE_SIGMA_PX)
         self._stereo_klt = replace(klt, levels=0)  # the predicted disparity is good to a few pixels
 
-    def estimate(self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure
-                 ) -> CoarsePose | None:
+    def estimate(
+        self, frame: StereoFrame, tracks: Tracks, T_odom_guess: Array, exposure: Exposure
+    ) -> CoarsePose | None:
         """Return the pose that most tracks support, None where fewer than MIN_LANDMARKS do.
 
         RANSAC on three points (Dang et al. 2012, section IV.B), then Gauss-Newton on the bearings in both cameras, in
@@ -82,8 +83,15 @@ class FrameToMap:
         T_curr_guess, is_inlier = ransac(in_guess, views, self._model, np.random.default_rng(frame.seq))
         landmarks = tracks.landmarks[is_inlier]
         noise = shift.noise(exposure.motion)[is_inlier]
-        solution, kept = self._solve(landmarks, views[is_inlier], T_curr_guess @ T_guess_odom, self._coarse_model,
-                                     noise, SharedError.none(len(landmarks)), converged=COARSE_CONVERGED)
+        solution, kept = self._solve(
+            landmarks,
+            views[is_inlier],
+            T_curr_guess @ T_guess_odom,
+            self._coarse_model,
+            noise,
+            SharedError.none(len(landmarks)),
+            converged=COARSE_CONVERGED,
+        )
         if solution is None:
             return None
         chosen = np.flatnonzero(is_inlier)[kept]
@@ -132,10 +140,21 @@ class FrameToMap:
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
         rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
         visible, tracked, supporting = (
-            round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks)))
-        return PoseEstimate(se3.inverse(solution.T), scale * solution.covariance, visible, tracked,
-                            min(supporting, len(landmarks)), landmarks, views, pixels, variance[kept], rejected,
-                            assumed)
+            round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks))
+        )
+        return PoseEstimate(
+            se3.inverse(solution.T),
+            scale * solution.covariance,
+            visible,
+            tracked,
+            min(supporting, len(landmarks)),
+            landmarks,
+            views,
+            pixels,
+            variance[kept],
+            rejected,
+            assumed,
+        )
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.
@@ -157,8 +176,9 @@ class FrameToMap:
                 break
         return best
 
-    def _views(self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift, spread_px: Array
-               ) -> tuple[Array, Array]:
+    def _views(
+        self, frame: StereoFrame, tracks: Tracks, slopes: Array, shift: ViewShift, spread_px: Array
+    ) -> tuple[Array, Array]:
         """Return the views (M, 3) [px] of tracks: pixels, and the rows in the upper panorama where they match there.
 
         slopes (M, 2) of their disparities; spread_px: standard deviations (M,) of the columns there, twice. Also
@@ -174,8 +194,14 @@ class FrameToMap:
         return np.column_stack([tracks.pixels, rows]), variance
 
     def _solve(
-        self, landmarks: Indices, views: Array, T_curr_odom: Array, model: StereoModel, noise: Array,
-        shared: SharedError, converged: float = CONVERGED,
+        self,
+        landmarks: Indices,
+        views: Array,
+        T_curr_odom: Array,
+        model: StereoModel,
+        noise: Array,
+        shared: SharedError,
+        converged: float = CONVERGED,
     ) -> tuple[GaussNewtonResult | None, Flags]:
         """Return the solution of Gauss-Newton in rounds, and flags (M,) of the inliers; None where they are too few."""
         kept = np.ones(len(landmarks), bool)
@@ -184,8 +210,17 @@ class FrameToMap:
             if kept.sum() < MIN_LANDMARKS:
                 return None, kept
             rows, table = landmarks[kept], self._map.store.table
-            solution = gauss_newton(table.points[rows], table.covariance[rows], views[kept], T_curr_odom, model,
-                                    noise[kept], steps, shared.of(kept), converged)
+            solution = gauss_newton(
+                table.points[rows],
+                table.covariance[rows],
+                views[kept],
+                T_curr_odom,
+                model,
+                noise[kept],
+                steps,
+                shared.of(kept),
+                converged,
+            )
             T_curr_odom = solution.T
             squared = np.full(len(landmarks), np.inf)
             squared[kept] = solution.squared

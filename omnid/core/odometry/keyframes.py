@@ -43,8 +43,15 @@ class KeyframeRequest:
 class Keyframes:
     """Decides whether the local map needs a keyframe, and adds it."""
 
-    def __init__(self, local_map: LocalMap, model: StereoModel, klt: KltSettings, limits: OdometryLimits,
-                 relocaliser: KeyframeLocaliser, features: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        local_map: LocalMap,
+        model: StereoModel,
+        klt: KltSettings,
+        limits: OdometryLimits,
+        relocaliser: KeyframeLocaliser,
+        features: Callable[[], float],
+    ) -> None:
         """features: called for each keyframe, the share of limits.features that it is to have. klt: from the lower
         panorama to the upper one.
         """

@@ -17,12 +17,25 @@ CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one
 OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 
 
-@compiled("(i8[:], f8[:], f8[:], i8[:], f8[:, :, ::1], f8[:, :, ::1], UniTuple(f8, 5), f8, "
-          "f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])",
-          writes=("points", "covariance", "in_odom", "covariance_in_odom"))
-def update_depths(rows: Indices, disparity: Array, variance: Array, keyframe: Indices, T_curr_keyframe: Array,
-                  T_odom_keyframe: Array, camera: CameraNumbers, sigma_px: float, points: Array, covariance: Array,
-                  in_odom: Array, covariance_in_odom: Array) -> None:
+@compiled(
+    "(i8[:], f8[:], f8[:], i8[:], f8[:, :, ::1], f8[:, :, ::1], UniTuple(f8, 5), f8, "
+    "f8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8[:, :, ::1])",
+    writes=("points", "covariance", "in_odom", "covariance_in_odom"),
+)
+def update_depths(
+    rows: Indices,
+    disparity: Array,
+    variance: Array,
+    keyframe: Indices,
+    T_curr_keyframe: Array,
+    T_odom_keyframe: Array,
+    camera: CameraNumbers,
+    sigma_px: float,
+    points: Array,
+    covariance: Array,
+    in_odom: Array,
+    covariance_in_odom: Array,
+) -> None:
     """Correct the landmarks' points and covariances by disparities: see `LandmarkStore.update_depths`.
 
     keyframe (M,): index of the anchor of each of the rows into the transforms (K, 4, 4). points (N, 3) and covariance
@@ -57,8 +70,9 @@ def update_depths(rows: Indices, disparity: Array, variance: Array, keyframe: In
 
 
 @compiled("(f8[:, ::1], f8[:, :, ::1], f8[:, :], f8[:, ::1], f8[:, :, ::1])", writes=("in_odom", "covariance_in_odom"))
-def place_all(points: Array, covariance: Array, T_odom_keyframe: Array, in_odom: Array, covariance_in_odom: Array
-              ) -> None:
+def place_all(
+    points: Array, covariance: Array, T_odom_keyframe: Array, in_odom: Array, covariance_in_odom: Array
+) -> None:
     """Write points (N, 3) [m] and covariances (N, 3, 3) [m^2] of a keyframe's rectified frame in odom."""
     for n in range(len(points)):
         place(points[n], covariance[n], T_odom_keyframe, in_odom[n], covariance_in_odom[n])

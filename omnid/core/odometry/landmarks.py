@@ -101,8 +101,9 @@ class LandmarkStore:
     def __len__(self) -> int:
         return len(self.table.id)
 
-    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None,
-                     pixels: Array | None = None) -> Indices:
+    def add_keyframe(
+        self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
+    ) -> Indices:
         """Add a keyframe with new landmarks; return their ids (N,), -1 for views that cannot be triangulated.
 
         They are observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
@@ -114,14 +115,29 @@ class LandmarkStore:
         finite = np.isfinite(points).all(axis=1)
         pixels = (views[:, :2] if pixels is None else pixels)[finite]
         views, slopes, points = views[finite], slopes[finite], points[finite]
-        covariance = point_covariance(points, self._model.cylinder, self._model.baseline_m, self._model.sigma_px,
-                                      None if noise is None else noise[finite])
+        covariance = point_covariance(
+            points,
+            self._model.cylinder,
+            self._model.baseline_m,
+            self._model.sigma_px,
+            None if noise is None else noise[finite],
+        )
         count = len(points)
         ids = np.arange(self._next_id, self._next_id + count)
         self._next_id += count
         in_odom = _in_odom(keyframe, points, covariance)
-        new = LandmarkTable(ids, np.full(count, keyframe.seq), points, covariance, views, pixels, slopes, *in_odom,
-                            pixels=pixels, misses=np.zeros(count, np.intp))
+        new = LandmarkTable(
+            ids,
+            np.full(count, keyframe.seq),
+            points,
+            covariance,
+            views,
+            pixels,
+            slopes,
+            *in_odom,
+            pixels=pixels,
+            misses=np.zeros(count, np.intp),
+        )
         self.keyframes[keyframe.seq] = keyframe
         self.table = _joined(self.table, new)
         self._observe(ids, keyframe.seq, views)
@@ -154,7 +170,8 @@ class LandmarkStore:
         for seq in np.unique(before.anchor[rows]).tolist():
             own = rows[before.anchor[rows] == seq]
             found.points[own], found.covariance[own] = _in_odom(
-                self.keyframes[seq], found.anchor_points[own], found.anchor_covariance[own])
+                self.keyframes[seq], found.anchor_points[own], found.anchor_covariance[own]
+            )
         self.table = found
 
     def add_observations(self, seq: int, ids: Indices, views: Array) -> None:
@@ -186,12 +203,30 @@ class LandmarkStore:
         errors of one texture are alike from frame to frame, so each counts as several times as uncertain.
         """
         before, (T_odom_keyframe, keyframe) = self.table, self._anchors(rows)
-        corrected = (before.anchor_points.copy(), before.anchor_covariance.copy(), before.points.copy(),
-                     before.covariance.copy())
-        landmark_kernels.update_depths(rows, disparity, variance, keyframe, se3.inverse(T_odom_rect) @ T_odom_keyframe,
-                                       T_odom_keyframe, self._model.camera, self._model.sigma_px, *corrected)
-        self.table = replace(before, anchor_points=corrected[0], anchor_covariance=corrected[1], points=corrected[2],
-                             covariance=corrected[3])
+        corrected = (
+            before.anchor_points.copy(),
+            before.anchor_covariance.copy(),
+            before.points.copy(),
+            before.covariance.copy(),
+        )
+        landmark_kernels.update_depths(
+            rows,
+            disparity,
+            variance,
+            keyframe,
+            se3.inverse(T_odom_rect) @ T_odom_keyframe,
+            T_odom_keyframe,
+            self._model.camera,
+            self._model.sigma_px,
+            *corrected,
+        )
+        self.table = replace(
+            before,
+            anchor_points=corrected[0],
+            anchor_covariance=corrected[1],
+            points=corrected[2],
+            covariance=corrected[3],
+        )
 
     def update_tracked(self, rows: Indices, pixels: Array) -> None:
         """Record the inliers (rows of the table) of an accepted frame with their pixels (M, 2).

@@ -28,11 +28,19 @@ class OdometryLimits:
     max_speed_mps: float = knob(5.0, "poses that imply a higher speed are refused, m/s", low=0.1, high=100)
     lost_after: int = knob(3, "consecutive refused frames after which the state is lost", low=1, high=1000)
     restart_after: int = knob(
-        10, "frames with enough corners that match no landmark, after which the map is started again", low=1,
+        10,
+        "frames with enough corners that match no landmark, after which the map is started again",
+        low=1,
         high=10_000,
     )
     max_gap_s: float = knob(0.5, "a pose after a longer time without frames is degraded, s", low=0.01, high=60)
-    bridge_s: float = knob(10.0, "longest time for which wheels and gyro carry the pose on while the cameras show "
-                           "nothing, as degraded; 0: never, s", low=0, high=600)
-    bridge_sigma_m: float = knob(0.15, "uncertainty of the position that ends that, standard deviation, m", low=0.001,
-                                 high=10)
+    bridge_s: float = knob(
+        10.0,
+        "longest time for which wheels and gyro carry the pose on while the cameras show "
+        "nothing, as degraded; 0: never, s",
+        low=0,
+        high=600,
+    )
+    bridge_sigma_m: float = knob(
+        0.15, "uncertainty of the position that ends that, standard deviation, m", low=0.001, high=10
+    )

@@ -58,8 +58,9 @@ class LocalMap:
         self.late_depths.clear()
         self._last = None
 
-    def add_keyframe(self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None,
-                     pixels: Array | None = None) -> Indices:
+    def add_keyframe(
+        self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
+    ) -> Indices:
         """Add a keyframe at the last panorama with new landmarks: see LandmarkStore.add_keyframe."""
         self._last = keyframe.lower
         return self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
@@ -69,8 +70,9 @@ class LocalMap:
         self.store.update_tracked(landmarks, pixels)
         self._last = lower
 
-    def track(self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0,
-              near: bool = False) -> Tracks:
+    def track(
+        self, lower: PaddedPanorama, T_odom_rect: Array, most: int | None = None, *, turn: int = 0, near: bool = False
+    ) -> Tracks:
         """Track landmarks of the last panorama into a new one, from the pixels that a guessed pose predicts.
 
         most: only about so many, evenly chosen; None: all. With another turn, others are chosen. near: the guess is
@@ -105,8 +107,7 @@ class LocalMap:
         rows = np.flatnonzero(is_inside)
         return rows, predicted[rows]
 
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, shift: Array
-              ) -> AlignedPatches:
+    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, shift: Array) -> AlignedPatches:
         """Align the keyframes' patches of landmarks (M,) with a panorama whose pose is known well.
 
         A patch is found where it has texture and moved little from its prediction. shift: see ViewShift.lower.
@@ -119,8 +120,9 @@ class LocalMap:
         T_curr_ref = self.store.from_anchors(T_rect_odom, landmarks)
         surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
         images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
-        templates = plane_templates(images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model,
-                                    predicted)
+        templates = plane_templates(
+            images, anchors, table.anchor_pixels[landmarks], surfaces, T_curr_ref, self._model, predicted
+        )
         return align(templates, lower, predicted, anchors, REACH_PX)
 
     def slopes(self, T_odom_rect: Array, landmarks: Indices) -> Array:

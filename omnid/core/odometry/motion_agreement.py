@@ -189,8 +189,9 @@ class MotionAgreement:
         is_long = self._late_since_s is not None and now_s - self._late_since_s >= LATE_S
         return Witness(reason, found.text, bool(is_long or found.excess >= 1.0))
 
-    def _finding(self, span_s: tuple[Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
-                 ) -> _Finding:
+    def _finding(
+        self, span_s: tuple[Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
+    ) -> _Finding:
         """Compare the motion seen (N,) in steps with that of a sensor. limits: noise of a step, least sum, unit."""
         noise, least, unit = limits
         by_lag = travel.between(span_s[0] - self._lags_s[:, None], span_s[1] - self._lags_s[:, None])
@@ -212,8 +213,11 @@ class MotionAgreement:
         length = float(path[min(count, len(path)) - 1])
         difference = abs(float((moved[:count] - seen[:count]).sum()))
         is_whole = count <= len(path) or span_s[1][-1] - span_s[0][0] >= WINDOW_S - LEAST_STEPS * EVERY_S
-        limit = max(SCALE_SHARE * (length if is_whole else WINDOW_M), least) if unit == "m" else max(
-            SCALE_SHARE * length, least)
+        limit = (
+            max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
+            if unit == "m"
+            else max(SCALE_SHARE * length, least)
+        )
         steps_s = span_s[1][known] - span_s[0][known]
         limit += LAG_SIGMA_S * float((np.abs(seen[::-1]) / np.maximum(steps_s, LEAST_SAMPLE_S)).max())
         if unit == "m":

@@ -63,8 +63,9 @@ class MotionModel:
         """Return the velocity at the end of a step with its covariance (6, 6)."""
         return self._exposures.after(T_prev_curr, covariance, dt_s)
 
-    def accept(self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool
-               ) -> RigVelocity | None:
+    def accept(
+        self, T_prev_curr: Array, covariance: Array, dt_s: float, *, exposed_at_once: bool
+    ) -> RigVelocity | None:
         """Update the filter with the step that the cameras found (eq. 11); after a sudden one begin from standstill.
 
         Returns the velocity at the pair before the step, where the steps around it tell it.

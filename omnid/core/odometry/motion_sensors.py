@@ -122,8 +122,13 @@ class MotionSensors:
             distance, turn = wheels[0]
             twist[0], slopes[0, DISTANCE] = self.values[DISTANCE] * distance, distance
             rough = math.sqrt(self._noise_factors[DISTANCE])
-            sigma[:5] = (rough * math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
-                         math.hypot(SIDE_SHARE * distance, SIDE_M), HEIGHT_M, TILT_RAD, TILT_RAD)
+            sigma[:5] = (
+                rough * math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
+                math.hypot(SIDE_SHARE * distance, SIDE_M),
+                HEIGHT_M,
+                TILT_RAD,
+                TILT_RAD,
+            )
             if math.isfinite(turn):
                 twist[5], slopes[5, TURN] = self.values[TURN] * turn, turn
                 sigma[5] = math.sqrt(self._noise_factors[TURN]) * math.hypot(TURN_SHARE * turn, WHEEL_RAD)
@@ -171,8 +176,10 @@ class MotionSensors:
     def _learn_wheels(self, wheels: tuple[Array, Array], seen: Array, variance: Array) -> None:
         """Learn scales and offset of the wheels from the cameras' twist (6,) with variances (6,)."""
         agree = True
-        rows = ((DISTANCE, seen[0], variance[0], DISTANCE_SHARE, WHEEL_M),
-                (TURN, seen[5], variance[5], TURN_SHARE, WHEEL_RAD))
+        rows = (
+            (DISTANCE, seen[0], variance[0], DISTANCE_SHARE, WHEEL_M),
+            (TURN, seen[5], variance[5], TURN_SHARE, WHEEL_RAD),
+        )
         for number, (state, truth, noise, share, least) in enumerate(rows):
             amount, change = wheels[0][number], wheels[1][number]
             if not math.isfinite(amount):

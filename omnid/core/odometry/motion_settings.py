@@ -15,16 +15,29 @@ from omnid.settings import knob
 class MotionSensorSettings:
     """Wheels and gyro beside the cameras. Scales, bias and offsets of their clocks are estimated on the way."""
 
-    wheels: str = knob("auto", "speeds of the wheels: those that the motor controller reports, of the bus (cmd/"
-                       "wheel_odom) or of the log", choices=("auto", "off"))
+    wheels: str = knob(
+        "auto",
+        "speeds of the wheels: those that the motor controller reports, of the bus (cmd/wheel_odom) or of the log",
+        choices=("auto", "off"),
+    )
     imu: str = knob("auto", "gyro: that of imu_port, of the bus (cmd/imu) or of the log", choices=("auto", "off"))
     imu_port: str = knob("", "serial port of an IMU of WitMotion (WT61, WT901 ...), by a persistent name; empty: none")
-    imu_baud: int = knob(9600, "its baud rate; 9600 carries 10 measurements a second: set it to 115200 and 100 Hz with "
-                         "its maker's program", low=1200, high=4_000_000)
-    wheel_topic: str = knob("", "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
-                            "name contains 'wheel'. With left_joint: of JointState; empty: the only one")
-    left_joint: str = knob("", "name of the left wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, "
-                           "which then stands for the Odometry of the wheels; empty: none")
+    imu_baud: int = knob(
+        9600,
+        "its baud rate; 9600 carries 10 measurements a second: set it to 115200 and 100 Hz with its maker's program",
+        low=1200,
+        high=4_000_000,
+    )
+    wheel_topic: str = knob(
+        "",
+        "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
+        "name contains 'wheel'. With left_joint: of JointState; empty: the only one",
+    )
+    left_joint: str = knob(
+        "",
+        "name of the left wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, "
+        "which then stands for the Odometry of the wheels; empty: none",
+    )
     right_joint: str = knob("", "name of the right one; radius and track are those of motor.drive")
     imu_topic: str = knob("", "topic of a log with sensor_msgs/msg/Imu; empty: the only one")
     imu_roll_deg: float = knob(0.0, "orientation of the IMU on the base: roll about x, deg", low=-360, high=360)

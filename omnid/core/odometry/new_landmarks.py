@@ -37,8 +37,9 @@ class NewLandmarks:
         return np.asarray(self.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
 
 
-def located(frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure
-            ) -> NewLandmarks:
+def located(
+    frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure
+) -> NewLandmarks:
     """Return those of the corners (N, 2) of the lower panorama that are found in the upper one as well.
 
     They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.

@@ -49,8 +49,14 @@ COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked 
 class VisualOdometry:
     """Estimate the pose of the rectified frame; odom is the rectified frame of the first pair."""
 
-    def __init__(self, model: StereoModel, klt: KltSettings, limits: OdometryLimits,
-                 relocaliser: KeyframeLocaliser, features: Callable[[], float] = lambda: 1.0) -> None:
+    def __init__(
+        self,
+        model: StereoModel,
+        klt: KltSettings,
+        limits: OdometryLimits,
+        relocaliser: KeyframeLocaliser,
+        features: Callable[[], float] = lambda: 1.0,
+    ) -> None:
         """features: called for each keyframe, the share of limits.features that it is to have."""
         self._limits, self._model = limits, model
         self._map = LocalMap(model, klt, limits.keyframes)
@@ -66,8 +72,14 @@ class VisualOdometry:
         self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
         self._requested: KeyframeRequest | None = None  # by the last frame, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
-        self._exposures = FrameExposures(self._motion, model, max_gap_s=limits.max_gap_s, local_map=self._map,
-                                         keyframes=self._keyframes, frame_to_map=self._frame_to_map)
+        self._exposures = FrameExposures(
+            self._motion,
+            model,
+            max_gap_s=limits.max_gap_s,
+            local_map=self._map,
+            keyframes=self._keyframes,
+            frame_to_map=self._frame_to_map,
+        )
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
@@ -105,8 +117,9 @@ class VisualOdometry:
             return replace(refused, refused_mps=too_fast_mps)
         self._resets += gap.is_turned  # odom has another heading than it was published with
 
-        estimate = self._exposures.start_again(frame, usable, estimate, dt_s, request=self._request,
-                                               tracked=self._tracked())
+        estimate = self._exposures.start_again(
+            frame, usable, estimate, dt_s, request=self._request, tracked=self._tracked()
+        )
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s)
@@ -159,8 +172,7 @@ class VisualOdometry:
         yield T_predicted, True
         yield T_predicted, False
         assert self._previous is not None
-        peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable,
-                                  turn_px=frame.lower.period_px)
+        peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable, turn_px=frame.lower.period_px)
         T_unturned = self._T_odom_rect.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
         yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
@@ -205,8 +217,9 @@ class VisualOdometry:
         at_previous: RigVelocity | None = None
         if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            at_previous = self._motion.accept(T_prev_curr, estimate.covariance, dt_s,
-                                              exposed_at_once=frame.times.is_at_once)
+            at_previous = self._motion.accept(
+                T_prev_curr, estimate.covariance, dt_s, exposed_at_once=frame.times.is_at_once
+            )
             if estimate.inliers >= self._limits.good_inliers:
                 self._step = T_prev_curr, estimate.covariance
         elif frame.sensed is None:
@@ -218,15 +231,23 @@ class VisualOdometry:
         self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
-    def _refuse(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *,
-                elsewhere: GapStep | None) -> OdometryEstimate:
+    def _refuse(
+        self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, elsewhere: GapStep | None
+    ) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
         elsewhere: the frame was recognised so far from the predicted pose; None: it was not recognised elsewhere.
         """
         carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and elsewhere is None
-        self._advance(FrameFacts(FrameOutcome.REFUSED, dt_s, textured=self._is_textured(frame, usable),
-                                 elsewhere=elsewhere is not None, carried=carried))
+        self._advance(
+            FrameFacts(
+                FrameOutcome.REFUSED,
+                dt_s,
+                textured=self._is_textured(frame, usable),
+                elsewhere=elsewhere is not None,
+                carried=carried,
+            )
+        )
         if not self._status.restart:
             return self._result(0, 0, exposure=self._exposures.now(frame))
         self._map.clear()
@@ -238,8 +259,9 @@ class VisualOdometry:
             self._motion.reset()
             self._resets += 1
         known = elsewhere is not None
-        return self._start_map(frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known,
-                                                         carried=carried))
+        return self._start_map(
+            frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known, carried=carried)
+        )
 
     def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
         """Start a map where there is none, after the motion that wheels and gyro know of."""
@@ -279,8 +301,9 @@ class VisualOdometry:
         if after_s > before_s and not facts.carried:
             self._covariance = self._covariance + UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2) * np.eye(6)
 
-    def _update_map(self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure
-                    ) -> KeyframeRequest | None:
+    def _update_map(
+        self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure
+    ) -> KeyframeRequest | None:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
         store = self._map.store
         ids = store.table.id[estimate.landmarks]
@@ -310,8 +333,9 @@ class VisualOdometry:
             total = total + share * A @ keyframes[seq].covariance @ A.T
         return total
 
-    def _result(self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
-                ) -> OdometryEstimate:
+    def _result(
+        self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None
+    ) -> OdometryEstimate:
         return OdometryEstimate(
             self._T_odom_rect,
             self._covariance,

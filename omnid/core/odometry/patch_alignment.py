@@ -40,8 +40,9 @@ class AlignedPatches:
         return AlignedPatches(predicted + fit.shift, fit.covariance, fit.fits)
 
 
-def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
-          ) -> AlignedPatches:
+def align(
+    templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
+) -> AlignedPatches:
     """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
 
     groups (N,): patches that come from one image have one number. reach_px: a patch that has to move so far was
@@ -51,8 +52,9 @@ def align(templates: Image, current: PaddedPanorama, predicted: Array, groups: I
     return AlignedPatches.of(fit_patches(templates, cells, groups, current.noise_grey), predicted)
 
 
-def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near: Array, slopes: Array,
-               model: StereoModel) -> tuple[Array, Array]:
+def align_rows(
+    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near: Array, slopes: Array, model: StereoModel
+) -> tuple[Array, Array]:
     """Align patches of the lower panorama at points (N, 2) with the upper one near pixels (N, 2), NaN where unknown.
 
     slopes (N, 2) of the disparity. Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by
@@ -62,8 +64,9 @@ def align_rows(pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near:
     pixels, predicted = points[known], near[known]
     in_space = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
     one, still = np.zeros(len(known), np.intp), np.tile(np.eye(4), (len(known), 1, 1))
-    templates = plane_templates({0: pair[0]}, one, pixels, (in_space, slopes[known]), still, model, predicted,
-                                upper=True)
+    templates = plane_templates(
+        {0: pair[0]}, one, pixels, (in_space, slopes[known]), still, model, predicted, upper=True
+    )
     found = align(templates, pair[1], predicted, one)
     fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < CROSS_PX)
     aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))

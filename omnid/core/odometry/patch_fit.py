@@ -49,6 +49,13 @@ def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: flo
     """
     count = len(templates)
     found = PatchFit(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
-    patch_kernels.fit(np.ascontiguousarray(templates), np.ascontiguousarray(cells), groups, noise_grey, found.shift,
-                      found.covariance, found.fits)
+    patch_kernels.fit(
+        np.ascontiguousarray(templates),
+        np.ascontiguousarray(cells),
+        groups,
+        noise_grey,
+        found.shift,
+        found.covariance,
+        found.fits,
+    )
     return found

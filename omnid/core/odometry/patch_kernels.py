@@ -32,10 +32,13 @@ SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)  # of Scharr
 LANES = 16
 
 
-@compiled("(u1[:, :, ::1], u1[:, :, ::1], i8[:], f8, f8[:, ::1], f8[:, :, ::1], b1[::1])",
-          writes=("shift", "covariance", "fits"))
-def fit(templates: Image, cells: Image, groups: Indices, noise_grey: float, shift: Array, covariance: Array,
-        fits: Flags) -> None:
+@compiled(
+    "(u1[:, :, ::1], u1[:, :, ::1], i8[:], f8, f8[:, ::1], f8[:, :, ::1], b1[::1])",
+    writes=("shift", "covariance", "fits"),
+)
+def fit(
+    templates: Image, cells: Image, groups: Indices, noise_grey: float, shift: Array, covariance: Array, fits: Flags
+) -> None:
     """Write shift (N, 2), covariance (N, 2, 2) and fits (N,) of `patch_fit.fit_patches`."""
     count, reach = len(templates), (cells.shape[1] - WINDOW_PX) // 2
     designs = np.empty((count, 3, WINDOW_PX, LANES), np.float32)
@@ -196,8 +199,18 @@ def invert(normal: Array, prior: float, inverse: Array) -> None:
 
 
 @inner
-def solve(design: Floats, cell: Floats, lanes: Floats, reach: int, sums: Array, normal: Array, inverse: Array,
-          of_gain: float, shift: Array, solution: Array) -> float:
+def solve(
+    design: Floats,
+    cell: Floats,
+    lanes: Floats,
+    reach: int,
+    sums: Array,
+    normal: Array,
+    inverse: Array,
+    of_gain: float,
+    shift: Array,
+    solution: Array,
+) -> float:
     """Iterate shift (2,) and solution (3,) until they converge or leave the reach; return the mean squared residual.
 
     lanes (9, LANES): room for sums.

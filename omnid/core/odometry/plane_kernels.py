@@ -27,10 +27,23 @@ LARGEST_GREY = np.float32(255.0)  # because images have 8 bits
 INNER_CUBE, INNER_SQUARE = np.float32(1.5), np.float32(2.5)  # of the inner part of the cubic kernel (Keys 1981)
 
 
-@compiled("(u1[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8, f8, f8[:, ::1], "
-          "u1[:, :, ::1])", writes=("templates",))
-def sample(image: Image, chosen: Indices, centres: Array, points: Array, slopes: Array, T_curr_ref: Array,
-           baseline_m: float, height_m: float, focal_px: float, shift: Array, templates: Image) -> None:
+@compiled(
+    "(u1[:, ::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, :, ::1], f8, f8, f8, f8[:, ::1], u1[:, :, ::1])",
+    writes=("templates",),
+)
+def sample(
+    image: Image,
+    chosen: Indices,
+    centres: Array,
+    points: Array,
+    slopes: Array,
+    T_curr_ref: Array,
+    baseline_m: float,
+    height_m: float,
+    focal_px: float,
+    shift: Array,
+    templates: Image,
+) -> None:
     """Write the templates (N, TEMPLATE, TEMPLATE) of the chosen patches, whose image this is.
 
     centres (N, 2) [px] in the image, shift (N, 2) [px] of the templates' middle pixels from the centres in the current
@@ -45,8 +58,11 @@ def sample(image: Image, chosen: Indices, centres: Array, points: Array, slopes:
     weights, first, found = np.empty((8, LANES), np.float32), np.empty(LANES, np.int32), np.empty(LANES, np.float32)
     for n in chosen:
         # A place that is NaN or absurd has no template; it would lead out of the image's memory.
-        if not (max(abs(shift[n, 0]), abs(shift[n, 1])) <= 1.0 and abs(centres[n, 0]) < FARTHEST_PX
-                and abs(centres[n, 1]) < FARTHEST_PX):
+        if not (
+            max(abs(shift[n, 0]), abs(shift[n, 1])) <= 1.0
+            and abs(centres[n, 0]) < FARTHEST_PX
+            and abs(centres[n, 1]) < FARTHEST_PX
+        ):
             for row in range(TEMPLATE_PX):
                 for column in range(TEMPLATE_PX):
                     templates[n, row, column] = 0
@@ -128,8 +144,9 @@ def write_homography(point: Array, normal: Array, T: Array, height_m: float, H: 
 
 
 @inner
-def write_sources(H: Array, own_height: float, height: float, focal_px: float, shift: Array, columns: Floats,
-                  rows: Floats) -> None:
+def write_sources(
+    H: Array, own_height: float, height: float, focal_px: float, shift: Array, columns: Floats, rows: Floats
+) -> None:
     """Write where the keyframe shows the template's pixels: offsets [px] from the patch, by column and row.
 
     The arctangent is its series: an angle of 15 degrees is exact to 1e-7 rad, and a patch is smaller than that.
@@ -188,8 +205,18 @@ def copy_around(image: Image, columns: Floats, rows: Floats, centre: Array, grey
 
 
 @inner
-def write_cubic(greys: Floats, columns: Floats, rows: Floats, x: np.float32, y: np.float32, left: int, top: int,
-                weights: Floats, first: Places, found: Floats) -> None:
+def write_cubic(
+    greys: Floats,
+    columns: Floats,
+    rows: Floats,
+    x: np.float32,
+    y: np.float32,
+    left: int,
+    top: int,
+    weights: Floats,
+    first: Places,
+    found: Floats,
+) -> None:
     """Write greys (LANES,) between pixels by cubic convolution (Keys 1981, a = -1/2).
 
     columns, rows (LANES,): offsets [px] from x, y; greys: see `copy_around`, whose first pixel is that at left, top.
@@ -199,8 +226,9 @@ def write_cubic(greys: Floats, columns: Floats, rows: Floats, x: np.float32, y: 
     for lane in range(LANES):
         column, row = x + columns[lane], y + rows[lane]
         whole_column, whole_row = np.floor(column), np.floor(row)
-        first[lane] = ((np.int32(whole_row) - np.int32(top + 1)) * np.int32(AROUND_PX)
-                       + (np.int32(whole_column) - np.int32(left + 1)))
+        first[lane] = (np.int32(whole_row) - np.int32(top + 1)) * np.int32(AROUND_PX) + (
+            np.int32(whole_column) - np.int32(left + 1)
+        )
         u, v = column - whole_column, row - whole_row
         p, q = ONE - u, ONE - v
         weights[0, lane], weights[3, lane] = -HALF * u * p * p, -HALF * p * u * u
@@ -215,8 +243,11 @@ def write_cubic(greys: Floats, columns: Floats, rows: Floats, x: np.float32, y: 
         for lane in range(LANES):
             at = np.uint64(first[lane] + k * AROUND_PX)
             found[lane] += weights[4 + k, lane] * (
-                weights[0, lane] * greys[at] + weights[1, lane] * greys[at + FIRST]
-                + weights[2, lane] * greys[at + SECOND] + weights[3, lane] * greys[at + THIRD])
+                weights[0, lane] * greys[at]
+                + weights[1, lane] * greys[at + FIRST]
+                + weights[2, lane] * greys[at + SECOND]
+                + weights[3, lane] * greys[at + THIRD]
+            )
 
 
 @inner

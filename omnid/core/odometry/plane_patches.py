@@ -33,9 +33,17 @@ SLOPE_PRIOR = 50.0  # px^2, weight of slope zero (an upright surface facing the 
 MIN_NOISE_GREY = 1.0  # of images: rounding and what the model leaves out
 
 
-def plane_templates(images: Mapping[int, PaddedPanorama], anchors: Indices, pixels: Array,
-                    surfaces: tuple[Array, Array], T_curr_ref: Array, model: StereoModel, predicted: Array, *,
-                    upper: bool = False) -> Image:
+def plane_templates(
+    images: Mapping[int, PaddedPanorama],
+    anchors: Indices,
+    pixels: Array,
+    surfaces: tuple[Array, Array],
+    T_curr_ref: Array,
+    model: StereoModel,
+    predicted: Array,
+    *,
+    upper: bool = False,
+) -> Image:
     """Return templates (N, TEMPLATE, TEMPLATE) of patches at pixels (N, 2) of images, as the current view shows them.
 
     anchors (N,): the key of the image of each. surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of
@@ -48,8 +56,19 @@ def plane_templates(images: Mapping[int, PaddedPanorama], anchors: Indices, pixe
     T_curr_ref, shift = np.ascontiguousarray(T_curr_ref), np.ascontiguousarray(np.rint(predicted) - predicted)
     height_m = model.baseline_m if upper else 0.0
     for key in np.unique(anchors).tolist():
-        plane_kernels.sample(images[key].image, np.flatnonzero(anchors == key), _padded(images[key], pixels), points,
-                             slopes, T_curr_ref, model.baseline_m, height_m, model.cylinder.focal_px, shift, templates)
+        plane_kernels.sample(
+            images[key].image,
+            np.flatnonzero(anchors == key),
+            _padded(images[key], pixels),
+            points,
+            slopes,
+            T_curr_ref,
+            model.baseline_m,
+            height_m,
+            model.cylinder.focal_px,
+            shift,
+            templates,
+        )
     return templates
 
 
@@ -83,8 +102,9 @@ def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: 
     return np.asarray(np.column_stack([yy * x - xy * y, xx * y - xy * x]) / (xx * yy - xy**2)[:, None])
 
 
-def fitted_slopes(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array, near: Array, start: Array,
-                  model: StereoModel) -> Array:
+def fitted_slopes(
+    pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array, near: Array, start: Array, model: StereoModel
+) -> Array:
     """Return slopes (N, 2) of the disparity at pixels (N, 2) of the lower panorama, seen near (N, 2) in the upper one.
 
     start (N, 2): first values, which stay where near is NaN or the fit fails. A plane makes the upper window a bent
@@ -97,8 +117,17 @@ def fitted_slopes(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array, ne
     slopes, found = start.copy(), np.empty((len(known), 2))
     heights = (model.cylinder.row0 - pixels[known, 1]) / model.cylinder.focal_px
     noise_grey = max(lower.noise_grey, MIN_NOISE_GREY)
-    slope_kernels.fit(lower.image, upper.image, _padded(lower, pixels[known]), _padded(upper, near[known]),
-                      np.ascontiguousarray(start[known]), heights, model.cylinder.focal_px, noise_grey, found)
+    slope_kernels.fit(
+        lower.image,
+        upper.image,
+        _padded(lower, pixels[known]),
+        _padded(upper, near[known]),
+        np.ascontiguousarray(start[known]),
+        heights,
+        model.cylinder.focal_px,
+        noise_grey,
+        found,
+    )
     slopes[known] = found
     return slopes
 

@@ -48,8 +48,13 @@ def rigid_fit(a: Array, b: Array) -> Array:
     return se3.transform(R, (mean_b[..., 0, :, None] - R @ mean_a[..., 0, :, None])[..., 0])
 
 
-def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Generator,
-           threshold_px: float = RANSAC_THRESHOLD_PX) -> tuple[Array, Flags]:
+def ransac(
+    landmarks: Array,
+    views: Array,
+    model: StereoModel,
+    rng: np.random.Generator,
+    threshold_px: float = RANSAC_THRESHOLD_PX,
+) -> tuple[Array, Flags]:
     """Return the motion T_curr_ref with the largest consensus set of landmarks (N, 3), and the set's flags (N,).
 
     Three of the points seen in both cameras give a hypothesis; the errors of the views [px] give its consensus set:
@@ -63,16 +68,18 @@ def ransac(landmarks: Array, views: Array, model: StereoModel, rng: np.random.Ge
     return best, consensus
 
 
-def whitening(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-              noise: Array | None = None) -> Array:
+def whitening(
+    landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel, noise: Array | None = None
+) -> Array:
     """Return W (N, 3, 3) with W S W^T = I for the covariance S of each view's error: corner and landmark noise.
 
     noise: covariance (N, 3, 3) [px^2] of the views beside sigma_px; None: none.
     A view without the upper row (NaN) gets a row of zeros there.
     """
     W = np.empty((len(landmarks), 3, 3))
-    pose_kernels.whiten(landmarks, covariance, views, T, model.camera, model.sigma_px,
-                        NO_NOISE if noise is None else noise, W)
+    pose_kernels.whiten(
+        landmarks, covariance, views, T, model.camera, model.sigma_px, NO_NOISE if noise is None else noise, W
+    )
     return W
 
 
@@ -87,9 +94,17 @@ class GaussNewtonResult:
     shared_covariance: Array  # (K, K)
 
 
-def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, model: StereoModel,
-                 noise: Array | None = None, steps: int = GAUSS_NEWTON_STEPS, shared: SharedError | None = None,
-                 converged: float = CONVERGED) -> GaussNewtonResult:
+def gauss_newton(
+    landmarks: Array,
+    covariance: Array,
+    views: Array,
+    T: Array,
+    model: StereoModel,
+    noise: Array | None = None,
+    steps: int = GAUSS_NEWTON_STEPS,
+    shared: SharedError | None = None,
+    converged: float = CONVERGED,
+) -> GaussNewtonResult:
     """Return the motion T_curr_ref (4, 4) that best explains the views (N, 3), from a start T.
 
     Minimises the sum of rho(e^T S^-1 e) over the bearings of both cameras, rho the Cauchy kernel, S the covariance of
@@ -104,6 +119,18 @@ def gauss_newton(landmarks: Array, covariance: Array, views: Array, T: Array, mo
     T, error, squared = np.array(T, order="C"), np.zeros(components), np.empty(len(views))
     spread = np.empty((6 + components, 6 + components))
     prior = np.asarray(np.linalg.inv(shared.covariance), float) if components else shared.covariance
-    pose_kernels.gauss_newton(landmarks, views, W, np.ascontiguousarray(shared.derivatives), prior, model.camera, steps,
-                              converged, T, error, spread, squared)
+    pose_kernels.gauss_newton(
+        landmarks,
+        views,
+        W,
+        np.ascontiguousarray(shared.derivatives),
+        prior,
+        model.camera,
+        steps,
+        converged,
+        T,
+        error,
+        spread,
+        squared,
+    )
     return GaussNewtonResult(T, spread[:6, :6], squared, error, spread[6:, 6:])

@@ -31,8 +31,16 @@ def robust_weight(squared: float) -> float:
 
 
 @compiled("(f8[:, :], f8[:, :, :], f8[:, :], f8[:, :], UniTuple(f8, 5), f8, f8[:, :, :], f8[:, :, ::1])", writes=("W",))
-def whiten(landmarks: Array, covariance: Array, views: Array, T: Array, camera: CameraNumbers, sigma_px: float,
-           noise: Array, W: Array) -> None:
+def whiten(
+    landmarks: Array,
+    covariance: Array,
+    views: Array,
+    T: Array,
+    camera: CameraNumbers,
+    sigma_px: float,
+    noise: Array,
+    W: Array,
+) -> None:
     """Write `pose_estimation.whitening` into W (N, 3, 3); noise (N, 3, 3), or (0, 3, 3) for none."""
     focal, _, _, baseline, _ = camera
     J, S, JR = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
@@ -64,10 +72,25 @@ def whiten(landmarks: Array, covariance: Array, views: Array, T: Array, camera: 
             W[n, 2, 0], W[n, 2, 1], W[n, 2, 2] = 0.0, 0.0, 0.0
 
 
-@compiled("(f8[:, :], f8[:, :], f8[:, :, ::1], f8[:, :, ::1], f8[:, :], UniTuple(f8, 5), i8, f8, "
-          "f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])", writes=("T", "error", "inverse", "squared"))
-def gauss_newton(landmarks: Array, views: Array, W: Array, derivatives: Array, prior: Array, camera: CameraNumbers,
-                 steps: int, converged: float, T: Array, error: Array, inverse: Array, squared: Array) -> None:
+@compiled(
+    "(f8[:, :], f8[:, :], f8[:, :, ::1], f8[:, :, ::1], f8[:, :], UniTuple(f8, 5), i8, f8, "
+    "f8[:, ::1], f8[::1], f8[:, ::1], f8[::1])",
+    writes=("T", "error", "inverse", "squared"),
+)
+def gauss_newton(
+    landmarks: Array,
+    views: Array,
+    W: Array,
+    derivatives: Array,
+    prior: Array,
+    camera: CameraNumbers,
+    steps: int,
+    converged: float,
+    T: Array,
+    error: Array,
+    inverse: Array,
+    squared: Array,
+) -> None:
     """Improve the motion T (4, 4) and the shared error (K,); see `pose_estimation.gauss_newton`.
 
     derivatives (N, 3, K) of the views by the shared error, prior (K, K) the inverse of its covariance. Also writes the
@@ -97,8 +120,19 @@ def gauss_newton(landmarks: Array, views: Array, W: Array, derivatives: Array, p
 
 
 @inner
-def accumulate(landmarks: Array, views: Array, W: Array, derivatives: Array, prior: Array, camera: CameraNumbers,
-               T: Array, error: Array, H: Array, g: Array, squared: Array) -> None:
+def accumulate(
+    landmarks: Array,
+    views: Array,
+    W: Array,
+    derivatives: Array,
+    prior: Array,
+    camera: CameraNumbers,
+    T: Array,
+    error: Array,
+    H: Array,
+    g: Array,
+    squared: Array,
+) -> None:
     """Write the normal equations H [step; change] = g, and the squared errors (N,) of the views.
 
     step: [t; r] on the left of T; change (K,): of the shared error.

@@ -28,8 +28,16 @@ _HIGH_BITS, _UNIT = np.uint64(11), 2.0**-53  # exact: the 53 high bits are a dou
 
 
 @compiled("(f8[:, :], f8[:, :], f8[:, :], UniTuple(f8, 5), f8, u8, f8[:, ::1], b1[::1])", writes=("best", "consensus"))
-def ransac(landmarks: Array, views: Array, seen: Array, camera: CameraNumbers, threshold_px: float, seed: np.uint64,
-           best: Array, consensus: Flags) -> None:
+def ransac(
+    landmarks: Array,
+    views: Array,
+    seen: Array,
+    camera: CameraNumbers,
+    threshold_px: float,
+    seed: np.uint64,
+    best: Array,
+    consensus: Flags,
+) -> None:
     """Write the best motion (4, 4) and its consensus set (N,): see `pose_estimation.ransac`.
 
     seen (N, 3): the views' points, NaN for those that cannot be triangulated.
@@ -146,8 +154,16 @@ def triangle_axes(points: Array, a: int, b: int, c: int, axes: Array) -> bool:
 
 
 @inner
-def consensus_of(landmarks: Array, views: Array, bearing: Array, camera: CameraNumbers, threshold_px: float, T: Array,
-                 agree: Flags, least: int) -> int:
+def consensus_of(
+    landmarks: Array,
+    views: Array,
+    bearing: Array,
+    camera: CameraNumbers,
+    threshold_px: float,
+    T: Array,
+    agree: Flags,
+    least: int,
+) -> int:
     """Write which views agree with a motion (N,) and return how many; -1 as soon as `least` is out of reach.
 
     The column is compared as the sine of the angle between the bearings, which needs no arctangent.
@@ -163,8 +179,12 @@ def consensus_of(landmarks: Array, views: Array, bearing: Array, camera: CameraN
         upper_error = views[n, 2] - lower - scale * baseline
         sine, cosine = bearing[n, 0] * y - bearing[n, 1] * x, bearing[n, 0] * x + bearing[n, 1] * y
         # An unknown upper row is NaN, and not larger than the threshold.
-        agree[n] = (abs(views[n, 1] - lower) < threshold_px and not abs(upper_error) >= threshold_px and cosine > 0
-                    and abs(sine) < largest_sine * r)
+        agree[n] = (
+            abs(views[n, 1] - lower) < threshold_px
+            and not abs(upper_error) >= threshold_px
+            and cosine > 0
+            and abs(sine) < largest_sine * r
+        )
         count += agree[n]
         left -= 1
         if count + left <= least:

@@ -26,7 +26,7 @@ class RateHistory:
         """Add samples at times (N,) with rates (N, size); one at a known time replaces the other."""
         times, first = np.unique(np.concatenate([times_s, self._times]), return_index=True)
         rates = np.concatenate([rates, self._rates])[first]
-        self._times, self._rates = times[-self._most:], rates[-self._most:]
+        self._times, self._rates = times[-self._most :], rates[-self._most :]
 
     def integral(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
         """Return the integral (size,) of the rates over an interval, and their change (size,) from start to end.
@@ -47,8 +47,7 @@ class RateHistory:
         return total, rates[-1] - rates[0]
 
     def largest(self, start_s: float, end_s: float, zero: Array) -> Array | None:
-        """Return the largest differences (size,) of the rates in an interval from zero (size,); None without samples.
-        """
+        """Return the largest differences (size,) of the rates in an interval from zero (size,); None if empty."""
         inner = self._rates[(self._times >= start_s) & (self._times <= end_s)] - zero
         return np.asarray(np.abs(inner).max(axis=0)) if len(inner) else None
 

@@ -27,10 +27,20 @@ MAX_SHIFT_PX = 1.5  # from where the patch was found before
 DAMPING = 1e-3  # grey^2, of the shifts: keeps patches without texture from being singular
 
 
-@compiled("(u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[:, ::1])",
-          writes=("slopes",))
-def fit(lower: Image, upper: Image, pixels: Array, near: Array, start: Array, heights: Array, focal_px: float,
-        noise_grey: float, slopes: Array) -> None:
+@compiled(
+    "(u1[:, ::1], u1[:, ::1], f8[:, ::1], f8[:, ::1], f8[:, ::1], f8[::1], f8, f8, f8[:, ::1])", writes=("slopes",)
+)
+def fit(
+    lower: Image,
+    upper: Image,
+    pixels: Array,
+    near: Array,
+    start: Array,
+    heights: Array,
+    focal_px: float,
+    noise_grey: float,
+    slopes: Array,
+) -> None:
     """Write the slopes (N, 2) of patches at pixels (N, 2) of the lower image, seen near pixels (N, 2) of the upper one.
 
     start (N, 2) stays where the fit fails; heights (N,): z / r of the pixels.
@@ -44,8 +54,17 @@ def fit(lower: Image, upper: Image, pixels: Array, near: Array, start: Array, he
             continue
         write_design(lower, column, row, design, normal)
         if normal[UNKNOWNS - 1, UNKNOWNS - 1] > PIXELS * MIN_CONTRAST**2:
-            iterate(upper, design, normal, near[n], near[n, 1] - pixels[n, 1], heights[n] * focal_px, focal_px,
-                    2 * noise_grey**2, slopes[n])
+            iterate(
+                upper,
+                design,
+                normal,
+                near[n],
+                near[n, 1] - pixels[n, 1],
+                heights[n] * focal_px,
+                focal_px,
+                2 * noise_grey**2,
+                slopes[n],
+            )
 
 
 @inner
@@ -81,8 +100,17 @@ def write_design(image: Image, column: int, row: int, design: Array, normal: Arr
 
 
 @inner
-def iterate(upper: Image, design: Array, normal: Array, near: Array, disparity: float, height_px: float,
-            focal_px: float, noise: float, slopes: Array) -> None:
+def iterate(
+    upper: Image,
+    design: Array,
+    normal: Array,
+    near: Array,
+    disparity: float,
+    height_px: float,
+    focal_px: float,
+    noise: float,
+    slopes: Array,
+) -> None:
     """Set the slopes (2,) by Gauss-Newton, unless it fails; height_px: of the patch above row0."""
     right, weighted, factor = np.empty(UNKNOWNS), np.empty(UNKNOWNS), np.empty((UNKNOWNS, UNKNOWNS))
     solution = np.empty(UNKNOWNS)
@@ -112,15 +140,26 @@ def iterate(upper: Image, design: Array, normal: Array, near: Array, disparity: 
         along, down = along + solution[2] / gain, down + solution[3] / gain
         if not (max(abs(x), abs(y)) < MAX_SHIFT_PX and max(abs(along), abs(down)) < MAX_SLOPE):
             return
-        if (max(abs(solution[2]), abs(solution[3])) < CONVERGED_SLOPE * gain
-                and max(abs(solution[0]), abs(solution[1])) < CONVERGED_PX * gain):
+        if (
+            max(abs(solution[2]), abs(solution[3])) < CONVERGED_SLOPE * gain
+            and max(abs(solution[0]), abs(solution[1])) < CONVERGED_PX * gain
+        ):
             slopes[0], slopes[1] = along, down
             return
 
 
 @inner
-def project(upper: Image, design: Array, column: float, row: float, upright: float, along: float, down: float,
-            focal_px: float, right: Array) -> float:
+def project(
+    upper: Image,
+    design: Array,
+    column: float,
+    row: float,
+    upright: float,
+    along: float,
+    down: float,
+    focal_px: float,
+    right: Array,
+) -> float:
     """Write the products (5,) of the design with the bent window about a pixel; return its energy about the mean.
 
     On a plane the disparity is linear in the row, and a sine wave of the azimuth: upright is its amplitude where the
@@ -159,5 +198,7 @@ def bilinear(image: Image, column: float, row: float) -> float:
     column, row = min(max(column, 0.0), width - 1.001), min(max(row, 0.0), height - 1.001)
     left, top = int(column), int(row)
     x, y = column - left, row - top
-    return float((1 - y) * ((1 - x) * image[top, left] + x * image[top, left + 1])
-                 + y * ((1 - x) * image[top + 1, left] + x * image[top + 1, left + 1]))
+    return float(
+        (1 - y) * ((1 - x) * image[top, left] + x * image[top, left + 1])
+        + y * ((1 - x) * image[top + 1, left] + x * image[top + 1, left + 1])
+    )

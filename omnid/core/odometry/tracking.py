@@ -59,8 +59,16 @@ def flow(
     start, target = _padded(points, a), _padded(guess, b)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, klt.iterations, CONVERGED_PX)
     there, status, _ = cv2.calcOpticalFlowPyrLK(
-        a.image, b.image, start, target, winSize=(klt.window_px, klt.window_px), maxLevel=klt.levels,
-        criteria=criteria, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=MIN_EIGENVALUE)
+        a.image,
+        b.image,
+        start,
+        target,
+        winSize=(klt.window_px, klt.window_px),
+        maxLevel=klt.levels,
+        criteria=criteria,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=MIN_EIGENVALUE,
+    )
     moved = there.reshape(-1, 2).astype(float)
     inside = (moved[:, 1] >= 0) & (moved[:, 1] <= b.image.shape[0] - 1)
     moved[:, 0], shown = b.unpadded(moved[:, 0])

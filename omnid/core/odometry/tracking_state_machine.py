@@ -1,14 +1,14 @@
 """State machine of the tracking state: all its transitions stand in one pure function.
 
-    NOT_STARTED ----------------------------------------------> LOST
-    STARTED, ACCEPTED ----------------------------------------> TRACKING
-    STARTED again after an unknown motion --------------------> DEGRADED
-    ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
-    REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
-    REFUSED from then on -------------------------------------> LOST, and the map is started again when
-                                                                restart_after textured frames matched nothing,
-                                                                or one was recognised elsewhere
-    REFUSED, carried on by wheels and gyro -------------------> DEGRADED, and the map is started again likewise
+NOT_STARTED ----------------------------------------------> LOST
+STARTED, ACCEPTED ----------------------------------------> TRACKING
+STARTED again after an unknown motion --------------------> DEGRADED
+ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
+REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
+REFUSED from then on -------------------------------------> LOST, and the map is started again when
+                                                            restart_after textured frames matched nothing,
+                                                            or one was recognised elsewhere
+REFUSED, carried on by wheels and gyro -------------------> DEGRADED, and the map is started again likewise
 """
 
 from __future__ import annotations

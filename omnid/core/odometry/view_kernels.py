@@ -44,8 +44,11 @@ def linearise(landmark: Array, seen: Array, camera: CameraNumbers, T: Array, J: 
 @inner
 def moved(T: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return the point T p."""
-    return (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3], T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
-            T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3])
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
 
 
 @inner

@@ -48,8 +48,9 @@ def fit(seen: Mapping[int, Landmark], known: Mapping[int, Landmark]) -> tuple[Ar
     """
     common = sorted(seen.keys() & known.keys())
     here, there = (np.array([marks[id].xyz_m for id in common]).reshape(-1, 3) for marks in (seen, known))
-    facing = [(seen[id], known[id]) for id in common
-              if seen[id].facing_rad is not None and known[id].facing_rad is not None]
+    facing = [
+        (seen[id], known[id]) for id in common if seen[id].facing_rad is not None and known[id].facing_rad is not None
+    ]
     a = np.concatenate([here[:, :2], np.array([_ahead(one) for one, _ in facing]).reshape(-1, 2)])
     b = np.concatenate([there[:, :2], np.array([_ahead(one) for _, one in facing]).reshape(-1, 2)])
     if len(a) < 2:

@@ -38,8 +38,10 @@ class BeamModel:
         distance_m = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * grid.cell_m
         if empty.all():
             distance_m = np.full(cells.shape, 1e3, np.float32)
-        self._log = {sigma_m: np.log(np.exp(-0.5 * (distance_m / sigma_m) ** 2) + RANDOM).astype(np.float32).ravel()
-                     for sigma_m in (SIGMA_M, COARSE_SIGMA_M)}
+        self._log = {
+            sigma_m: np.log(np.exp(-0.5 * (distance_m / sigma_m) ** 2) + RANDOM).astype(np.float32).ravel()
+            for sigma_m in (SIGMA_M, COARSE_SIGMA_M)
+        }
         self._fits = (distance_m < HIT_M).ravel()
         self._standing = np.where(cells == FREE, 0.0, NOT_FREE).ravel()
         self._free = np.argwhere(grid.cells == FREE)

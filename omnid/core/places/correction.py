@@ -64,10 +64,12 @@ class MapCorrection:
         row = {id: n for n, id in enumerate(part)}
         links = [link for link in self._places.links if link.a in row]
         self.factor = self._drift_factor(links)
-        edges = PoseEdges(np.array([(row[link.a], row[link.b]) for link in links]),
-                          np.array([link.T_a_b for link in links]),
-                          np.array([self._covariance(link) for link in links]),
-                          np.array([link.is_loop for link in links]))
+        edges = PoseEdges(
+            np.array([(row[link.a], row[link.b]) for link in links]),
+            np.array([link.T_a_b for link in links]),
+            np.array([self._covariance(link) for link in links]),
+            np.array([link.is_loop for link in links]),
+        )
         stays = np.array([id in fixed for id in part])
         result = optimise(np.array([self._places.poses[id] for id in part]), edges, stays if stays.any() else None)
         self._places.move(dict(zip(part, result.poses, strict=True)))
@@ -99,21 +101,24 @@ class MapCorrection:
 
     def _drift_factor(self, links: list[Link]) -> float:
         """Return the factor on odometry's covariance that explains the loops within one run."""
-        pairs = [(link, self._places.keyframes[link.a], self._places.keyframes[link.b])
-                 for link in links if link.is_loop]
+        pairs = [
+            (link, self._places.keyframes[link.a], self._places.keyframes[link.b]) for link in links if link.is_loop
+        ]
         pairs = [(link, a, b) for link, a, b in pairs if a.session == b.session]
         if not pairs:
             return self.factor
         T_a_b = np.array([se3.inverse(a.T_odom_rect) @ b.T_odom_rect for _, a, b in pairs])
         by_loop = np.array([link.T_a_b for link, _, _ in pairs])
-        by_odometry = relative_covariance(T_a_b, np.array([a.covariance for _, a, _ in pairs]),
-                                          np.array([b.covariance for _, _, b in pairs]))
+        by_odometry = relative_covariance(
+            T_a_b, np.array([a.covariance for _, a, _ in pairs]), np.array([b.covariance for _, _, b in pairs])
+        )
         errors, spread = se3.log(se3.inverse(by_loop) @ T_a_b), np.array([link.covariance for link, _, _ in pairs])
         by_odometry = by_odometry + LEAST_ODOMETRY
         errors, by_odometry, spread = _per_pair([(link.a, link.b) for link, _, _ in pairs], errors, by_odometry, spread)
         # The drift of the whole path, or of its newest part where that is larger: a rig may have been bent meanwhile.
-        return max(drift_factor(errors[-count:], by_odometry[-count:], spread[-count:])
-                   for count in (len(errors), RECENT))
+        return max(
+            drift_factor(errors[-count:], by_odometry[-count:], spread[-count:]) for count in (len(errors), RECENT)
+        )
 
 
 def _per_pair(pairs: Sequence[tuple[int, int]], *values: Array) -> list[Array]:

@@ -16,8 +16,13 @@ SCALE = np.float32(512.0)  # of the square roots of a descriptor's shares, so th
 LEAST_LENGTH = np.float32(1e-3)  # grey levels: guards against division by zero where a patch has no contrast
 BINS_PER_RAD = np.float32(BINS / (2 * np.pi))
 # Polynomial of the arc tangent of 0 to 1, with an error of 1e-5 rad: Abramowitz and Stegun 1964, 4.4.49.
-ATAN = (np.float32(0.9998660), np.float32(-0.3302995), np.float32(0.1801410), np.float32(-0.0851330),
-        np.float32(0.0208351))
+ATAN = (
+    np.float32(0.9998660),
+    np.float32(-0.3302995),
+    np.float32(0.1801410),
+    np.float32(-0.0851330),
+    np.float32(0.0208351),
+)
 QUARTER, HALF, FULL = np.float32(BINS / 4), np.float32(BINS / 2), np.float32(BINS)  # turns, in directions: exact
 ZERO, TINY = np.float32(0), np.float32(1e-20)  # guards against division by zero
 

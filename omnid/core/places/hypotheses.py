@@ -52,8 +52,13 @@ class Hypothesis:
 
     def link(self) -> Link:
         """Return the recognition as an edge from the recognised keyframe to the newest one of the run."""
-        found = Link(self.recognition.id, -1, self.recognition.T_place_rect, self.recognition.covariance,
-                     self.recognition.inliers)
+        found = Link(
+            self.recognition.id,
+            -1,
+            self.recognition.T_place_rect,
+            self.recognition.covariance,
+            self.recognition.inliers,
+        )
         return found.then(Link(self.keyframe, -1, self.T_keyframe_rect, self.covariance).reversed())
 
 

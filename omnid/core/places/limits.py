@@ -11,12 +11,17 @@ from omnid.settings import knob
 class PlaceLimits:
     """Distance and number of the keyframes that stay."""
 
-    keyframe_m: float = knob(0.3, "distance after which a keyframe is kept for the recognition of the place, m",
-                             low=0.05, high=10)
+    keyframe_m: float = knob(
+        0.3, "distance after which a keyframe is kept for the recognition of the place, m", low=0.05, high=10
+    )
     keyframe_deg: float = knob(15.0, "turn after which a keyframe is kept, deg", low=1, high=180)
-    rate_hz: float = knob(5.0, "keyframes a second, at most: each is searched for in the map, which takes some 30 ms",
-                          low=0.1, high=100)
+    rate_hz: float = knob(
+        5.0, "keyframes a second, at most: each is searched for in the map, which takes some 30 ms", low=0.1, high=100
+    )
     max_keyframes: int = knob(1000, "keyframes kept; more drop those that others are nearest to", low=2, high=100_000)
-    by_scan: bool = knob(False, "where no place of a saved map is recognised, localise by the shape of the room: a "
-                         "particle filter on range scans; another building of the same shape would mislead it")
+    by_scan: bool = knob(
+        False,
+        "where no place of a saved map is recognised, localise by the shape of the room: a "
+        "particle filter on range scans; another building of the same shape would mislead it",
+    )
     max_mb: float = knob(50.0, "memory of the keyframes, MB; the same", low=0.1, high=10_000)

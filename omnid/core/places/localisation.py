@@ -74,8 +74,9 @@ class MapPose:
 class MapLocaliser:
     """Holds the map, and the pose of odom in it."""
 
-    def __init__(self, model: StereoModel, limits: PlaceLimits, places: PlaceMap | None = None, *,
-                 localize_only: bool = False) -> None:
+    def __init__(
+        self, model: StereoModel, limits: PlaceLimits, places: PlaceMap | None = None, *, localize_only: bool = False
+    ) -> None:
         """places: a map to be extended; None: a new one, which begins where odom does.
 
         localize_only: the map stays as it is. The newest keyframes of the run tie odom to it, and are no places.
@@ -84,8 +85,10 @@ class MapLocaliser:
         self.places = places if places is not None else PlaceMap()
         self._fixed = frozenset(self.places.keyframes) if localize_only else frozenset()
         self._localize_only = localize_only
-        self.places.bound(len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes,
-                          round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed))
+        self.places.bound(
+            len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes,
+            round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed),
+        )
         # A map has the columns of full turns, whatever sector of them the cameras show.
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self._tags = TagRecogniser(model, self.places) if self.places.tags else None
@@ -113,8 +116,9 @@ class MapLocaliser:
             return self._pose(frame, MapState.LOST)
         if idle:
             return self._pose(frame, self._state())
-        is_keyframe = self._schedule.keyframe_is_due(self._newest, frame.stamp_ns, frame.T_odom_rect,
-                                                     has_depth=frame.is_keyframe)
+        is_keyframe = self._schedule.keyframe_is_due(
+            self._newest, frame.stamp_ns, frame.T_odom_rect, has_depth=frame.is_keyframe
+        )
         if is_keyframe or self._search_is_due(frame):
             small = thumbnail(frame.stereo.lower)
             features = describe(frame.stereo)
@@ -139,18 +143,32 @@ class MapLocaliser:
     @property
     def counts(self) -> dict[str, int]:
         """Sizes and counters, for the status."""
-        return {"keyframes": len(self.places), "map_kb": self.places.nbytes // 1000, "loops": self.places.loops,
-                "dropped": self.places.dropped, "aged": self.ageing.aged, "rejected": self.correction.rejected,
+        return (
+            {
+                "keyframes": len(self.places),
+                "map_kb": self.places.nbytes // 1000,
+                "loops": self.places.loops,
+                "dropped": self.places.dropped,
+                "aged": self.ageing.aged,
+                "rejected": self.correction.rejected,
                 "unjoined": max(0, len(self._parts) - 1),
-                "ambiguous": self.search.ambiguous, "refused": self.search.refused} | self._counts_of_tags() | (
-                    {} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous})
+                "ambiguous": self.search.ambiguous,
+                "refused": self.search.refused,
+            }
+            | self._counts_of_tags()
+            | ({} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous})
+        )
 
     def _counts_of_tags(self) -> dict[str, int]:
         if self._tags is None:
             return {}
-        return {"tags_seen": len({view.tag for view in self.places.tags.views}),
-                "tag_views": len(self.places.tags.views), "tag_views_forgotten": self.places.tags.forgotten,
-                "tags_ambiguous": self._tags.ambiguous, "tags_of_other_size": self._tags.refused}
+        return {
+            "tags_seen": len({view.tag for view in self.places.tags.views}),
+            "tag_views": len(self.places.tags.views),
+            "tag_views_forgotten": self.places.tags.forgotten,
+            "tags_ambiguous": self._tags.ambiguous,
+            "tags_of_other_size": self._tags.refused,
+        }
 
     def map(self) -> PlaceMap:
         """Return the keyframes whose poses are known relative to the oldest one: what can be saved."""
@@ -161,8 +179,14 @@ class MapLocaliser:
 
         Of a map that stays as it is, its own ones only.
         """
-        now = (self.places.next_id, len(self.places), self._parts.current, len(self._parts),
-               self.correction.optimisations, len(self.places.links))
+        now = (
+            self.places.next_id,
+            len(self.places),
+            self._parts.current,
+            len(self._parts),
+            self.correction.optimisations,
+            len(self.places.links),
+        )
         if self._scans is None or self._scans[0] != now:
             ids = sorted(self._parts.ids())
             ids = [id for id in ids if id in self._fixed] or ids
@@ -190,8 +214,9 @@ class MapLocaliser:
         """True if a recognition is to be checked, or where odom is in the map is not known."""
         is_unknown = self._recognised_at is None and bool(self._elsewhere())
         is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
-        return self._schedule.search_is_due(frame.stamp_ns, frame.T_odom_rect, is_unknown=is_unknown,
-                                            is_pending=is_pending)
+        return self._schedule.search_is_due(
+            frame.stamp_ns, frame.T_odom_rect, is_unknown=is_unknown, is_pending=is_pending
+        )
 
     def _elsewhere(self) -> list[int]:
         """Return the keyframes of other parts of the map."""
@@ -201,8 +226,9 @@ class MapLocaliser:
         """True if a keyframe holds what recognises it."""
         return len(self.places.keyframes[id].features.views) > 0
 
-    def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]
-                   ) -> Recognition | None:
+    def _recognise(
+        self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]
+    ) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
         self._schedule.begin(frame.stamp_ns, frame.T_odom_rect)
         expected = self._expected(frame)
@@ -215,8 +241,9 @@ class MapLocaliser:
         self._schedule.end(found=found is not None, could_find=len(features.views) >= MIN_MATCHES)
         return found
 
-    def _recognise_by_tag(self, recogniser: TagRecogniser, tags: list[TagPose], expected: Expected
-                          ) -> Recognition | None:
+    def _recognise_by_tag(
+        self, recogniser: TagRecogniser, tags: list[TagPose], expected: Expected
+    ) -> Recognition | None:
         """Return the place of a frame by a tag: as odometry expects it, else in the oldest other part that has it."""
         near = recogniser.recognise(tags, expected.error_m)
         if near is not None:
@@ -261,9 +288,16 @@ class MapLocaliser:
             ties = [id for id in self.places.keyframes if id not in self._fixed]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)
-        keyframe = PlaceKeyframe(self.places.next_id, self._session, frame.stamp_ns, frame.T_odom_rect,
-                                 frame.covariance, small,
-                                 frame.scan().astype(np.float16), features)
+        keyframe = PlaceKeyframe(
+            self.places.next_id,
+            self._session,
+            frame.stamp_ns,
+            frame.T_odom_rect,
+            frame.covariance,
+            small,
+            frame.scan().astype(np.float16),
+            features,
+        )
         link = None if self._newest is None else _by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._parts.add(keyframe.id)

@@ -81,8 +81,7 @@ class MapTags:
     def join(self, other: MapTags, renumbered: Callable[[int], int]) -> None:
         """Add the tags of another map, whose keyframes have got new ids."""
         self.known = other.known | self.known
-        self.add(TagView(renumbered(view.keyframe), view.tag, view.T_rect_tag, view.covariance)
-                 for view in other.views)
+        self.add(TagView(renumbered(view.keyframe), view.tag, view.T_rect_tag, view.covariance) for view in other.views)
 
     def located(self, tag: int, poses: Mapping[int, Array], among: Container[int]) -> tuple[TagEstimate, int] | None:
         """Return the pose of a tag in the map, by its views from some keyframes, and the keyframe of the best view.

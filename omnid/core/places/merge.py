@@ -62,8 +62,10 @@ def _renumbered(other: PlaceMap, places: PlaceMap) -> PlaceMap:
     first_session = 1 + max((keyframe.session for keyframe in places.keyframes.values()), default=-1)
     new = {id: places.next_id + n for n, id in enumerate(sorted(other.keyframes))}
     found = PlaceMap()
-    found.keyframes = {new[id]: replace(other.keyframes[id], id=new[id],
-                                        session=first_session + other.keyframes[id].session) for id in new}
+    found.keyframes = {
+        new[id]: replace(other.keyframes[id], id=new[id], session=first_session + other.keyframes[id].session)
+        for id in new
+    }
     found.poses = {new[id]: other.poses[id] for id in new}
     found.links = [replace(link, a=new[link.a], b=new[link.b]) for link in other.links]
     found.uses = {new[id]: use for id, use in other.uses.items()}

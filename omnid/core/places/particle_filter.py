@@ -135,8 +135,10 @@ class ParticleFilter:
         if not len(drawn):
             return None
         # The newest and the oldest scan together, as many places look alike from one pose only.
-        fit = sum(self._model.log_likelihood(self._at(drawn, odometry), scan, coarse=True)
-                  for scan, odometry in (self._scans[0], self._scans[-1]))
+        fit = sum(
+            self._model.log_likelihood(self._at(drawn, odometry), scan, coarse=True)
+            for scan, odometry in (self._scans[0], self._scans[-1])
+        )
         other, score = self._improved(drawn[np.argsort(-fit, kind="stable")[:BEST_DRAWN]], pose)
         _, best = self._improved(pose[None], None)
         return other if score > best - MARGIN else None
@@ -160,8 +162,9 @@ class ParticleFilter:
 
     def _joint(self, poses: Array) -> Array:
         """Return the log likelihoods (K,) of the last scans, if the robot stands at poses (K, 3) now."""
-        return np.asarray(sum(self._model.log_likelihood(self._at(poses, odometry), scan)
-                              for scan, odometry in self._scans))
+        return np.asarray(
+            sum(self._model.log_likelihood(self._at(poses, odometry), scan) for scan, odometry in self._scans)
+        )
 
     def _at(self, poses: Array, odometry: Array) -> Array:
         """Return the poses (K, 3) at the time of an earlier scan of robots that are now at poses (K, 3)."""

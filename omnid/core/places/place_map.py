@@ -145,8 +145,10 @@ class PlaceMap:
         if bridge is not None:
             joined = [link.reversed().then(bridge) for link in leaving if link is not bridge and link.b != bridge.b]
             loops = sorted((link for link in joined if link.is_loop), key=lambda link: float(np.trace(link.covariance)))
-            self.links += [link if link.a < link.b else link.reversed()
-                           for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])]
+            self.links += [
+                link if link.a < link.b else link.reversed()
+                for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])
+            ]
         self._move_tag_views(id, bridge)
         del self.keyframes[id], self.poses[id]
         self.uses.pop(id, None)

@@ -43,8 +43,10 @@ class PlaceRig:
             return f"a baseline of {self.baseline_m:.4f} m, not {other.baseline_m:.4f} m"
         moved = se3.log(se3.inverse(self.T_rig_rect) @ other.T_rig_rect)
         if np.linalg.norm(moved[3:]) > TURN_RAD or np.linalg.norm(moved[:3]) > SHIFT_M:
-            return (f"viewpoints that lie otherwise in the rig, by {1e3 * np.linalg.norm(moved[:3]):.0f} mm and "
-                    f"{np.degrees(np.linalg.norm(moved[3:])):.1f} degrees")
+            return (
+                f"viewpoints that lie otherwise in the rig, by {1e3 * np.linalg.norm(moved[:3]):.0f} mm and "
+                f"{np.degrees(np.linalg.norm(moved[3:])):.1f} degrees"
+            )
         return ""
 
 

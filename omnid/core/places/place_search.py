@@ -64,33 +64,47 @@ class PlaceSearch:
         self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
         self._seen: list[Recognition] = []  # by the last search, whether they count or not
 
-    def near(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
-             ) -> Recognition | None:
+    def near(
+        self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
+    ) -> Recognition | None:
         """Return the best recognition among keyframes near the expected pose that odometry does not contradict."""
         known = list(expected.error_m)
         apart_m = np.linalg.norm(places.positions(known) - expected.T_map_rect[:3, 3], axis=1)
         near = apart_m < NEAR_M + np.array(list(expected.error_m.values()))
         ids = [known[n] for n in np.flatnonzero(near).tolist()]
         enough = ENOUGH_INLIERS if expected.recognised else FEATURES + 1
-        found = [place for place in self._compare(small, features, (places, ids), NEAR_EFFORT, enough)
-                 if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS]
+        found = [
+            place
+            for place in self._compare(small, features, (places, ids), NEAR_EFFORT, enough)
+            if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS
+        ]
         best = self._unambiguous(found, places.poses)
         if best is not None and not _is_expected(best, places.poses, expected):
             self.refused += 1
             return None
         return best
 
-    def far(self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int],
-            T_map_rect: Array | None = None) -> Recognition | None:
+    def far(
+        self,
+        small: NDArray[np.int8],
+        features: PlaceFeatures,
+        places: PlaceMap,
+        ids: list[int],
+        T_map_rect: Array | None = None,
+    ) -> Recognition | None:
         """Return the best recognition among keyframes (ids) of which odometry does not know where they are.
 
         T_map_rect: the pose by other evidence, which settles which of several places that look alike it is.
         """
-        found = [place for place in self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1)
-                 if place.inliers >= FAR_INLIERS and place.sectors >= FAR_SECTORS]
+        found = [
+            place
+            for place in self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1)
+            if place.inliers >= FAR_INLIERS and place.sectors >= FAR_SECTORS
+        ]
         if T_map_rect is not None:
-            found = [place for place in found
-                     if not _is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)]
+            found = [
+                place for place in found if not _is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)
+            ]
         return self._unambiguous(found, places.poses)
 
     def expected_only(self, found: Recognition | None, places: PlaceMap, expected: Expected) -> Recognition | None:
@@ -104,8 +118,14 @@ class PlaceSearch:
         """Return the poses T_map_rect (4, 4) that the last search recognised, whether they count or not."""
         return [poses[place.id] @ place.T_place_rect for place in self._seen if place.id in poses]
 
-    def _compare(self, small: NDArray[np.int8], features: PlaceFeatures, among: tuple[PlaceMap, list[int]],
-                 effort: Effort, enough: int) -> list[Recognition]:
+    def _compare(
+        self,
+        small: NDArray[np.int8],
+        features: PlaceFeatures,
+        among: tuple[PlaceMap, list[int]],
+        effort: Effort,
+        enough: int,
+    ) -> list[Recognition]:
         """Return the recognitions among the keyframes of a map (ids); it ends at one with enough inliers."""
         places, ids = among
         self.compared, self._seen = {}, []
@@ -113,7 +133,7 @@ class PlaceSearch:
             return []
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
         similar = similarities(signature_of(small), others)
-        ids = [ids[n] for n in np.argsort(-similar, kind="stable")[:effort.voted].tolist()]
+        ids = [ids[n] for n in np.argsort(-similar, kind="stable")[: effort.voted].tolist()]
         voted = [votes(features, places.keyframes[id].features, self._model.cylinder.width) for id in ids]
         ranked = np.argsort([-count for count, _ in voted], kind="stable")
         found: list[Recognition] = []
@@ -143,8 +163,7 @@ class PlaceSearch:
             return None
         T = poses[best.id] @ best.T_place_rect
         for place in found:
-            if (_is_elsewhere(T, poses[place.id] @ place.T_place_rect)
-                    and place.inliers > RUNNER_UP * best.inliers):
+            if _is_elsewhere(T, poses[place.id] @ place.T_place_rect) and place.inliers > RUNNER_UP * best.inliers:
                 self.ambiguous += 1
                 return None
         return best
@@ -174,5 +193,4 @@ def _is_elsewhere(a: Array, b: Array) -> bool:
 def _is_expected(place: Recognition, poses: Mapping[int, Array], expected: Expected) -> bool:
     """True if a recognition is within the largest error of odometry."""
     difference = se3.inverse(expected.T_map_rect) @ poses[place.id] @ place.T_place_rect
-    return (length_m(difference) < expected.error_m[place.id]
-            and angle_rad(difference) < expected.error_rad[place.id])
+    return length_m(difference) < expected.error_m[place.id] and angle_rad(difference) < expected.error_rad[place.id]

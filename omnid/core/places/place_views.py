@@ -49,11 +49,19 @@ def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
     extent = np.ptp(xy, axis=0) if len(xy) else np.zeros(2)
     stamps = [keyframe.stamp_ns for keyframe in keyframes] or [0]
     return PlaceSummary(
-        len(keyframes), len({keyframe.session for keyframe in keyframes}),
-        sum(len(keyframe.features.views) for keyframe in keyframes), places.loops, places.dropped, len(parts(places)),
+        len(keyframes),
+        len({keyframe.session for keyframe in keyframes}),
+        sum(len(keyframe.features.views) for keyframe in keyframes),
+        places.loops,
+        places.dropped,
+        len(parts(places)),
         float(sum(np.linalg.norm(link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)),
-        (float(extent[0]), float(extent[1])), len(places.tags.known),
-        len({view.tag for view in places.tags.views}), min(stamps), max(stamps))
+        (float(extent[0]), float(extent[1])),
+        len(places.tags.known),
+        len({view.tag for view in places.tags.views}),
+        min(stamps),
+        max(stamps),
+    )
 
 
 def parts(places: PlaceMap) -> list[list[int]]:

@@ -134,8 +134,14 @@ class _Graph:
     def _factorised(self, stacked: Any) -> Any:
         """Return the factorised normal equations."""
         H = csc_matrix(stacked.T @ stacked + self._fixed)
-        return splu(H, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, relax=6, panel_size=6,  # blocks of 6 x 6
-                    options={"SymmetricMode": True})
+        return splu(
+            H,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            relax=6,
+            panel_size=6,  # blocks of 6 x 6
+            options={"SymmetricMode": True},
+        )
 
 
 def linearised(T: Array, edges: PoseEdges, W: Array) -> tuple[Array, Array]:

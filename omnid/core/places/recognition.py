@@ -47,8 +47,9 @@ class Recognition:
     by_tag: bool = False  # an AprilTag tells the place, whose corners are the inliers
 
 
-def recognise(here: PlaceFeatures, there: PlaceFeatures, id: int, turn_rad: float, model: StereoModel
-              ) -> Recognition | None:
+def recognise(
+    here: PlaceFeatures, there: PlaceFeatures, id: int, turn_rad: float, model: StereoModel
+) -> Recognition | None:
     """Return the pose of a frame among the features of a keyframe; None where they do not fit.
 
     turn_rad: about the yaw from the keyframe to the frame.

@@ -100,9 +100,7 @@ class Relocaliser:
             self._searched = 0
         return best
 
-    def _match(
-        self, here: KeyframeDescriptor, seed: int, kept: StereoFrame, keyframe: Keyframe
-    ) -> PoseEstimate | None:
+    def _match(self, here: KeyframeDescriptor, seed: int, kept: StereoFrame, keyframe: Keyframe) -> PoseEstimate | None:
         """Return the pose relative to one keyframe, with the complete covariance; None where it is not recognised."""
         if kept.seq not in self._descriptors:
             self._descriptors[kept.seq] = _describe(kept, self._model)

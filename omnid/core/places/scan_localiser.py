@@ -53,8 +53,9 @@ class ScanLocaliser:
         """Return the pose (4, 4) in the map of a frame after the last scan; None while the filter has not converged."""
         return None if self._found is None else np.asarray(self._found.T_map_odom @ T_odom_rect)
 
-    def process(self, T_odom_rect: Array, scan: Callable[[], RangeScan], proposed: Sequence[Array] = ()
-                ) -> ScanPose | None:
+    def process(
+        self, T_odom_rect: Array, scan: Callable[[], RangeScan], proposed: Sequence[Array] = ()
+    ) -> ScanPose | None:
         """Return the pose of odom; None while the filter has not converged. scan is called where it is compared.
 
         proposed: poses T_map_rect (4, 4), at which the filter begins.

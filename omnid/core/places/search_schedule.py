@@ -40,16 +40,18 @@ class SearchSchedule:
         self._searched: tuple[int, Array] | None = None  # stamp and T_odom_rect of the last search
         self._failed = 0  # searches of this part of the map that found nothing
 
-    def keyframe_is_due(self, newest: PlaceKeyframe | None, stamp_ns: int, T_odom_rect: Array, *, has_depth: bool
-                        ) -> bool:
+    def keyframe_is_due(
+        self, newest: PlaceKeyframe | None, stamp_ns: int, T_odom_rect: Array, *, has_depth: bool
+    ) -> bool:
         """True if the view has changed enough since the newest keyframe; sooner for a frame whose depth is known."""
         if newest is None:
             return True
         if stamp_ns - newest.stamp_ns < 1e9 / self._limits.rate_hz - JITTER_NS:
             return False
         moved = se3.inverse(newest.T_odom_rect) @ T_odom_rect
-        change = max(length_m(moved) / self._limits.keyframe_m,
-                     angle_rad(moved) / math.radians(self._limits.keyframe_deg))
+        change = max(
+            length_m(moved) / self._limits.keyframe_m, angle_rad(moved) / math.radians(self._limits.keyframe_deg)
+        )
         return change >= (1.0 if has_depth else WAIT_FACTOR)
 
     def search_is_due(self, stamp_ns: int, T_odom_rect: Array, *, is_unknown: bool, is_pending: bool) -> bool:

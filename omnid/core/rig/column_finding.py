@@ -68,8 +68,10 @@ class RigFinding:
         if self.drift is None:
             return f"{self.state}: {self.matches} of {self.tried} points found in both panoramas"
         x, y, z = np.rad2deg(self.drift.turn)
-        return (f"{self.state}: columns off by {self.offset_px:+.2f} px (spread {self.spread_px:.2f}), upper "
-                f"camera turned by {self.turn_deg:.3f} deg ({x:+.3f} {y:+.3f} {z:+.3f}) by {self.matches} points")
+        return (
+            f"{self.state}: columns off by {self.offset_px:+.2f} px (spread {self.spread_px:.2f}), upper "
+            f"camera turned by {self.turn_deg:.3f} deg ({x:+.3f} {y:+.3f} {z:+.3f}) by {self.matches} points"
+        )
 
 
 def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
@@ -85,8 +87,16 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     residuals = _by_azimuth(found.lower, drift.residuals * cylinder.focal_px, cylinder) if drift else ()
     offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
-    return RigFinding(_state(drift, left_px, (len(aside), found.clear)), len(aside), found.tried, offset, spread,
-                      _by_azimuth(found.lower, aside, cylinder), left_px, drift)
+    return RigFinding(
+        _state(drift, left_px, (len(aside), found.clear)),
+        len(aside),
+        found.tried,
+        offset,
+        spread,
+        _by_azimuth(found.lower, aside, cylinder),
+        left_px,
+        drift,
+    )
 
 
 def _state(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) -> RigState:
@@ -113,5 +123,7 @@ def _by_azimuth(lower: Array, aside: Array, cylinder: Cylinder) -> tuple[tuple[f
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     middle = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS
     chosen = [aside[sector == k] for k in range(SECTORS)]
-    return tuple((float(middle[k]), float(np.median(part)) if len(part) else float("nan"), len(part))
-                 for k, part in enumerate(chosen))
+    return tuple(
+        (float(middle[k]), float(np.median(part)) if len(part) else float("nan"), len(part))
+        for k, part in enumerate(chosen)
+    )

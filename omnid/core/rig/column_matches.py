@@ -137,8 +137,8 @@ def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tupl
     for index, (column, row) in enumerate((padded / COARSE).round().astype(int).tolist()):
         left, right, top = column - PATCH_PX, column + PATCH_PX + 1, row - PATCH_PX
         low, high = max(0, left - ASIDE_PX), min(width, right + ASIDE_PX)
-        strip = small_upper[max(0, top):min(height, row + PATCH_PX + 1 + DOWN_PX), low:high]
-        patch = small_lower[max(0, top):row + PATCH_PX + 1, max(0, left):right]
+        strip = small_upper[max(0, top) : min(height, row + PATCH_PX + 1 + DOWN_PX), low:high]
+        patch = small_lower[max(0, top) : row + PATCH_PX + 1, max(0, left) : right]
         if left < 0 or top < 0 or right > width or patch.shape[0] != 2 * PATCH_PX + 1 or strip.shape[0] < len(patch):
             continue
         _, best, _, (aside, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
@@ -150,5 +150,5 @@ def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tupl
 
 def _reduced(image: Image) -> Image:
     width, height = image.shape[1] // COARSE, image.shape[0] // COARSE
-    whole = image[:height * COARSE, :width * COARSE]
+    whole = image[: height * COARSE, : width * COARSE]
     return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)

@@ -19,8 +19,10 @@ from omnid.errors import OmnidError
 
 CheckMode = Literal["refuse", "warn", "off"]
 
-EXCHANGE: Final = ("exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "
-                   "is that of other cameras")
+EXCHANGE: Final = (
+    "exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "
+    "is that of other cameras"
+)
 CALIBRATE: Final = "give the rig of these cameras, or calibrate it: `omnid calibrate check` shows by how much it is off"
 GO_ON: Final = "give the rig of these cameras with --rig, or go on all the same with --set rig.check=warn"
 
@@ -93,14 +95,20 @@ class RigHealth:
         if self._first.state.is_contradicted:
             return contradiction(finding)
         if self._first.state is RigState.UNCHECKED:
-            return ("the rig could not be checked by the images: too few points are seen by both cameras; are they "
-                    "dark, covered or unsharp?")
+            return (
+                "the rig could not be checked by the images: too few points are seen by both cameras; are they "
+                "dark, covered or unsharp?"
+            )
         if finding.state is RigState.DRIFTED and self._first.used_unknown_motion:
-            return ("the rig could only be checked to 2 deg: the cameras are not synchronised, and the motion between "
-                    "their exposures is not known: check it by a recording of slow driving, `omnid calibrate check`")
+            return (
+                "the rig could only be checked to 2 deg: the cameras are not synchronised, and the motion between "
+                "their exposures is not known: check it by a recording of slow driving, `omnid calibrate check`"
+            )
         if finding.state is RigState.DRIFTED:
-            return (f"the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate check` on "
-                    "a recording")
+            return (
+                f"the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate check` on "
+                "a recording"
+            )
         return ""
 
     def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
@@ -129,7 +137,11 @@ def contradiction(finding: StartFinding) -> str:
     """Return what the first pairs show against the rig, and what to do."""
     straight = finding.straight
     if finding.state is RigState.EXCHANGED:
-        return (f"the images match better the other way round: {finding.exchanged_matches} points are seen as if the "
-                f"lower camera were the upper one, {straight.matches} as the rig says: {EXCHANGE}")
-    return (f"the images contradict the rig: the upper camera seems turned by {straight.turn_deg:.1f} deg by "
-            f"{straight.matches} points: {CALIBRATE}")
+        return (
+            f"the images match better the other way round: {finding.exchanged_matches} points are seen as if the "
+            f"lower camera were the upper one, {straight.matches} as the rig says: {EXCHANGE}"
+        )
+    return (
+        f"the images contradict the rig: the upper camera seems turned by {straight.turn_deg:.1f} deg by "
+        f"{straight.matches} points: {CALIBRATE}"
+    )

@@ -174,7 +174,9 @@ def line_difference(images: tuple[Image, Image], start: Array, end: Array, sampl
     for first in range(0, len(difference), CHUNK_LINES):
         part = slice(first, first + CHUNK_LINES)
         columns, rows, disparities = start[:, part, None] + along * (end - start)[:, part, None]
-        lower, upper = (cv2.remap(image, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                        for image, at in zip(images, (rows, rows + disparities), strict=True))
+        lower, upper = (
+            cv2.remap(image, columns, at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for image, at in zip(images, (rows, rows + disparities), strict=True)
+        )
         difference[part] = cv2.reduce(cv2.absdiff(lower, upper), 1, cv2.REDUCE_AVG, dtype=cv2.CV_32F)[:, 0]
     return difference

@@ -38,8 +38,9 @@ class MatchingSettings:
     """Settings of the matching: method, window and threshold of the SAD, choice of edges."""
 
     method: str = knob(
-        "auto", "chooses among several candidates; auto: enhanced for the paper's odometry, else semiglobal",
-        choices=("auto", *METHODS)
+        "auto",
+        "chooses among several candidates; auto: enhanced for the paper's odometry, else semiglobal",
+        choices=("auto", *METHODS),
     )
     window_px: int = knob(9, "side of the matching window, px; odd", low=3, high=15)
     disparities: int = knob(
@@ -49,10 +50,14 @@ class MatchingSettings:
         12.0, "largest mean difference of grey levels in the window of a match", low=0, high=255
     )
     runner_up_ratio: float = knob(
-        2.0, "enhanced: a runner-up's SAD is at most so many times the lowest one, plus runner_up_difference",
-        low=1, high=10)
+        2.0,
+        "enhanced: a runner-up's SAD is at most so many times the lowest one, plus runner_up_difference",
+        low=1,
+        high=10,
+    )
     runner_up_difference: float = knob(
-        4.0, "enhanced: mean difference of grey levels; a point without a runner-up is an anchor", low=0, high=255)
+        4.0, "enhanced: mean difference of grey levels; a point without a runner-up is an anchor", low=0, high=255
+    )
     edge_threshold: int = knob(40, "least Sobel response of an edge, 8 per grey level and pixel", low=0, high=1020)
     max_points: int = knob(30_000, "largest number of edge pixels matched in a pair", low=100, high=1_000_000)
     sigma_px: float = knob(0.8, "standard deviation of the Gaussian blur before matching, px; 0: none", low=0, high=10)
@@ -77,8 +82,9 @@ class Matcher:
         self._matching = matching
         self._search: CandidateSearch = SEARCHES[matching.method](shape, matching)
 
-    def match(self, lower: Image, upper: Image, valid: Flags, noise_grey: float = 0.0,
-              aside: ColumnShift | None = None) -> Matches:
+    def match(
+        self, lower: Image, upper: Image, valid: Flags, noise_grey: float = 0.0, aside: ColumnShift | None = None
+    ) -> Matches:
         """Return the matches of panoramas (H, W) uint8, padded at the seam, among the valid pixels (H, W).
 
         noise_grey: standard deviation of the noise; where it is large, the threshold of the edges follows it.
@@ -193,7 +199,10 @@ class EnhancedSearch:
 
 
 SEARCHES: dict[str, Callable[[tuple[int, int], MatchingSettings], CandidateSearch]] = {
-    "auto": SemiGlobalSearch, "semiglobal": SemiGlobalSearch, "enhanced": EnhancedSearch, "sad": ColumnSearch,
+    "auto": SemiGlobalSearch,
+    "semiglobal": SemiGlobalSearch,
+    "enhanced": EnhancedSearch,
+    "sad": ColumnSearch,
 }
 
 

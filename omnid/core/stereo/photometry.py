@@ -56,7 +56,8 @@ def light(panorama: Image, visible: Flags, noise_grey: float) -> Light:
     """Return the light of a panorama (H, W) where it is visible (H, W), with noise of noise_grey."""
     sample = slice(None, None, LIGHT_EVERY_PX), slice(None, None, LIGHT_EVERY_PX)
     mean, spread = (
-        float(value.item()) for value in cv2.meanStdDev(panorama[sample], mask=visible.view(np.uint8)[sample]))
+        float(value.item()) for value in cv2.meanStdDev(panorama[sample], mask=visible.view(np.uint8)[sample])
+    )
     contrast = math.sqrt(max(0.0, spread**2 - noise_grey**2))
     return Light(mean, contrast / max(noise_grey, LEAST_NOISE_GREY))
 

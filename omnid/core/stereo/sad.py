@@ -31,8 +31,9 @@ class SadVolume:
         for d in disparities or range(len(self.planes)):
             rows, plane = lower.shape[0] - d, self.planes[d]
             difference = cv2.absdiff(lower[:rows], upper[d:], self._difference[:rows])
-            cv2.boxFilter(difference, cv2.CV_16U, window, plane[:rows], normalize=False,
-                          borderType=cv2.BORDER_REPLICATE)
+            cv2.boxFilter(
+                difference, cv2.CV_16U, window, plane[:rows], normalize=False, borderType=cv2.BORDER_REPLICATE
+            )
 
     def at(self, pixels: Indices) -> Costs:
         """Return the costs (D, N) of pixels of the lower panorama (flat indices)."""

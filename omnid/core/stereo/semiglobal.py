@@ -46,9 +46,16 @@ class SemiGlobalPrior:
     def __init__(self, disparities: int) -> None:
         self._rows = STEP_ROWS * max(1, -(-disparities // (SCALE * STEP_ROWS)))  # searched at the prior's resolution
         self._matcher = cv2.StereoSGBM.create(
-            minDisparity=0, numDisparities=self._rows, blockSize=BLOCK_PX, P1=SMALL_STEP_PENALTY,
-            P2=LARGE_STEP_PENALTY, disp12MaxDiff=LEFT_RIGHT_PX, preFilterCap=PREFILTER_CAP, uniquenessRatio=0,
-            mode=cv2.STEREO_SGBM_MODE_SGBM)
+            minDisparity=0,
+            numDisparities=self._rows,
+            blockSize=BLOCK_PX,
+            P1=SMALL_STEP_PENALTY,
+            P2=LARGE_STEP_PENALTY,
+            disp12MaxDiff=LEFT_RIGHT_PX,
+            preFilterCap=PREFILTER_CAP,
+            uniquenessRatio=0,
+            mode=cv2.STEREO_SGBM_MODE_SGBM,
+        )
 
     def disparity(self, lower: Image, upper: Image) -> tuple[Floats, NDArray[np.bool_]]:
         """Return disparities (H, W) float32 [px at full size], good to about a pixel, and flags of the known ones.
@@ -83,8 +90,9 @@ class WarpedSad:
         self._window = (window_px, window_px)
         self._columns, self._rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1]))
 
-    def costs(self, lower: Image, upper: Image, prior: Floats, pixels: Indices, aside: ColumnShift | None = None
-              ) -> Costs:
+    def costs(
+        self, lower: Image, upper: Image, prior: Floats, pixels: Indices, aside: ColumnShift | None = None
+    ) -> Costs:
         """Return the costs (2 REACH_PX + 1, N) of pixels (flat indices) of the lower panorama, by shift."""
         height, columns = len(lower), self._columns
         if aside is not None:
@@ -94,8 +102,9 @@ class WarpedSad:
         costs = np.empty((2 * REACH_PX + 1, len(pixels)), np.uint16)
         for shift, row in enumerate(costs):
             difference = cv2.absdiff(lower, padded[shift : shift + height])
-            plane = cv2.boxFilter(difference, cv2.CV_16U, self._window, normalize=False,
-                                  borderType=cv2.BORDER_REPLICATE)
+            plane = cv2.boxFilter(
+                difference, cv2.CV_16U, self._window, normalize=False, borderType=cv2.BORDER_REPLICATE
+            )
             np.take(plane.reshape(-1), pixels, out=row, mode="clip")
         return costs
 

@@ -64,8 +64,9 @@ def view_jacobian(points: Array, cylinder: Cylinder, baseline_m: float) -> Array
     return J
 
 
-def point_covariance(points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float,
-                     noise: Array | None = None) -> Array:
+def point_covariance(
+    points: Array, cylinder: Cylinder, baseline_m: float, sigma_px: float, noise: Array | None = None
+) -> Array:
     """Return covariances (N, 3, 3) [m^2] of points triangulated from views of sigma_px in each coordinate.
 
     noise: covariance (N, 3, 3) [px^2] of the views beside it; None: none.

@@ -29,8 +29,9 @@ FOOTPRINT, QUARTER = np.float32(2.0), np.float32(0.25)
 
 
 @inner
-def bilinear(texels: NDArray[np.uint8], first: int, size: tuple[int, int], place: tuple[np.float32, np.float32]
-             ) -> np.float32:
+def bilinear(
+    texels: NDArray[np.uint8], first: int, size: tuple[int, int], place: tuple[np.float32, np.float32]
+) -> np.float32:
     """Return the texture of a size (height, width) at fractions u, v of its outline; its border is repeated."""
     height, width = size
     x = min(max(place[0] * np.float32(width) - HALF, ZERO), np.float32(width - 1))
@@ -44,12 +45,21 @@ def bilinear(texels: NDArray[np.uint8], first: int, size: tuple[int, int], place
 
 
 @inner
-def take_nearer(number: np.int32, surface: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
-                ) -> None:
-    """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays.
-    """
-    n0, n1, n2, u0, u1, u2, v0, v1, v2 = (surface[0], surface[1], surface[2], surface[3], surface[4], surface[5],
-                                          surface[6], surface[7], surface[8])
+def take_nearer(
+    number: np.int32, surface: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
+) -> None:
+    """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays."""
+    n0, n1, n2, u0, u1, u2, v0, v1, v2 = (
+        surface[0],
+        surface[1],
+        surface[2],
+        surface[3],
+        surface[4],
+        surface[5],
+        surface[6],
+        surface[7],
+        surface[8],
+    )
     n, u, v = surface[9], surface[10], surface[11]
     (x, y, z), (a, b, c) = rays, origins
     for i in range(len(x)):
@@ -64,11 +74,28 @@ def take_nearer(number: np.int32, surface: Floats, rays: Rows, origins: Rows, ne
 
 
 @inner
-def place_on(number: np.int32, surface: Floats, rays: Rows, origins: Rows, spacing: Floats, nearest: Numbers,
-             distance: Floats, places: Rows) -> None:
+def place_on(
+    number: np.int32,
+    surface: Floats,
+    rays: Rows,
+    origins: Rows,
+    spacing: Floats,
+    nearest: Numbers,
+    distance: Floats,
+    places: Rows,
+) -> None:
     """Set u, v and the footprint [texels] (3, N) of the rays whose nearest rectangle this is."""
-    n0, n1, n2, u0, u1, u2, v0, v1, v2 = (surface[0], surface[1], surface[2], surface[3], surface[4], surface[5],
-                                          surface[6], surface[7], surface[8])
+    n0, n1, n2, u0, u1, u2, v0, v1, v2 = (
+        surface[0],
+        surface[1],
+        surface[2],
+        surface[3],
+        surface[4],
+        surface[5],
+        surface[6],
+        surface[7],
+        surface[8],
+    )
     u, v, density = surface[10], surface[11], surface[13]
     (x, y, z), (a, b, c) = rays, origins
     across, down, footprint = places
@@ -94,11 +121,25 @@ def turn(poses: Doubles, row: Numbers, rays: Floats, origins: Floats, turned: Fl
             moved[k, i] = T[k, 0] * a + T[k, 1] * b + T[k, 2] * c + T[k, 3]
 
 
-@compiled("(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f8[:, :, ::1], b1[:, ::1], f4[:, ::1], "
-          "i8[:, ::1], i8[:, ::1], u1[::1], f4[::1])", writes=("image",))
-def cast(rays: Floats, origins: Floats, spacing: Floats, index: Numbers, starts: Whole, poses: Doubles,
-         seen: NDArray[np.bool_], surfaces: Floats, pyramids: Whole, levels: Whole, texels: NDArray[np.uint8],
-         image: Floats) -> None:
+@compiled(
+    "(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f8[:, :, ::1], b1[:, ::1], f4[:, ::1], "
+    "i8[:, ::1], i8[:, ::1], u1[::1], f4[::1])",
+    writes=("image",),
+)
+def cast(
+    rays: Floats,
+    origins: Floats,
+    spacing: Floats,
+    index: Numbers,
+    starts: Whole,
+    poses: Doubles,
+    seen: NDArray[np.bool_],
+    surfaces: Floats,
+    pyramids: Whole,
+    levels: Whole,
+    texels: NDArray[np.uint8],
+    image: Floats,
+) -> None:
     """Add the grey of N samples in M tiles to an image.
 
     rays (3, N), origins (3, N) [m] in the camera frame, (3, 1) where all are the same; spacing (N,) [rad]; index (2, N)
@@ -122,8 +163,14 @@ def cast(rays: Floats, origins: Floats, spacing: Floats, index: Numbers, starts:
         ray = rays[0, low:high], rays[1, low:high], rays[2, low:high]
         origin = moved[0, :count], moved[1, :count], moved[2, :count]
         if moving:
-            turn(poses, index[1, low:high], rays[:, low:high],
-                 origins[:, low:high] if origins.shape[1] > 1 else origins, turned, moved)
+            turn(
+                poses,
+                index[1, low:high],
+                rays[:, low:high],
+                origins[:, low:high] if origins.shape[1] > 1 else origins,
+                turned,
+                moved,
+            )
             ray = turned[0, :count], turned[1, :count], turned[2, :count]
         for i in range(count):
             nearest[i], distance[i] = -1, FAR_M
@@ -132,8 +179,16 @@ def cast(rays: Floats, origins: Floats, spacing: Floats, index: Numbers, starts:
                 take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count])
         for k in range(len(surfaces)):
             if seen[tile, k]:
-                place_on(np.int32(k), surfaces[k], ray, origin, spacing[low:high], nearest[:count], distance[:count],
-                         (places[0, :count], places[1, :count], places[2, :count]))
+                place_on(
+                    np.int32(k),
+                    surfaces[k],
+                    ray,
+                    origin,
+                    spacing[low:high],
+                    nearest[:count],
+                    distance[:count],
+                    (places[0, :count], places[1, :count], places[2, :count]),
+                )
         for i in range(count):
             k = nearest[i]
             if k < 0:
@@ -143,5 +198,6 @@ def cast(rays: Floats, origins: Floats, spacing: Floats, index: Numbers, starts:
             while footprint > FOOTPRINT and level < last:
                 footprint, level = footprint * QUARTER, level + 1
             size = (levels[level, 1], levels[level, 2])
-            image[index[0, low + i]] += surfaces[k, 12] * bilinear(texels, levels[level, 0], size,
-                                                                  (places[0, i], places[1, i]))
+            image[index[0, low + i]] += surfaces[k, 12] * bilinear(
+                texels, levels[level, 0], size, (places[0, i], places[1, i])
+            )

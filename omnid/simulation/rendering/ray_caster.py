@@ -31,8 +31,9 @@ def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample
     return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
 
 
-def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2,
-                row_twist: Array | None = None) -> Floats:
+def render_grey(
+    scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2, row_twist: Array | None = None
+) -> Floats:
     """Return the ideal image (H, W) float32, 0 to 255; 0 outside the mask and for rays that hit no rectangle.
 
     row_twist (6,): motion of the rig in its own frame from one image row to the next (rolling shutter).
@@ -47,16 +48,25 @@ def render_grey(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supers
     order = np.argsort(distance_m, kind="stable")
     atlas = cached_atlas([r.texture for r in scene.rectangles])
     image = np.zeros(table.shape[0] * table.shape[1], np.float32)
-    cast(table.rays, table.origins, table.spacing, table.index, table.starts,
-         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]), np.ascontiguousarray(seen[:, order]),
-         _surfaces([scene.rectangles[i] for i in order], poses[0]), atlas.pyramids[order], atlas.levels, atlas.texels,
-         image)
+    cast(
+        table.rays,
+        table.origins,
+        table.spacing,
+        table.index,
+        table.starts,
+        np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
+        np.ascontiguousarray(seen[:, order]),
+        _surfaces([scene.rectangles[i] for i in order], poses[0]),
+        atlas.pyramids[order],
+        atlas.levels,
+        atlas.texels,
+        image,
+    )
     return np.asarray(image.reshape(table.shape) / np.float32(supersample**2), np.float32)
 
 
 def _row_poses(table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[Array, float]:
-    """Return the poses (S, 4, 4) of the rig at the S rows of samples, one where it rests, and its largest turn [rad].
-    """
+    """Return the poses (S, 4, 4) of the rig at the S rows of samples, one if it rests, and its largest turn [rad]."""
     if not np.any(row_twist):
         return T_world_rig[None], 0.0
     height = table.shape[0]

@@ -60,8 +60,18 @@ def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
     origins = _origins(mounted, supersample, index)
     reach_m = float(np.linalg.norm(origins, axis=0).max())
     pixel = rows[index] // supersample * width + columns[index] // supersample
-    return RayTable((height, width), supersample, np.ascontiguousarray(rays[index].T), origins, spacing[index],
-                    np.stack([pixel, rows[index]]).astype(np.int32), starts, axes, angles, reach_m)
+    return RayTable(
+        (height, width),
+        supersample,
+        np.ascontiguousarray(rays[index].T),
+        origins,
+        spacing[index],
+        np.stack([pixel, rows[index]]).astype(np.int32),
+        starts,
+        axes,
+        angles,
+        reach_m,
+    )
 
 
 def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64]) -> Floats:

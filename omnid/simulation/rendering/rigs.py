@@ -17,12 +17,20 @@ TOPICS = ("/lower/image_raw/compressed", "/upper/image_raw/compressed")
 R_RIG_CAM = np.array([[0, -1.0, 0], [-1, 0, 0], [0, 0, -1]])
 
 
-def make_rig(*, size: int = 768, scale: float = 1.0, baseline_m: float = 0.2, rim: float = RIM, xi: float = 1.0,
-             misaligned_deg: tuple[float, float, float] = (0, 0, 0), offset_mm: tuple[float, float] = (0, 0),
-             lower_misaligned_deg: tuple[float, float, float] = (0, 0, 0),
-             lower_offset_mm: tuple[float, float] = (0, 0),
-             distortion: tuple[float, float, float, float] = (0, 0, 0, 0),
-             centre_px: tuple[float, float] = (0, 0)) -> Rig:
+def make_rig(
+    *,
+    size: int = 768,
+    scale: float = 1.0,
+    baseline_m: float = 0.2,
+    rim: float = RIM,
+    xi: float = 1.0,
+    misaligned_deg: tuple[float, float, float] = (0, 0, 0),
+    offset_mm: tuple[float, float] = (0, 0),
+    lower_misaligned_deg: tuple[float, float, float] = (0, 0, 0),
+    lower_offset_mm: tuple[float, float] = (0, 0),
+    distortion: tuple[float, float, float, float] = (0, 0, 0, 0),
+    centre_px: tuple[float, float] = (0, 0),
+) -> Rig:
     """Return a rig with its frame at the lower viewpoint, z up, unless lower_* are given.
 
     misaligned_deg: rotation vector of the upper camera, in the rig frame, about its viewpoint, which lies offset_mm

@@ -43,7 +43,7 @@ def brick(rng: Random, size: Size, px_per_m: float) -> Texture:
     one[:joint], one[:, :joint] = mortar, mortar
     courses = np.vstack([one, np.roll(one, length // 2, axis=1)])
     times = (-(-size[1] // courses.shape[0]), -(-size[0] // length))
-    return _grey(np.tile(courses, times)[:size[1], :size[0]])
+    return _grey(np.tile(courses, times)[: size[1], : size[0]])
 
 
 def plaster(rng: Random, size: Size, px_per_m: float) -> Texture:
@@ -77,8 +77,14 @@ def white(_: Random, size: Size, __: float) -> Texture:
     return np.full(size[::-1], 225, np.uint8)
 
 
-PAINTERS: dict[str, Painter] = {"brick": brick, "plaster": plaster, "granite": granite, "tiles": tiles, "plain": plain,
-                                "white": white}
+PAINTERS: dict[str, Painter] = {
+    "brick": brick,
+    "plaster": plaster,
+    "granite": granite,
+    "tiles": tiles,
+    "plain": plain,
+    "white": white,
+}
 
 
 def poster(rng: Random, size: Size) -> Texture:
@@ -94,7 +100,7 @@ def _page(rng: Random, size: Size) -> Texture:
     for bottom in range(2 * height, size[1] - height, height):
         text = "".join(chr(c) for c in rng.integers(65, 91, 200))
         cv2.putText(page, text, (height, bottom), cv2.FONT_HERSHEY_SIMPLEX, height / 34, 25, max(1, height // 12))
-    page[:, size[0] - height:] = page[0, 0]
+    page[:, size[0] - height :] = page[0, 0]
     return page
 
 
@@ -120,6 +126,7 @@ def _photograph(rng: Random, size: Size) -> Texture:
     for _ in range(int(rng.integers(2, 6))):
         centre = tuple(int(x) for x in rng.uniform(0, size))
         axes = (int(rng.uniform(0.05, 0.2) * size[0]), int(rng.uniform(0.05, 0.2) * size[1]))
-        cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(10, 245)), -1,
-                    cv2.LINE_AA)
+        cv2.ellipse(
+            image, centre, axes, float(rng.uniform(0, 180)), 0, 360, float(rng.uniform(10, 245)), -1, cv2.LINE_AA
+        )
     return image

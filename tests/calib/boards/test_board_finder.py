@@ -38,14 +38,18 @@ def errors_px(found: Array, truth: Array) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("sensor", "contrast", "shadow", "limit_px"), [
-    (Sensor(), (25.0, 225.0), 1.0, 0.08),
-    (Sensor(noise_sigma=6.0), (25.0, 225.0), 1.0, 0.5),
-    (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 1.0, 0.5),
-    (Sensor(), (25.0, 225.0), 0.3, 0.5),
-])
-def test_finds_boards_on_all_sides(sensor: Sensor, contrast: tuple[float, float], shadow: float,
-                                     limit_px: float) -> None:
+@pytest.mark.parametrize(
+    ("sensor", "contrast", "shadow", "limit_px"),
+    [
+        (Sensor(), (25.0, 225.0), 1.0, 0.08),
+        (Sensor(noise_sigma=6.0), (25.0, 225.0), 1.0, 0.5),
+        (Sensor(blur_px=1.4, vignette=0.6), (70.0, 140.0), 1.0, 0.5),
+        (Sensor(), (25.0, 225.0), 0.3, 0.5),
+    ],
+)
+def test_finds_boards_on_all_sides(
+    sensor: Sensor, contrast: tuple[float, float], shadow: float, limit_px: float
+) -> None:
     for seed, T in enumerate(poses(3)):
         rendered = RENDERER.render_board(T, seed=seed, sensor=sensor, contrast=contrast, shadow=shadow)
         view = find_board(rendered.image, BOARD, "x").view
@@ -82,7 +86,7 @@ def test_corner_order_is_clockwise_and_starts_at_a_dark_square() -> None:
         grid = view.pixels.reshape(BOARD.rows, BOARD.columns, 2)
         along, down = np.diff(grid, axis=1)[:-1], np.diff(grid, axis=0)[:, :-1]
         assert (along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0] > 0).all()
-        first, second = (grid[:2, i:i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
+        first, second = (grid[:2, i : i + 2].mean(axis=(0, 1)).round().astype(int) for i in (0, 1))
         assert rendered.image[first[1], first[0]] < rendered.image[second[1], second[0]]
         flipped = find_board(np.ascontiguousarray(rendered.image[:, ::-1]), BOARD).view
         assert flipped is not None
@@ -104,7 +108,7 @@ def test_drops_corners_that_are_off_by_less_than_a_fifth_of_a_square() -> None:
     rendered = RENDERER.render_board(poses(1)[0])
     image, moved_px = rendered.image.copy(), 2
     u, v = rendered.corners[14].round().astype(int).tolist()
-    image[v - 6:v + 7, u - 6:u + 7] = rendered.image[v - 6:v + 7, u - 6 - moved_px:u + 7 - moved_px]
+    image[v - 6 : v + 7, u - 6 : u + 7] = rendered.image[v - 6 : v + 7, u - 6 - moved_px : u + 7 - moved_px]
     view = find_board(image, BOARD).view
     assert view is not None
     off = errors_px(view.pixels, rendered.corners)
@@ -127,8 +131,13 @@ def test_finds_no_board_in_images_without_one() -> None:
     stripes = np.where(np.arange(300) // 10 % 2, 40, 200).astype(np.uint8)
     dots = np.where(np.hypot(*(np.indices((300, 300)) % 30 - 15)) < 9, 30, 220).astype(np.uint8)
     brickwork = np.where((np.indices((300, 300))[1] + 10 * (np.indices((300, 300))[0] // 12 % 2)) % 20 < 2, 30, 200)
-    images: list[NDArray[np.uint8]] = [noise, np.tile(stripes, (300, 1)), dots, brickwork.astype(np.uint8),
-                                         np.zeros((50, 40), np.uint8)]
+    images: list[NDArray[np.uint8]] = [
+        noise,
+        np.tile(stripes, (300, 1)),
+        dots,
+        brickwork.astype(np.uint8),
+        np.zeros((50, 40), np.uint8),
+    ]
     for number, image in enumerate(images):
         search = find_board(image, Board(4, 3, 0.03))
         assert search.view is None, number
@@ -140,10 +149,11 @@ def chequers(columns: int, rows: int, margin_px: int) -> NDArray[np.uint8]:
     return np.pad(squares, margin_px, constant_values=190).astype(np.uint8)
 
 
-@pytest.mark.parametrize(("columns", "rows", "margin_px", "whole"), [
-    (7, 6, 40, True), (9, 6, 40, False), (7, 9, 40, False), (20, 20, 0, False), (6, 5, 40, False)])
-def test_distinguishes_a_board_from_a_chequered_floor(columns: int, rows: int, margin_px: int,
-                                                                  whole: bool) -> None:
+@pytest.mark.parametrize(
+    ("columns", "rows", "margin_px", "whole"),
+    [(7, 6, 40, True), (9, 6, 40, False), (7, 9, 40, False), (20, 20, 0, False), (6, 5, 40, False)],
+)
+def test_distinguishes_a_board_from_a_chequered_floor(columns: int, rows: int, margin_px: int, whole: bool) -> None:
     """Check 6x5 corners in a board of that size, in larger boards, in a floor, and in a smaller board."""
     corner = 12.0 * (1 + (columns > 8) + (rows > 8)) + margin_px - 0.5
     grid = np.stack(np.meshgrid(corner + 12 * np.arange(6), corner + 12 * np.arange(5)), axis=-1)
@@ -158,8 +168,9 @@ def test_finds_the_board_in_all_ten_real_images(shared_data: Path) -> None:
         assert view is not None and np.isfinite(view.pixels).all() and view.confidence > 0.95, number
 
 
-@pytest.mark.parametrize(("columns", "rows", "square_m"), [(2, 5, 0.03), (6, 61, 0.03), (6, 5, 0.0), (6, 5, -0.03),
-                                                           (6, 5, float("nan"))])
+@pytest.mark.parametrize(
+    ("columns", "rows", "square_m"), [(2, 5, 0.03), (6, 61, 0.03), (6, 5, 0.0), (6, 5, -0.03), (6, 5, float("nan"))]
+)
 def test_refuses_an_impossible_board(columns: int, rows: int, square_m: float) -> None:
     with pytest.raises(CalibError, match="board: expected"):
         Board(columns, rows, square_m)

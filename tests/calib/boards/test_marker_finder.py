@@ -17,8 +17,9 @@ from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import BoardImage, board_poses_around_camera
 from tests.simulation.marker_boards import frame_board, print_of, render_marker_board
 
-MOUNTED = MountedCamera(UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480)), np.eye(4),
-                        Mask((241.3, 237.8), 40.0, 232.0))
+MOUNTED = MountedCamera(
+    UnifiedCamera(0.9, (-150.0, 151.0), (241.3, 237.8), (480, 480)), np.eye(4), Mask((241.3, 237.8), 40.0, 232.0)
+)
 CHARUCO = CharucoBoard(6, 5, 0.05, 0.0375, "4X4_50")
 GRID = AprilGrid(4, 3, 0.06, 0.3)
 
@@ -30,8 +31,10 @@ def rendered(board: MarkerBoard, hidden: float = 0.0) -> BoardImage:
     return render_marker_board(MOUNTED, board, T, seed=1, sensor=Sensor(noise_sigma=2.0), hidden=hidden)
 
 
-@pytest.mark.parametrize(("board", "hidden", "least", "most"), [
-    (CHARUCO, 0.0, 0.7, 1.0), (CHARUCO, 0.5, 0.25, 0.55), (GRID, 0.0, 0.7, 1.0), (GRID, 0.5, 0.25, 0.55)])
+@pytest.mark.parametrize(
+    ("board", "hidden", "least", "most"),
+    [(CHARUCO, 0.0, 0.7, 1.0), (CHARUCO, 0.5, 0.25, 0.55), (GRID, 0.0, 0.7, 1.0), (GRID, 0.5, 0.25, 0.55)],
+)
 def test_finds_the_visible_corners_in_a_mirror(board: MarkerBoard, hidden: float, least: float, most: float) -> None:
     made = rendered(board, hidden)
     view = find_marker_board(made.image, board, "name")
@@ -82,14 +85,21 @@ def test_a_corner_far_off_does_not_change_the_pose() -> None:
     np.testing.assert_allclose(T, made.T_cam_board, atol=1e-4)
 
 
-@pytest.mark.parametrize(("make", "words"), [
-    (lambda: CharucoBoard(6, 5, 0.05, 0.06, "4X4_50"), "markers of 0.3 to 0.95 of the squares' side, found 60 mm"),
-    (lambda: CharucoBoard(6, 5, 0.05, 0.03, "4X5_50"), "expected a dictionary of markers .*4X4_50.* found '4X5_50'"),
-    (lambda: CharucoBoard(20, 20, 0.05, 0.03, "4X4_50"), "4X4_50 has 50 markers, and this board needs 220"),
-    (lambda: CharucoBoard(1, 5, 0.05, 0.03, "4X4_50"), "expected 2 to 60 inner corners"),
-    (lambda: AprilGrid(6, 6, float("nan"), 0.3), "tags of 0.1 mm to 10 m"),
-    (lambda: AprilGrid(6, 6, 0.08, 24.0), "like Kalibr's tagSpacing, found 24"),
-    (lambda: AprilGrid(30, 30, 0.08, 0.3), "APRILTAG_36h11 has 587 markers, and this board needs 900")])
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: CharucoBoard(6, 5, 0.05, 0.06, "4X4_50"), "markers of 0.3 to 0.95 of the squares' side, found 60 mm"),
+        (
+            lambda: CharucoBoard(6, 5, 0.05, 0.03, "4X5_50"),
+            "expected a dictionary of markers .*4X4_50.* found '4X5_50'",
+        ),
+        (lambda: CharucoBoard(20, 20, 0.05, 0.03, "4X4_50"), "4X4_50 has 50 markers, and this board needs 220"),
+        (lambda: CharucoBoard(1, 5, 0.05, 0.03, "4X4_50"), "expected 2 to 60 inner corners"),
+        (lambda: AprilGrid(6, 6, float("nan"), 0.3), "tags of 0.1 mm to 10 m"),
+        (lambda: AprilGrid(6, 6, 0.08, 24.0), "like Kalibr's tagSpacing, found 24"),
+        (lambda: AprilGrid(30, 30, 0.08, 0.3), "APRILTAG_36h11 has 587 markers, and this board needs 900"),
+    ],
+)
 def test_refuses_impossible_boards(make: type[MarkerBoard], words: str) -> None:
     with pytest.raises(CalibError, match=words):
         make()

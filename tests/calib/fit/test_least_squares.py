@@ -21,10 +21,10 @@ def system(seed: int) -> tuple[ArrowSystem, Array, Array]:
     J = np.zeros((BLOCKS, 8, COMMON + BLOCKS * SIZE))
     for k in range(BLOCKS):
         J[k, :, :COMMON] = rng.standard_normal((8, COMMON))
-        J[k, :, COMMON + k * SIZE:COMMON + (k + 1) * SIZE] = rng.standard_normal((8, SIZE))
+        J[k, :, COMMON + k * SIZE : COMMON + (k + 1) * SIZE] = rng.standard_normal((8, SIZE))
     flat = J.reshape(-1, J.shape[2])
     H, g = flat.T @ flat, flat.T @ rng.standard_normal(len(flat))
-    blocks = np.array([H[at:at + SIZE, at:at + SIZE] for at in range(COMMON, len(H), SIZE)])
+    blocks = np.array([H[at : at + SIZE, at : at + SIZE] for at in range(COMMON, len(H), SIZE)])
     arrow = ArrowSystem(H[:COMMON, :COMMON], sparse.csr_matrix(H[:COMMON, COMMON:]), blocks, g[:COMMON], g[COMMON:])
     return arrow, H, g
 
@@ -68,9 +68,13 @@ class Decay:
     def normal_equations(self, state: Array, scale: float) -> ArrowSystem:
         decay, r = np.exp(-state[0] * self.t), self.residuals(state)
         by_rate, by_amplitude = -state[1:, None] * self.t * decay, np.tile(decay, (len(self.y), 1))
-        return ArrowSystem(np.array([[(by_rate**2).sum()]]), sparse.csr_matrix((by_rate * by_amplitude).sum(axis=1)),
-                           (by_amplitude**2).sum(axis=1)[:, None, None], np.array([(by_rate * r).sum()]),
-                           (by_amplitude * r).sum(axis=1))
+        return ArrowSystem(
+            np.array([[(by_rate**2).sum()]]),
+            sparse.csr_matrix((by_rate * by_amplitude).sum(axis=1)),
+            (by_amplitude**2).sum(axis=1)[:, None, None],
+            np.array([(by_rate * r).sum()]),
+            (by_amplitude * r).sum(axis=1),
+        )
 
 
 def test_finds_the_minimum_from_a_start_at_which_full_steps_fail() -> None:

@@ -23,10 +23,16 @@ def test_noise_alone_has_no_systematic_part() -> None:
     assert not structure.is_misfit
 
 
-@pytest.mark.parametrize("field", [
-    0.3 * np.sin(np.linalg.norm(OFFSET, axis=2, keepdims=True) / 60) * OFFSET
-    / np.linalg.norm(OFFSET, axis=2, keepdims=True),
-    0.3 * np.cos(2 * np.arctan2(OFFSET[..., 1:], OFFSET[..., :1])) * np.array([[1.0, 0.5]])])
+@pytest.mark.parametrize(
+    "field",
+    [
+        0.3
+        * np.sin(np.linalg.norm(OFFSET, axis=2, keepdims=True) / 60)
+        * OFFSET
+        / np.linalg.norm(OFFSET, axis=2, keepdims=True),
+        0.3 * np.cos(2 * np.arctan2(OFFSET[..., 1:], OFFSET[..., :1])) * np.array([[1.0, 0.5]]),
+    ],
+)
 def test_a_smooth_field_is_a_misfit(field: np.ndarray) -> None:
     structure = residual_structure(PIXELS, field + 0.05 * NOISE, BOARD.points, CENTER)
     rms = float(np.sqrt((field**2).mean()))

@@ -25,8 +25,9 @@ def rays(rig: Rig, points: Array, assumed: Rig) -> tuple[Array, Array]:
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (-3.0, 2.0, 5.0), (0, 0, 0)])
-def test_estimates_and_corrects_a_rotation_about_every_axis(rig: Rig, around: Array,
-                                                     turn_deg: tuple[float, float, float]) -> None:
+def test_estimates_and_corrects_a_rotation_about_every_axis(
+    rig: Rig, around: Array, turn_deg: tuple[float, float, float]
+) -> None:
     wrong = with_upper_rotated(rig, turn_deg)
     drift = estimate_rig_drift(*rays(rig, around, wrong))
     assert drift is not None
@@ -68,8 +69,10 @@ def test_returns_none_for_too_few_points(rig: Rig, around: Array) -> None:
     assert estimate_rig_drift(*rays(rig, around[:29], rig)) is None
 
 
-@pytest.mark.parametrize(("moved", "radius", "fits"), [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False),
-                                                      ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)])
+@pytest.mark.parametrize(
+    ("moved", "radius", "fits"),
+    [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False), ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)],
+)
 def test_detects_a_moved_rim(moved: tuple[float, float], radius: float, fits: bool) -> None:
     v, u = np.indices((260, 260))
     center = (130.0 + moved[0], 128.0 + moved[1])

@@ -43,14 +43,18 @@ def test_a_focal_length_changes_the_scale_as_much_as_it_does_in_the_odometry() -
 
 
 def test_parameters_are_perturbed_as_documented() -> None:
-    changed = perturbed_rig(RIG, ("lower fu", "upper pv", *TRANSFORM_NAMES), np.array(
-        [1.0, 0.5, 0.01, -0.02, 0.03, 0.004, -0.005, 1e-3]))
+    changed = perturbed_rig(
+        RIG, ("lower fu", "upper pv", *TRANSFORM_NAMES), np.array([1.0, 0.5, 0.01, -0.02, 0.03, 0.004, -0.005, 1e-3])
+    )
     assert isinstance(changed.lower.camera, UnifiedCamera) and isinstance(changed.upper.camera, UnifiedCamera)
     assert changed.lower.camera.focal == pytest.approx((-204.0, 206.2))
     assert changed.upper.camera.center == pytest.approx((391.2, 383.4))
     R = RIG.T_rect_rig[:3, :3]
-    np.testing.assert_allclose(R @ changed.upper.T_cam_rig[:3, :3].T, se3.rotation_exp([0.01, -0.02, 0.03]) @ R
-                               @ RIG.upper.T_cam_rig[:3, :3].T, atol=1e-12)
+    np.testing.assert_allclose(
+        R @ changed.upper.T_cam_rig[:3, :3].T,
+        se3.rotation_exp([0.01, -0.02, 0.03]) @ R @ RIG.upper.T_cam_rig[:3, :3].T,
+        atol=1e-12,
+    )
     x, y, z = R @ changed.upper.viewpoint
     assert (x / z, y / z) == pytest.approx((0.004, -0.005))
     assert changed.baseline_m == pytest.approx(RIG.baseline_m + 1e-3)

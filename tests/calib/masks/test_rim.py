@@ -67,12 +67,20 @@ def squares() -> NDArray[np.float64]:
 
 
 NOTHING = {
-    "black": 0 * U, "white": 0 * U + 255, "noise": np.random.default_rng(0).uniform(0, 255, U.shape),
-    "dark noise": np.random.default_rng(0).normal(8, 4, U.shape), "full frame": world(), "squares": squares(),
-    "soft vignette": 220 * np.exp(-(R / 300)**2), "lens vignette": 230 * np.cos(np.clip(R / 540, 0, 1.5))**4,
-    "square": np.where((np.abs(U - 384) < 300) & (np.abs(V - 384) < 300), 150, 5), "half": np.where(U < 384, 150, 5),
-    "ellipse": np.where(np.hypot((U - 384) / 1.15, V - 384) < 300, 150, 5), "tiny": np.zeros((20, 20)),
-    "thin": np.zeros((1, 900)), "dusk": np.where(R < RADIUS, 26, 6),
+    "black": 0 * U,
+    "white": 0 * U + 255,
+    "noise": np.random.default_rng(0).uniform(0, 255, U.shape),
+    "dark noise": np.random.default_rng(0).normal(8, 4, U.shape),
+    "full frame": world(),
+    "squares": squares(),
+    "soft vignette": 220 * np.exp(-((R / 300) ** 2)),
+    "lens vignette": 230 * np.cos(np.clip(R / 540, 0, 1.5)) ** 4,
+    "square": np.where((np.abs(U - 384) < 300) & (np.abs(V - 384) < 300), 150, 5),
+    "half": np.where(U < 384, 150, 5),
+    "ellipse": np.where(np.hypot((U - 384) / 1.15, V - 384) < 300, 150, 5),
+    "tiny": np.zeros((20, 20)),
+    "thin": np.zeros((1, 900)),
+    "dusk": np.where(R < RADIUS, 26, 6),
     "most of the rim dark": np.where((R < RADIUS) & (V < 500) & (U > 300), world(), 5),
     "moon": np.where(np.hypot(U - 150, V - 150) < 100, 200, 5),
     "blobs": cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, U.shape), (0, 0), 25) * 30 - 3700,
@@ -91,8 +99,9 @@ def test_returns_none_inside_the_mirror() -> None:
 
 def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
     """Ten images of one mirror: the image cuts off its rim above and below, and the lens is in its middle."""
-    images: list[Any] = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-                           for path in sorted((shared_data / "vmr_board").glob("*.jpg"))]
+    images: list[Any] = [
+        cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted((shared_data / "vmr_board").glob("*.jpg"))
+    ]
     found = [find_rim(image, (512.0, 384.0)) for image in images]
     masks = [mask for mask in found if mask is not None]
     assert len(masks) >= 8

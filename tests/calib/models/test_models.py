@@ -22,10 +22,12 @@ CAMERAS: dict[str, OmniCamera] = {
     "omni xi 1.7": UnifiedCamera(1.7, (-507.0, 513.0), (380.0, 390.0), (768, 770)),
     "omni bent": UnifiedCamera(0.95, (-207.0, 213.0), (380.0, 390.0), (768, 770), BENT),
     "ocam mirror": OcamCamera((-131.6, 0, 1.9e-3, 9e-8, -6e-10), (382.4, 514.6), (0.999, 2e-3, -3e-3), (1024, 768)),
-    "ocam direct": OcamCamera((-300.0, 0, 1.4e-3, -1.6e-6, 4e-9), (470.0, 650.0), (1.001, 1e-3, 2e-3), (1280, 960),
-                              "direct"),
-    "ocam tangential": OcamCamera((-131.6, 0, 1.9e-3, 9e-8, -6e-10), (382.4, 514.6), (0.999, 2e-3, -3e-3), (1024, 768),
-                                  "mirror", (3e-6, -5e-6)),
+    "ocam direct": OcamCamera(
+        (-300.0, 0, 1.4e-3, -1.6e-6, 4e-9), (470.0, 650.0), (1.001, 1e-3, 2e-3), (1280, 960), "direct"
+    ),
+    "ocam tangential": OcamCamera(
+        (-131.6, 0, 1.9e-3, 9e-8, -6e-10), (382.4, 514.6), (0.999, 2e-3, -3e-3), (1024, 768), "mirror", (3e-6, -5e-6)
+    ),
     "ds": DoubleSphereCamera(-0.27, 0.55, (310.0, 315.0), (380.0, 390.0), (768, 770)),
     "ds near a pinhole": DoubleSphereCamera(0.1, 0.2, (310.0, 315.0), (380.0, 390.0), (768, 770)),
     "eucm": ExtendedUnifiedCamera(0.63, 1.1, (240.0, 244.0), (380.0, 390.0), (768, 770)),
@@ -123,8 +125,13 @@ def test_omni_with_xi_zero_is_a_pinhole() -> None:
 
 @pytest.mark.parametrize(("view", "sign"), [("mirror", 1.0), ("direct", -1.0)])
 def test_ocam_projection_equals_the_equations(view: str, sign: float) -> None:
-    camera = OcamCamera((-100.0, 0.0, 0.002), (240.0, 320.0), (1.01, 0.02, -0.03), (640, 480),
-                        "mirror" if view == "mirror" else "direct")
+    camera = OcamCamera(
+        (-100.0, 0.0, 0.002),
+        (240.0, 320.0),
+        (1.01, 0.02, -0.03),
+        (640, 480),
+        "mirror" if view == "mirror" else "direct",
+    )
     x, y = 60.0, -80.0  # rho = 100, f = -100 + 20 = -80
     row, column = 1.01 * x + 0.02 * y + 240, -0.03 * x + y + 320
     ray = np.array([[x, y, sign * 80.0]])
@@ -158,8 +165,13 @@ def test_ocam_ends_at_the_radius_where_rays_repeat() -> None:
 def test_ocam_reproduces_the_toolbox_reprojection_errors(shared_data: Path) -> None:
     """The reprojection error of the toolbox's own board poses is the one that the toolbox reports."""
     found = json.loads((shared_data / "vmr_board" / "reference.json").read_text())["ocam_subpix"]
-    camera = OcamCamera(tuple(found["ss"]), (found["xc_row_1based"] - 1, found["yc_col_1based"] - 1),
-                        (found["c"], found["d"], found["e"]), (found["width"], found["height"]), "direct")
+    camera = OcamCamera(
+        tuple(found["ss"]),
+        (found["xc_row_1based"] - 1, found["yc_col_1based"] - 1),
+        (found["c"], found["d"], found["e"]),
+        (found["width"], found["height"]),
+        "direct",
+    )
     board = np.column_stack([found["Xt_mm"], found["Yt_mm"], np.ones(len(found["Xt_mm"]))])
     for image in found["images"]:
         pixels = camera.project(board @ np.array(image["RRfin_r1_r2_t"]).T)
@@ -168,9 +180,18 @@ def test_ocam_reproduces_the_toolbox_reprojection_errors(shared_data: Path) -> N
         assert error == pytest.approx(image["recomputed_mean_err_px"], abs=0.02)
 
 
-@pytest.mark.parametrize("change", [
-    {"polynomial": ()}, {"polynomial": (1.0, 0.0)}, {"polynomial": (math.nan,)}, {"affine": (0.0, 0.0, 1.0)},
-    {"size": (0, 4)}, {"view": "window"}, {"tangential": (math.inf, 0.0)}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"polynomial": ()},
+        {"polynomial": (1.0, 0.0)},
+        {"polynomial": (math.nan,)},
+        {"affine": (0.0, 0.0, 1.0)},
+        {"size": (0, 4)},
+        {"view": "window"},
+        {"tangential": (math.inf, 0.0)},
+    ],
+)
 def test_ocam_refuses_invalid_parameters(change: dict[str, object]) -> None:
     values = {"polynomial": (-100.0,), "center_row_column": (1.0, 1.0), "affine": (1.0, 0.0, 0.0), "size": (4, 4)}
     with pytest.raises(CalibError):

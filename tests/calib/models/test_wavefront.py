@@ -53,8 +53,9 @@ def test_offsets_are_the_gradient_of_the_support_function(axis: float) -> None:
         a, b, c_x, c_y, s = WAVEFRONT
         m = d[:, :2] / (np.linalg.norm(d, axis=1, keepdims=True) + axis * d[:, 2:])
         m2 = (m**2).sum(axis=1)
-        return np.asarray((a * (m[:, 0]**2 - m[:, 1]**2) + b * m[:, 0] * m[:, 1] + m2 * (m @ [c_x, c_y]) + s * m2**2)
-                          / (1 + m2))
+        return np.asarray(
+            (a * (m[:, 0] ** 2 - m[:, 1] ** 2) + b * m[:, 0] * m[:, 1] + m2 * (m @ [c_x, c_y]) + s * m2**2) / (1 + m2)
+        )
 
     step = 1e-5
     gradient = np.column_stack([(support(rays + step * e) - support(rays - step * e)) / (2 * step) for e in np.eye(3)])
@@ -88,9 +89,11 @@ def test_terms_are_restored_from_a_file(ocam_rig: Rig) -> None:
     camera = replace(with_terms(ocam_rig), distance_m=2.5)
     text = rig_toml(replace(ocam_rig, lower=replace(ocam_rig.lower, camera=camera)))
     assert parse_rig(text).lower.camera == camera and rig_toml(parse_rig(text)) == text
-    for old, new, message in (("distance_m = 2.5", "distance_m = 0.0", "expected distance_m of 0.05"),
-                              ("wavefront = [0.0002", "wavefront = [2.0", "a wavefront of 5 lengths below 0.1"),
-                              ("wavefront = [0.0002, ", "wavefront = [", "expected 5 finite numbers")):
+    for old, new, message in (
+        ("distance_m = 2.5", "distance_m = 0.0", "expected distance_m of 0.05"),
+        ("wavefront = [0.0002", "wavefront = [2.0", "a wavefront of 5 lengths below 0.1"),
+        ("wavefront = [0.0002, ", "wavefront = [", "expected 5 finite numbers"),
+    ):
         assert old in text
         with pytest.raises(CalibError, match=message):
             parse_rig(text.replace(old, new, 1))

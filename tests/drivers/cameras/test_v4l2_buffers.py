@@ -36,9 +36,7 @@ def test_accepts_complete_images(counter: Counter) -> None:
 @pytest.mark.parametrize(
     ("sequences", "drops"), [((7, 8, 10, 14), 4), ((2**32 - 2, 2**32 + 1), 2), ((3, 3 + 2**30), 2**30 - 1)]
 )
-def test_counts_gaps_as_drops_across_the_overflow_too(
-    counter: Counter, sequences: tuple[int, ...], drops: int
-) -> None:
+def test_counts_gaps_as_drops_across_the_overflow_too(counter: Counter, sequences: tuple[int, ...], drops: int) -> None:
     counter.accept(*sequences)
     assert (counter.state.drops, counter.state.restarts) == (drops, 0)
 

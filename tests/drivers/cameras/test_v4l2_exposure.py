@@ -39,7 +39,8 @@ class ControlTable:
 
     def __init__(self) -> None:
         self.controls = {  # id: name, kind, low, high, step
-            GAIN: ("Gain", INTEGER, 0, 255, 1), AUTO_GAIN: ("Gain, Automatic", BOOLEAN, 0, 1, 1),
+            GAIN: ("Gain", INTEGER, 0, 255, 1),
+            AUTO_GAIN: ("Gain, Automatic", BOOLEAN, 0, 1, 1),
             AUTO_EXPOSURE: ("Auto Exposure", MENU, 0, 3, 1),
             EXPOSURE: ("Exposure Time, Absolute", INTEGER, 3, 2047, 1),
             EXPOSURE_MAY_SLOW: ("Exposure, Dynamic Framerate", BOOLEAN, 0, 1, 1),

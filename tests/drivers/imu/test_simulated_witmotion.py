@@ -14,8 +14,10 @@ from drivers.imu.witmotion import RADPS_PER_UNIT, PacketReader, WitMotionGyro
 
 
 def test_the_driver_reads_the_rates() -> None:
-    with closing(SimulatedWitMotion(lambda: (0.01, -0.5, 1.5), 200.0)) as imu, \
-            closing(WitMotionGyro(imu.port, 115_200)) as gyro:
+    with (
+        closing(SimulatedWitMotion(lambda: (0.01, -0.5, 1.5), 200.0)) as imu,
+        closing(WitMotionGyro(imu.port, 115_200)) as gyro,
+    ):
         samples = list(islice(gyro.samples(), 10))
         assert gyro.broken == 0
     for sample in samples:

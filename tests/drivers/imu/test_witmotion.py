@@ -48,10 +48,10 @@ def test_packets_are_found_again_after_damaged_bytes() -> None:
     rng, reader = random.Random(4), PacketReader()
     stream = bytearray()
     for k in range(300):
-        stream += turn(k)[rng.randrange(30):] if k % 7 == 0 else turn(k)  # the start of it was lost
+        stream += turn(k)[rng.randrange(30) :] if k % 7 == 0 else turn(k)  # the start of it was lost
         if k % 10 == 1:
             stream[-5] ^= 1
-    found = [z for start in range(0, len(stream), 13) for _, _, z in reader.feed(bytes(stream[start:start + 13]))]
+    found = [z for start in range(0, len(stream), 13) for _, _, z in reader.feed(bytes(stream[start : start + 13]))]
     assert 250 <= len(found) <= 300 and reader.broken > 0
     known = {round(k * witmotion.RADPS_PER_UNIT, 9) for k in range(300)}
     assert sum(round(z, 9) not in known for z in found) <= 3  # a sum of eight bits passes one of 256 by chance

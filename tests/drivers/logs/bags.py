@@ -21,8 +21,10 @@ def write_db3(folder: Path, entries: Sequence[Entry], zstd: bool = False) -> Pat
     if zstd:
         writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
     with writer:
-        connections = {topic: writer.add_connection(topic, kind, typestore=STORE)
-                       for topic, kind in {entry.topic: entry.type for entry in entries}.items()}
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=STORE)
+            for topic, kind in {entry.topic: entry.type for entry in entries}.items()
+        }
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, entry.data)
     return next(folder.glob("*.db3"))
@@ -40,8 +42,10 @@ def write_bag(path: Path, entries: Sequence[Entry], compression: str = "") -> Pa
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
     with writer:
-        connections = {topic: writer.add_connection(topic, kind, typestore=ROS1)
-                       for topic, kind in {entry.topic: entry.type for entry in entries}.items()}
+        connections = {
+            topic: writer.add_connection(topic, kind, typestore=ROS1)
+            for topic, kind in {entry.topic: entry.type for entry in entries}.items()
+        }
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, ros1_bytes(entry))
     return path

@@ -76,7 +76,8 @@ def test_raw_images_of_ros1(tmp_path: Path) -> None:
     types = ROS1.types
     stamp = types["builtin_interfaces/msg/Time"](sec=START_NS // 10**9, nanosec=5)
     message = types["sensor_msgs/msg/Image"](
-        types["std_msgs/msg/Header"](seq=7, stamp=stamp, frame_id="abc"), 3, 4, "mono8", 0, 4, pixels.ravel())
+        types["std_msgs/msg/Header"](seq=7, stamp=stamp, frame_id="abc"), 3, 4, "mono8", 0, 4, pixels.ravel()
+    )
     data = bytes(ROS1.serialize_ros1(message, "sensor_msgs/msg/Image"))
     with Ros1Writer(tmp_path / "log.bag") as writer:
         for topic in ("/lower/image_raw", "/upper/image_raw"):
@@ -175,8 +176,10 @@ def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
     assert read(folder, lower="mav0/cam0/data", upper="mav0/cam1/data")[0] == expected(tmp_path)
 
 
-@pytest.mark.parametrize(("step", "apart"), [(100_000_000, "3.2 years"), (10_000, "2.8 hours"), (100_000, "27.8 hours"),
-                                             (1_000_000, "12 days")])
+@pytest.mark.parametrize(
+    ("step", "apart"),
+    [(100_000_000, "3.2 years"), (10_000, "2.8 hours"), (100_000, "27.8 hours"), (1_000_000, "12 days")],
+)
 def test_images_hours_apart_are_a_question(tmp_path: Path, step: int, apart: str) -> None:
     """Names of 10 digits that count nanoseconds or so would be seconds; one line says so, names the images and asks."""
     numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
@@ -197,17 +200,29 @@ def test_an_image_without_stamp_is_refused(tmp_path: Path) -> None:
         LogReader(folder)
 
 
-@pytest.mark.parametrize(("text", "stamp_ns"), [
-    ("1403636579763555584", 1403636579763555584),
-    ("1305031102.175304", 1305031102175304000),
-    ("1305031102.1753041239", 1305031102175304123),
-    ("7", 7_000_000_000), ("4611686018.427387903", 2**62 - 1), ("4611686018.427387904", None),
-    ("1.036336e-01", 103_633_600),
-    ("2011-09-26 13:02:25.951199337", 1317042145951199337),
-    ("2011-09-26T13:02:25", 1317042145000000000),
-    ("frame1", None), ("", None), ("-1", None), ("nan", None), ("1e30", None), ("9" * 400, None), ("1.2.3", None),
-    ("2011-09-26 13:02:25.x", None), ("1969-01-01", None),
-])
+@pytest.mark.parametrize(
+    ("text", "stamp_ns"),
+    [
+        ("1403636579763555584", 1403636579763555584),
+        ("1305031102.175304", 1305031102175304000),
+        ("1305031102.1753041239", 1305031102175304123),
+        ("7", 7_000_000_000),
+        ("4611686018.427387903", 2**62 - 1),
+        ("4611686018.427387904", None),
+        ("1.036336e-01", 103_633_600),
+        ("2011-09-26 13:02:25.951199337", 1317042145951199337),
+        ("2011-09-26T13:02:25", 1317042145000000000),
+        ("frame1", None),
+        ("", None),
+        ("-1", None),
+        ("nan", None),
+        ("1e30", None),
+        ("9" * 400, None),
+        ("1.2.3", None),
+        ("2011-09-26 13:02:25.x", None),
+        ("1969-01-01", None),
+    ],
+)
 def test_stamps_are_exact(text: str, stamp_ns: int | None) -> None:
     assert parse_stamp(text) == stamp_ns
 
@@ -215,10 +230,12 @@ def test_stamps_are_exact(text: str, stamp_ns: int | None) -> None:
 @pytest.mark.parametrize("kind", ["mcap", "db3", "bag", "folder"])
 def test_tells_the_contents_of_each_format(tmp_path: Path, kind: str) -> None:
     entries = pairs(PAIRS)
-    path = {"mcap": lambda: write_log(tmp_path / "log.mcap", entries),
-            "db3": lambda: write_db3(tmp_path / "bag", entries),
-            "bag": lambda: write_bag(tmp_path / "log.bag", entries),
-            "folder": lambda: write_folders(tmp_path / "images", entries)}[kind]()
+    path = {
+        "mcap": lambda: write_log(tmp_path / "log.mcap", entries),
+        "db3": lambda: write_db3(tmp_path / "bag", entries),
+        "bag": lambda: write_bag(tmp_path / "log.bag", entries),
+        "folder": lambda: write_folders(tmp_path / "images", entries),
+    }[kind]()
     found = log_info(path)
     assert [(kind, count) for kind, count in found.topics.values()] == [(COMPRESSED, PAIRS)] * 2
     assert found.span_ns == (START_NS, START_NS + (PAIRS - 1) * 10**8 + 10**6) and found.state is LogState.WHOLE
@@ -244,8 +261,10 @@ def test_a_view_in_place_of_the_messages_is_refused(tmp_path: Path) -> None:
     path = write_db3(tmp_path / "bag", pairs(1))
     with closing(sqlite3.connect(path)) as bag:
         bag.execute("DROP TABLE messages")
-        bag.execute("CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
-                    "SELECT id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n")
+        bag.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+            "SELECT id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n"
+        )
         bag.commit()
     with pytest.raises(DriverError, match="no bag of ROS 2"):
         LogReader(path)
@@ -315,8 +334,10 @@ def test_a_bag_whose_pages_are_named_again_and_again_ends(tmp_path: Path) -> Non
     assert log_info(path).state is LogState.BROKEN
 
 
-@pytest.mark.parametrize("columns", ["data, topic_id, timestamp, id INTEGER PRIMARY KEY",
-                                     "id INTEGER PRIMARY KEY, topic_id AS (1), timestamp, data"])
+@pytest.mark.parametrize(
+    "columns",
+    ["data, topic_id, timestamp, id INTEGER PRIMARY KEY", "id INTEGER PRIMARY KEY, topic_id AS (1), timestamp, data"],
+)
 def test_a_table_of_other_columns_is_no_bag(tmp_path: Path, columns: str) -> None:
     path = write_db3(tmp_path / "bag", pairs(1))
     with closing(sqlite3.connect(path)) as bag:

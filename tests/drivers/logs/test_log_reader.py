@@ -151,7 +151,8 @@ def test_a_part_of_a_log_is_counted_from_its_start(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", pairs(10))
     frames, reader = read(log, span_s=(0.2, 0.5))
     assert [(camera, seq) for camera, seq, _ in places(frames)] == [
-        (camera, seq) for seq in range(4) for camera in ("lower", "upper")][:len(frames)]
+        (camera, seq) for seq in range(4) for camera in ("lower", "upper")
+    ][: len(frames)]
     assert frames[0].stamp_ns == START_NS + 2 * 10**8 and frames[-1].stamp_ns <= START_NS + 5 * 10**8
     assert reader.counts["lower"] + reader.counts["upper"] == len(frames) == 7
     assert not reader.truncated and not reader.warnings and reader.pair_estimate() is None

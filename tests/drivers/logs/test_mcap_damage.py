@@ -191,8 +191,15 @@ def test_the_advice_for_other_bags_works(tmp_path: Path) -> None:
     original, bag, converted = tmp_path / "log.mcap", tmp_path / "bag", tmp_path / "converted"
     write_log(original, pairs(4))
     for source, target, storage in ((original, bag, "sqlite3"), (bag, converted, "mcap")):
-        command = [Path(sys.executable).with_name("rosbags-convert"), "--src", source, "--dst", target, "--dst-storage",
-                   storage]
+        command = [
+            Path(sys.executable).with_name("rosbags-convert"),
+            "--src",
+            source,
+            "--dst",
+            target,
+            "--dst-storage",
+            storage,
+        ]
         subprocess.run(command, check=True, capture_output=True)
     assert payloads(LogReader(converted)) == payloads(LogReader(original))
 

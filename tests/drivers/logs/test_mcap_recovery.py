@@ -166,7 +166,8 @@ def test_keeps_records_of_other_writers(tmp_path: Path) -> None:
         assert (late.create_time, late.log_time, late.media_type) == (3, 4, "text/x")
         summary = reader.get_summary()
         assert summary is not None and [c.metadata for c in summary.channels.values()] == [
-            {"n": str(n)} for n in range(5)]
+            {"n": str(n)} for n in range(5)
+        ]
 
 
 def test_overwrites_nothing_and_leaves_no_partial_file(tmp_path: Path) -> None:

@@ -106,9 +106,7 @@ def small_files() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("chunk_bytes", [2000, 2**30])
-def test_a_log_on_a_full_disk_stays_readable(
-    tmp_path: Path, small_files: None, chunk_bytes: int
-) -> None:
+def test_a_log_on_a_full_disk_stays_readable(tmp_path: Path, small_files: None, chunk_bytes: int) -> None:
     log = LogWriter(tmp_path / "log.mcap", RIG, chunk_bytes, compression="none")
     entries = pairs(200)
     with pytest.raises(DriverError, match=os.strerror(errno.EFBIG)):

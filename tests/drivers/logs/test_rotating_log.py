@@ -91,8 +91,9 @@ def test_a_file_has_the_suffix_part_until_it_is_complete(bench: Callable[..., Be
     assert (recording.state.status, recording.state.messages, recording.state.lost) == ("closed", 31, 1)
 
 
-@pytest.mark.parametrize("rotation", [replace(ROOMY, file_bytes=500_000), replace(ROOMY, file_s=50 * TICK_NS / 1e9)],
-                         ids=["size", "age"])
+@pytest.mark.parametrize(
+    "rotation", [replace(ROOMY, file_bytes=500_000), replace(ROOMY, file_s=50 * TICK_NS / 1e9)], ids=["size", "age"]
+)
 def test_starts_a_new_file_by_size_and_by_age(bench: Callable[..., Bench], rotation: RotationSettings) -> None:
     recording = bench(rotation)
     recording.write(200, size=10_000)
@@ -209,7 +210,8 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     recording.write(300, size=10_000)
     assert recording.state.status == "stopped" and "No space left" in recording.events[0][1]
     assert [level for level, _ in recording.events] == [logging.WARNING] and recording.names() == [
-        "robot_20231114T221320Z_001.mcap.part"]  # what was saved until then, and no more than that
+        "robot_20231114T221320Z_001.mcap.part"
+    ]  # what was saved until then, and no more than that
     lost = recording.state.lost
     time.sleep(1.1)
     recording.write(10)  # the next try fails too, and is not reported again
@@ -226,9 +228,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     assert recording.state.messages == saved + whole + recording.state.lost
 
 
-def test_keeps_the_reserved_space_free_and_completes_the_file(
-    small_disk: Path, bench: Callable[..., Bench]
-) -> None:
+def test_keeps_the_reserved_space_free_and_completes_the_file(small_disk: Path, bench: Callable[..., Bench]) -> None:
     rotation = replace(ROOMY, file_bytes=2 * 10**6, free_bytes=10**6, sync_s=0.0)
     recording = bench(rotation, folder=small_disk / "log")
     recording.write(20, size=10_000)

@@ -66,8 +66,9 @@ def test_one_topic_is_both_cameras_only_if_it_is_given_for_both(tmp_path: Path) 
     with closing(LogReader(path, lower=LOWER, upper=LOWER)) as reader:
         frames = list(reader.frames())
         assert [frame.camera for frame in frames] == ["lower", "upper"] * 3 and reader.pair_estimate() == 3
-        assert all(a.stamp_ns == b.stamp_ns and a.data is b.data
-                   for a, b in zip(frames[::2], frames[1::2], strict=True))
+        assert all(
+            a.stamp_ns == b.stamp_ns and a.data is b.data for a, b in zip(frames[::2], frames[1::2], strict=True)
+        )
 
 
 @pytest.mark.parametrize(

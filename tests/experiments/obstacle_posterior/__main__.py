@@ -65,20 +65,25 @@ class Scores:
     def row(self, case: str) -> str:
         """Return a row of the table."""
         share = [f"{100 * n / max(self.directions, 1):.2f} %" for n in (self.found, self.missed, self.false)]
-        target = [f"{100 * n / self.of_target:.1f} %" if self.of_target else "-"
-                  for n in (self.target_found, self.target_missed)]
+        target = [
+            f"{100 * n / self.of_target:.1f} %" if self.of_target else "-"
+            for n in (self.target_found, self.target_missed)
+        ]
         free = " / ".join(f"{100 * n / max(true, 1):.0f}" for n, true in self.open) + " %"
         excess = f"{100 * max(self.excess_m):.0f} cm" if self.excess_m else "-"
         cells = " | ".join([case, *share, *target, free, excess, f"{np.median(self.milliseconds):.1f}"])
         return f"| {cells} |"
 
 
-def pairs(scene: ObstacleScene, robot: SimulatedRobot, dewarp: Dewarp, steps: int, seed: int
-          ) -> Iterator[tuple[float, Panoramas]]:
+def pairs(
+    scene: ObstacleScene, robot: SimulatedRobot, dewarp: Dewarp, steps: int, seed: int
+) -> Iterator[tuple[float, Panoramas]]:
     """Yield the way and the panoramas of a drive."""
     rng = np.random.default_rng([seed, 61])
-    sensors = [MountedSensor.of(robot.sensor, camera.visible, camera.camera.size)
-               for camera in (robot.rig.lower, robot.rig.upper)]
+    sensors = [
+        MountedSensor.of(robot.sensor, camera.visible, camera.camera.size)
+        for camera in (robot.rig.lower, robot.rig.upper)
+    ]
     number = 0
     for step in range(steps):
         x_m = START_M + STEP_M * step
@@ -113,8 +118,14 @@ def columns_of(shape: Geometry, panoramas: Panoramas, grid: ObstacleGrid) -> Col
     T_rect_base = shape.rig.T_rect_rig @ se3.inverse(shape.rig.T_base_rig)
     plane = floor_plane(T_rect_base)
     grid.set_floor(T_rect_base, plane.height_m)
-    return Columns(shape.cylinder, shape.rig.baseline_m, plane, settings.heights_m,
-                   (NEAREST_M, settings.max_range_m), panoramas.visible)
+    return Columns(
+        shape.cylinder,
+        shape.rig.baseline_m,
+        plane,
+        settings.heights_m,
+        (NEAREST_M, settings.max_range_m),
+        panoramas.visible,
+    )
 
 
 def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) -> None:
@@ -172,8 +183,10 @@ def main() -> None:
         kernel.compile()
     robot = make_robot(arguments.size)
     robot = replace(robot, rig=with_masks(robot.rig))
-    print("| case | found | missed | false | thing found | thing missed | told free to "
-          f"{' / '.join(f'{m:g}' for m in OPEN_M)} m | most free beyond, ahead | ms a pair |")
+    print(
+        "| case | found | missed | false | thing found | thing missed | told free to "
+        f"{' / '.join(f'{m:g}' for m in OPEN_M)} m | most free beyond, ahead | ms a pair |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     total = np.zeros((len(ODDS_BINS) - 1, 2))
     for case in arguments.cases:
@@ -186,8 +199,10 @@ def main() -> None:
         print("| log-odds of the floor | cells | free | said |\n|---|---|---|---|")
         for low, high, (free, count) in zip(ODDS_BINS[:-1], ODDS_BINS[1:], total, strict=True):
             claimed = [100 / (1 + np.exp(-odds)) for odds in (low, high)]
-            print(f"| {low:g} to {high:g} | {count:.0f} | {100 * free / max(count, 1):.1f} % | "
-                  f"{claimed[0]:.0f} to {claimed[1]:.0f} % |")
+            print(
+                f"| {low:g} to {high:g} | {count:.0f} | {100 * free / max(count, 1):.1f} % | "
+                f"{claimed[0]:.0f} to {claimed[1]:.0f} % |"
+            )
 
 
 if __name__ == "__main__":

@@ -138,9 +138,12 @@ def malformed(setting: Setting) -> Outcome:
         accepted = int(operator.values("wheels")["commands"])
         for number in range(1000):
             kind = number % 4
-            payload = (rng.randbytes(rng.randrange(200)), good[: rng.randrange(len(good))],
-                       codec.heading_cdr(time.time_ns(), float("nan"), 0.0),
-                       codec.heading_cdr(time.time_ns(), 1e9, 0.0))
+            payload = (
+                rng.randbytes(rng.randrange(200)),
+                good[: rng.randrange(len(good))],
+                codec.heading_cdr(time.time_ns(), float("nan"), 0.0),
+                codec.heading_cdr(time.time_ns(), 1e9, 0.0),
+            )
             operator.send("cmd/heading" if kind > 1 else rng.choice(("cmd/heading", "cmd/twist")), payload[kind])
 
         def refused() -> int:

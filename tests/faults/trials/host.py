@@ -19,8 +19,10 @@ from tests.replay.live import PATIENCE_S, Base, Operator, robot, wait_until
 def sigterm(setting: Setting) -> Outcome:
     """Five times, at five moments within the period of the images."""
     for part in range(5):
-        with tempfile.TemporaryDirectory(dir=setting.folder) as folder, \
-                driving(Setting(setting.scene, Path(folder))) as (_, _, base):
+        with (
+            tempfile.TemporaryDirectory(dir=setting.folder) as folder,
+            driving(Setting(setting.scene, Path(folder))) as (_, _, base),
+        ):
             time.sleep(0.02 * part)
         speeds = [note.wheels_mps[0] for note in base.line.notes if note.wheels_mps[0] > 0]
         assert speeds[-1] < 0.2, "slowed down, not at once"
@@ -128,8 +130,10 @@ def another_clock(setting: Setting) -> Outcome:
             assert not base.line.moved_since(0.0)
             status.append(f"{step_s:+g} s: refused as {reason!r}, counted")
         assert daemon.end()[0] == 0
-    with tempfile.TemporaryDirectory(dir=setting.folder) as folder, \
-            robot(setting.scene, Path(folder), "--set", 'bus.command_clock="arrival"') as (_, operator, base):
+    with (
+        tempfile.TemporaryDirectory(dir=setting.folder) as folder,
+        robot(setting.scene, Path(folder), "--set", 'bus.command_clock="arrival"') as (_, operator, base),
+    ):
         for step_s in steps_s:
             send_until(operator, base, step_s)
             expect_stop(base)

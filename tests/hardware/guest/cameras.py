@@ -66,8 +66,14 @@ class CameraReader:
     """A camera that is read by a thread; `taken`: seq, stamp and arrival of each frame."""
 
     def __init__(self, device: str = LOWER, **fields: Any) -> None:
-        fields = {"width_px": SIZE[0], "height_px": SIZE[1], "rate_hz": RATE_HZ, "pixel_format": "GREY",
-                  "timeout_s": 5.0, "controls": STILL} | fields
+        fields = {
+            "width_px": SIZE[0],
+            "height_px": SIZE[1],
+            "rate_hz": RATE_HZ,
+            "pixel_format": "GREY",
+            "timeout_s": 5.0,
+            "controls": STILL,
+        } | fields
         self.events: list[tuple[int, str]] = []
         self.taken: list[tuple[int, int, int]] = []
         self.last: Frame | None = None

@@ -119,8 +119,12 @@ def unit() -> Iterator[None]:
     run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", "omnid")
     run("python3", "-m", "compileall", "-q", "/opt/omnid/omnid", "/opt/omnid/drivers", "/opt/omnid/calib")
     run("chmod", "-R", "a+rX", "/opt/omnid")
-    for path, text in ((Path("/opt/omnid/bin/omnid"), PROGRAM), (Path("/etc/omnid/omnid.toml"), SETTINGS),
-                       (DROP_INS / "slow.conf", SLOW), (Path("/etc/udev/rules.d/90-omnid.rules"), RULES)):
+    for path, text in (
+        (Path("/opt/omnid/bin/omnid"), PROGRAM),
+        (Path("/etc/omnid/omnid.toml"), SETTINGS),
+        (DROP_INS / "slow.conf", SLOW),
+        (Path("/etc/udev/rules.d/90-omnid.rules"), RULES),
+    ):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
     Path("/opt/omnid/bin/omnid").chmod(0o755)
@@ -217,7 +221,7 @@ def test_a_killed_daemon_stops_the_wheels_until_it_is_back(operator: GuestOperat
 
 def save_the_recording(killed_ns: int, newest_age_ns: int) -> None:
     """Save the recording for the host, which is faster."""
-    left, = RECORDINGS.glob("*.part")
+    (left,) = RECORDINGS.glob("*.part")
     shutil.copy(left, RESULTS / "killed.mcap.part")
     (RESULTS / "killed.json").write_text(json.dumps({"killed_ns": killed_ns, "newest_age_ns": newest_age_ns}))
 
@@ -248,9 +252,19 @@ def test_stopping_the_unit_stops_the_wheels(operator: GuestOperator, wheels: Whe
 
 def test_records_a_log_from_the_cameras_alone(operator: GuestOperator, tmp_path: Path) -> None:
     """`omnid record` beside no daemon, ended as Ctrl-C does."""
-    run("timeout", "--preserve-status", "-s", "INT", "60", "/opt/omnid/bin/omnid", "record", str(tmp_path / "boards"),
-        "--config", "/etc/omnid/omnid.toml")
-    log, = (tmp_path / "boards").glob("*.mcap")
+    run(
+        "timeout",
+        "--preserve-status",
+        "-s",
+        "INT",
+        "60",
+        "/opt/omnid/bin/omnid",
+        "record",
+        str(tmp_path / "boards"),
+        "--config",
+        "/etc/omnid/omnid.toml",
+    )
+    (log,) = (tmp_path / "boards").glob("*.mcap")
     assert "rig.toml" in run("/opt/omnid/bin/omnid", "log", "info", str(log))
     images = LogImages.load(log)
     for frames in (images.lower, images.upper):

@@ -13,8 +13,18 @@ OUTPUT = 2  # V4L2_BUF_TYPE_VIDEO_OUTPUT
 
 def load_loopback() -> None:
     """Load two loopback cameras with 4 buffers: with more, a reader that requests 4 has crashed the kernel."""
-    subprocess.run(["modprobe", "v4l2loopback", "devices=2", "video_nr=10,11", "card_label=omni-lower,omni-upper",
-                    "exclusive_caps=1,1", "max_buffers=4"], check=True)
+    subprocess.run(
+        [
+            "modprobe",
+            "v4l2loopback",
+            "devices=2",
+            "video_nr=10,11",
+            "card_label=omni-lower,omni-upper",
+            "exclusive_caps=1,1",
+            "max_buffers=4",
+        ],
+        check=True,
+    )
     subprocess.run(["udevadm", "settle"], check=True)
 
 

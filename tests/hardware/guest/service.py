@@ -32,6 +32,7 @@ TimeoutStartSec=400
 
 def reported() -> dict[str, Any]:
     """Return the report of the running daemon."""
+
     def is_there() -> bool:
         return REPORT.exists() and json.loads(REPORT.read_text())["pid"] == int(show("MainPID"))
 
@@ -75,12 +76,21 @@ def test_memory_is_locked() -> None:
 
 def test_writes_only_to_its_own_folders() -> None:
     assert {path: found == "done" for path, found in reported()["written"].items()} == {
-        "/etc/omnid": False, "/opt/omnid": False, "/var/lib": False, "/var/lib/omnid": True, "/run/omnid": True}
+        "/etc/omnid": False,
+        "/opt/omnid": False,
+        "/var/lib": False,
+        "/var/lib/omnid": True,
+        "/run/omnid": True,
+    }
 
 
 def test_opens_only_cameras_and_serial_ports() -> None:
     assert {path: found == "done" for path, found in reported()["opened"].items()} == {
-        "/dev/ttyS1": True, "/dev/video0": True, "/dev/vda": False, "/dev/kmsg": False}
+        "/dev/ttyS1": True,
+        "/dev/video0": True,
+        "/dev/vda": False,
+        "/dev/kmsg": False,
+    }
 
 
 def test_reaches_only_this_machine_unless_more_is_allowed() -> None:

@@ -36,8 +36,9 @@ def short_log(path: Path, count: int = BYTES) -> Path:
 
 
 def omnid(*words: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "omnid", *map(str, words)], capture_output=True, text=True,
-                          timeout=4 * DEADLINE_S)
+    return subprocess.run(
+        [sys.executable, "-m", "omnid", *map(str, words)], capture_output=True, text=True, timeout=4 * DEADLINE_S
+    )
 
 
 def rows(out: Path) -> dict[str, dict[str, str]]:
@@ -69,8 +70,17 @@ def test_results_are_those_of_single_runs_and_a_bad_log_stops_nothing(tmp_path: 
     """Also where a truth lies beside the log, here the trajectory of the single run."""
     good, out = short_log(tmp_path / "logs" / "day1" / "log.mcap"), tmp_path / "out"
     (tmp_path / "logs" / "broken.mcap").write_text("no log")
-    single = omnid("replay", good, "--tum", tmp_path / "est.txt", "--cloud", tmp_path / "cloud.ply", "--plan",
-                   tmp_path / "plan.png", "--quiet")
+    single = omnid(
+        "replay",
+        good,
+        "--tum",
+        tmp_path / "est.txt",
+        "--cloud",
+        tmp_path / "cloud.ply",
+        "--plan",
+        tmp_path / "plan.png",
+        "--quiet",
+    )
     assert single.returncode == 0
     shutil.copy(tmp_path / "est.txt", good.parent / "truth.txt")
     done = omnid("batch", tmp_path / "logs", "--out", out, "--jobs", 2)
@@ -90,15 +100,24 @@ def test_results_are_those_of_single_runs_and_a_bad_log_stops_nothing(tmp_path: 
     assert again.returncode == 0 and "1 of 2 logs have their results already" in again.stderr, again.stderr
     assert (out / "day1-log" / "result.json").stat().st_mtime_ns == before
     assert rows(out)["broken"]["status"] == "ok" and rows(out)["broken"]["ate_rmse_m"] == "", "no truth lies beside it"
-    (changed,) = [job for job in jobs(find_logs([str(tmp_path / "logs")]), out,
-                                      BatchOptions(("--set", "odometry.limits.features=300"))) if job.log == str(good)]
+    (changed,) = [
+        job
+        for job in jobs(
+            find_logs([str(tmp_path / "logs")]), out, BatchOptions(("--set", "odometry.limits.features=300"))
+        )
+        if job.log == str(good)
+    ]
     assert stored_result(changed) is None
 
 
 def test_a_job_whose_program_is_killed_is_run_again(tmp_path: Path) -> None:
     log, out = short_log(tmp_path / "log.mcap", 2 * BYTES), tmp_path / "out"
-    with subprocess.Popen([sys.executable, "-m", "omnid", "batch", str(log), "--out", str(out)], text=True,
-                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as batch:
+    with subprocess.Popen(
+        [sys.executable, "-m", "omnid", "batch", str(log), "--out", str(out)],
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    ) as batch:
         wait_until(lambda: bool(replays_of(log)))
         os.kill(replays_of(log)[0], signal.SIGKILL)
         text, messages = batch.communicate(timeout=DEADLINE_S)
@@ -111,8 +130,11 @@ def test_an_interrupted_batch_leaves_no_program_and_goes_on_later(
     tmp_path: Path, number: signal.Signals, default_signals: None
 ) -> None:
     log, out = short_log(tmp_path / "log.mcap", 2 * BYTES), tmp_path / "out"
-    with subprocess.Popen([sys.executable, "-m", "omnid", "batch", str(log), "--out", str(out)],
-                          stderr=subprocess.PIPE, stdout=subprocess.PIPE) as batch:
+    with subprocess.Popen(
+        [sys.executable, "-m", "omnid", "batch", str(log), "--out", str(out)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as batch:
         wait_until(lambda: bool(replays_of(log)))
         second = omnid("batch", log, "--out", out)
         assert second.returncode == 2 and "another batch writes into" in second.stderr
@@ -122,8 +144,10 @@ def test_an_interrupted_batch_leaves_no_program_and_goes_on_later(
     wait_until(lambda: not replays_of(log))
     assert not (out / "log").exists()
     assert omnid("batch", log, "--out", out).returncode == 0
-    assert sorted(path.name for path in out.iterdir()) == [".lock", "index.html", "log", "results.csv"] or (
-        out / "results.parquet").exists()
+    assert (
+        sorted(path.name for path in out.iterdir()) == [".lock", "index.html", "log", "results.csv"]
+        or (out / "results.parquet").exists()
+    )
 
 
 def test_a_log_that_takes_too_long_is_ended(tmp_path: Path) -> None:
@@ -159,8 +183,9 @@ def test_reads_logs_at_addresses(tmp_path: Path) -> None:
 
 
 def test_tables_hold_names_that_are_no_formulas_and_no_html(tmp_path: Path) -> None:
-    write_tables([JobResult("=1+1", "/logs/<b>.mcap", FAILED, "<script>alert(1)</script>"), JobResult("a", "/a", OK)],
-                 tmp_path)
+    write_tables(
+        [JobResult("=1+1", "/logs/<b>.mcap", FAILED, "<script>alert(1)</script>"), JobResult("a", "/a", OK)], tmp_path
+    )
     assert "'=1+1" in rows(tmp_path)
     text = (tmp_path / "index.html").read_text()
     assert "<script>" not in text and "&lt;script&gt;" in text
@@ -203,15 +228,41 @@ def test_wrong_options_are_one_line(tmp_path: Path) -> None:
 def test_a_dask_worker_that_is_killed_costs_nothing_but_repetition(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     logs = [short_log(tmp_path / "logs" / f"{number}.mcap", BYTES + 1000 * number) for number in range(8)]
-    scheduler = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1",
-                                  "--port", "0", "--no-dashboard", "--scheduler-file", str(tmp_path / "scheduler")])
+    scheduler = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "distributed.cli.dask_scheduler",
+            "--host",
+            "127.0.0.1",
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--scheduler-file",
+            str(tmp_path / "scheduler"),
+        ]
+    )
     workers = []
     try:
         wait_until((tmp_path / "scheduler").exists)
         address = json.loads((tmp_path / "scheduler").read_text())["address"]
-        workers = [subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1",
-                                     "--no-dashboard", "--no-nanny", "--local-directory", str(tmp_path)])
-                   for _ in range(2)]
+        workers = [
+            subprocess.Popen(
+                [
+                    sys.executable,
+                    "-m",
+                    "distributed.cli.dask_worker",
+                    address,
+                    "--nthreads",
+                    "1",
+                    "--no-dashboard",
+                    "--no-nanny",
+                    "--local-directory",
+                    str(tmp_path),
+                ]
+            )
+            for _ in range(2)
+        ]
         results = []
         for result in dask_workers(address)(jobs([str(log) for log in logs], tmp_path / "out", BatchOptions())):
             results.append(result)

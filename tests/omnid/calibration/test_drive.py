@@ -40,24 +40,30 @@ def changed(rig: Rig, changes: dict[str, float]) -> tuple[RigParameters, Array]:
     return found.parameters, found.state.steps
 
 
-@pytest.mark.parametrize(("rig", "changes", "words"), [
-    (MEASURED, {"r_x": np.deg2rad(3)}, "3.0 deg turned"),
-    (MEASURED, {"e_y": np.deg2rad(-4)}, "4.0 deg aside"),
-    (nominal_rig(with_real_mirrors(MEASURED, 1)), {"r_x": np.deg2rad(5)}, "5.0 deg turned"),
-    (MEASURED, {"lower_fu": 25.0, "lower_fv": 25.0}, "would change"),
-    (MEASURED, {"upper_xi": -0.2}, "upper xi would change from 1 to 0.8"),
-    (MEASURED, {"lower_pu": 20.0}, "lower pu would change"),
-])
+@pytest.mark.parametrize(
+    ("rig", "changes", "words"),
+    [
+        (MEASURED, {"r_x": np.deg2rad(3)}, "3.0 deg turned"),
+        (MEASURED, {"e_y": np.deg2rad(-4)}, "4.0 deg aside"),
+        (nominal_rig(with_real_mirrors(MEASURED, 1)), {"r_x": np.deg2rad(5)}, "5.0 deg turned"),
+        (MEASURED, {"lower_fu": 25.0, "lower_fv": 25.0}, "would change"),
+        (MEASURED, {"upper_xi": -0.2}, "upper xi would change from 1 to 0.8"),
+        (MEASURED, {"lower_pu": 20.0}, "lower pu would change"),
+    ],
+)
 def test_another_rig_is_refused(rig: Rig, changes: dict[str, float], words: str) -> None:
     with pytest.raises(OmnidError, match=words) as raised:
         require_same_rig(*changed(rig, changes))
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(("rig", "changes"), [
-    (MEASURED, {"r_x": np.deg2rad(1.5), "e_y": np.deg2rad(1), "lower_fu": 5.0, "upper_xi": 0.02, "upper_pv": 5.0}),
-    (nominal_rig(with_real_mirrors(MEASURED, 1)), {"r_y": np.deg2rad(-4)}),
-])
+@pytest.mark.parametrize(
+    ("rig", "changes"),
+    [
+        (MEASURED, {"r_x": np.deg2rad(1.5), "e_y": np.deg2rad(1), "lower_fu": 5.0, "upper_xi": 0.02, "upper_pv": 5.0}),
+        (nominal_rig(with_real_mirrors(MEASURED, 1)), {"r_y": np.deg2rad(-4)}),
+    ],
+)
 def test_the_same_rig_is_accepted(rig: Rig, changes: dict[str, float]) -> None:
     require_same_rig(*changed(rig, changes))
 

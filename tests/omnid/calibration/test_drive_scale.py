@@ -39,11 +39,15 @@ def test_the_level_is_that_of_the_base() -> None:
     np.testing.assert_allclose(se3.rotation_log(turn), [0.0, 0.01, 0.0], atol=1e-6)
 
 
-@pytest.mark.parametrize("poses", [
-    spline_path(1, 40, 0.05, sway_m=0.01),
-    vibrate(loop(1, 60), 1, 0.2, shake_mm=40.0),
-    loop(1, 60) @ se3.transform(se3.rotation_exp([0.1, 0, 0]), np.zeros(3)),
-], ids=["straight", "rough", "far off"])
+@pytest.mark.parametrize(
+    "poses",
+    [
+        spline_path(1, 40, 0.05, sway_m=0.01),
+        vibrate(loop(1, 60), 1, 0.2, shake_mm=40.0),
+        loop(1, 60) @ se3.transform(se3.rotation_exp([0.1, 0, 0]), np.zeros(3)),
+    ],
+    ids=["straight", "rough", "far off"],
+)
 def test_a_path_without_a_plane_of_the_base_changes_nothing(poses: np.ndarray) -> None:
     assert level_turn(make_rig(), se3.inverse(se3.inverse(poses[0]) @ poses)) is None
 

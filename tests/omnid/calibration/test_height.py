@@ -81,8 +81,9 @@ def test_a_log_without_a_floor_ends_with_one_line(scene: Path, monkeypatch: pyte
         omnid.calibrate_height(scene / "log.mcap", read_rig(scene / "rig.toml"))
 
 
-def test_commands_that_make_a_rig_take_its_height(tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]
-                                                  ) -> None:
+def test_commands_that_make_a_rig_take_its_height(
+    tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ("import", scene / "camchain.yaml", "-o", tmp_path / "rig.toml")
     assert command(*words) == 0 and "no height of the cameras" in capsys.readouterr().out
     assert "T_base_rig" not in (tmp_path / "rig.toml").read_text()

@@ -51,8 +51,10 @@ def test_hours_and_rings_are_those_of_a_clock_in_the_image() -> None:
         coverage.add(at(hour, radius))
     counts = coverage.counts()
     assert [tuple(place) for place in np.argwhere(counts)] == [(0, 0), (1, 3), (2, 9)]
-    assert coverage.missing() == ["no board at 1, 2, 4 to 8, 10, 11 o'clock",
-                                  "one ring only: hold it nearer, farther, higher, lower"]
+    assert coverage.missing() == [
+        "no board at 1, 2, 4 to 8, 10, 11 o'clock",
+        "one ring only: hold it nearer, farther, higher, lower",
+    ]
 
 
 def test_enough_is_all_hours_and_two_rings() -> None:
@@ -79,10 +81,19 @@ def test_a_pair_is_kept_where_the_board_stands_still_at_a_new_place(folder: Path
     boards = LiveBoards(BOARD)
     first, second = (tuple(image(folder, f"{side}_{name}") for side in ("lower", "upper")) for name in ("00", "01"))
     empty = np.zeros_like(first[0])
-    seen = [boards.process(pair, need_still=True)
-            for pair in (first, first, first, second, second, (empty, empty), (first[0], empty))]
-    assert seen == [PairOutcome.MOVING, PairOutcome.KEPT, PairOutcome.SEEN_BEFORE, PairOutcome.MOVING,
-                    PairOutcome.KEPT, PairOutcome.NO_BOARD, PairOutcome.ONE_CAMERA]
+    seen = [
+        boards.process(pair, need_still=True)
+        for pair in (first, first, first, second, second, (empty, empty), (first[0], empty))
+    ]
+    assert seen == [
+        PairOutcome.MOVING,
+        PairOutcome.KEPT,
+        PairOutcome.SEEN_BEFORE,
+        PairOutcome.MOVING,
+        PairOutcome.KEPT,
+        PairOutcome.NO_BOARD,
+        PairOutcome.ONE_CAMERA,
+    ]
     assert boards.pairs == 2 and boards.missing()[0] == "13 more positions"
     lines = fitted(table(boards, seen[-1], "Ctrl-C ends"), 60, 20)
     assert len(lines) <= 19 and all(len(line) <= 60 for line in lines) and "more" not in lines[-1]
@@ -91,8 +102,9 @@ def test_a_pair_is_kept_where_the_board_stands_still_at_a_new_place(folder: Path
     boards.close()
 
 
-def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(folder: Path, tmp_path: Path,
-                                                              capsys: pytest.CaptureFixture[str]) -> None:
+def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     omnid, kept = Command(capsys), tmp_path / "kept"
     first = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
     assert first.code == 1 and "3 pairs, not enough yet: 12 more positions" in first.err

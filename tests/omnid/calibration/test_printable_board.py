@@ -41,12 +41,25 @@ def test_a_checkerboard_is_true_to_scale(tmp_path: Path) -> None:
     assert longest_px / PX_PER_MM == pytest.approx(100, abs=0.2)
 
 
-@pytest.mark.parametrize(("options", "family", "border", "count", "side_mm"), [
-    (("--board", "charuco", "--corners", "5x7", "--square-mm", 30, "--marker-mm", 22, "--dictionary", "5X5_100"),
-     cv2.aruco.DICT_5X5_100, 1, 24, 22.0),
-    (("--board", "aprilgrid", "--tags", "6x6", "--tag-mm", 22, "--tag-spacing", 0.3),
-     cv2.aruco.DICT_APRILTAG_36h11, 2, 36, 22.0),
-])
+@pytest.mark.parametrize(
+    ("options", "family", "border", "count", "side_mm"),
+    [
+        (
+            ("--board", "charuco", "--corners", "5x7", "--square-mm", 30, "--marker-mm", 22, "--dictionary", "5X5_100"),
+            cv2.aruco.DICT_5X5_100,
+            1,
+            24,
+            22.0,
+        ),
+        (
+            ("--board", "aprilgrid", "--tags", "6x6", "--tag-mm", 22, "--tag-spacing", 0.3),
+            cv2.aruco.DICT_APRILTAG_36h11,
+            2,
+            36,
+            22.0,
+        ),
+    ],
+)
 def test_markers_are_read_and_true_to_scale(
     tmp_path: Path, options: tuple[object, ...], family: int, border: int, count: int, side_mm: float
 ) -> None:
@@ -61,15 +74,25 @@ def test_markers_are_read_and_true_to_scale(
 
 
 def test_a_board_that_does_not_fit_names_a_paper_that_does(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "omnid", "calibrate", "board", "--corners", "12x13", "--square-mm", "50", "-o",
-               tmp_path / "board.pdf"]
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "calibrate",
+        "board",
+        "--corners",
+        "12x13",
+        "--square-mm",
+        "50",
+        "-o",
+        tmp_path / "board.pdf",
+    ]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and "does not fit on a4" in done.stderr and "--paper a0" in done.stderr
     assert not (tmp_path / "board.pdf").exists()
 
 
-def test_a_board_that_looks_the_same_when_turned_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]
-                                                            ) -> None:
+def test_a_board_that_looks_the_same_when_turned_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("calibrate", "board", "--corners", "6x6", "--square-mm", "25", "-o", str(tmp_path / "board.pdf"))
     assert main(words) == 2 and not (tmp_path / "board.pdf").exists()
     assert "--corners 6x6: such a board looks the same when it is turned" in capsys.readouterr().err

@@ -41,7 +41,8 @@ def test_imports_and_exports_kalibr_files(omni_rig: Rig, tmp_path: Path, capsys:
 
 def test_the_line_says_how_far_a_lens_sees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A rectified camera of 1241x376 px reaches 42 degrees to its corners, not the 15 to its upper edge."""
-    cameras = "".join(f"""
+    cameras = "".join(
+        f"""
 cam{n}:
   camera_model: pinhole
   intrinsics: [718.9, 718.9, 607.2, 185.2]
@@ -49,7 +50,9 @@ cam{n}:
   distortion_coeffs: [0, 0, 0, 0]
   resolution: [1241, 376]
   rostopic: /{name}/image
-""" for n, name in enumerate(("lower", "upper")))
+"""
+        for n, name in enumerate(("lower", "upper"))
+    )
     chain = "  T_cn_cnm1: [[1, 0, 0, 0], [0, 1, 0, 0.54], [0, 0, 1, 0], [0, 0, 0, 1]]\n"
     (tmp_path / "k.yaml").write_text(cameras + chain)
     assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
@@ -64,11 +67,16 @@ def test_imports_and_exports_ocam_files(ocam_rig: Rig, tmp_path: Path, capsys: p
     assert omnid("import", *files, "--transform", tmp_path / "o.transform.toml", "-o", tmp_path / "again.toml") == 0
     again = read_rig(tmp_path / "again.toml")
     assert (again.lower.camera, again.upper.camera) == (ocam_rig.lower.camera, ocam_rig.upper.camera)
-    np.testing.assert_allclose(again.lower.T_cam_rig @ se3.inverse(again.upper.T_cam_rig),
-                               ocam_rig.lower.T_cam_rig @ se3.inverse(ocam_rig.upper.T_cam_rig), atol=1e-11)
+    np.testing.assert_allclose(
+        again.lower.T_cam_rig @ se3.inverse(again.upper.T_cam_rig),
+        ocam_rig.lower.T_cam_rig @ se3.inverse(ocam_rig.upper.T_cam_rig),
+        atol=1e-11,
+    )
     assert omnid("import", *files, "--baseline", 0.2, "--view", "direct", "-o", tmp_path / "up.toml") == 0
-    assert "upper ocam direct 1000x780, 0 to 138 deg from its axis, baseline 200.0 mm, upper rotated by 0.00 deg" in \
-        capsys.readouterr().out
+    assert (
+        "upper ocam direct 1000x780, 0 to 138 deg from its axis, baseline 200.0 mm, upper rotated by 0.00 deg"
+        in capsys.readouterr().out
+    )
     (tmp_path / "folder").mkdir()
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "folder") == 0
     assert (tmp_path / "folder" / "calib_results.upper.txt").read_text() == export_ocam(ocam_rig.upper.camera)

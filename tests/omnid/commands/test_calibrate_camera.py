@@ -37,8 +37,7 @@ def run(*words: object, corners: str = "6x5") -> int:
     return main(["calibrate", "camera", *map(str, words), "--corners", corners, "--square-mm", "30", "--quiet"])
 
 
-def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path,
-                                                    capsys: pytest.CaptureFixture[str]) -> None:
+def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, report, mask = (tmp_path / name for name in ("camera.toml", "report.html", "mask.png"))
     assert run(folder, "-o", out, "--report", report, "--mask", mask) == 0
     line = capsys.readouterr().out
@@ -55,8 +54,9 @@ def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_calibrates_an_omni_camera_by_a_pattern_with_a_blank_image(folder: Path, tmp_path: Path,
-                                                                      capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrates_an_omni_camera_by_a_pattern_with_a_blank_image(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for path in folder.iterdir():
         shutil.copy(path, tmp_path)
     cv2.imwrite(str(tmp_path / "p9.png"), np.full((362, 360), 90, np.uint8))
@@ -81,8 +81,9 @@ def log_of(folder: Path, path: Path, topics: tuple[str, ...]) -> None:
 
 
 @pytest.mark.slow
-def test_calibrates_by_a_log_and_requires_the_topic(folder: Path, tmp_path: Path,
-                                                            capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrates_by_a_log_and_requires_the_topic(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     log_of(folder, tmp_path / "log.mcap", ("/lower", "/upper"))
     assert run(tmp_path / "log.mcap", "-o", tmp_path / "camera.toml") == 2
     assert "expected --topic, to select the camera, found image topics /lower, /upper" in capsys.readouterr().err
@@ -99,40 +100,68 @@ def bad_folder(tmp_path: Path, folder: Path, kind: str) -> list[object]:
     cv2.imwrite(str(other), np.full((300, 360), 90, np.uint8))
     text.write_text("no image")
     (tmp_path / "empty").mkdir(exist_ok=True)
-    kinds: dict[str, list[object]] = {"blank": [blank], "three": [*three], "sizes": [*three, other], "text": [text],
-                                      "empty": [tmp_path / "empty"], "none": [tmp_path / "none.png"],
-                                      "topic": [*three, "--topic", "/x"], "log": [tmp_path / "none.mcap"]}
+    kinds: dict[str, list[object]] = {
+        "blank": [blank],
+        "three": [*three],
+        "sizes": [*three, other],
+        "text": [text],
+        "empty": [tmp_path / "empty"],
+        "none": [tmp_path / "none.png"],
+        "topic": [*three, "--topic", "/x"],
+        "log": [tmp_path / "none.mcap"],
+    }
     return kinds[kind]
 
 
-@pytest.mark.parametrize(("kind", "message"), [
-    ("blank", "no board of 6x5 inner corners in any of 1 images; count the inner corners"),
-    ("three", "expected at least 4 views of the board, found 3; take more images"),
-    ("sizes", "all of one size, found 360x362 (p0.png), 360x300 (other.png)"),
-    ("text", "notes.png: expected an image"),
-    ("empty", "no image"), ("none", "no such file"), ("topic", "only a log has topics"), ("log", "none.mcap"),
-])
-def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, message: str,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("blank", "no board of 6x5 inner corners in any of 1 images; count the inner corners"),
+        ("three", "expected at least 4 views of the board, found 3; take more images"),
+        ("sizes", "all of one size, found 360x362 (p0.png), 360x300 (other.png)"),
+        ("text", "notes.png: expected an image"),
+        ("empty", "no image"),
+        ("none", "no such file"),
+        ("topic", "only a log has topics"),
+        ("log", "none.mcap"),
+    ],
+)
+def test_invalid_input_is_one_line_and_exit_code_2(
+    folder: Path, tmp_path: Path, kind: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(*bad_folder(tmp_path, folder, kind), "-o", tmp_path / "camera.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
     assert not (tmp_path / "camera.toml").exists()
 
 
-def test_suggests_the_right_number_of_corners(folder: Path, tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+def test_suggests_the_right_number_of_corners(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(folder / "p0.png", "-o", tmp_path / "camera.toml", corners="7x4") == 2
     assert "a grid of 5x6 was found in 1: try --corners 5x6" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("words", [["--corners", "6by5", "--square-mm", "30"]])
-def test_invalid_options_are_one_line(folder: Path, tmp_path: Path, words: list[str],
-                                      capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_options_are_one_line(
+    folder: Path, tmp_path: Path, words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["calibrate", "camera", str(folder), *words, "-o", str(tmp_path / "c.toml")])
     assert ended.value.code == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
-    assert main(["calibrate", "camera", str(folder), "--corners", "6x5", "--square-mm", "-3", "-o",
-                 str(tmp_path / "c.toml")]) == 2
+    assert (
+        main(
+            [
+                "calibrate",
+                "camera",
+                str(folder),
+                "--corners",
+                "6x5",
+                "--square-mm",
+                "-3",
+                "-o",
+                str(tmp_path / "c.toml"),
+            ]
+        )
+        == 2
+    )
     assert "squares of 0.1 mm to 10 m" in capsys.readouterr().err

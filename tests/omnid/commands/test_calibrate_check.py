@@ -44,8 +44,9 @@ def test_images_that_are_not_synchronous_make_pairs(tmp_path: Path) -> None:
     assert [pair.skew_s for pair in found] == pytest.approx([0.04] * 4)
 
 
-def test_motion_between_the_exposures_is_no_drift_to_correct(tmp_path: Path, capsys: pytest.CaptureFixture[str]
-                                                             ) -> None:
+def test_motion_between_the_exposures_is_no_drift_to_correct(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = build("two_walls", 3, 256, 8)
     write_log(tmp_path, run.rig, run.poses, run.scene, readout=Readout(skew_ms=(-20.0, -20.0)), supersample=1)
     words = ["calibrate", "check", str(tmp_path / "log.mcap"), "--rig", str(tmp_path / "rig.toml")]
@@ -94,8 +95,7 @@ def run(*words: object) -> int:
     return main(["calibrate", "check", *map(str, words)])
 
 
-def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, wrong, right = scene / "log.mcap", tmp_path / "wrong.toml", tmp_path / "right.toml"
     truth = read_rig(scene / "rig.toml")
     write_rig(wrong, with_upper_rotated(truth, (0.6, -0.4, 1.5)))
@@ -113,8 +113,9 @@ def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path,
     assert run(log, "--rig", right) == 0
 
 
-def test_recommends_recalibration_for_a_shifted_centre(scene: Path, tmp_path: Path,
-                                                               capsys: pytest.CaptureFixture[str]) -> None:
+def test_recommends_recalibration_for_a_shifted_centre(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rig = read_rig(scene / "rig.toml")
     camera = rig.upper.camera
     assert isinstance(camera, UnifiedCamera)
@@ -128,27 +129,36 @@ def test_reports_a_mask_beyond_the_rim(scene: Path, tmp_path: Path, capsys: pyte
     rig = read_rig(scene / "rig.toml")
     assert rig.lower.mask is not None
     u, v = rig.lower.mask.center
-    write_rig(tmp_path / "rig.toml", replace(rig, lower=replace(rig.lower, mask=Mask((u + 9, v), 0.0,
-                                                                                   rig.lower.mask.outer_px))))
+    write_rig(
+        tmp_path / "rig.toml",
+        replace(rig, lower=replace(rig.lower, mask=Mask((u + 9, v), 0.0, rig.lower.mask.outer_px))),
+    )
     assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
     output = capsys.readouterr().out
     assert output.startswith("drifted: ") and "lower rim: centre moved by -9.0" in output and "upper rim" in output
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    ([], "no rig.toml is attached to the log"), (["--rig", "none.toml"], "none.toml: there is no such rig"),
-    (["--refine"], "--refine and -o go together"), (["-o", "rig.toml"], "--refine and -o go together"),
-    (["--lower", "/x"], "no topic '/x'"),
-])
-def test_invalid_input_is_one_line(scene: Path, words: list[str], message: str,
-                                   capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "no rig.toml is attached to the log"),
+        (["--rig", "none.toml"], "none.toml: there is no such rig"),
+        (["--refine"], "--refine and -o go together"),
+        (["-o", "rig.toml"], "--refine and -o go together"),
+        (["--lower", "/x"], "no topic '/x'"),
+    ],
+)
+def test_invalid_input_is_one_line(
+    scene: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(scene / "log.mcap", *words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
 
 
-def test_images_of_another_size_are_a_one_line_error(scene: Path, tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_of_another_size_are_a_one_line_error(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
     (tmp_path / "rig.toml").write_text(text)
     assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 2

@@ -29,22 +29,29 @@ def test_a_short_drive_is_refused(scene: Path, tmp_path: Path, capsys: pytest.Ca
     assert not (tmp_path / "rig.toml").exists()
 
 
-@pytest.mark.parametrize(("distance", "logs", "words"), [
-    ("0", 1, "expected a distance above 0 m"), ("nan", 1, "expected a distance above 0 m"),
-    ("3", 2, "is the length of one drive"),
-])
-def test_a_distance_that_cannot_be_is_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-                                              distance: str, logs: int, words: str) -> None:
-    code = calibrate(*[scene / "log.mcap"] * logs, "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml",
-                     "--distance-m", distance)
+@pytest.mark.parametrize(
+    ("distance", "logs", "words"),
+    [
+        ("0", 1, "expected a distance above 0 m"),
+        ("nan", 1, "expected a distance above 0 m"),
+        ("3", 2, "is the length of one drive"),
+    ],
+)
+def test_a_distance_that_cannot_be_is_refused(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], distance: str, logs: int, words: str
+) -> None:
+    code = calibrate(
+        *[scene / "log.mcap"] * logs, "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--distance-m", distance
+    )
     assert code == 2 and words in capsys.readouterr().err
 
 
 def test_exchanged_cameras_are_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = read_rig(scene / "rig.toml")
     lower, upper = rig.topics
-    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--lower", upper,
-                     "--upper", lower)
+    code = calibrate(
+        scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--lower", upper, "--upper", lower
+    )
     assert code == 2 and len(capsys.readouterr().err.splitlines()) < 6
     assert not (tmp_path / "rig.toml").exists()
 
@@ -91,8 +98,9 @@ def test_a_nominal_rig_with_real_mirrors_becomes_useful(tmp_path: Path, capsys: 
     for name, pairs in (("rooms", 100), ("two_walls", 60)):
         run = build(name, 15, pairs=pairs)
         write_log(tmp_path / name, with_real_mirrors(run.rig, 15), run.poses, run.scene, sensor=run.sensor, seed=15)
-    code = calibrate(tmp_path / "rooms" / "log.mcap", "--rig", tmp_path / "rooms" / "nominal.toml", "-o",
-                     tmp_path / "better.toml")
+    code = calibrate(
+        tmp_path / "rooms" / "log.mcap", "--rig", tmp_path / "rooms" / "nominal.toml", "-o", tmp_path / "better.toml"
+    )
     assert code == 0 and "scale uncertain by" in capsys.readouterr().out
     length, ate_m = errors(tmp_path / "two_walls", tmp_path / "better.toml")
     assert abs(length) < 3e-3 and ate_m < 8e-3

@@ -31,8 +31,10 @@ PAIRS = 7
 def rig_of(size: int) -> Rig:
     """Return a rig whose upper camera is rotated about every axis, with images of size x size."""
     scale, mounted = size / 768, []
-    for xi, focal, center, T in ((0.93, (-205.0, 206.2), (384.2, 380.9), np.eye(4)),
-                                 (0.97, (-208.0, 207.2), (381.2, 385.9), T_UPPER_LOWER)):
+    for xi, focal, center, T in (
+        (0.93, (-205.0, 206.2), (384.2, 380.9), np.eye(4)),
+        (0.97, (-208.0, 207.2), (381.2, 385.9), T_UPPER_LOWER),
+    ):
         u, v = center[0] * scale, center[1] * scale
         camera = UnifiedCamera(xi, (focal[0] * scale, focal[1] * scale), (u, v), (size, size))
         mounted.append(MountedCamera(camera, T, Mask((u, v), 50 * scale, 372 * scale)))
@@ -94,8 +96,7 @@ def turn_off_deg(rig: Rig) -> float:
 
 
 @pytest.mark.slow
-def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path,
-                                                         capsys: pytest.CaptureFixture[str]) -> None:
+def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, report = tmp_path / "rig.toml", tmp_path / "report.html"
     assert run(many, "-o", out, "--model", "omni", "--report", report, "--expected-baseline-mm", "180") == 0
     output = capsys.readouterr()
@@ -133,8 +134,9 @@ def alone(folder: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_views_of_one_camera_are_used_if_cameras_are_refined(folder: Path, alone: Path,
-                                                      capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_of_one_camera_are_used_if_cameras_are_refined(
+    folder: Path, alone: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = [*given(folder), "--refine-cameras", "--report", alone / "report.html"]
     assert run(alone, "-o", alone / "rig.toml", *words) == 0
     output = capsys.readouterr()
@@ -146,14 +148,17 @@ def test_views_of_one_camera_are_used_if_cameras_are_refined(folder: Path, alone
 
 
 def test_given_cameras_are_kept_and_single_views_rejected(
-        folder: Path, alone: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder: Path, alone: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(alone, "-o", alone / "rig.toml", *given(folder)) == 0
     found, output = read_rig(alone / "rig.toml"), capsys.readouterr()
     assert found.lower.camera == LOWER and found.upper.camera == UPPER and found.lower.mask == TRUTH.lower.mask
     assert turn_off_deg(found) < 0.02 and found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=3e-4)
     assert output.out.splitlines()[0].endswith("5 pairs")
-    assert [line[:45] for line in output.err.splitlines()] == ["warning: left out 05: only the lower camera s",
-                                                             "warning: left out 06: only the upper camera s"]
+    assert [line[:45] for line in output.err.splitlines()] == [
+        "warning: left out 05: only the lower camera s",
+        "warning: left out 06: only the upper camera s",
+    ]
 
 
 def log_of(folder: Path, path: Path) -> None:
@@ -162,7 +167,7 @@ def log_of(folder: Path, path: Path) -> None:
     kinds, schema = store.types, "sensor_msgs/msg/CompressedImage"
     with LogWriter(path) as writer:
         for k in range(PAIRS):
-            for name, late_ns in (("lower", 0), ("upper", 2_000_000), ("upper", 50_000_000))[:2 + (k == 3)]:
+            for name, late_ns in (("lower", 0), ("upper", 2_000_000), ("upper", 50_000_000))[: 2 + (k == 3)]:
                 data = np.frombuffer((folder / f"{name}_{k:02d}.png").read_bytes(), np.uint8)
                 header = kinds["std_msgs/msg/Header"](kinds["builtin_interfaces/msg/Time"](k + 1, late_ns), name)
                 cdr = store.serialize_cdr(kinds[schema](header, "png", data), schema)
@@ -210,39 +215,56 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
     return [made]
 
 
-@pytest.mark.parametrize(("kind", "message"), [
-    ("three", "expected at least 4 views of the board, found 3"),
-    ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images"),
-    ("sizes", "all of one size, found 480x480"), ("text", "lower_09.png: expected an image"),
-    ("one side", "no images upper_*"), ("unpaired", "no pair of images: found 3 of the lower camera, 3 of"),
-    ("missing", "found nothing"), ("one camera", "expected both --lower-camera and --upper-camera"),
-    ("size of camera", "--lower-camera: expected a camera of 480x480 px like the lower images, found 640x480 px"),
-    ("topic", "only a log has topics"),
-])
-def test_invalid_input_is_one_line_and_exit_code_2(folder: Path, tmp_path: Path, kind: str, message: str,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("three", "expected at least 4 views of the board, found 3"),
+        ("blank", "upper camera: calibrate: no board of 7x6 inner corners in any of 3 images"),
+        ("sizes", "all of one size, found 480x480"),
+        ("text", "lower_09.png: expected an image"),
+        ("one side", "no images upper_*"),
+        ("unpaired", "no pair of images: found 3 of the lower camera, 3 of"),
+        ("missing", "found nothing"),
+        ("one camera", "expected both --lower-camera and --upper-camera"),
+        ("size of camera", "--lower-camera: expected a camera of 480x480 px like the lower images, found 640x480 px"),
+        ("topic", "only a log has topics"),
+    ],
+)
+def test_invalid_input_is_one_line_and_exit_code_2(
+    folder: Path, tmp_path: Path, kind: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run(*bad(folder, tmp_path, kind), "-o", tmp_path / "rig.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line and not (tmp_path / "rig.toml").exists()
 
 
-@pytest.mark.parametrize(("square_mm", "words", "message"), [
-    (25, ["--expected-baseline-mm", "180"], "--square-mm 29.97 would explain it"),
-    (0.3, [], "expected a baseline of 10 to 3000 mm, found 1.802 mm"),
-    (30000, [], "squares of 0.1 mm to 10 m, found 30000 mm"),
-    (30, ["--expected-baseline-mm", "-4"], "expected a length above 0"),
-])
-def test_detects_a_wrong_square_by_the_baseline(folder: Path, four: Path, tmp_path: Path, square_mm: float,
-                                                words: list[str], message: str,
-                                                capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("square_mm", "words", "message"),
+    [
+        (25, ["--expected-baseline-mm", "180"], "--square-mm 29.97 would explain it"),
+        (0.3, [], "expected a baseline of 10 to 3000 mm, found 1.802 mm"),
+        (30000, [], "squares of 0.1 mm to 10 m, found 30000 mm"),
+        (30, ["--expected-baseline-mm", "-4"], "expected a length above 0"),
+    ],
+)
+def test_detects_a_wrong_square_by_the_baseline(
+    folder: Path,
+    four: Path,
+    tmp_path: Path,
+    square_mm: float,
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     out = tmp_path / "rig.toml"
     assert run(four, "-o", out, *given(folder), *words, square_mm=square_mm) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line and not out.exists()
 
 
-def test_suggests_the_right_number_of_corners(folder: Path, four: Path, tmp_path: Path,
-                                               capsys: pytest.CaptureFixture[str]) -> None:
+def test_suggests_the_right_number_of_corners(
+    folder: Path, four: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for path in four.glob("*_0[0-3].png"):
         if path.name.endswith(("_00.png", "_01.png")):
             shutil.copy(path, tmp_path)

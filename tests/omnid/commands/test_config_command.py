@@ -41,19 +41,29 @@ def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
     file = tmp_path / "omnid.toml"
     file.write_text("[bus]\nrobot = 'rover'\n")
     assert omnid("config", "check", file).out == (
-        f"{file}: good; 1 settings differ from their defaults\nbus.robot = 'rover', default 'omnid'\n")
+        f"{file}: good; 1 settings differ from their defaults\nbus.robot = 'rover', default 'omnid'\n"
+    )
     file.write_text("[bus]\nrobots = 'rover'\n")
     assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
 
 
 def test_migrate_moves_renamed_keys(omnid: Command, tmp_path: Path) -> None:
     old, new = tmp_path / "old.toml", tmp_path / "new.toml"
-    old.write_text("[guidance]\nvelocity_mps = 0.3\n[guidance.limits]\ngain_hz = 2.0\n[service]\nhung_s = 5.0\n"
-                   "[bus]\nrobot = 'rover'\n")
+    old.write_text(
+        "[guidance]\nvelocity_mps = 0.3\n[guidance.limits]\ngain_hz = 2.0\n[service]\nhung_s = 5.0\n"
+        "[bus]\nrobot = 'rover'\n"
+    )
     done = omnid("config", "migrate", old)
     new.write_text(done.out)
-    assert load_config(new) == load_config(None, ["controller.setpoint.velocity_mps=0.3", "bus.robot=rover",
-                                                  "controller.heading.gain_hz=2", "service.stall_timeout_s=5"])
+    assert load_config(new) == load_config(
+        None,
+        [
+            "controller.setpoint.velocity_mps=0.3",
+            "bus.robot=rover",
+            "controller.heading.gain_hz=2",
+            "service.stall_timeout_s=5",
+        ],
+    )
     assert "service.hung_s is now called service.stall_timeout_s" in done.err and "guidance.limits" in done.err
     assert omnid("config", "migrate", new).out == done.out, "a file of this version stays as it is"
 

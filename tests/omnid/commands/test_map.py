@@ -26,8 +26,13 @@ def omap(tmp_path: Path) -> Path:
 def test_info_tells_the_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["map", "info", str(omap)]) == 0
     printed = capsys.readouterr().out
-    for text in ("sessions     2", "keyframes    12, with 240 features; 3 were dropped", "loops        1",
-                 "path         3.3 m", "rig          0123abcd0123, baseline 0.2400 m, panoramas of 1304 x 378 px"):
+    for text in (
+        "sessions     2",
+        "keyframes    12, with 240 features; 3 were dropped",
+        "loops        1",
+        "path         3.3 m",
+        "rig          0123abcd0123, baseline 0.2400 m, panoramas of 1304 x 378 px",
+    ):
         assert text in printed
 
 
@@ -67,8 +72,10 @@ def test_align_moves_a_map_into_the_axes_of_a_plan(omap: Path, capsys: pytest.Ca
     np.testing.assert_allclose(after[:, 0, 3], 11 - (before[:, 1, 3] - 2), atol=1e-9)
     np.testing.assert_allclose(after[:, 1, 3], 2 + before[:, 0, 3] - 1, atol=1e-9)
     two = SEEN + SEEN[11:].replace("5", "6").replace("[1, 2,", "[4, 2,")
-    for text, message in ((SEEN.replace("facing_deg = 0\n", ""), "1 tags in common: two landmarks"),
-                          (two, "from its place on the plan")):
+    for text, message in (
+        (SEEN.replace("facing_deg = 0\n", ""), "1 tags in common: two landmarks"),
+        (two, "from its place on the plan"),
+    ):
         seen.write_text(text)
         plan.write_text(text.replace("[4, 2,", "[6, 2,"))
         assert main(words) == 2
@@ -78,8 +85,24 @@ def test_align_moves_a_map_into_the_axes_of_a_plan(omap: Path, capsys: pytest.Ca
 
 def test_export_writes_what_is_asked_for(omap: Path) -> None:
     out = omap.parent
-    assert main(["map", "export", str(omap), "--ply", str(out / "a.ply"), "--plan", str(out / "a.png"), "--grid",
-                 str(out / "a.yaml"), "--cell", "0.1"]) == 0
+    assert (
+        main(
+            [
+                "map",
+                "export",
+                str(omap),
+                "--ply",
+                str(out / "a.ply"),
+                "--plan",
+                str(out / "a.png"),
+                "--grid",
+                str(out / "a.yaml"),
+                "--cell",
+                "0.1",
+            ]
+        )
+        == 0
+    )
     assert len(read_ply(out / "a.ply").xyz) > 50
     assert cv2.imread(str(out / "a.png")) is not None
     assert "resolution: 0.1\n" in (out / "a.yaml").read_text() and (out / "a.pgm").read_bytes().startswith(b"P5\n")

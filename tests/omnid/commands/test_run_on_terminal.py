@@ -20,8 +20,19 @@ def test_says_that_it_is_ready_and_ends_with_a_summary(tmp_path: Path) -> None:
     with SAMPLE.open("rb") as sample:
         log.write_bytes(sample.read(450_000))
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "omnid", "run", "--log", str(log), "--once", "--motor", "simulated",
-               "--set", f'bus.listen=["{endpoint}"]']
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "run",
+        "--log",
+        str(log),
+        "--once",
+        "--motor",
+        "simulated",
+        "--set",
+        f'bus.listen=["{endpoint}"]',
+    ]
     with subprocess.Popen(command, stdout=slave, stderr=slave, stdin=subprocess.DEVNULL) as process:
         os.close(slave)
         shown = b""

@@ -22,10 +22,12 @@ from omnid.engine.telemetry import StageStats
 
 PERIOD_S = 0.05
 PERIOD_NS = 50_000_000
-LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8,
-                       yaw_acceleration_radps2=4.0)
-SETTINGS = ControllerSettings(Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0),
-                              trust=TrustSettings(battery_v=11.0)).without_obstacles
+LIMITS = VelocityLimits(
+    velocity_mps=0.4, acceleration_mps2=0.6, deceleration_mps2=1.5, yaw_rate_radps=0.8, yaw_acceleration_radps2=4.0
+)
+SETTINGS = ControllerSettings(
+    Deadlines(), LIMITS, HeadingLimits(velocity_mps=1.0, acceleration_mps2=5.0), trust=TrustSettings(battery_v=11.0)
+).without_obstacles
 UNATTENDED = replace(SETTINGS, arming=AUTOMATIC)
 AHEAD = Setpoint(0.3, None, 0.0)
 
@@ -49,8 +51,16 @@ class Wheels:
         velocity_mps, yaw_rate_radps = self.drive.limited(command)
         if self.velocity_mps is not None:
             velocity_mps, yaw_rate_radps = self.velocity_mps, 0.0
-        return MotorStatus(velocity_mps, self.heading_rad, yaw_rate_radps, self.expired, self.fault, self.battery_v,
-                           self.bumper, self.cliff)
+        return MotorStatus(
+            velocity_mps,
+            self.heading_rad,
+            yaw_rate_radps,
+            self.expired,
+            self.fault,
+            self.battery_v,
+            self.bumper,
+            self.cliff,
+        )
 
     def close(self) -> None:
         """Note that it was closed."""
@@ -66,19 +76,44 @@ class Bench:
         self.wheels = Wheels()
         self.lines: list[str] = []
         self.wheels.drive = drive or self.wheels.drive
-        self.controller = Controller(self.wheels, settings, PERIOD_S, self.lines.append, clock_ns=lambda: self.now_ns,
-                                     limited=drive.limited if drive else None)
+        self.controller = Controller(
+            self.wheels,
+            settings,
+            PERIOD_S,
+            self.lines.append,
+            clock_ns=lambda: self.now_ns,
+            limited=drive.limited if drive else None,
+        )
         self.statistics = ControllerStatistics(StageStats("motor"))
 
     @property
     def last(self) -> VelocityCommand:
         return self.wheels.commands[-1]
 
-    def send_pose(self, heading_rad: float = 0.0, *, state: str = "tracking", rate_radps: float = 0.0,
-            age_s: float = 0.0, velocity_mps: float = math.nan, sigma_mps: float = 0.0, resets: int = 0,
-            witness: Witness = AGREE) -> None:
-        self.controller.set_pose(ControllerPose(self.now_ns - round(age_s * 1e9), heading_rad, rate_radps, state,
-                                                velocity_mps, sigma_mps, resets=resets, witness=witness))
+    def send_pose(
+        self,
+        heading_rad: float = 0.0,
+        *,
+        state: str = "tracking",
+        rate_radps: float = 0.0,
+        age_s: float = 0.0,
+        velocity_mps: float = math.nan,
+        sigma_mps: float = 0.0,
+        resets: int = 0,
+        witness: Witness = AGREE,
+    ) -> None:
+        self.controller.set_pose(
+            ControllerPose(
+                self.now_ns - round(age_s * 1e9),
+                heading_rad,
+                rate_radps,
+                state,
+                velocity_mps,
+                sigma_mps,
+                resets=resets,
+                witness=witness,
+            )
+        )
 
     def send_setpoint(self, setpoint: Setpoint = AHEAD, source: str = OPERATOR, sender: str = "") -> None:
         self.now_ns += 1

@@ -144,8 +144,9 @@ def test_a_fault_while_the_wheels_stand_is_reported(driving: Bench) -> None:
     report_a_fault(driving)
     driving.tick()
     reported = [line for line in driving.lines if line.startswith("disarmed while the wheels stand")]
-    assert reported == [f"disarmed while the wheels stand: {safety_rules.MOTOR_FAULT}; "
-                    "they stay stopped until cmd/arm (`omnid arm`)"]
+    assert reported == [
+        f"disarmed while the wheels stand: {safety_rules.MOTOR_FAULT}; they stay stopped until cmd/arm (`omnid arm`)"
+    ]
 
 
 @pytest.mark.parametrize("reason", FAULTS)
@@ -291,7 +292,8 @@ def test_an_old_stop_that_is_repeated_does_not_release_a_newer_one(mode: str) ->
 @pytest.mark.parametrize("wired", ["bus", "motor controller"])
 @pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
 def test_bumper_and_cliff_latch_in_both_modes_and_no_request_is_accepted_while_they_hold(
-        contact: str, wired: str, mode: str) -> None:
+    contact: str, wired: str, mode: str
+) -> None:
     """As a stop that was asked for; poses and commands at every tick release nothing."""
     bench = Bench(UNATTENDED if mode == AUTOMATIC else SETTINGS)
     bench.drive()

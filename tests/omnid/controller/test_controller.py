@@ -234,8 +234,11 @@ def test_a_motor_that_fails_voids_earlier_setpoints(driving: Bench) -> None:
     send_both(driving)
     driving.tick()
     assert 0.0 < driving.last.velocity_mps <= LIMITS.acceleration_mps2 * PERIOD_S + 1e-9, "from a stop"
-    assert driving.lines == ["motor on /dev/x gave no answer", f"the wheels stop: {safety_rules.FAILED}",
-                            "the motor controller is back"]
+    assert driving.lines == [
+        "motor on /dev/x gave no answer",
+        f"the wheels stop: {safety_rules.FAILED}",
+        "the motor controller is back",
+    ]
 
 
 def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
@@ -254,6 +257,7 @@ def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
 
 def test_continues_the_ramp_after_a_late_answer(driving: Bench) -> None:
     """A command without an answer counts as a step of the ramp to the stop."""
+
     def late(_: VelocityCommand) -> MotorStatus:
         raise LateReplyError("motor on /dev/x gave no answer")
 
@@ -365,8 +369,12 @@ def test_a_simulated_motor_that_holds_headings_follows_headings_and_rates(setpoi
             run_until(controller, twin, setpoint, lambda: abs(twin.pose[2] - goal_rad) < 0.02)
         else:
             # On a busy machine a late tick lets the base reach the last heading, where it waits for the next one.
-            run_until(controller, twin, setpoint,
-                      lambda: twin.pose[2] > 0.4 and twin.base.yaw_rate_radps == pytest.approx(0.4, abs=0.2))
+            run_until(
+                controller,
+                twin,
+                setpoint,
+                lambda: twin.pose[2] > 0.4 and twin.base.yaw_rate_radps == pytest.approx(0.4, abs=0.2),
+            )
         controller.stop(time.monotonic_ns())
         heading_rad, slowed = twin.pose[2], time.monotonic() + PATIENCE_S
         while not (is_stop(twin.last_command) and twin.base.yaw_rate_radps == 0) and time.monotonic() < slowed:
@@ -447,8 +455,12 @@ def test_a_base_that_follows_drives_for_a_minute(bench: Bench) -> None:
     bench.wheels.velocity_mps = None
     for tick in range(1200):
         done = bench.wheels.commands[-2:][0] if bench.wheels.commands else None
-        bench.send_pose(age_s=0.1, velocity_mps=done.velocity_mps if done else 0.0, sigma_mps=0.01,
-                        rate_radps=done.yaw_rate_radps if done else 0.0)
+        bench.send_pose(
+            age_s=0.1,
+            velocity_mps=done.velocity_mps if done else 0.0,
+            sigma_mps=0.01,
+            rate_radps=done.yaw_rate_radps if done else 0.0,
+        )
         bench.send_setpoint(Setpoint(0.4 if tick % 200 < 120 else 0.0, None, 0.6 if tick % 90 < 30 else 0.0))
         bench.tick()
     assert not bench.controller.state.stops and not bench.controller.state.slowed and bench.lines == []

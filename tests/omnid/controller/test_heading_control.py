@@ -1,5 +1,4 @@
-"""Motor controllers that hold headings by themselves, and faster than the limits allow: limits hold, jumps do not turn.
-"""
+"""Motor controllers that hold headings by themselves, faster than the limits allow: limits hold, jumps do not turn."""
 
 from __future__ import annotations
 
@@ -26,8 +25,9 @@ from omnid.core.control.velocity_limits import VelocityLimits
 
 PERIOD_S = 0.05
 LIMITS = VelocityLimits(yaw_rate_radps=1.0)
-SETTINGS = ControllerSettings(Deadlines(5.0, 5.0, 5.0), LIMITS, HeadingLimits(yaw_rate_radps=1.0),
-                              arming=AUTOMATIC).without_obstacles
+SETTINGS = ControllerSettings(
+    Deadlines(5.0, 5.0, 5.0), LIMITS, HeadingLimits(yaw_rate_radps=1.0), arming=AUTOMATIC
+).without_obstacles
 GAIN_HZ = 8.0
 RIPPLE = 1.2  # the goal moves in steps, one a tick, and this motor controller follows within a tick
 FAST = MotionLimits(yaw_rate_radps=10.0, yaw_acceleration_radps2=50.0, heading_gain_hz=GAIN_HZ)
@@ -108,8 +108,9 @@ def test_after_a_jump_a_heading_is_the_one_of_the_corrected_odometry() -> None:
 
 def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> None:
     robot = Lockstep()
-    robot.controller = Controller(robot.driver, replace(SETTINGS, arming="manual"), PERIOD_S,
-                                  clock_ns=lambda: robot.now_ns)
+    robot.controller = Controller(
+        robot.driver, replace(SETTINGS, arming="manual"), PERIOD_S, clock_ns=lambda: robot.now_ns
+    )
     robot.run(STRAIGHT, 2)
     robot.controller.arm(ArmRequest(robot.now_ns))
     robot.run(STRAIGHT, 40)

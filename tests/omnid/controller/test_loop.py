@@ -128,7 +128,7 @@ def test_after_the_daemon_the_wheels_slow_down_to_a_stop(bench: Bench) -> None:
     bench.end()
     speeds = [command.velocity_mps for command in bench.wheels.commands]
     assert speeds[-1] == 0.0 and bench.controller.state.reason == ENDS
-    assert any(0.0 < speed < 0.19 for speed in speeds[speeds.index(max(speeds)):]), "it slows down, and never jumps"
+    assert any(0.0 < speed < 0.19 for speed in speeds[speeds.index(max(speeds)) :]), "it slows down, and never jumps"
 
 
 def test_the_loop_ends_in_time_where_the_wheels_do_not_stop(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,8 +33,9 @@ class RobotWithRings:
         self.base = base
         self.lines: list[str] = []
         start = start_message(base.port)
-        settings = ControllerSettings(DEADLINES, start.controller.limits, arming=start.controller.arming,
-                                      collision=CollisionSettings(stale_s=2.0))
+        settings = ControllerSettings(
+            DEADLINES, start.controller.limits, arming=start.controller.arming, collision=CollisionSettings(stale_s=2.0)
+        )
         self.link = ControllerLink(start._replace(controller=settings), StageStats("motor"), self.lines.append)
         self.thread = threading.Thread(target=lambda: list(self.link.commands()))
         self.thread.start()

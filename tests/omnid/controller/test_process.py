@@ -6,10 +6,30 @@ import json
 import subprocess
 import sys
 
-HEAVY = ("calib.models", "calib.panorama", "calib.rig", "calib.se3", "cv2", "numpy", "rosbags", "scipy", "zenoh",
-         "drivers.cameras", "drivers.frame", "drivers.logs", "drivers.motors.simulated", "omnid.config",
-         "omnid.core.mapping", "omnid.core.odometry", "omnid.core.places", "omnid.core.stereo", "omnid.engine.graph",
-         "omnid.messages", "omnid.stages", "omnid.transport")
+HEAVY = (
+    "calib.models",
+    "calib.panorama",
+    "calib.rig",
+    "calib.se3",
+    "cv2",
+    "numpy",
+    "rosbags",
+    "scipy",
+    "zenoh",
+    "drivers.cameras",
+    "drivers.frame",
+    "drivers.logs",
+    "drivers.motors.simulated",
+    "omnid.config",
+    "omnid.core.mapping",
+    "omnid.core.odometry",
+    "omnid.core.places",
+    "omnid.core.stereo",
+    "omnid.engine.graph",
+    "omnid.messages",
+    "omnid.stages",
+    "omnid.transport",
+)
 
 
 def loaded(statement: str) -> list[str]:

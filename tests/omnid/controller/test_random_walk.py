@@ -43,8 +43,14 @@ SLOW_SHARE = SETTINGS.trust.degraded_speed
 # Of some phases, what the motor controller reports and the poses show: its fault, volts, the speed of the wheels (None:
 # as commanded), the speed that is seen (NaN: unknown) and its standard deviation.
 USUAL = (0, 12.0, None, math.nan, 0.0)
-ODDITIES = ((7, 12.0, None, math.nan, 0.0), (0, 10.0, None, math.nan, 0.0), (0, 12.0, 2.0, math.nan, 0.0),
-            (0, 12.0, None, 0.0, 0.0), (0, 12.0, None, 1.5, 0.0), (0, 12.0, None, math.nan, 1.0))
+ODDITIES = (
+    (7, 12.0, None, math.nan, 0.0),
+    (0, 10.0, None, math.nan, 0.0),
+    (0, 12.0, 2.0, math.nan, 0.0),
+    (0, 12.0, None, 0.0, 0.0),
+    (0, 12.0, None, 1.5, 0.0),
+    (0, 12.0, None, math.nan, 1.0),
+)
 
 
 class RandomMotor:
@@ -65,8 +71,9 @@ class RandomMotor:
         if self.fault == "late":
             raise LateReplyError("no answer yet")
         velocity_mps = command.velocity_mps if self.wheels_mps is None else self.wheels_mps
-        return MotorStatus(velocity_mps, self.counted_rad, self.rate_radps, self.fault == "expired", self.number,
-                           self.battery_v)
+        return MotorStatus(
+            velocity_mps, self.counted_rad, self.rate_radps, self.fault == "expired", self.number, self.battery_v
+        )
 
     def close(self) -> None:
         """Release nothing."""
@@ -124,9 +131,16 @@ class Oracle:
     def fault(self, now_ns: int, late_s: float) -> bool:
         """True if a fault holds at a tick."""
         pose = self.pose
-        return (self.contact or self.failed or self.stopped or late_s > DEADLINES.tick_s or pose is None
-                or pose.state == "lost" or pose.witness.is_fault
-                or abs(now_ns - pose.stamp_ns) * 1e-9 > DEADLINES.pose_s)
+        return (
+            self.contact
+            or self.failed
+            or self.stopped
+            or late_s > DEADLINES.tick_s
+            or pose is None
+            or pose.state == "lost"
+            or pose.witness.is_fault
+            or abs(now_ns - pose.stamp_ns) * 1e-9 > DEADLINES.pose_s
+        )
 
     def step(self, now_ns: int, late_s: float) -> TimedSetpoint | None:
         """Return the command that may move the wheels at a tick; None where they may only slow down."""
@@ -230,8 +244,16 @@ class Walk:
         state = "lost" if self.chance(0.002, 0.05) else rng.choice(("tracking", "tracking", "degraded"))
         age_s = rng.uniform(0.0, 0.15) if self.chance(0.999, 0.95) else rng.uniform(-1, 1)
         self.resets += not self.chance(0.9995, 0.99)
-        pose = ControllerPose(self.now_ns - round(age_s * 1e9), wrap_angle(self.heading_rad), rng.uniform(-0.5, 0.5),
-                              state, self.seen_mps, self.sigma_mps, resets=self.resets, witness=self.witness)
+        pose = ControllerPose(
+            self.now_ns - round(age_s * 1e9),
+            wrap_angle(self.heading_rad),
+            rng.uniform(-0.5, 0.5),
+            state,
+            self.seen_mps,
+            self.sigma_mps,
+            resets=self.resets,
+            witness=self.witness,
+        )
         self.oracle.pose = pose
         self.controller.set_pose(pose)
 
@@ -249,8 +271,12 @@ class Walk:
             ranges = [rng.choice((math.inf, math.nan, rng.uniform(0.1, 3.0))) for _ in range(360)]
         moving = (MovingPoint(rng.uniform(0.4, 2), rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-1, 1), 0.2),)
         age_s = rng.uniform(0.0, 0.15) if self.chance(0.99, 0.9) else rng.uniform(-1, 2)
-        ring = ControllerRing(self.now_ns - round(age_s * 1e9), tuple(ranges[:360]),
-                              (rng.uniform(0, 2),) * 360, moving if kind == "person" else ())
+        ring = ControllerRing(
+            self.now_ns - round(age_s * 1e9),
+            tuple(ranges[:360]),
+            (rng.uniform(0, 2),) * 360,
+            moving if kind == "person" else (),
+        )
         if self.oracle.ring is None or ring.stamp_ns >= self.oracle.ring.stamp_ns:
             self.oracle.ring = ring
         self.controller.set_ring(ring)
@@ -284,12 +310,18 @@ class Walk:
             assert nearer(self.motion.velocity_mps, now.velocity_mps), (self.motion, now, state)
             assert nearer(self.motion.yaw_rate_radps, now.yaw_rate_radps), (self.motion, now, state)
         else:
-            self.expect_obeys(permitted.setpoint, now, state.reason, SLOW_SHARE if state.slowed_by else 1.0,
-                              limited=bool(state.obstacle))
+            self.expect_obeys(
+                permitted.setpoint,
+                now,
+                state.reason,
+                SLOW_SHARE if state.slowed_by else 1.0,
+                limited=bool(state.obstacle),
+            )
         self.seen[state.obstacle] += bool(state.obstacle)
         if abs(now.yaw_rate_radps) < TINY and abs(self.motion.yaw_rate_radps) < TINY and now != STOP:
             assert not self.oracle.blocked(self.now_ns, now.velocity_mps > 0) or nearer(
-                self.motion.velocity_mps, now.velocity_mps), (self.motion, now, state, self.oracle.ring)
+                self.motion.velocity_mps, now.velocity_mps
+            ), (self.motion, now, state, self.oracle.ring)
         if now != STOP and permitted:
             self.seen["driven"] += 1
             self.seen[f"driven by {permitted.source}"] += 1

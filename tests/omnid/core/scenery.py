@@ -64,8 +64,15 @@ class RenderedCameras:
         seen = visible(rig.lower, maps[0], 2) & visible(rig.upper, maps[1], 2)
         seen[:BORDER_PX], seen[-BORDER_PX:] = False, False
         sensors = [MountedSensor.of(Sensor(), m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
-        return RenderedCameras(rig, scene, cylinder, maps, seen[:, PAD_PX:-PAD_PX], (sensors[0], sensors[1]),
-                    Matcher(seen.shape, MatchingSettings(disparities=32)))
+        return RenderedCameras(
+            rig,
+            scene,
+            cylinder,
+            maps,
+            seen[:, PAD_PX:-PAD_PX],
+            (sensors[0], sensors[1]),
+            Matcher(seen.shape, MatchingSettings(disparities=32)),
+        )
 
     @property
     def model(self) -> StereoModel:
@@ -76,8 +83,9 @@ class RenderedCameras:
         """Return the frame seen from a pose."""
         rng = np.random.default_rng([seq, 99])
         mounted = (self.rig.lower, self.rig.upper)
-        images = [e.expose(render_grey(self.scene, m, T_world_rig), rng)
-                    for e, m in zip(self.exposures, mounted, strict=True)]
+        images = [
+            e.expose(render_grey(self.scene, m, T_world_rig), rng) for e, m in zip(self.exposures, mounted, strict=True)
+        ]
         return self.stereo_frame(seq, images[0], images[1])
 
     def darkness(self, seq: int) -> StereoFrame:
@@ -87,8 +95,10 @@ class RenderedCameras:
 
     def stereo_frame(self, seq: int, lower: Image, upper: Image) -> StereoFrame:
         """Return the frame of two images."""
-        panoramas = [np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
-                     for image, maps in zip((lower, upper), self.maps, strict=True)]
+        panoramas = [
+            np.asarray(cv2.remap(image, *maps, cv2.INTER_LINEAR), np.uint8)
+            for image, maps in zip((lower, upper), self.maps, strict=True)
+        ]
         padded = np.zeros(panoramas[0].shape, bool)
         padded[:, PAD_PX:-PAD_PX] = self.usable
         pixels, found = self.matcher.match(panoramas[0], panoramas[1], padded)

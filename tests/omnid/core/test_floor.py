@@ -20,8 +20,13 @@ def noisy(points: np.ndarray, rng: np.random.Generator) -> Points:
     return along, sigma**2
 
 
-def plane(count: int, rng: np.random.Generator, height_m: float = HEIGHT_M, slope: tuple[float, float] = (0.0, 0.0),
-          azimuths: tuple[float, float] = (-np.pi, np.pi)) -> np.ndarray:
+def plane(
+    count: int,
+    rng: np.random.Generator,
+    height_m: float = HEIGHT_M,
+    slope: tuple[float, float] = (0.0, 0.0),
+    azimuths: tuple[float, float] = (-np.pi, np.pi),
+) -> np.ndarray:
     """Return points of a plane below the cameras."""
     angle, r = rng.uniform(*azimuths, count), rng.uniform(0.8, 3.5, count)
     x, y = r * np.cos(angle), r * np.sin(angle)
@@ -59,13 +64,17 @@ def test_a_table_above_the_floor_is_not_the_floor() -> None:
     assert found is not None and abs(found.floor.height_m - HEIGHT_M) < 0.04
 
 
-@pytest.mark.parametrize("points", [
-    lambda rng: walls(4000, rng),
-    lambda rng: plane(2000, rng, azimuths=(0.0, 1.5)),
-    lambda rng: plane(10, rng),
-    lambda rng: np.zeros((0, 3)),
-    lambda rng: plane(2000, rng) * [1, 1, -1],
-], ids=["walls only", "in a quarter of the directions", "few", "none", "a ceiling"])
+@pytest.mark.parametrize(
+    "points",
+    [
+        lambda rng: walls(4000, rng),
+        lambda rng: plane(2000, rng, azimuths=(0.0, 1.5)),
+        lambda rng: plane(10, rng),
+        lambda rng: np.zeros((0, 3)),
+        lambda rng: plane(2000, rng) * [1, 1, -1],
+    ],
+    ids=["walls only", "in a quarter of the directions", "few", "none", "a ceiling"],
+)
 def test_without_a_floor_that_is_seen_there_is_none(points: object) -> None:
     rng, estimator = np.random.default_rng(4), FloorEstimator()
     for _ in range(MOST_PAIRS):

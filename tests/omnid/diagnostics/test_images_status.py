@@ -22,8 +22,19 @@ S = 1_000_000_000
 def update(tiles: TileStates, stamp_ns: int) -> OdometryUpdate:
     """Return a pose whose pair has these tiles."""
     pair = small_depth(stamp_ns).panoramas
-    return OdometryUpdate(0, stamp_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 9, 9,
-                          StereoDepth(replace(pair, tiles=tiles)))
+    return OdometryUpdate(
+        0,
+        stamp_ns,
+        np.eye(4),
+        np.eye(6),
+        np.zeros(6),
+        np.eye(6),
+        TrackingState.TRACKING,
+        0,
+        9,
+        9,
+        StereoDepth(replace(pair, tiles=tiles)),
+    )
 
 
 def lost(first: int, last: int, *, is_dead: bool) -> TileStates:
@@ -32,8 +43,12 @@ def lost(first: int, last: int, *, is_dead: bool) -> TileStates:
     tiles = none.copy()
     tiles[:, np.arange(first, last) % TILE_COLUMNS] = True
     dead, blind = (tiles, none) if is_dead else (none, tiles)
-    return TileStates({"lower": none, "upper": dead}, {"lower": none, "upper": blind},
-                      {"lower": none.any(axis=0), "upper": tiles.any(axis=0)}, {"lower": 0, "upper": 100 * S})
+    return TileStates(
+        {"lower": none, "upper": dead},
+        {"lower": none, "upper": blind},
+        {"lower": none.any(axis=0), "upper": tiles.any(axis=0)},
+        {"lower": 0, "upper": 100 * S},
+    )
 
 
 def test_names_camera_directions_and_time_and_reports_changes_once() -> None:

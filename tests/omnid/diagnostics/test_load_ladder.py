@@ -28,7 +28,8 @@ def test_under_lasting_overload_everything_is_given_up_in_order() -> None:
     observed = Observed()
     assert observed.level_after(OBSERVATIONS_UP - 1, dropped=30) == 0
     assert [observed.level_after(1, dropped=30)] + [
-        observed.level_after(OBSERVATIONS_UP, dropped=30) for _ in range(4)] == [1, 2, 3, 3, 3]
+        observed.level_after(OBSERVATIONS_UP, dropped=30) for _ in range(4)
+    ] == [1, 2, 3, 3, 3]
     assert observed.ladder.level is LoadLevel.REDUCED
 
 

@@ -104,8 +104,19 @@ class Daemon:
             self.pair.process(Frame(0, time.monotonic_ns() - round(age_s * 1e9), camera, "jpeg", data))
 
     def pose(self, state: str = "tracking", age_s: float = 0.0) -> None:
-        odometry = OdometryUpdate(0, time.monotonic_ns() - round(age_s * 1e9), se3.transform(np.eye(3), [0, 0, 0]),
-                            np.eye(6), np.zeros(6), np.eye(6), state, 0, 80, 99, small_depth())
+        odometry = OdometryUpdate(
+            0,
+            time.monotonic_ns() - round(age_s * 1e9),
+            se3.transform(np.eye(3), [0, 0, 0]),
+            np.eye(6),
+            np.zeros(6),
+            np.eye(6),
+            state,
+            0,
+            80,
+            99,
+            small_depth(),
+        )
         self.statistics.process(odometry)
         self.latency.process(odometry)
         self.controller.set_pose(controller_pose(odometry, np.eye(4)))

@@ -34,8 +34,10 @@ from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
 UNPRIVILEGED = 65534
-FORMATS = (Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0,)),
-           Mode("MJPG", SizeRange(1280, 1280), SizeRange(960, 960), (30.0, 15.0)))
+FORMATS = (
+    Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0,)),
+    Mode("MJPG", SizeRange(1280, 1280), SizeRange(960, 960), (30.0, 15.0)),
+)
 
 
 class Robot:
@@ -62,8 +64,10 @@ class Robot:
 
     def examined(self, lower: str = "/dev/omnid/lower", **how: int | str | float) -> list[Finding]:
         """Return the findings for both cameras with these settings."""
-        wanted = {name: V4l2Settings(device, **{"width_px": 1280, "height_px": 960, **how})  # type: ignore[arg-type]
-                  for name, device in (("lower", lower), ("upper", "/dev/omnid/upper"))}
+        wanted = {
+            name: V4l2Settings(device, **{"width_px": 1280, "height_px": 960, **how})  # type: ignore[arg-type]
+            for name, device in (("lower", lower), ("upper", "/dev/omnid/upper"))
+        }
         return list(cameras(wanted, self.known, self.root))
 
 
@@ -208,8 +212,12 @@ def test_finds_a_port_in_use(port: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "level", "words"),
-    [("", "ok", "motor.port is empty"), ("simulated", "ok", "simulated"), ("/dev/ttyNONE", "error", "does not exist"),
-     ("/etc/passwd", "error", "is no serial port")],
+    [
+        ("", "ok", "motor.port is empty"),
+        ("simulated", "ok", "simulated"),
+        ("/dev/ttyNONE", "error", "does not exist"),
+        ("/etc/passwd", "error", "is no serial port"),
+    ],
 )
 def test_checks_other_motor_settings(name: str, level: str, words: str) -> None:
     (found,) = motor(name)
@@ -226,9 +234,11 @@ def test_finds_a_device_without_permission() -> None:
 def _closed_then_open(device: Path) -> None:
     device.chmod(0)
     os.chown(device, -1, grp.getgrnam("video").gr_gid)
-    script = (f"import os, json; from pathlib import Path; from omnid.doctor.devices import access\n"
-              f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
-              f"print(json.dumps([str(finding) for finding in access('motor', Path('{device}'))]))")
+    script = (
+        f"import os, json; from pathlib import Path; from omnid.doctor.devices import access\n"
+        f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
+        f"print(json.dumps([str(finding) for finding in access('motor', Path('{device}'))]))"
+    )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     assert "no permission" in json.loads(done.stdout)[0] and "usermod" in done.stdout, done.stderr
     device.chmod(0o660)
@@ -301,10 +311,12 @@ def test_checks_the_clock_source(source: str, level: str, tmp_path: Path) -> Non
 
 
 def test_checks_the_rights_of_this_user() -> None:
-    script = ("import os, resource; from omnid.doctor.machine import rights\n"
-              "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
-              f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
-              "print(*rights(20, True), *rights(0, False), sep='\\n')")
+    script = (
+        "import os, resource; from omnid.doctor.machine import rights\n"
+        "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
+        f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
+        "print(*rights(20, True), *rights(0, False), sep='\\n')"
+    )
     done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
     lines = done.stdout.splitlines()
     assert [line.split()[0] for line in lines] == ["warning", "warning", "ok", "ok"], done.stderr
@@ -388,9 +400,16 @@ def test_warns_of_an_impossible_router(endpoint: str) -> None:
 
 @pytest.mark.parametrize(
     ("endpoint", "local"),
-    [("tcp/127.0.0.1:7447", True), ("tcp/[::1]:7447", True), ("tcp/localhost:7447", True),
-     ("unixsock-stream//run/x", True), ("tcp/0.0.0.0:7447", False), ("tcp/[::]:7447", False),
-     ("tcp/192.168.1.2:7447", False), ("udp/robot.local:7447", False)],
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/[::1]:7447", True),
+        ("tcp/localhost:7447", True),
+        ("unixsock-stream//run/x", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/192.168.1.2:7447", False),
+        ("udp/robot.local:7447", False),
+    ],
 )
 def test_warns_of_open_endpoints_without_command_users(endpoint: str, local: bool) -> None:
     for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
@@ -419,8 +438,19 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
-    for subject in ("camera lower", "camera upper", "rig", "motor", "groups", "real time", "memory", "clock", "disk",
-                    "router", "programs"):
+    for subject in (
+        "camera lower",
+        "camera upper",
+        "rig",
+        "motor",
+        "groups",
+        "real time",
+        "memory",
+        "clock",
+        "disk",
+        "router",
+        "programs",
+    ):
         assert any(line[9:].startswith(subject) for line in lines)
     assert " errors, " in last
 

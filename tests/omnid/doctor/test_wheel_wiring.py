@@ -59,8 +59,14 @@ class Person:
         if "forwards first" in question:
             return "y" if sum(self._first) > 0 else "n"
         if "How many" in question:
-            wait_until(lambda: not any(self._base.base.commanded_mps) and self._base.base.velocity_mps == 0
-                       and self._base.base.yaw_rate_radps == 0, "wheels that stand")
+            wait_until(
+                lambda: (
+                    not any(self._base.base.commanded_mps)
+                    and self._base.base.velocity_mps == 0
+                    and self._base.base.yaw_rate_radps == 0
+                ),
+                "wheels that stand",
+            )
             return f"{(self._base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
         self._travel_m = self._base.base.travel_m[0]
         return "yes"
@@ -79,14 +85,17 @@ def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, 
         yield settings, Person(watched), motor
 
 
-@pytest.mark.parametrize(("protocol", "true"), [
-    pytest.param("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}, marks=pytest.mark.slow),
-    ("roboteq_power", {"reverse_right": True, "max_wheel_mps": 2.0}),
-    pytest.param("odrive_ascii", {"swapped": True, "gear": 40.0}, marks=pytest.mark.slow),
-    pytest.param("vesc", {"reverse_left": True, "reverse_right": True, "gear": 10.0}, marks=pytest.mark.slow),
-    pytest.param("waveshare_json", {"swapped": True, "reverse_right": True}, marks=pytest.mark.slow),
-    ("ros_arduino_bridge", {"reverse_left": True, "ticks_per_turn": 800.0}),
-])
+@pytest.mark.parametrize(
+    ("protocol", "true"),
+    [
+        pytest.param("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}, marks=pytest.mark.slow),
+        ("roboteq_power", {"reverse_right": True, "max_wheel_mps": 2.0}),
+        pytest.param("odrive_ascii", {"swapped": True, "gear": 40.0}, marks=pytest.mark.slow),
+        pytest.param("vesc", {"reverse_left": True, "reverse_right": True, "gear": 10.0}, marks=pytest.mark.slow),
+        pytest.param("waveshare_json", {"swapped": True, "reverse_right": True}, marks=pytest.mark.slow),
+        ("ros_arduino_bridge", {"reverse_left": True, "ticks_per_turn": 800.0}),
+    ],
+)
 def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[str, object]) -> None:
     with simulated(protocol, **true) as (config, person, motor):
         drive = WiringTest(config, person.answer, speed_mps=0.4, turns=1.5, move_s=0.1, rest_s=0.05).run()
@@ -105,8 +114,10 @@ def test_wheels_that_the_settings_describe_give_the_same_settings() -> None:
         assert not any("How many" in question for question in person.questions)
 
 
-@pytest.mark.parametrize(("answers", "message"), [(["n"], "did not move"), (["b"], "moved both"),
-                                                  (["l", "y", "l", "y", "", "n"], "did not move")])
+@pytest.mark.parametrize(
+    ("answers", "message"),
+    [(["n"], "did not move"), (["b"], "moved both"), (["l", "y", "l", "y", "", "n"], "did not move")],
+)
 def test_answers_without_a_result(answers: list[str], message: str) -> None:
     with simulated("roboteq") as (config, _, motor):
         given = iter(answers)
@@ -130,16 +141,36 @@ def test_the_found_wiring_undoes_that_of_the_base(swapped: bool, reverse_left: b
 
 def test_the_command_asks_prints_and_writes(tmp_path: Path) -> None:
     path = tmp_path / "omnid.toml"
-    path.write_text("# mine\n[motor]\nprotocol = 'roboteq'\n[motor.drive] # of the base\nswapped = false\n"
-                    f"wheel_radius_m = {RADIUS_M}\n[record]\nfile_mb = 7\n")
+    path.write_text(
+        "# mine\n[motor]\nprotocol = 'roboteq'\n[motor.drive] # of the base\nswapped = false\n"
+        f"wheel_radius_m = {RADIUS_M}\n[record]\nfile_mb = 7\n"
+    )
     with simulated("roboteq", swapped=True, reverse_left=True, gear=1.0) as (config, person, motor):
-        command = [sys.executable, "-m", "omnid", "motor", "test", "--motor", config.port, "--config", str(path),
-                   "--write", str(path), "--turns", "1", "--speed", "0.4", "--set", "motor.watchdog_ms=1000", "--set",
-                   "motor.rate_hz=5"]
+        command = [
+            sys.executable,
+            "-m",
+            "omnid",
+            "motor",
+            "test",
+            "--motor",
+            config.port,
+            "--config",
+            str(path),
+            "--write",
+            str(path),
+            "--turns",
+            "1",
+            "--speed",
+            "0.4",
+            "--set",
+            "motor.watchdog_ms=1000",
+            "--set",
+            "motor.rate_hz=5",
+        ]
         with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
             assert process.stdin is not None and process.stdout is not None
             shown = ""
-            while (letter := process.stdout.read(1)):
+            while letter := process.stdout.read(1):
                 shown += letter
                 if shown.endswith(("? ", ": ")):
                     process.stdin.write(f"{person.answer(shown)}\n")
@@ -158,16 +189,20 @@ def test_a_section_is_set_where_it_is_or_added() -> None:
     assert toml_with("", "a.b", {"x": "1"}) == "[a.b]\nx = 1\n"
     assert toml_with("[a]\ny = 2\n", "a.b", {"x": "1"}) == "[a]\ny = 2\n\n[a.b]\nx = 1\n"
     assert toml_with("[a.b]\n x=3 # old\ny = 2\n[c]\nx = 4\n", "a.b", {"x": "1", "z": "5"}) == (
-        "[a.b]\nz = 5\nx = 1\ny = 2\n[c]\nx = 4\n")
+        "[a.b]\nz = 5\nx = 1\ny = 2\n[c]\nx = 4\n"
+    )
 
 
-@pytest.mark.parametrize(("words", "message"), [
-    ((), "no motor controller is configured"),
-    (("--motor", "simulated"), "set there"),
-    (("--motor", "simulated", "--set", "motor.protocol=vesc", "--speed", "9"), "--speed"),
-    (("--motor", "simulated", "--set", "motor.protocol=vesc", "--turns", "-1"), "--turns"),
-    (("--motor", "simulated", "--set", "motor.protocol=vesc", "--write", "/nowhere/x"), "--write"),
-])
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "no motor controller is configured"),
+        (("--motor", "simulated"), "set there"),
+        (("--motor", "simulated", "--set", "motor.protocol=vesc", "--speed", "9"), "--speed"),
+        (("--motor", "simulated", "--set", "motor.protocol=vesc", "--turns", "-1"), "--turns"),
+        (("--motor", "simulated", "--set", "motor.protocol=vesc", "--write", "/nowhere/x"), "--write"),
+    ],
+)
 def test_wrong_options_are_refused(words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert message in Command(capsys).refused("motor", "test", *words)
 

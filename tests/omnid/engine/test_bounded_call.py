@@ -17,8 +17,10 @@ def test_says_whether_the_call_has_returned() -> None:
 
 
 def test_a_call_that_blocks_for_ever_does_not_keep_the_program_from_ending() -> None:
-    code = ("import threading; from omnid.engine.bounded_call import returns_within; "
-            "print(returns_within(threading.Event().wait, 0.01, 'blocked'))")
+    code = (
+        "import threading; from omnid.engine.bounded_call import returns_within; "
+        "print(returns_within(threading.Event().wait, 0.01, 'blocked'))"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout == "False\n"
 

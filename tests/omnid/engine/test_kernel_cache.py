@@ -42,8 +42,14 @@ READ, COMPILED_HERE = "[1.5, 2.5] 1", "[1.5, 2.5] 0"  # what the program prints 
 
 def started(cache: Path, *arguments: str, root: Path = ROOT) -> subprocess.Popen[str]:
     environment = os.environ | {"OMNID_CACHE_DIR": str(cache), "PYTHONPATH": str(root)}
-    return subprocess.Popen([sys.executable, "-P", "-c", PROGRAM, *arguments], stdout=subprocess.PIPE,
-                            stderr=subprocess.PIPE, text=True, env=environment, cwd=root)
+    return subprocess.Popen(
+        [sys.executable, "-P", "-c", PROGRAM, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        cwd=root,
+    )
 
 
 def run(cache: Path, *arguments: str, root: Path = ROOT) -> subprocess.CompletedProcess[str]:
@@ -101,8 +107,12 @@ def test_a_copy_of_the_same_sources_compiles_nothing(cache: Path, tmp_path: Path
     """As another virtual environment does, and an installation of a later day."""
     copy = tmp_path / "copy"
     for folder in ("omnid", "drivers", "calib", "tests/omnid/engine"):
-        shutil.copytree(ROOT / folder, copy / folder, copy_function=shutil.copyfile,
-                        ignore=shutil.ignore_patterns("__pycache__", "*.mcap"))
+        shutil.copytree(
+            ROOT / folder,
+            copy / folder,
+            copy_function=shutil.copyfile,
+            ignore=shutil.ignore_patterns("__pycache__", "*.mcap"),
+        )
     (copy / "tests/__init__.py").touch()
     done = run(cache, root=copy)
     assert done.stdout == f"{READ}\n", done.stderr

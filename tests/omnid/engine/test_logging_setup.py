@@ -108,8 +108,12 @@ def test_writes_unlimited_records_every_time(log: Log) -> None:
 
 
 def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) -> None:
-    done = subprocess.run([sys.executable, "-m", "omnid", "config", "--config", "/nowhere"], cwd=ROOT,
-                          env=os.environ | journal(pipe[1]), stderr=pipe[1])
+    done = subprocess.run(
+        [sys.executable, "-m", "omnid", "config", "--config", "/nowhere"],
+        cwd=ROOT,
+        env=os.environ | journal(pipe[1]),
+        stderr=pipe[1],
+    )
     assert done.returncode == 2
     assert os.read(pipe[0], 1000).startswith(b"<3>cannot read the settings file '/nowhere'")
 
@@ -132,8 +136,14 @@ def test_remembers_a_bounded_number_of_kinds(log: Log) -> None:
 
 @pytest.mark.parametrize(
     ("text", "line"),
-    [("two\nlines", "two lines"), ("\x1b[31mred\x00\x07", r"\x1b[31mred\x00\x07"), (" much   room ", "much room"),
-     ("", ""), ("<0>panic", "<0>panic"), ("100 %s", "100 %s")],
+    [
+        ("two\nlines", "two lines"),
+        ("\x1b[31mred\x00\x07", r"\x1b[31mred\x00\x07"),
+        (" much   room ", "much room"),
+        ("", ""),
+        ("<0>panic", "<0>panic"),
+        ("100 %s", "100 %s"),
+    ],
 )
 def test_writes_one_printable_line_per_record(log: Log, text: str, line: str) -> None:
     log(logging.INFO, text)
@@ -197,8 +207,9 @@ def test_a_line_of_the_terminal_stays_below_the_others() -> None:
             shown += os.read(master, 4096).decode()
     os.close(master)
     first = ("one of " + 100 * "x")[:79]  # of 80 columns: a wrapped line could not be erased
-    assert shown == (f"\r\x1b[K{first}\r\x1b[Komnid: hello\r\n{first}\r\x1b[K"
-                     f"{'1 m, ' * 14}1 m\r\x1b[Ktwo\r\x1b[Komnid: end\r\n")
+    assert shown == (
+        f"\r\x1b[K{first}\r\x1b[Komnid: hello\r\n{first}\r\x1b[K{'1 m, ' * 14}1 m\r\x1b[Ktwo\r\x1b[Komnid: end\r\n"
+    )
 
 
 def test_nothing_is_shown_where_there_is_no_terminal() -> None:

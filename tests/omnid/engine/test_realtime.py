@@ -52,8 +52,9 @@ if os.getuid() == 0:
 
 def process(script: str) -> subprocess.CompletedProcess[str]:
     """Run the script in a process of its own."""
-    return subprocess.run([sys.executable, "-c", PREAMBLE + script], cwd=ROOT, capture_output=True, text=True,
-                          timeout=60)
+    return subprocess.run(
+        [sys.executable, "-c", PREAMBLE + script], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
 
 
 def answer(script: str) -> SimpleNamespace:
@@ -134,24 +135,30 @@ print(json.dumps(found))
 
 
 def test_reports_a_refused_priority_once_with_advice() -> None:
-    done = answer(WITHOUT_RIGHTS + """
+    done = answer(
+        WITHOUT_RIGHTS
+        + """
 reported = []
 start = ThreadStart({"motor": 20, "lower": 10}, lambda *words: reported.append(words))
 for name in ("motor", "lower", "stereo"):
     start(name)
 print(json.dumps({"reported": reported, "policy": os.sched_getscheduler(0)}))
-""")
+"""
+    )
     ((priority, text),) = done.reported
     assert priority == logging.WARNING and text.startswith("thread 'motor' cannot have real-time priority 20")
     assert "LimitRTPRIO=20" in text and done.policy == os.SCHED_OTHER
 
 
 def test_does_not_lock_memory_under_a_limit() -> None:
-    done = answer(WITHOUT_RIGHTS + """
+    done = answer(
+        WITHOUT_RIGHTS
+        + """
 reported = lock_memory()
 grown = len(bytearray(50 << 20))
 print(json.dumps({"reported": reported, "locked": locked_kb()}))
-""")
+"""
+    )
     assert done.reported.endswith(f"swapped out: {LOCK_ADVICE}") and done.locked == 0  # not even tried
 
 
@@ -213,8 +220,11 @@ while time.monotonic() < until_s:
 
 
 def test_reads_capabilities() -> None:
-    mask = next(int(line.split()[1], 16) for line in Path("/proc/self/status").read_text().splitlines()
-                if line.startswith("CapEff"))
+    mask = next(
+        int(line.split()[1], 16)
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith("CapEff")
+    )
     assert [has_capability(number) for number in range(41)] == [bool(mask >> number & 1) for number in range(41)]
 
 

@@ -10,8 +10,13 @@ from omnid.core.places.map_tags import MapTag, TagView
 from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 
-RIG = PlaceRig(Cylinder(1304, 378, 128.75), 0.24, se3.exp([0.01, 0.02, 0.03, 0.01, 0.02, 0.3]),
-               se3.exp([0.1, 0, 0.5, 0, 0, 1.0]), "0123abcd" * 8)
+RIG = PlaceRig(
+    Cylinder(1304, 378, 128.75),
+    0.24,
+    se3.exp([0.01, 0.02, 0.03, 0.01, 0.02, 0.3]),
+    se3.exp([0.1, 0, 0.5, 0, 0, 1.0]),
+    "0123abcd" * 8,
+)
 
 
 def some_places(count: int, features: int = 256, seed: int = 1) -> PlaceMap:
@@ -24,8 +29,16 @@ def some_places(count: int, features: int = 256, seed: int = 1) -> PlaceMap:
         views = rng.uniform([0, 0, 0], [1304, 300, 0], (features, 3)).astype(np.float32)
         views[:, 2] = views[:, 1] + rng.uniform(1, 50, features)
         seen = PlaceFeatures(rng.integers(0, 256, (features, 128), dtype=np.uint8), views)
-        keyframe = PlaceKeyframe(id, id // 10, 10**18 + id, se3.inverse(T), covariance(rng),
-                                 rng.integers(-127, 128, (16, 128)).astype(np.int8), scan, seen)
+        keyframe = PlaceKeyframe(
+            id,
+            id // 10,
+            10**18 + id,
+            se3.inverse(T),
+            covariance(rng),
+            rng.integers(-127, 128, (16, 128)).astype(np.int8),
+            scan,
+            seen,
+        )
         link = Link(id - 1, id, se3.exp([0.3, 0, 0, 0, 0, 0.01]), covariance(rng)) if id else None
         places.add(keyframe, T, link)
     if count > 2:

@@ -24,8 +24,9 @@ def test_map_server_reads_the_same_cells(tmp_path: Path, name: str) -> None:
     assert image is not None
     # nav2_map_server/src/map_io.cpp, mode trinary: darkness against both thresholds, first row at the top.
     darkness = (255 - image[::-1].astype(float)) / 255
-    read = np.where(darkness > described["occupied_thresh"], OCCUPIED,
-                    np.where(darkness < described["free_thresh"], FREE, UNKNOWN))
+    read = np.where(
+        darkness > described["occupied_thresh"], OCCUPIED, np.where(darkness < described["free_thresh"], FREE, UNKNOWN)
+    )
     np.testing.assert_array_equal(read, CELLS)
     assert described["resolution"] == 0.05 and described["origin"] == [-1.5, 2.25, 0.0] and described["negate"] == 0
 

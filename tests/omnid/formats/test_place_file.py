@@ -59,8 +59,7 @@ def test_a_map_of_the_version_before_is_read(tmp_path: Path) -> None:
     write_places(path, places, RIG)
     row = head_of(path)
     row = (*row[:3], *row[5:-1])
-    changed(path, "DROP TABLE tag", "DROP TABLE tag_view", "DROP TABLE map", SCHEMA_2["map"],
-            "PRAGMA user_version = 2")
+    changed(path, "DROP TABLE tag", "DROP TABLE tag_view", "DROP TABLE map", SCHEMA_2["map"], "PRAGMA user_version = 2")
     with closing(sqlite3.connect(path)) as database:
         database.execute(f"INSERT INTO map VALUES ({', '.join('?' * 11)})", (*row, checksum(row)))
         database.commit()
@@ -196,8 +195,12 @@ def test_a_map_that_was_changed_is_refused(tmp_path: Path, statement: str, messa
 def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
     path = tmp_path / "a.omap"
     endless = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x FROM n) SELECT x FROM n"
-    changed(path, f"PRAGMA application_id = {APPLICATION_ID}", "PRAGMA user_version = 4",
-            *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map", "tag", "tag_view")))
+    changed(
+        path,
+        f"PRAGMA application_id = {APPLICATION_ID}",
+        "PRAGMA user_version = 4",
+        *(f"CREATE VIEW {name} AS {endless}" for name in ("keyframe", "link", "map", "tag", "tag_view")),
+    )
     with pytest.raises(OmnidError, match="tables are not those"):
         read_places(path)
 
@@ -227,8 +230,11 @@ def test_values_outside_their_range_are_not_written(tmp_path: Path, change: dict
 
 
 def test_links_to_nowhere_and_loops_without_uncertainty_are_refused(tmp_path: Path) -> None:
-    for change, message in (({"b": 99}, "joins no two keyframes"), ({"a": 2}, "joins no two keyframes"),
-                            ({"covariance": np.zeros((6, 6))}, "not positive")):
+    for change, message in (
+        ({"b": 99}, "joins no two keyframes"),
+        ({"a": 2}, "joins no two keyframes"),
+        ({"covariance": np.zeros((6, 6))}, "not positive"),
+    ):
         places = some_places(3)
         places.links[2] = dataclasses.replace(places.links[2], **change)
         with pytest.raises(OmnidError, match=message):
@@ -281,12 +287,15 @@ def test_a_program_that_is_killed_while_it_writes_leaves_the_old_map(tmp_path: P
     path, old = tmp_path / "a.omap", some_places(3)
     write_places(path, old, RIG)
     before = path.read_bytes()
-    code = ("import sys; from tests.omnid.formats.place_maps import *; from omnid.formats.place_file import *\n"
-            "places = some_places(60); print('ready', flush=True)\nwhile True: write_places(sys.argv[1], places, RIG)")
+    code = (
+        "import sys; from tests.omnid.formats.place_maps import *; from omnid.formats.place_file import *\n"
+        "places = some_places(60); print('ready', flush=True)\nwhile True: write_places(sys.argv[1], places, RIG)"
+    )
     rng = random.Random(1)
     for _ in range(3):
-        with subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE,
-                              cwd=Path(__file__).parents[3]) as writer:
+        with subprocess.Popen(
+            [sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, cwd=Path(__file__).parents[3]
+        ) as writer:
             assert writer.stdout is not None and writer.stdout.readline()
             time.sleep(rng.uniform(0.0, 0.1))
             os.kill(writer.pid, signal.SIGKILL)

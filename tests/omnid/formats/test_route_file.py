@@ -17,8 +17,16 @@ from omnid.formats.route_file import MAX_BYTES, RouteFolder, parse_route, route_
 def route(name: str = "hall", points: int = 40) -> Route:
     rng = np.random.default_rng(1)
     poses = np.column_stack([np.arange(points) * 0.1, rng.normal(0, 0.01, points), rng.normal(0, 0.1, points)])
-    return Route(name, poses.round(6), np.full(points, 0.25), np.arange(points) // 10,
-                 rng.normal(0, 0.3, (points, 3)).round(6), {k: 10**18 + k for k in range(4)}, 1_790_000_000, "a.omap")
+    return Route(
+        name,
+        poses.round(6),
+        np.full(points, 0.25),
+        np.arange(points) // 10,
+        rng.normal(0, 0.3, (points, 3)).round(6),
+        {k: 10**18 + k for k in range(4)},
+        1_790_000_000,
+        "a.omap",
+    )
 
 
 def test_a_route_comes_back(tmp_path: Path) -> None:
@@ -57,14 +65,28 @@ def test_a_copy_under_another_name_is_refused(tmp_path: Path) -> None:
         folder.read("other")
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"version": 2}, "version 2, expected 1"), ({"version": "1" * 50}, "of version"),
-    ({"format": "x"}, "no route file"),
-    ({"points": []}, "no points"), ({"points": [[1] * 8] * 2}, "checksum"), ({"points": [[1] * 7] * 2}, "8 numbers"),
-    ({"points": {"a": 1}}, "a list"), ({"points": [[1, 2, 3, 4, 1.5, 0, 0, 0]] * 3}, "keyframe is no number"),
-    ({"points": [[True] * 8] * 2}, "8 numbers"), ({"keyframes": [[1, -1]]}, "keyframes are no numbers"),
-    ({"name": "../x"}, "checksum"), ({"name": 3}, "texts"), ({"map": None}, "texts"), ({"crc32": 1}, "checksum"),
-    ({"more": 1}, "keys"), ({"created_s": -1}, "time"), ({"created_s": 1.5}, "time")])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 2}, "version 2, expected 1"),
+        ({"version": "1" * 50}, "of version"),
+        ({"format": "x"}, "no route file"),
+        ({"points": []}, "no points"),
+        ({"points": [[1] * 8] * 2}, "checksum"),
+        ({"points": [[1] * 7] * 2}, "8 numbers"),
+        ({"points": {"a": 1}}, "a list"),
+        ({"points": [[1, 2, 3, 4, 1.5, 0, 0, 0]] * 3}, "keyframe is no number"),
+        ({"points": [[True] * 8] * 2}, "8 numbers"),
+        ({"keyframes": [[1, -1]]}, "keyframes are no numbers"),
+        ({"name": "../x"}, "checksum"),
+        ({"name": 3}, "texts"),
+        ({"map": None}, "texts"),
+        ({"crc32": 1}, "checksum"),
+        ({"more": 1}, "keys"),
+        ({"created_s": -1}, "time"),
+        ({"created_s": 1.5}, "time"),
+    ],
+)
 def test_what_does_not_fit_is_refused_in_one_line(change: dict[str, object], words: str) -> None:
     content = json.loads(route_bytes(route())) | change
     with pytest.raises(OmnidError, match=words) as error:
@@ -72,10 +94,24 @@ def test_what_does_not_fit_is_refused_in_one_line(change: dict[str, object], wor
     assert "\n" not in str(error.value) and len(str(error.value)) < 200
 
 
-@pytest.mark.parametrize("content", [
-    b"", b"\0" * 50, b"[" * 100_000, b"{}", b"null", b"[1]", b'{"format":"omnid route"', b"\xff\xfe", b"1" * 5000,
-    b'{"format":"omnid route","version":1}', b" " * (MAX_BYTES + 1), b"NaN",
-    b'{"format": "omnid route", "version": NaN}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\0" * 50,
+        b"[" * 100_000,
+        b"{}",
+        b"null",
+        b"[1]",
+        b'{"format":"omnid route"',
+        b"\xff\xfe",
+        b"1" * 5000,
+        b'{"format":"omnid route","version":1}',
+        b" " * (MAX_BYTES + 1),
+        b"NaN",
+        b'{"format": "omnid route", "version": NaN}',
+    ],
+)
 def test_other_bytes_are_refused(content: bytes) -> None:
     with pytest.raises(OmnidError):
         parse_route(content, "r")
@@ -88,7 +124,7 @@ def test_damaged_files_are_refused_or_the_same_route() -> None:
         for _ in range(rng.randint(1, 4)):
             damaged[rng.randrange(len(damaged))] = rng.randrange(256)
         try:
-            found = parse_route(bytes(damaged[:rng.randint(len(damaged) // 2, len(damaged))]), "r")
+            found = parse_route(bytes(damaged[: rng.randint(len(damaged) // 2, len(damaged))]), "r")
         except OmnidError:
             continue
         assert np.isfinite(found.poses).all()

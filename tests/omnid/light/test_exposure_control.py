@@ -34,12 +34,19 @@ def area(rig: Rig) -> UsefulArea:
 class Robot:
     """Two cameras under one light, which carry out requests as the driver does, and their regulation."""
 
-    def __init__(self, area: UsefulArea, light: float, config: CamerasConfig | None = None,
-                 ranges: tuple[ExposureRanges | None, ExposureRanges | None] = (RANGES, RANGES)) -> None:
+    def __init__(
+        self,
+        area: UsefulArea,
+        light: float,
+        config: CamerasConfig | None = None,
+        ranges: tuple[ExposureRanges | None, ExposureRanges | None] = (RANGES, RANGES),
+    ) -> None:
         names: tuple[Camera, Camera] = ("lower", "upper")
         self.light, self.deaf = light, False
-        self.cameras = {name: CameraState(exposure=None if one is None else CameraExposure(
-            one, in_force=ExposureSetting(5000, 0))) for name, one in zip(names, ranges, strict=True)}
+        self.cameras = {
+            name: CameraState(exposure=None if one is None else CameraExposure(one, in_force=ExposureSetting(5000, 0)))
+            for name, one in zip(names, ranges, strict=True)
+        }
         self.control = ExposureControl(area, config or CamerasConfig(), self.cameras)
         self.pairs = 0
         self.unequal = 0  # pairs of images with different exposures
@@ -48,8 +55,10 @@ class Robot:
         for _ in range(round(seconds * 1e9 / PERIOD_NS)):
             self.pairs += 1
             stamp_ns = self.pairs * PERIOD_NS
-            settings = [ExposureSetting(5000, 0) if state.exposure is None else state.exposure.in_force
-                        for state in self.cameras.values()]
+            settings = [
+                ExposureSetting(5000, 0) if state.exposure is None else state.exposure.in_force
+                for state in self.cameras.values()
+            ]
             self.unequal += settings[0] != settings[1]
             grey = [self._grey(setting) for setting in settings]
             # The lower camera's thread is past this image already when the pair is measured, the upper one's is not.
@@ -124,8 +133,12 @@ def test_leaves_the_exposure_to_the_cameras_and_says_why(
 
 
 def test_gives_the_exposure_back_to_cameras_that_do_not_answer_or_refuse(area: UsefulArea) -> None:
-    robot = Robot(area, 0.3, CamerasConfig(exposure_limit_ms=45.0),
-                  ranges=(ExposureRanges(ValueRange(100, 50_000)), ExposureRanges(ValueRange(100, 50_000))))
+    robot = Robot(
+        area,
+        0.3,
+        CamerasConfig(exposure_limit_ms=45.0),
+        ranges=(ExposureRanges(ValueRange(100, 50_000)), ExposureRanges(ValueRange(100, 50_000))),
+    )
     robot.deaf = True
     for state in robot.cameras.values():
         assert state.exposure is not None

@@ -20,8 +20,9 @@ PERIOD_NS = 250_000_000  # of the pairs; more would be skipped
 class Sensor:
     """A camera: grey = 255 * (light * exposure * gain)^gamma, saturated; decibels: gain 100 is a factor of 16."""
 
-    def __init__(self, light: float, *, gamma: float = 1.0, linear_gain: bool = False, scene: np.ndarray = SCENE
-                 ) -> None:
+    def __init__(
+        self, light: float, *, gamma: float = 1.0, linear_gain: bool = False, scene: np.ndarray = SCENE
+    ) -> None:
         self.light, self._gamma, self._linear, self._scene = light, gamma, linear_gain, scene
 
     def levels(self, setting: ExposureSetting) -> GreyLevels:

@@ -32,8 +32,11 @@ ONE_GONE = "3 robots, 1 with warnings, 1 with errors or gone"
 
 def publish(bus: Bus, number: int, level: int = 0) -> None:
     T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.1]), [0.5, -0.25, 0.0])
-    bus.publish("odom", codec.odometry_cdr(10**18 + number, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6)),
-                PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
+    bus.publish(
+        "odom",
+        codec.odometry_cdr(10**18 + number, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6)),
+        PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes(),
+    )
     bus.publish("status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, level, "it is late", {})]))
 
 
@@ -66,7 +69,10 @@ def test_shows_all_robots_behind_a_router_the_worst_first() -> None:
             ends.callback(bus.close)
         process = subprocess.Popen(
             [sys.executable, "-m", "omnid", "listen", "--all", "--connect", endpoint, "--seconds", str(LIMIT_S)],
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         ends.callback(process.kill)
         stopped = threading.Event()
         ends.callback(stopped.set)
@@ -91,7 +97,8 @@ def test_the_number_of_robots_is_bounded_and_their_names_are_plain() -> None:
     assert len(fleet.robots) == MAX_ROBOTS and len(fleet.refused) == MAX_ROBOTS
     assert next(fleet_table(fleet.robots, len(fleet.refused), 3)) == (
         f"{MAX_ROBOTS} robots, 0 with warnings, {MAX_ROBOTS} with errors or gone; {MAX_ROBOTS} more than {MAX_ROBOTS} "
-        "are left out; 3 messages dropped")
+        "are left out; 3 messages dropped"
+    )
     hostile = FleetState()
     hostile.process(ReceivedMessage(0, "\x1b[2J" + 300 * "x" + "/status", b"junk", b""))
     stream = io.StringIO()
@@ -100,8 +107,9 @@ def test_the_number_of_robots_is_bounded_and_their_names_are_plain() -> None:
 
 
 def test_options_of_one_robot_are_refused() -> None:
-    done = subprocess.run([sys.executable, "-m", "omnid", "listen", "--all", "--robot", "one"], capture_output=True,
-                          text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "omnid", "listen", "--all", "--robot", "one"], capture_output=True, text=True
+    )
     assert done.returncode == 2 and "--robot does not go with it" in done.stderr
 
 

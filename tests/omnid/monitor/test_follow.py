@@ -34,8 +34,12 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 
 @contextlib.contextmanager
 def listening(*words: object) -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen([sys.executable, "-m", "omnid", "listen", *map(str, words)], stdout=subprocess.PIPE,
-                          stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-m", "omnid", "listen", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
         try:
             yield process
         finally:
@@ -50,9 +54,7 @@ def odometry_at(number: int) -> bytes:
 def publish(bus: Bus, number: int) -> None:
     bus.publish("odom", odometry_at(number), PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
     bus.publish("/tf", codec.transform_cdr(10**18, []))
-    bus.publish(
-        "status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 1, "no command", {"sent": "4"})])
-    )
+    bus.publish("status", codec.diagnostics_cdr(10**18, [DiagnosticStatus(WHEELS, 1, "no command", {"sent": "4"})]))
 
 
 def publish_until_it_ends(bus: Bus, process: subprocess.Popen[str]) -> tuple[str, str]:
@@ -82,9 +84,13 @@ def test_prints_a_line_per_second_and_writes_files(tmp_path: Path) -> None:
     with AnyReader([log]) as reader:
         kinds = {connection.topic: connection.msgtype for connection in reader.connections}
         poses = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/rover/odom"]
-    assert kinds == {"/rover/odom": "nav_msgs/msg/Odometry", "/tf": "tf2_msgs/msg/TFMessage",
-                     "/tf_static": "tf2_msgs/msg/TFMessage", "/rover/map": "nav_msgs/msg/OccupancyGrid",
-                     "/rover/status": "diagnostic_msgs/msg/DiagnosticArray"}, "with what was sent before it came"
+    assert kinds == {
+        "/rover/odom": "nav_msgs/msg/Odometry",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/tf_static": "tf2_msgs/msg/TFMessage",
+        "/rover/map": "nav_msgs/msg/OccupancyGrid",
+        "/rover/status": "diagnostic_msgs/msg/DiagnosticArray",
+    }, "with what was sent before it came"
     assert len(poses) > 20 and {pose.pose.pose.position.x for pose in poses} == {0.5}
     assert b"name = 'rig'" in log.read_bytes()
 
@@ -115,12 +121,15 @@ def test_exit_code_is_1_without_a_pose() -> None:
     assert it.returncode == 1 and out == "omnid: no pose yet\n"
 
 
-@pytest.mark.parametrize(("words", "expected"), [
-    (("--seconds", "-1"), "--seconds"),
-    (("--connect", "nonsense"), "bus.connect"),
-    (("--tum", "/nowhere/x"), "--tum"),
-    (("--robot", "a b"), "bus.robot"),
-])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--seconds", "-1"), "--seconds"),
+        (("--connect", "nonsense"), "bus.connect"),
+        (("--tum", "/nowhere/x"), "--tum"),
+        (("--robot", "a b"), "bus.robot"),
+    ],
+)
 def test_refuses_invalid_options(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert expected in Command(capsys).refused("listen", *words)
 
@@ -202,7 +211,11 @@ def test_the_load_is_shown_by_threads() -> None:
     values = {"all": "0.500", "bus": "0.104", "odometry": "0.396", "words": "none", "\x1b[2J": "0.001"}
     state.statuses[THREADS] = DiagnosticStatus(THREADS, 0, "", values)
     assert list(load_table("rover", state)) == [
-        "rover: 50.0 % of a core", "   39.6 %  odometry", "   10.4 %  bus", "    0.1 %  \\x1b[2J"]
+        "rover: 50.0 % of a core",
+        "   39.6 %  odometry",
+        "   10.4 %  bus",
+        "    0.1 %  \\x1b[2J",
+    ]
     assert load_line("rover", state) == "rover: 50.0 % of a core, 39.6 % odometry, 10.4 % bus, 0.1 % \\x1b[2J"
     out = io.StringIO()
     Screen("rover", out, shows_load=True).show(state)

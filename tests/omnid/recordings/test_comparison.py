@@ -136,8 +136,10 @@ def test_detects_a_rotation_by_half_a_turn(capsys: pytest.CaptureFixture[str], t
 
 
 def test_angles_wrap_at_half_a_turn(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    both = [run_of(tmp_path / f"{name}.mcap", [(0, se3.exp((0, 0, 0, 0, 0, math.radians(turn_deg))))])
-            for name, turn_deg in (("a", 170), ("b", -170))]
+    both = [
+        run_of(tmp_path / f"{name}.mcap", [(0, se3.exp((0, 0, 0, 0, 0, math.radians(turn_deg))))])
+        for name, turn_deg in (("a", 170), ("b", -170))
+    ]
     code, out = diff(capsys, *both)
     assert code == 1 and "at most 0.000 mm, 20.0000 deg" in out
 
@@ -183,9 +185,7 @@ def test_reports_different_commands(capsys: pytest.CaptureFixture[str], tmp_path
     assert f"first at {text_of(15)}: 10.000 mm/s, 0.0000 deg/s; 5 commands in all" in out
 
 
-def test_aligns_runs_with_different_starts(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path
-) -> None:
+def test_aligns_runs_with_different_starts(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path) -> None:
     elsewhere = se3.exp((3.0, -1.0, 0.2, 0.0, 0.0, 2.0))
     other = run_of(tmp_path / "b.mcap", [(i, elsewhere @ T) for i, T in circle()[2:]])
     code, out = diff(capsys, first, other)
@@ -236,9 +236,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_gives_one_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path, case: str
-) -> None:
+def test_wrong_input_gives_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, first: Path, case: str) -> None:
     words, expected = WRONG[case]
     bare, two = Recording(tmp_path / "bare.mcap"), Recording(tmp_path / "two.mcap")
     bare.drive(0, 1.0)
@@ -275,8 +273,10 @@ def test_names_keys_by_their_paths() -> None:
     a = {"rig": {"T": [[1.0, 0.0], [0.0, 1.0]], "name": "x"}, "same": 1, "flag": True}
     b = {"rig": {"T": [[1.0, 0.0], [0.5, 1.0]], "name": "x"}, "same": 1.0, "flag": 1, "new": "y" * 100}
     found = table_differences(a, b)
-    assert [(entry.path, entry.a, entry.b) for entry in found[:2]] == [("rig.T[1][0]", "0.0", "0.5"),
-                                                                        ("flag", "True", "1")]
+    assert [(entry.path, entry.a, entry.b) for entry in found[:2]] == [
+        ("rig.T[1][0]", "0.0", "0.5"),
+        ("flag", "True", "1"),
+    ]
     assert found[2].path == "new" and found[2].a == "nothing" and found[2].b.endswith("(102 characters)")
 
 

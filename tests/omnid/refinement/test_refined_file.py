@@ -81,10 +81,17 @@ def test_the_file_of_another_calibration_is_not_used_and_is_replaced(base: Path)
     assert started(base)[0].used is not None
 
 
-@pytest.mark.parametrize("damage", [lambda data: b"", lambda data: data[:len(data) // 2], lambda data: b"\xff" * 99,
-                                    lambda data: data.replace(b"lengths = ", b"lengths = nan #"),
-                                    lambda data: data + b"unknown = 1\n"],
-                         ids=["empty", "half", "no text", "nan", "unknown key"])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda data: b"",
+        lambda data: data[: len(data) // 2],
+        lambda data: b"\xff" * 99,
+        lambda data: data.replace(b"lengths = ", b"lengths = nan #"),
+        lambda data: data + b"unknown = 1\n",
+    ],
+    ids=["empty", "half", "no text", "nan", "unknown key"],
+)
 def test_a_damaged_file_is_reported_and_the_calibration_used(base: Path, damage: Callable[[bytes], bytes]) -> None:
     file = opened(base)
     file.write(change(read_rig(base)))

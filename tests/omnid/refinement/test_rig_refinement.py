@@ -87,8 +87,13 @@ def shifted(mounted: MountedCamera, sign: float, off_px: float = 0.5, off_part: 
     return replace(mounted, camera=replace(camera, center=centre, focal=focal))
 
 
-def refined(folder: Path, rig: Rig, settings: RigConfig = SETTINGS, file: RefinedRigFile | None = None,
-            report: Callable[[str], None] = ignore) -> tuple[RigRefinement, list[OdometryUpdate]]:
+def refined(
+    folder: Path,
+    rig: Rig,
+    settings: RigConfig = SETTINGS,
+    file: RefinedRigFile | None = None,
+    report: Callable[[str], None] = ignore,
+) -> tuple[RigRefinement, list[OdometryUpdate]]:
     """Run a log through the stages; return the refinement and the poses."""
     place, config, graph = geometry(rig, PanoramaConfig()), Config(), Graph(threaded=False)
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "off"))
@@ -159,7 +164,7 @@ def disturbed(truth: Rig) -> Rig:
 
 def path_error(poses: list[OdometryUpdate], truth: Path) -> float:
     """Return the relative error of the length of a path."""
-    return abs(path_m(np.array([update.T_odom_rig for update in poses])) / path_m(read_tum(truth).T[:len(poses)]) - 1)
+    return abs(path_m(np.array([update.T_odom_rig for update in poses])) / path_m(read_tum(truth).T[: len(poses)]) - 1)
 
 
 def path_m(T: Array) -> float:
@@ -179,7 +184,9 @@ def test_a_refined_rig_is_written_and_the_next_start_uses_it(rooms: Path, tmp_pa
     values = first.report().values
     assert values["refined_file"] == lines[0] and float(values["lower_pu_before"]) > float(values["lower_pu_after"])
     assert calibration.read_bytes() == content and [each.name for each in sorted(tmp_path.iterdir())] == [
-        "rig.refined.toml", "rig.toml"]
+        "rig.refined.toml",
+        "rig.toml",
+    ]
     # 2. The second one begins with it, and its lengths are better.
     file = RefinedRigFile(path, read_rig(calibration), calibration)
     rig = file.start(lambda _, line: lines.append(line), is_wanted=True)
@@ -198,11 +205,15 @@ def test_a_late_upper_camera_is_found_where_there_is_one(offset_ms: float) -> No
     azimuth, range_m = rng.uniform(-np.pi, np.pi, landmarks), rng.uniform(1.6, 4.0, landmarks)
     points = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.uniform(-1, 1.2, landmarks)])
     keyframe, landmark, camera = (part.ravel() for part in np.mgrid[:keyframes, :landmarks, :2])
-    twist = np.column_stack([rng.uniform(-0.6, 0.6, (keyframes, 2)), np.zeros((keyframes, 3)),
-                             rng.uniform(-0.7, 0.7, keyframes)])
+    twist = np.column_stack(
+        [rng.uniform(-0.6, 0.6, (keyframes, 2)), np.zeros((keyframes, 3)), rng.uniform(-0.7, 0.7, keyframes)]
+    )
     late = se3.exp(-(5e-3 + 1e-3 * offset_ms) * twist) @ T_rig_odom
-    in_rig = np.where(camera[:, None] == 1, se3.apply(late, points)[keyframe, landmark],
-                      se3.apply(T_rig_odom, points)[keyframe, landmark])
+    in_rig = np.where(
+        camera[:, None] == 1,
+        se3.apply(late, points)[keyframe, landmark],
+        se3.apply(T_rig_odom, points)[keyframe, landmark],
+    )
     pixels = project(truth, camera, in_rig) + 0.05 * rng.standard_normal((len(keyframe), 2))
     seen = np.isfinite(pixels).all(axis=1)
     state = DriveState(T_rig_odom, points, np.zeros(0), KeyframeMotion(twist, np.full(keyframes, 5e-3)))

@@ -27,11 +27,13 @@ def at(pose: float) -> int:
 def T_odom_base(pose: int) -> np.ndarray:
     """Return poses on a circle, 5 cm and 0.02 rad apart."""
     return se3.exp([2.5 * math.sin(0.02 * pose), 2.5 * (1 - math.cos(0.02 * pose)), 0, 0, 0, 0]) @ se3.exp(
-        [0, 0, 0, 0, 0, 0.02 * pose])
+        [0, 0, 0, 0, 0, 0.02 * pose]
+    )
 
 
-def odom(pose: int, T: np.ndarray | None = None, *, topic: str = "/omnid/odom", sigma_m: float = 0.01,
-         speed_mps: float = 0.5) -> Entry:
+def odom(
+    pose: int, T: np.ndarray | None = None, *, topic: str = "/omnid/odom", sigma_m: float = 0.01, speed_mps: float = 0.5
+) -> Entry:
     """A pose."""
     covariance, velocity = np.eye(6) * sigma_m**2, np.array([speed_mps, 0, 0, 0, 0, 0.2])
     payload = codec.odometry_cdr(at(pose), T_odom_base(pose) if T is None else T, covariance, velocity, covariance)

@@ -42,9 +42,13 @@ def page(request: pytest.FixtureRequest, report: Path) -> Iterator[Any]:
         errors: list[str] = []
         found.on("pageerror", lambda error: errors.append(str(error)))
         found.on("console", lambda message: errors.append(message.text))
-        found.route("**/*", lambda route: route.fulfill(
-            body=report.read_text("utf-8"), headers={"content-type": "text/html; charset=utf-8",
-                                                     "content-security-policy": REPORT_POLICY}))
+        found.route(
+            "**/*",
+            lambda route: route.fulfill(
+                body=report.read_text("utf-8"),
+                headers={"content-type": "text/html; charset=utf-8", "content-security-policy": REPORT_POLICY},
+            ),
+        )
         found.goto("http://127.0.0.1:1/report")
         yield found
         browser.close()
@@ -60,8 +64,11 @@ def across(page: Any, share: float, selector: str = SPEED) -> tuple[float, float
 
 
 def shown(page: Any, figure: str = "figure.chart") -> str:
-    return str(page.locator(figure, has=page.locator(SPEED) if figure == "figure.chart" else None)
-               .locator("output").text_content())
+    return str(
+        page.locator(figure, has=page.locator(SPEED) if figure == "figure.chart" else None)
+        .locator("output")
+        .text_content()
+    )
 
 
 def test_the_pointer_shows_time_and_values_and_the_place_on_the_plan(page: Any) -> None:

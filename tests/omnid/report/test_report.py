@@ -99,15 +99,28 @@ def assert_harmless(page: Page) -> None:
 
 
 def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    entries = [*run(100, lost=range(40, 50)), drive(3, 0.4), drive(60, 0.4),
-               cloud(99, np.random.default_rng(1).uniform(-2, 3, (500, 3)))]
+    entries = [
+        *run(100, lost=range(40, 50)),
+        drive(3, 0.4),
+        drive(60, 0.4),
+        cloud(99, np.random.default_rng(1).uniform(-2, 3, (500, 3))),
+    ]
     log, out = save(tmp_path / "log.mcap", entries), tmp_path / "out.html"
     assert main(["report", str(log), "-o", str(out)]) == 0
     assert "100 poses of /omnid/odom" in capsys.readouterr().out
     page = Page(out.read_text("utf-8"))
     assert_harmless(page)
-    for words in ("Run of omnid", "9.9 s", "4.95 m", "90.0 %", "sent to the wheels", "Standard deviation", "lost here",
-                  "of the map's 500 points", "no settings are attached".capitalize()):
+    for words in (
+        "Run of omnid",
+        "9.9 s",
+        "4.95 m",
+        "90.0 %",
+        "sent to the wheels",
+        "Standard deviation",
+        "lost here",
+        "of the map's 500 points",
+        "no settings are attached".capitalize(),
+    ):
         assert words in page.text, words
     assert any(tag == "image" for tag, _ in page.tags)  # the map
     assert "://" not in out.read_text("utf-8")
@@ -143,9 +156,14 @@ def test_reports_gaps_resets_and_lost_cameras(tmp_path: Path) -> None:
     ]
     data = collect_report_data(save(tmp_path / "log.mcap", entries))
     assert event_texts(data) == [
-        ("poses", "none for 2.10 s"), ("state", "odometry was reset, with an unknown gap"),
-        ("upper camera", "lost since 1.0 s"), ("wheels", "the pose is lost"), ("wheels", "stopped, the pose is lost"),
-        ("upper camera", "images dropped"), ("wheels", "driving")]
+        ("poses", "none for 2.10 s"),
+        ("state", "odometry was reset, with an unknown gap"),
+        ("upper camera", "lost since 1.0 s"),
+        ("wheels", "the pose is lost"),
+        ("wheels", "stopped, the pose is lost"),
+        ("upper camera", "images dropped"),
+        ("wheels", "driving"),
+    ]
     assert data.statuses.resets == 1
     page = Page(report_html(tmp_path / "log.mcap", data))
     assert "images dropped (5)" in page.text and "upper camera" in page.text
@@ -172,18 +190,35 @@ def test_orders_status_from_before_the_first_pose_and_late_status(tmp_path: Path
 
 def test_shows_stages_and_latencies(tmp_path: Path) -> None:
     def second(k: int) -> tuple[DiagnosticStatus, ...]:
-        odometry = {"inliers": str(200 + k), "tracked": "300", "capture_to_pose_p50_ms": "81.25", "rate_hz": "9.5",
-                    "capture_to_pose_p99_ms": "163.00"}
-        stereo = {"processed": str(10 * k), "dropped": str(k), "work_p50_ms": "31.5", "work_p99_ms": "44.0",
-                  "work_max_ms": "52.1"}
+        odometry = {
+            "inliers": str(200 + k),
+            "tracked": "300",
+            "capture_to_pose_p50_ms": "81.25",
+            "rate_hz": "9.5",
+            "capture_to_pose_p99_ms": "163.00",
+        }
+        stereo = {
+            "processed": str(10 * k),
+            "dropped": str(k),
+            "work_p50_ms": "31.5",
+            "work_p99_ms": "44.0",
+            "work_max_ms": "52.1",
+        }
         return DiagnosticStatus(ODOMETRY, 0, "tracking", odometry), DiagnosticStatus(
             stage_name("stereo"), 0, "", stereo
         )
 
     entries = [*run(100), *(status(10 * k, *second(k)) for k in range(10))]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
-    for words in ("81.2 / 163 ms", "stereo", "31.5", "52.1", "stereo, dropped", "inliers of the pose",
-                  "messages dropped (9)"):
+    for words in (
+        "81.2 / 163 ms",
+        "stereo",
+        "31.5",
+        "52.1",
+        "stereo, dropped",
+        "inliers of the pose",
+        "messages dropped (9)",
+    ):
         assert words in text, words
     assert "no status of the daemon" not in text
 
@@ -191,9 +226,17 @@ def test_shows_stages_and_latencies(tmp_path: Path) -> None:
 def test_names_the_missing_parts_of_a_foreign_log(tmp_path: Path) -> None:
     entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
     text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
-    for words in ("Run of wheels", "does not hold the state", "they were not set", "no numbers of landmarks",
-                  "no status of the daemon", "holds no images", "no rig.toml is attached", "holds no map",
-                  "holds no commands"):
+    for words in (
+        "Run of wheels",
+        "does not hold the state",
+        "they were not set",
+        "no numbers of landmarks",
+        "no status of the daemon",
+        "holds no images",
+        "no rig.toml is attached",
+        "holds no map",
+        "holds no commands",
+    ):
         assert words in text, words
 
 
@@ -255,11 +298,16 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
         DiagnosticStatus(ODOMETRY, 0, EVIL, odometry),
     )
     settings = f'robot = "{EVIL.replace(chr(34), "")}"\n["<b>"]\nx = 1\n'
-    entries = [*(odom(k, topic=f"/{EVIL}/odom") for k in range(5)),
-               (at(2), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(2, *parts)[3]),
-               (at(3), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(3, *parts, *parts)[3])]
-    log = save(tmp_path / "<b>log.mcap", entries, {"omnid.toml": settings.encode(), EVIL: b"",
-                                                   "rig.toml": b'schema = 1\n"<img src=x onerror=y>" = 1\n'})
+    entries = [
+        *(odom(k, topic=f"/{EVIL}/odom") for k in range(5)),
+        (at(2), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(2, *parts)[3]),
+        (at(3), f"/{EVIL}/status", "diagnostic_msgs/msg/DiagnosticArray", status(3, *parts, *parts)[3]),
+    ]
+    log = save(
+        tmp_path / "<b>log.mcap",
+        entries,
+        {"omnid.toml": settings.encode(), EVIL: b"", "rig.toml": b'schema = 1\n"<img src=x onerror=y>" = 1\n'},
+    )
     html = html_of(log, Trajectory(np.array([at(k) for k in range(5)]), np.tile(np.eye(4), (5, 1, 1))))
     page = Page(html)
     assert_harmless(page)
@@ -277,13 +325,20 @@ def test_a_very_large_log_gives_a_small_page(tmp_path: Path) -> None:
         entries.append(state(k, rng.choice(("tracking", "degraded", "lost")), resets=k))
         if k % 30 == 0:
             values = {f"stopped, {rng.randrange(10**6)}" * 20: str(k) for _ in range(70)}
-            entries.append(status(k, *(DiagnosticStatus(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
-                                       for n in range(k, k + 9))))
+            entries.append(
+                status(
+                    k,
+                    *(
+                        DiagnosticStatus(f"part {n}", 1, f"{'x' * 300}{rng.choice('abc')}", values)
+                        for n in range(k, k + 9)
+                    ),
+                )
+            )
     entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
     data = collect_report_data(save(tmp_path / "log.mcap", entries))
     html = report_html(tmp_path / "log.mcap", data)
     assert len(html) < 3_000_000
-    assert len(data.events.in_order()) <= 32 * 40 and data.events.left_out['others'] > 100
+    assert len(data.events.in_order()) <= 32 * 40 and data.events.left_out["others"] > 100
     assert re.search(r"and \d+ more: ", Page(html).text)
 
 
@@ -338,8 +393,10 @@ def test_refuses_a_truth_of_another_time(tmp_path: Path, capsys: pytest.CaptureF
 def hostile(tmp_path: Path) -> Path:
     """A log whose topic, frames, states, file name, attachments and settings hold sequences that control a terminal."""
     entries = [odom(k, topic=f"/{TERMINAL}/odom") for k in range(5)]
-    entries += [status(2, DiagnosticStatus(ODOMETRY, 2, TERMINAL, {TERMINAL: TERMINAL})),
-                status(3, DiagnosticStatus(TERMINAL, 1, f"{TERMINAL} again", {}))]
+    entries += [
+        status(2, DiagnosticStatus(ODOMETRY, 2, TERMINAL, {TERMINAL: TERMINAL})),
+        status(3, DiagnosticStatus(TERMINAL, 1, f"{TERMINAL} again", {})),
+    ]
     attachments = {f"{TERMINAL}.txt": b"", "omnid.toml": b'"\\u001b]0;x\\u0007" = "\\u009b31m"', "rig.toml": b"a = 1"}
     return save(tmp_path / f"{TERMINAL}.mcap", entries, attachments)
 

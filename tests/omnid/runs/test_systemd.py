@@ -88,8 +88,16 @@ def test_does_not_wait_for_a_manager_that_does_not_read(manager: Manager) -> Non
 
 @pytest.mark.parametrize(
     ("usec", "pid", "expected"),
-    [("10000000", "", 10.0), ("3000000", "own", 3.0), ("3000000", "1", None), ("", "", None),
-     ("0", "", None), ("-5", "", None), ("²", "", None), ("x", "", None)],
+    [
+        ("10000000", "", 10.0),
+        ("3000000", "own", 3.0),
+        ("3000000", "1", None),
+        ("", "", None),
+        ("0", "", None),
+        ("-5", "", None),
+        ("²", "", None),
+        ("x", "", None),
+    ],
 )
 def test_reads_the_timeout_of_the_watchdog(
     usec: str, pid: str, expected: float | None, monkeypatch: pytest.MonkeyPatch
@@ -101,8 +109,11 @@ def test_reads_the_timeout_of_the_watchdog(
 
 
 def test_only_a_stage_with_one_message_for_too_long_is_stalled() -> None:
-    stages = [StageStats("idle"), StageStats("busy", busy_since_ns=9 * 10**9),
-              StageStats("stalled", busy_since_ns=10**9)]
+    stages = [
+        StageStats("idle"),
+        StageStats("busy", busy_since_ns=9 * 10**9),
+        StageStats("stalled", busy_since_ns=10**9),
+    ]
     assert stalled_stages(stages, 10 * 10**9, 2.0) == {"stalled": 9.0}
 
 
@@ -281,9 +292,11 @@ def test_does_not_raise_where_stderr_is_no_file(capsys: pytest.CaptureFixture[st
 
 @pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGXCPU], ids=lambda number: number.name)
 def test_prints_the_stacks_when_killed(number: signal.Signals) -> None:
-    stuck = ("import os, signal, time; from omnid.runs.systemd import print_stacks_when_killed\n"
-             f"def stalled_function():\n  os.kill(os.getpid(), {number.value}); time.sleep(20)\n"
-             "print_stacks_when_killed()\nstalled_function()")
+    stuck = (
+        "import os, signal, time; from omnid.runs.systemd import print_stacks_when_killed\n"
+        f"def stalled_function():\n  os.kill(os.getpid(), {number.value}); time.sleep(20)\n"
+        "print_stacks_when_killed()\nstalled_function()"
+    )
     done = subprocess.run([sys.executable, "-c", stuck], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == -number
     assert "in stalled_function" in done.stderr

@@ -71,9 +71,10 @@ def test_refuses_a_program_that_the_unit_cannot_see(tmp_path: Path, program: str
         Installation(tmp_path, Path(program)).steps()
 
 
-@pytest.mark.parametrize(("name", "unit"), [
-    ("with space", "omnid.service"), ("100%n", "omnid-web.service"),
-    ("a %n ; ${HOME} größe", "omnid.service")])
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("with space", "omnid.service"), ("100%n", "omnid-web.service"), ("a %n ; ${HOME} größe", "omnid.service")],
+)
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="apt-get install systemd")
 def test_systemd_starts_a_program_of_any_name(tmp_path: Path, name: str, unit: str) -> None:
     """Without the program systemd names the path that it has read."""
@@ -90,10 +91,12 @@ def test_systemd_starts_a_program_of_any_name(tmp_path: Path, name: str, unit: s
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("name", ["two\nExecStartPre=/bin/evil", "tab\t", "\udcff", "\x1b[2J", 'a "b"', "a 'b'",
-                                  "a\\x41"])
-def test_refuses_a_program_that_no_unit_can_name(omnid: Command, tmp_path: Path, name: str,
-                                                 monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "name", ["two\nExecStartPre=/bin/evil", "tab\t", "\udcff", "\x1b[2J", 'a "b"', "a 'b'", "a\\x41"]
+)
+def test_refuses_a_program_that_no_unit_can_name(
+    omnid: Command, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sys, "prefix", f"/srv/{name}")
     assert "characters that a systemd unit cannot name" in omnid.refused("install-service", "--root", tmp_path, "--yes")
     assert list(tmp_path.iterdir()) == []

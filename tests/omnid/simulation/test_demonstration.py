@@ -23,8 +23,9 @@ from omnid.tracking_state import MapState
 REACHED, DRIVING = NavigationState.REACHED, NavigationState.DRIVING
 
 
-def moment(time_s: float, state: NavigationState | None, map_state: MapState = MapState.LOCALIZED, refusal: str = ""
-           ) -> Moment:
+def moment(
+    time_s: float, state: NavigationState | None, map_state: MapState = MapState.LOCALIZED, refusal: str = ""
+) -> Moment:
     """Return a moment of an armed robot."""
     answer = RequestAnswer(1, "teach", refusal)
     navigation = None if state is None else NavigationUpdate(0, 0, None, state, "why", answers=(answer,))
@@ -55,9 +56,14 @@ def test_the_oval_is_round_and_closed() -> None:
 def test_the_route_is_taught_and_repeated_when_its_start_is_recognised() -> None:
     script, lines = begun()
     sent: list[Request] = []
-    for at_s, state, map_state in ((1.2, REACHED, MapState.ODOMETRY_ONLY), (9.0, DRIVING, MapState.ODOMETRY_ONLY),
-                                   (17.0, REACHED, MapState.ODOMETRY_ONLY), (18.0, REACHED, MapState.LOCALIZED),
-                                   (18.1, REACHED, MapState.LOCALIZED), (30.0, DRIVING, MapState.LOCALIZED)):
+    for at_s, state, map_state in (
+        (1.2, REACHED, MapState.ODOMETRY_ONLY),
+        (9.0, DRIVING, MapState.ODOMETRY_ONLY),
+        (17.0, REACHED, MapState.ODOMETRY_ONLY),
+        (18.0, REACHED, MapState.LOCALIZED),
+        (18.1, REACHED, MapState.LOCALIZED),
+        (30.0, DRIVING, MapState.LOCALIZED),
+    ):
         sent += list(script(moment(at_s, state, map_state)))
     assert sent == [RouteRequest(RouteAction.FINISH), RouteRequest(RouteAction.REPEAT, "demo")]
     assert script.repeated_s == 18.0
@@ -65,11 +71,16 @@ def test_the_route_is_taught_and_repeated_when_its_start_is_recognised() -> None
     assert any("repeats" in line for line in lines)
 
 
-@pytest.mark.parametrize(("at_s", "state", "map_state", "refusal", "end"), [
-    (9.0, NavigationState.FAILED, MapState.LOCALIZED, "", "failed: why"),
-    (9.0, DRIVING, MapState.LOCALIZED, "no map", "refused: no map")])
-def test_a_drive_that_fails_is_reported(at_s: float, state: NavigationState, map_state: MapState, refusal: str,
-                                        end: str) -> None:
+@pytest.mark.parametrize(
+    ("at_s", "state", "map_state", "refusal", "end"),
+    [
+        (9.0, NavigationState.FAILED, MapState.LOCALIZED, "", "failed: why"),
+        (9.0, DRIVING, MapState.LOCALIZED, "no map", "refused: no map"),
+    ],
+)
+def test_a_drive_that_fails_is_reported(
+    at_s: float, state: NavigationState, map_state: MapState, refusal: str, end: str
+) -> None:
     script, _ = begun()
     assert list(script(moment(at_s, state, map_state, refusal))) == ["end"]
     assert script.end == end and math.isinf(script.repeated_s)
@@ -97,10 +108,10 @@ def test_both_paths_and_what_was_seen_are_drawn() -> None:
     # 2. What was seen is drawn in its cells; a position outside the world is not.
     bare = draw(world, obstacles[:0], first[:0], first[:0]).astype(int)
     seen = (without != bare).any(axis=2)
-    assert seen.sum() == pytest.approx(4.0 / 0.05 * math.ceil(0.05 * PX_PER_M)**2, rel=0.2)
+    assert seen.sum() == pytest.approx(4.0 / 0.05 * math.ceil(0.05 * PX_PER_M) ** 2, rel=0.2)
     # 3. The start is marked and named: a ring of 18 px and a word.
     marked = draw(world, obstacles[:0], first[:1], first[:0]).astype(int)
     assert (marked.max(axis=2) < 40).sum() - (bare.max(axis=2) < 40).sum() > 120
     # 4. The legend stands below, and the scale bar above.
-    assert (image[-20:] < 255).any() and (image[40:60, -3 * MARGIN_PX:] < 40).any()
+    assert (image[-20:] < 255).any() and (image[40:60, -3 * MARGIN_PX :] < 40).any()
     np.testing.assert_allclose(cross_track_m(first, np.array([(-0.5, -1.2), (0.3, -0.5), (-1.0, -1.0)])), [0.2, 0.3, 0])

@@ -31,8 +31,7 @@ def forward(moment: Moment) -> Iterator[Request]:
 
 
 def drive(seed: int, seconds: float = 2.0, **options: object) -> SimulatedRun:
-    return simulate(WORLD, make_robot(SIZE), forward, seconds=seconds, seed=seed, config=CONFIG,
-                    **options)  # type: ignore[arg-type]
+    return simulate(WORLD, make_robot(SIZE), forward, seconds=seconds, seed=seed, config=CONFIG, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +77,9 @@ def test_a_goal_is_reached_by_the_true_robot() -> None:
 
 
 def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
-    run = simulate(WORLD, with_slips(make_robot(SIZE), [Slip(1.5, 9.0, 0.9)]), forward, seconds=2.5, seed=1,
-                   config=CONFIG)
+    run = simulate(
+        WORLD, with_slips(make_robot(SIZE), [Slip(1.5, 9.0, 0.9)]), forward, seconds=2.5, seed=1, config=CONFIG
+    )
     x_m = run.truth_in_odom[:, 0, 3]
     assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
     noticed_s = (run.stamps_ns[run.slipping] - run.stamps_ns[0]) * 1e-9

@@ -55,8 +55,10 @@ def slowed(daemon: Daemon) -> Iterator[None]:
 
 def newest(port: int) -> Diagnostics:
     """Return a whole status of the daemon."""
-    with Robot(settings=BusConfig(connect=(f"tcp/127.0.0.1:{port}",))) as robot, \
-            robot.subscribe(Diagnostics) as statuses:
+    with (
+        Robot(settings=BusConfig(connect=(f"tcp/127.0.0.1:{port}",))) as robot,
+        robot.subscribe(Diagnostics) as statuses,
+    ):
         while True:
             report = statuses.wait(20.0)
             assert report is not None
@@ -64,17 +66,32 @@ def newest(port: int) -> Diagnostics:
                 return report
 
 
-def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]
-                                                            ) -> None:
+def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     port, truth = free_port(), tmp_path / "truth.tum"
     connect = ["--connect", f"tcp/127.0.0.1:{port}"]
-    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320", "--truth", str(truth),
-               "--set", f'bus.listen=["tcp/127.0.0.1:{port}"]', "--set", "live.status_s=0.2",
-               "--set", "controller.collision.unknown=slow"]  # such small images show little of the floor
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "simulate",
+        "room",
+        "--no-people",
+        "--size",
+        "320",
+        "--truth",
+        str(truth),
+        "--set",
+        f'bus.listen=["tcp/127.0.0.1:{port}"]',
+        "--set",
+        "live.status_s=0.2",
+        "--set",
+        "controller.collision.unknown=slow",
+    ]  # such small images show little of the floor
     with started(command, port) as daemon:
         wait_until(lambda: main(["arm", *connect]) == 0, "arming")
-        assert [main(["goto", *words, *connect]) for words in (["0.2", "0", "--no-wait"], ["--pause"], ["--resume"])
-                ] == [0, 0, 0]
+        assert [
+            main(["goto", *words, *connect]) for words in (["0.2", "0", "--no-wait"], ["--pause"], ["--resume"])
+        ] == [0, 0, 0]
         assert "paused by a request: `omnid goto --resume`" in capsys.readouterr().out
         with slowed(daemon):
             reached = main(["goto", *GOAL, *connect])
@@ -120,8 +137,10 @@ def test_messages_are_dated_by_the_simulated_clock() -> None:
 
 def test_commands_wait_for_the_stages_and_end_with_the_run() -> None:
     link = PacedLink(StageStats("motor"), 100)
-    reports = [TickReport(VelocityCommand(k, 0.1, 0.0, 0.0), 0.0, 0.0, math.nan, ControllerState(),
-                          WheelSample(k, 0.1, 0.0)) for k in range(3 * MOST_COMMANDS)]
+    reports = [
+        TickReport(VelocityCommand(k, 0.1, 0.0, 0.0), 0.0, 0.0, math.nan, ControllerState(), WheelSample(k, 0.1, 0.0))
+        for k in range(3 * MOST_COMMANDS)
+    ]
     ticking = threading.Thread(target=lambda: [link.take(report) for report in reports])
     ticking.start()
     taken = link.commands()

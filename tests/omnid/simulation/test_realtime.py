@@ -31,8 +31,10 @@ def test_commands_on_the_serial_port_move_the_cameras() -> None:
     frames: dict[str, list[Frame]] = {"lower": [], "upper": []}
     with closing(RealtimeRobot(load_world("room", 1), make_robot(SIZE), "line", drive)) as robot:
         cameras = {name: robot.open_camera(name, clock) for name in ("lower", "upper")}  # type: ignore[arg-type]
-        threads = [Thread(target=lambda name=name, camera=camera: frames[name].extend(islice(camera.frames(), FRAMES)))
-                   for name, camera in cameras.items()]
+        threads = [
+            Thread(target=lambda name=name, camera=camera: frames[name].extend(islice(camera.frames(), FRAMES)))
+            for name, camera in cameras.items()
+        ]
         with closing(SerialMotor(robot.port, LineProtocol(drive), timeout_s=1.0, watchdog_ms=2000)) as motor:
             for thread in threads:
                 thread.start()
@@ -51,9 +53,11 @@ def test_commands_on_the_serial_port_move_the_cameras() -> None:
 
 def test_the_gyro_measures_the_turn_of_the_base() -> None:
     drive = DifferentialDrive()
-    with closing(RealtimeRobot(load_world("room", 1), make_robot(SIZE), "line", drive)) as robot, \
-            closing(SerialMotor(robot.port, LineProtocol(drive), timeout_s=1.0, watchdog_ms=2000)) as motor, \
-            closing(WitMotionGyro(robot.imu_port, 115_200)) as gyro:
+    with (
+        closing(RealtimeRobot(load_world("room", 1), make_robot(SIZE), "line", drive)) as robot,
+        closing(SerialMotor(robot.port, LineProtocol(drive), timeout_s=1.0, watchdog_ms=2000)) as motor,
+        closing(WitMotionGyro(robot.imu_port, 115_200)) as gyro,
+    ):
         turned_rad, first_ns, last_ns, begin_rad = 0.0, 0, 0, robot.pose_at(0)[2]
         for sample in gyro.samples():
             motor.send(VelocityCommand(0, 0.2, 1.0, 0.0))
@@ -65,13 +69,16 @@ def test_the_gyro_measures_the_turn_of_the_base() -> None:
     assert truth_rad > 0.2 and turned_rad == pytest.approx(truth_rad, abs=0.1)
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (["castle"], "world 'castle' is not known"),
-    (["room", "--size", "9"], "--size 9: expected 64 to 2048 px"),
-    (["room", "--light", "-1"], "brightness -1"),
-    (["room", "--seed", "-1"], "--seed -1: expected 0 or more"),
-    (["room", "--truth", "/none/truth.txt"], "--truth"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["castle"], "world 'castle' is not known"),
+        (["room", "--size", "9"], "--size 9: expected 64 to 2048 px"),
+        (["room", "--light", "-1"], "brightness -1"),
+        (["room", "--seed", "-1"], "--seed -1: expected 0 or more"),
+        (["room", "--truth", "/none/truth.txt"], "--truth"),
+    ],
+)
 def test_wrong_options_are_one_line(capsys: pytest.CaptureFixture[str], arguments: list[str], message: str) -> None:
     assert main(["simulate", *arguments]) == 2
     error = capsys.readouterr().err

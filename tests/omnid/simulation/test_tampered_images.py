@@ -24,8 +24,16 @@ AHEAD, BEHIND = sector(SIZE_PX, 0.0, 180.0), sector(SIZE_PX, 180.0, 120.0)
 
 def drive(tamper: Tamper | None = None, *faults: Fault) -> SimulatedRun:
     """Return a drive ahead at 0.5 m/s."""
-    return simulate(WORLD, replace(make_robot(SIZE_PX), samples=1), ahead, seconds=3.0, seed=1, config=CONFIG,
-                    faults=faults, tamper=tamper)
+    return simulate(
+        WORLD,
+        replace(make_robot(SIZE_PX), samples=1),
+        ahead,
+        seconds=3.0,
+        seed=1,
+        config=CONFIG,
+        faults=faults,
+        tamper=tamper,
+    )
 
 
 def stop_s(run: SimulatedRun, reason: str) -> float:
@@ -55,7 +63,14 @@ def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
 @pytest.mark.parametrize("gyro", [True, False])
 def test_in_the_dark_a_base_stops_although_wheels_carry_its_pose(gyro: bool) -> None:
     """Half a second, and the ramp."""
-    run = simulate(WORLD, replace(make_robot(SIZE_PX), samples=1, has_gyro=gyro), ahead, seconds=3.0, seed=1,
-                   config=CONFIG, faults=(Fault("dark", STARTS_S, 9.0),))
+    run = simulate(
+        WORLD,
+        replace(make_robot(SIZE_PX), samples=1, has_gyro=gyro),
+        ahead,
+        seconds=3.0,
+        seed=1,
+        config=CONFIG,
+        faults=(Fault("dark", STARTS_S, 9.0),),
+    )
     assert 0.0 < stop_s(run, UNSEEN) < 0.5
     assert "lost" not in run.states

@@ -109,20 +109,27 @@ def test_posters_are_exchanged() -> None:
     assert all(name.startswith("poster") for name in changed) and 0.2 * hung < len(changed) < 0.8 * hung
 
 
-@pytest.mark.parametrize(("old", "new", "message"), [
-    ("schema = 1", "schema = 2", "schema"),
-    ('texture = "white"', 'texture = "whit"', "wall\\[0\\].texture: expected"),
-    ("at_m = 0.5", "at = 0.5", "unknown key"),
-    ("high = [4.0, 2.0]", "high = [400.0, 2.0]", "space.high"),
-    ("size_m = [0.4, 0.2, 0.5]", "size_m = [0.4, 0.2]", "box\\[0\\].size_m"),
-    ("path = [[3.0, 1.5], [3.0, 0.5]]", "path = [[3.0, 1.5]]", "2 to 100 points"),
-    ("[space]", "[space", "not a TOML file"),
-    ("at = [0.0, 1.0]", "at = [0.15, 0.0]", "box\\[0\\].at: expected a place where the robot does not start inside"),
-    ("at = [0.0, 1.0]", "at = [0.0, 0.15]\nyaw_deg = 90.0", "the robot does not start inside"),
-    ("at = [0.0, 1.0]", "at = [0.0, 5.0]", "box\\[0\\].at: expected a place where the whole box is within"),
-    ("at = [0.0, 1.0]", "at = [0.0, 1.85]\nyaw_deg = 90.0", "the whole box is within"),
-    ("start = [0.0, 0.0, 90.0]", "start = [0.0, 2.1, 90.0]", "start: expected a place within"),
-])
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("schema = 1", "schema = 2", "schema"),
+        ('texture = "white"', 'texture = "whit"', "wall\\[0\\].texture: expected"),
+        ("at_m = 0.5", "at = 0.5", "unknown key"),
+        ("high = [4.0, 2.0]", "high = [400.0, 2.0]", "space.high"),
+        ("size_m = [0.4, 0.2, 0.5]", "size_m = [0.4, 0.2]", "box\\[0\\].size_m"),
+        ("path = [[3.0, 1.5], [3.0, 0.5]]", "path = [[3.0, 1.5]]", "2 to 100 points"),
+        ("[space]", "[space", "not a TOML file"),
+        (
+            "at = [0.0, 1.0]",
+            "at = [0.15, 0.0]",
+            "box\\[0\\].at: expected a place where the robot does not start inside",
+        ),
+        ("at = [0.0, 1.0]", "at = [0.0, 0.15]\nyaw_deg = 90.0", "the robot does not start inside"),
+        ("at = [0.0, 1.0]", "at = [0.0, 5.0]", "box\\[0\\].at: expected a place where the whole box is within"),
+        ("at = [0.0, 1.0]", "at = [0.0, 1.85]\nyaw_deg = 90.0", "the whole box is within"),
+        ("start = [0.0, 0.0, 90.0]", "start = [0.0, 2.1, 90.0]", "start: expected a place within"),
+    ],
+)
 def test_wrong_worlds_are_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
     with pytest.raises(OmnidError, match=message):
         load_world(write(tmp_path, HALL.replace(old, new)), 1)
@@ -137,11 +144,14 @@ def test_unknown_worlds_and_options_are_refused(tmp_path: Path) -> None:
         WorldOptions(brightness=9.0)
 
 
-@pytest.mark.parametrize("text", [
-    HALL.replace("[4.0, 2.0]", "[24.0, 22.0]") + 199 * "[[box]]\nat = [12.0, 11.0]\nsize_m = [20.0, 20.0, 20.0]\n",
-    HALL + 18 * "[[person]]\npath = [[0.0, 0.0], [1.0, 0.0]]\nsize_m = [20.0, 20.0, 20.0]\n",
-    HALL.replace("[[2.0, 1.0], [2.0, -1.0]]", "[[2.0, 1.0], [2.0, -1e9]]"),
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        HALL.replace("[4.0, 2.0]", "[24.0, 22.0]") + 199 * "[[box]]\nat = [12.0, 11.0]\nsize_m = [20.0, 20.0, 20.0]\n",
+        HALL + 18 * "[[person]]\npath = [[0.0, 0.0], [1.0, 0.0]]\nsize_m = [20.0, 20.0, 20.0]\n",
+        HALL.replace("[[2.0, 1.0], [2.0, -1.0]]", "[[2.0, 1.0], [2.0, -1e9]]"),
+    ],
+)
 def test_the_area_is_checked_before_anything_is_painted(
     tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

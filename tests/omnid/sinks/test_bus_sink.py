@@ -78,8 +78,19 @@ def test_panoramas_are_published_at_the_configured_rate() -> None:
     assert shown.shape == (64, 128) and np.abs(shown.astype(int) - IMAGE[:, 16:-16]).max() < 20
 
 
-@pytest.mark.parametrize("data", [b"", b"{}", b"[]", b"\xff", b"[" * 3000, b'{"inliers":3,"rejected":[],"new":[]}',
-                                  b'{"inliers":[[1]],"rejected":[],"new":[]}', bytes(1 << 18)])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        b"{}",
+        b"[]",
+        b"\xff",
+        b"[" * 3000,
+        b'{"inliers":3,"rejected":[],"new":[]}',
+        b'{"inliers":[[1]],"rejected":[],"new":[]}',
+        bytes(1 << 18),
+    ],
+)
 def test_refuses_bytes_that_are_no_features(data: bytes) -> None:
     with pytest.raises(OmnidError, match="attached to a panorama"):
         features_from_bytes(data)

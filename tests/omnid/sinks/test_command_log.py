@@ -47,8 +47,13 @@ def test_commands_are_recorded_unchanged(tmp_path: Path) -> None:
     (path,) = (tmp_path / "log").glob("*.mcap")
     with AnyReader([path]) as bag:
         found = {place.topic: (at_ns, bag.deserialize(data, place.msgtype)) for place, at_ns, data in bag.messages()}
-    assert list(found) == ["/omnid/cmd/heading", "/omnid/cmd/twist", "/omnid/cmd/stop", "/omnid/cmd/arm",
-                           "/omnid/cmd/planner/heading"]
+    assert list(found) == [
+        "/omnid/cmd/heading",
+        "/omnid/cmd/twist",
+        "/omnid/cmd/stop",
+        "/omnid/cmd/arm",
+        "/omnid/cmd/planner/heading",
+    ]
     assert all(0 <= at_ns - NOW_NS < 60 * 10**9 for at_ns, _ in found.values())
     heading, twist = found["/omnid/cmd/heading"][1].vector, found["/omnid/cmd/twist"][1].twist
     assert (heading.x, heading.z, twist.linear.x, twist.angular.z) == (0.3, -1.2, 0.4, 0.5)

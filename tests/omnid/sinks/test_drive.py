@@ -53,8 +53,9 @@ class Link:
 
 def odometry(stamp_ns: int) -> OdometryUpdate:
     depth: Any = None
-    return OdometryUpdate(0, stamp_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 99, 99,
-                          depth)
+    return OdometryUpdate(
+        0, stamp_ns, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 99, 99, depth
+    )
 
 
 @pytest.fixture

@@ -24,8 +24,7 @@ T_BASE_RIG = se3.exp([0.2, -0.1, 0.5, 0.1, -0.2, 1.0])
 def pose(seq: int, T_odom_base: np.ndarray, period_ns: int = 10**8) -> OdometryUpdate:
     """Return the pose of a rig whose base is given."""
     T = se3.inverse(T_BASE_RIG) @ T_odom_base @ T_BASE_RIG
-    return OdometryUpdate(seq, period_ns * seq, T, np.eye(6), np.zeros(6), np.eye(6), "tracking", 0, 9, 9,
-                          None)  # type: ignore[arg-type]  # the depth is not used
+    return OdometryUpdate(seq, period_ns * seq, T, np.eye(6), np.zeros(6), np.eye(6), "tracking", 0, 9, 9, None)  # type: ignore[arg-type]  # the depth is not used
 
 
 def ahead(x_m: float, heading_rad: float = 0.0) -> np.ndarray:
@@ -44,9 +43,16 @@ def decoded(payload: bytes) -> Any:
 def test_the_bytes_are_those_of_rosbags(count: int) -> None:
     poses = np.random.default_rng(count).normal(size=(count, 7))
     stamps_ns = 10**18 + np.arange(count) * 123_456_789
-    entries = [ros.geometry_msgs__msg__PoseStamped(codec.header_message(int(t), "odom"), ros.geometry_msgs__msg__Pose(
-        ros.geometry_msgs__msg__Point(*map(float, p[:3])), ros.geometry_msgs__msg__Quaternion(*map(float, p[3:]))))
-        for t, p in zip(stamps_ns, poses, strict=True)]
+    entries = [
+        ros.geometry_msgs__msg__PoseStamped(
+            codec.header_message(int(t), "odom"),
+            ros.geometry_msgs__msg__Pose(
+                ros.geometry_msgs__msg__Point(*map(float, p[:3])),
+                ros.geometry_msgs__msg__Quaternion(*map(float, p[3:])),
+            ),
+        )
+        for t, p in zip(stamps_ns, poses, strict=True)
+    ]
     message = ros.nav_msgs__msg__Path(codec.header_message(5 * 10**17 + 7, "odom"), entries)
     expected = bytes(STORE.serialize_cdr(message, "nav_msgs/msg/Path"))
     assert driven_path_cdr(5 * 10**17 + 7, stamps_ns, poses) == expected

@@ -11,8 +11,9 @@ from omnid.tracking_state import TrackingState
 
 def odometry(seq: int) -> OdometryUpdate:
     state = TrackingState.LOST if seq % 7 == 0 else TrackingState.TRACKING
-    return OdometryUpdate(seq, 10**9 + seq, np.eye(4) * seq, np.eye(6) * seq, np.zeros(6), np.eye(6), state, 0, 5, 9,
-                          None)  # type: ignore[arg-type]  # the depth is not used
+    return OdometryUpdate(
+        seq, 10**9 + seq, np.eye(4) * seq, np.eye(6) * seq, np.zeros(6), np.eye(6), state, 0, 5, 9, None
+    )  # type: ignore[arg-type]  # the depth is not used
 
 
 def test_keeps_all_poses_beyond_its_first_capacity() -> None:
@@ -28,4 +29,7 @@ def test_keeps_all_poses_beyond_its_first_capacity() -> None:
 def test_empty_arrays_have_their_shapes() -> None:
     collector = PoseCollector()
     assert (collector.stamps_ns.shape, collector.T_odom_rig.shape, collector.covariances.shape) == (
-        (0,), (0, 4, 4), (0, 6, 6))
+        (0,),
+        (0, 4, 4),
+        (0, 6, 6),
+    )

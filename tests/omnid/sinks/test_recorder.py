@@ -98,14 +98,16 @@ def test_rows_without_padding_get_their_step() -> None:
 
 
 def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
-    return OdometryUpdate(seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60,
-                    small_depth())
+    return OdometryUpdate(
+        seq, 5 * 10**9 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), state, 0, 50, 60, small_depth()
+    )
 
 
 def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     encode = Encoder(np.eye(4), MapEncoding(100), OFFSET_NS)
-    recorder = open_recorder(settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode,
-                             offset_ns=OFFSET_NS)
+    recorder = open_recorder(
+        settings(tmp_path / "log"), "version = 1", lambda *_: None, encode=encode, offset_ns=OFFSET_NS
+    )
     points = MapPoints(np.zeros((3, 3), np.float32), np.zeros(3, np.float32), *[np.zeros(3, np.int32)] * 2)
     for n in range(4):
         recorder.process(odometry(n, "lost" if n == 3 else "tracking"))
@@ -122,8 +124,16 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
             header = message.transforms[0].header if connection.topic.startswith("/tf") else message.header
             written_ns = header.stamp.sec * 10**9 + header.stamp.nanosec
             assert START_NS <= written_ns <= START_NS + 3 and stamp_ns == written_ns
-    assert counts == {"/omnid/odom": 4, "/omnid/pose": 4, "/tf": 4, "/omnid/drive": 4, "/omnid/status": 3,
-                      "/omnid/cloud": 1, "/tf_static": 1, "/omnid/path": 1}
+    assert counts == {
+        "/omnid/odom": 4,
+        "/omnid/pose": 4,
+        "/tf": 4,
+        "/omnid/drive": 4,
+        "/omnid/status": 3,
+        "/omnid/cloud": 1,
+        "/tf_static": 1,
+        "/omnid/path": 1,
+    }
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
 
 
@@ -241,11 +251,17 @@ class Seen:
 def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
     events: list[tuple[int, str]] = []
     now_ns = time.monotonic_ns()
-    sources = {camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
-               for camera in ("lower", "upper")}
+    sources = {
+        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
+        for camera in ("lower", "upper")
+    }
     before = signal.getsignal(signal.SIGTERM)
-    state = record(sources, settings(tmp_path / "log"), "version = 1",  # type: ignore[arg-type]
-                   lambda severity, text: events.append((severity, text))).state
+    state = record(
+        sources,
+        settings(tmp_path / "log"),
+        "version = 1",  # type: ignore[arg-type]
+        lambda severity, text: events.append((severity, text)),
+    ).state
     assert signal.getsignal(signal.SIGTERM) is before
     assert (state.messages, state.lost, state.status) == (20, 0, "closed")
     assert "20 messages in 1 files" in events[-1][1]

@@ -49,13 +49,20 @@ def test_a_recording_keeps_them_for_late_subscribers_of_its_player(tmp_path: Pat
     """rosbag2 publishes them as transient local, as the quality that is stored with the topic says."""
     recorder = Recorder(SingleLog(tmp_path / "a.mcap", {}), "omnid", Encoder(RIG.T_base_rig, MapEncoding(1), 0, RIG))
     for seq in range(3):
-        recorder.process(OdometryUpdate(seq, 10**18 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), "tracking", 0,
-                                        9, 9, small_depth()))
+        recorder.process(
+            OdometryUpdate(
+                seq, 10**18 + seq, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), "tracking", 0, 9, 9, small_depth()
+            )
+        )
     recorder.finish()
     with AnyReader([tmp_path / "a.mcap"]) as bag:
         (connection,) = [found for found in bag.connections if found.topic == "/tf_static"]
         (stored,) = cast("Any", connection.ext).offered_qos_profiles
         messages = [data for _, _, data in bag.messages([connection])]
     assert (stored.history.name, stored.depth, stored.reliability.name, stored.durability.name) == (
-        "KEEP_LAST", 1, "RELIABLE", "TRANSIENT_LOCAL")
+        "KEEP_LAST",
+        1,
+        "RELIABLE",
+        "TRANSIENT_LOCAL",
+    )
     assert len(messages) == 1

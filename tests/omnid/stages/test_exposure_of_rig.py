@@ -15,12 +15,17 @@ from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import geometry
 
 
-@pytest.mark.parametrize(("config", "delay_s", "line_s"), [
-    (TimingConfig(), 8e-3, 2e-5), (TimingConfig(upper_delay_ms=3.0), 3e-3, 2e-5),
-    (TimingConfig(line_time_us=30.0), 8e-3, 3e-5),
-])
-def test_times_of_the_rig_unless_the_configuration_has_others(config: TimingConfig, delay_s: float, line_s: float
-                                                              ) -> None:
+@pytest.mark.parametrize(
+    ("config", "delay_s", "line_s"),
+    [
+        (TimingConfig(), 8e-3, 2e-5),
+        (TimingConfig(upper_delay_ms=3.0), 3e-3, 2e-5),
+        (TimingConfig(line_time_us=30.0), 8e-3, 3e-5),
+    ],
+)
+def test_times_of_the_rig_unless_the_configuration_has_others(
+    config: TimingConfig, delay_s: float, line_s: float
+) -> None:
     rig = replace(make_rig(size=128), times=ShutterTimes(8e-3, 2e-5))
     dark = np.zeros((128, 128), np.uint8)
     seen = Dewarp(geometry(rig, PanoramaConfig()), PanoramaConfig(), config).process(FramePair(0, 0, dark, dark, 1e-3))

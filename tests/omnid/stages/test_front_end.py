@@ -54,7 +54,8 @@ def test_one_call_gives_the_poses_of_two_stages(place: Geometry, pairs: list[Fra
 
 
 def test_the_rig_is_checked_by_pairs_that_are_not_synchronised_after_odometry_has_found_their_motion(
-        place: Geometry, pairs: list[FramePair]) -> None:
+    place: Geometry, pairs: list[FramePair]
+) -> None:
     at_once, skewed = Seen(place), Seen(place)
     for health, skew_s in ((at_once, 0.0), (skewed, 0.015)):
         front_end = FrontEnd(place, Config(), health)

@@ -72,21 +72,36 @@ def test_two_threads_that_read_at_the_same_time_compute_the_depth_once() -> None
     assert counted.computed == [3] and found[0] is found[1]
 
 
-@pytest.mark.parametrize(("rate_hz", "speed_mps", "expected"), [
-    (5.0, 1.0, 10),  # as often as the rate says, of 30 pairs a second for 2 s
-    (0.0, 0.0, 60),  # all
-    (5.0, 0.0, 2),  # at rest, once a second
-    (1000.0, 0.5, 30),  # as soon as the view has changed by 3 cm, which is every second pair
-])
-def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(rate_hz: float, speed_mps: float, expected: int
-                                                               ) -> None:
+@pytest.mark.parametrize(
+    ("rate_hz", "speed_mps", "expected"),
+    [
+        (5.0, 1.0, 10),  # as often as the rate says, of 30 pairs a second for 2 s
+        (0.0, 0.0, 60),  # all
+        (5.0, 0.0, 2),  # at rest, once a second
+        (1000.0, 0.5, 30),  # as soon as the view has changed by 3 cm, which is every second pair
+    ],
+)
+def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(rate_hz: float, speed_mps: float, expected: int) -> None:
     counted = Counted()
     mapping = Mapping(MappingConfig(rate_hz=rate_hz), DenseDepths(counted))
     for seq in range(60):
         stamp_ns = round(seq * 1e9 / 30)
         T = se3.transform(np.eye(3), np.array([speed_mps * stamp_ns * 1e-9, 0, 0]))
-        mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                       50, 50, StereoDepth(panoramas(seq, stamp_ns))))
+        mapping.process(
+            OdometryUpdate(
+                seq,
+                stamp_ns,
+                T,
+                np.eye(6),
+                np.zeros(6),
+                np.eye(6),
+                TrackingState.TRACKING,
+                0,
+                50,
+                50,
+                StereoDepth(panoramas(seq, stamp_ns)),
+            )
+        )
     assert len(counted.computed) == expected
     path_xy = mapping.finish()[0].path_xy  # it goes on where no pair enters the map
     np.testing.assert_allclose(path_xy[-1], [speed_mps * 59 / 30, 0], atol=1e-6)
@@ -99,8 +114,22 @@ def test_keyframes_enter_the_map_after_half_the_time() -> None:
     for seq in range(60):
         stamp_ns = round(seq * 1e9 / 30)
         T = se3.transform(np.eye(3), np.array([stamp_ns * 1e-9, 0, 0]))
-        mapping.process(OdometryUpdate(seq, stamp_ns, T, np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                       50, 50, StereoDepth(panoramas(seq, stamp_ns)), is_keyframe=seq % 4 == 0))
+        mapping.process(
+            OdometryUpdate(
+                seq,
+                stamp_ns,
+                T,
+                np.eye(6),
+                np.zeros(6),
+                np.eye(6),
+                TrackingState.TRACKING,
+                0,
+                50,
+                50,
+                StereoDepth(panoramas(seq, stamp_ns)),
+                is_keyframe=seq % 4 == 0,
+            )
+        )
     assert counted.computed == list(range(0, 60, 4))
 
 

@@ -25,17 +25,20 @@ LIMITS = VelocityLimits(velocity_mps=0.4, acceleration_mps2=0.5, deceleration_mp
 
 
 def settings(velocity_mps: float = 0.3, heading_deg: float = 0.0) -> ControllerSettings:
-    return ControllerSettings(Deadlines(), LIMITS, HeadingLimits(acceleration_mps2=10.0),
-                              ReplaySetpoint(velocity_mps, heading_deg))
+    return ControllerSettings(
+        Deadlines(), LIMITS, HeadingLimits(acceleration_mps2=10.0), ReplaySetpoint(velocity_mps, heading_deg)
+    )
 
 
-def odometry(at_s: float, state: TrackingState = TrackingState.TRACKING, *, heading_rad: float = 0.0,
-             rate_radps: float = 0.0) -> OdometryUpdate:
+def odometry(
+    at_s: float, state: TrackingState = TrackingState.TRACKING, *, heading_rad: float = 0.0, rate_radps: float = 0.0
+) -> OdometryUpdate:
     T_odom_rig = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading_rad]))
     velocity = np.array([0.0, 0.0, 0.0, 0.0, 0.0, rate_radps])
     depth: Any = None
-    return OdometryUpdate(0, 10**12 + round(at_s * 1e9), T_odom_rig, np.eye(6), velocity, 1e-4 * np.eye(6), state, 0,
-                          99, 99, depth)
+    return OdometryUpdate(
+        0, 10**12 + round(at_s * 1e9), T_odom_rig, np.eye(6), velocity, 1e-4 * np.eye(6), state, 0, 99, 99, depth
+    )
 
 
 def driven(drive: LockstepDrive, count: int, start_s: float = 0.0, **kwargs: Any) -> list[VelocityCommand]:
@@ -74,10 +77,13 @@ def test_a_gap_in_the_log_stops_the_wheels(gap_s: float, speed_mps: float) -> No
 
 def test_is_the_same_every_time() -> None:
     rng = np.random.default_rng(3)
-    poses = [odometry(0.1 * k + rng.uniform(0, 0.05), heading_rad=rng.normal(), rate_radps=rng.normal())
-             for k in range(100)]
-    first, second = ([drive.process(pose) for pose in poses]
-                     for drive in (LockstepDrive(settings(), PERIOD_S, np.eye(4)) for _ in range(2)))
+    poses = [
+        odometry(0.1 * k + rng.uniform(0, 0.05), heading_rad=rng.normal(), rate_radps=rng.normal()) for k in range(100)
+    ]
+    first, second = (
+        [drive.process(pose) for pose in poses]
+        for drive in (LockstepDrive(settings(), PERIOD_S, np.eye(4)) for _ in range(2))
+    )
     assert first == second and not all(map(is_stop, first))
 
 

@@ -63,8 +63,9 @@ class Walk:
     def __init__(self, seed: int, folder: Path) -> None:
         self.rng, self.seen, self.t_s = random.Random(seed), Counter[str](), 1000.0
         self.law = ControlLaw(SETTINGS, -1)
-        self.stage = NavigationStage(NAVIGATION, SETTINGS.collision, np.eye(4), self.wheels,
-                                     Routes(FixedMap(is_new=True)))
+        self.stage = NavigationStage(
+            NAVIGATION, SETTINGS.collision, np.eye(4), self.wheels, Routes(FixedMap(is_new=True))
+        )
         self.asked: list[NavigationCommand] = []
         self.files = RouteFiles(RouteFolder(folder), self.asked.append)
         self.pose, self.motion = np.zeros(3), (0.0, 0.0)
@@ -129,14 +130,21 @@ class Walk:
         frame = rng.choice(list(NavigationFrame))
         place = self.pose[:2] + np.array([rng.gauss(0, 1.5), rng.gauss(0, 1.5)])
         route = rng.choice(("a", "a", "a", "b", "missing"))
-        return rng.choice((
-            GoalRequest(frame, *place.tolist(), rng.choice((None, rng.uniform(-3, 3)))),
-            GoalRequest(frame, *(self.pose[:2] + rng.choice((0.0, 1e3))).tolist()),
-            PathRequest(frame, np.vstack([self.pose[:2], place, place + rng.uniform(-1, 1)])),
-            NavigationVerb.CANCEL, NavigationVerb.PAUSE, NavigationVerb.PAUSE, NavigationVerb.RESUME,
-            RouteRequest(RouteAction.TEACH, route), RouteRequest(RouteAction.FINISH),
-            RouteRequest(RouteAction.REPEAT, route, rng.random() < 0.5, rng.randint(1, 3)),
-            RouteRequest(RouteAction.STOP)))
+        return rng.choice(
+            (
+                GoalRequest(frame, *place.tolist(), rng.choice((None, rng.uniform(-3, 3)))),
+                GoalRequest(frame, *(self.pose[:2] + rng.choice((0.0, 1e3))).tolist()),
+                PathRequest(frame, np.vstack([self.pose[:2], place, place + rng.uniform(-1, 1)])),
+                NavigationVerb.CANCEL,
+                NavigationVerb.PAUSE,
+                NavigationVerb.PAUSE,
+                NavigationVerb.RESUME,
+                RouteRequest(RouteAction.TEACH, route),
+                RouteRequest(RouteAction.FINISH),
+                RouteRequest(RouteAction.REPEAT, route, rng.random() < 0.5, rng.randint(1, 3)),
+                RouteRequest(RouteAction.STOP),
+            )
+        )
 
     def ask(self, request: NavigationRequest) -> None:
         """Send a request, and take its answer into the oracle."""
@@ -151,8 +159,11 @@ class Walk:
             update = self.stage.process(self.asked.pop(0))
         assert update is not None and update.answer is not None
         accepted = not update.answer.refusal
-        word = type(request).__name__ if not isinstance(request, NavigationVerb | RouteRequest) else str(
-            request if isinstance(request, NavigationVerb) else request.action)
+        word = (
+            type(request).__name__
+            if not isinstance(request, NavigationVerb | RouteRequest)
+            else str(request if isinstance(request, NavigationVerb) else request.action)
+        )
         self.seen[f"{word} {'accepted' if accepted else 'refused'}"] += 1
         match request:
             case GoalRequest() | PathRequest() | RouteRequest(RouteAction.REPEAT) if accepted:
@@ -186,12 +197,18 @@ class Walk:
         self.seq += 1
         T = transform(self.pose)
         velocity = np.array([self.motion[0], 0, 0, 0, 0, self.motion[1]])
-        self.law.set_pose(ControllerPose(self.now_ns, float(self.pose[2]), self.motion[1], self.state, self.motion[0],
-                                         resets=self.resets))
+        self.law.set_pose(
+            ControllerPose(
+                self.now_ns, float(self.pose[2]), self.motion[1], self.state, self.motion[0], resets=self.resets
+            )
+        )
         self.stage.process(PlaceUpdate(self.seq, self.now_ns, np.eye(4), T, UNIT, self.map_state, 3, T))
         self.posed_s = self.t_s if self.state is not TrackingState.LOST else -math.inf
-        self.take(self.stage.process(OdometryUpdate(self.seq, self.now_ns, T, UNIT, velocity, UNIT, self.state,
-                                                    self.resets, 100, 100, DEPTH)))
+        self.take(
+            self.stage.process(
+                OdometryUpdate(self.seq, self.now_ns, T, UNIT, velocity, UNIT, self.state, self.resets, 100, 100, DEPTH)
+            )
+        )
 
     def send_ring(self) -> None:
         """Send what stands around the base, in a stale phase nothing."""
@@ -202,12 +219,18 @@ class Walk:
         ranges[ahead] = (0.9 / np.cos(AZIMUTHS[ahead] * 0.9)).clip(0, 3)
         if self.kind == "person":
             to = composed(self.pose[None], np.array([1.0, 0.0, 0.0]))[0]
-            moving = (MovingObstacle(*to[:2].tolist(), self.rng.uniform(-1, 1), self.rng.uniform(-1, 1),
-                                     np.eye(4) * 0.01, 0.2),)
+            moving = (
+                MovingObstacle(
+                    *to[:2].tolist(), self.rng.uniform(-1, 1), self.rng.uniform(-1, 1), np.eye(4) * 0.01, 0.2
+                ),
+            )
         self.law.set_ring(ControllerRing(self.now_ns, tuple(ranges.tolist())))
         self.ringed_s = self.t_s
-        self.stage.process(ObstacleRing(self.seq, self.now_ns, ranges, np.full(360, 0.01, np.float32), ranges,
-                                        transform(self.pose), moving))
+        self.stage.process(
+            ObstacleRing(
+                self.seq, self.now_ns, ranges, np.full(360, 0.01, np.float32), ranges, transform(self.pose), moving
+            )
+        )
 
     def tick(self) -> None:
         """Tick, and hold the motion against the oracle."""
@@ -220,8 +243,10 @@ class Walk:
         before, now = self.motion, (motion.velocity_mps, motion.yaw_rate_radps)
         goal = self.wanted and not self.paused and self.published in MOVES
         person = self.t_s - self.operated_s <= SETTINGS.deadlines.command_s
-        sees = (self.t_s - self.posed_s <= SETTINGS.deadlines.pose_s
-                and self.t_s - self.ringed_s <= SETTINGS.collision.stale_s)
+        sees = (
+            self.t_s - self.posed_s <= SETTINGS.deadlines.pose_s
+            and self.t_s - self.ringed_s <= SETTINGS.collision.stale_s
+        )
         if not (armed and sees and (goal or person)):
             for was, be in zip(before, now, strict=True):
                 assert abs(be) <= abs(was) + TINY and was * be >= 0, (before, now, self.published, self.law.reason)
@@ -232,9 +257,21 @@ class Walk:
         self.pose = composed(self.pose[None], np.array([now[0] * TICK_S, 0.0, now[1] * TICK_S]))[0]
 
 
-EXPECTED = {"moves for a goal", "slows down", "stands", "GoalRequest accepted", "GoalRequest refused",
-            "repeat accepted", "repeat refused", "teach accepted", "finish accepted", "finish refused",
-            "resume accepted", "cancel accepted", *map(str, NavigationState)} - {str(NavigationState.AVOIDING)}
+EXPECTED = {
+    "moves for a goal",
+    "slows down",
+    "stands",
+    "GoalRequest accepted",
+    "GoalRequest refused",
+    "repeat accepted",
+    "repeat refused",
+    "teach accepted",
+    "finish accepted",
+    "finish refused",
+    "resume accepted",
+    "cancel accepted",
+    *map(str, NavigationState),
+} - {str(NavigationState.AVOIDING)}
 
 
 def walk(seed: int, folder: Path, poses: int) -> Counter[str]:

@@ -71,8 +71,9 @@ class Robot:
     def __init__(self, folder: Path, places: FixedMap | None = None) -> None:
         self.wheels = WheelState(True, False)
         self.places = FixedMap() if places is None else places
-        self.stage = NavigationStage(NavigationSettings(), CollisionSettings(), T_BASE_RIG, lambda: self.wheels,
-                                     Routes(self.places))
+        self.stage = NavigationStage(
+            NavigationSettings(), CollisionSettings(), T_BASE_RIG, lambda: self.wheels, Routes(self.places)
+        )
         self.asked: list[NavigationCommand] = []
         self.files = RouteFiles(RouteFolder(folder), self.asked.append, self.places.save)
         self.pose, self.velocity = np.zeros(3), np.zeros(2)
@@ -105,20 +106,38 @@ class Robot:
             T_map_odom = se3.inverse(T_BASE_RIG) @ T_MAP_ODOM @ T_BASE_RIG
             T_map_rig = T_map_odom @ T_odom_rig
             T_keyframe_rig = T_map_rig  # keyframe 3 stands where the map begins
-            self.stage.process(PlaceUpdate(self.seq, stamp_ns, T_map_odom, T_map_rig, UNIT, self.map_state, 3,
-                                           T_keyframe_rig))
-        update = self.stage.process(OdometryUpdate(
-            self.seq, stamp_ns, T_odom_rig, UNIT, velocity, UNIT, TrackingState.TRACKING, self.resets, 100, 100, DEPTH))
+            self.stage.process(
+                PlaceUpdate(self.seq, stamp_ns, T_map_odom, T_map_rig, UNIT, self.map_state, 3, T_keyframe_rig)
+            )
+        update = self.stage.process(
+            OdometryUpdate(
+                self.seq,
+                stamp_ns,
+                T_odom_rig,
+                UNIT,
+                velocity,
+                UNIT,
+                TrackingState.TRACKING,
+                self.resets,
+                100,
+                100,
+                DEPTH,
+            )
+        )
         if update is not None:
             self.updates.append(update)
         if update is not None and update.setpoint is not None:
             wanted = update.setpoint
-            rate = wanted.yaw_rate_radps if wanted.heading_rad is None else np.clip(
-                3 * math.remainder(wanted.heading_rad - self.pose[2], math.tau), -1, 1)
+            rate = (
+                wanted.yaw_rate_radps
+                if wanted.heading_rad is None
+                else np.clip(3 * math.remainder(wanted.heading_rad - self.pose[2], math.tau), -1, 1)
+            )
             self.velocity = np.array([wanted.velocity_mps, rate])
         heading = self.pose[2] + 0.05 * self.velocity[1]
-        self.pose = self.pose + 0.1 * np.array([self.velocity[0] * math.cos(heading),
-                                                self.velocity[0] * math.sin(heading), self.velocity[1]])
+        self.pose = self.pose + 0.1 * np.array(
+            [self.velocity[0] * math.cos(heading), self.velocity[0] * math.sin(heading), self.velocity[1]]
+        )
         return update
 
     def run(self, periods: int = 600) -> NavigationUpdate:

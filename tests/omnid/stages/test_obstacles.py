@@ -39,8 +39,11 @@ def rings_of(scene: Path, *settings: str, inline: bool = True) -> Rings:
     """Return the rings of the rendered run."""
     found = Rings()
     config = load_config(None, ["places.enabled=false", *settings])
-    run_log(scene / "log.mcap", config, ReplayOptions(rig=scene / "rig.toml", inline=inline,
-                                                      observer=lambda geometry, telemetry: found))
+    run_log(
+        scene / "log.mcap",
+        config,
+        ReplayOptions(rig=scene / "rig.toml", inline=inline, observer=lambda geometry, telemetry: found),
+    )
     return found
 
 
@@ -86,7 +89,10 @@ def test_floor_between_edges_is_free_where_the_rig_states_its_height_and_nothing
     dense = DensePoints(np.full(visible.shape, np.nan, np.float32), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0))
     stage = Obstacles(Geometry(rig, CYLINDER), load_config().obstacles, DenseDepths(lambda panoramas, exposure: dense))
     pair = Panoramas(0, 0, *panoramas(worn, 9.0, plain), visible)
-    ring = stage.process(OdometryUpdate(0, 0, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0,
-                                        100, 100, StereoDepth(pair)))
+    ring = stage.process(
+        OdometryUpdate(
+            0, 0, np.eye(4), np.eye(6), np.zeros(6), np.eye(6), TrackingState.TRACKING, 0, 100, 100, StereoDepth(pair)
+        )
+    )
     assert ring is not None and np.isnan(ring.ranges_m).all()
     assert np.median(ring.free_m) > 2.0 if height_m else ring.free_m.max() == 0.0

@@ -66,8 +66,9 @@ def test_the_motion_of_a_right_rig_is_plausible(scene: Path) -> None:
     assert found == [("", "")] * STRAIGHT_PAIRS
 
 
-def with_people(rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], T_world_rig: np.ndarray
-                ) -> list[tuple[np.ndarray, np.ndarray]]:
+def with_people(
+    rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], T_world_rig: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the images with people who walk past on three sides, 0.9 to 1.8 m away, up to 1.2 m/s fast."""
     rng = np.random.default_rng(5)
     cloth = [cv2.GaussianBlur(rng.integers(0, 255, (64, 256)).astype(np.float32), (0, 0), 1.5) for _ in range(3)]
@@ -86,8 +87,10 @@ def with_people(rig: Rig, images: list[tuple[np.ndarray, np.ndarray]], T_world_r
             canvas = image.reshape(-1).copy()
             for person, shirt in zip(people.T, cloth, strict=True):
                 range_m = np.hypot(person[0], person[1])
-                aside = np.remainder(np.arctan2(ray[:, 1], ray[:, 0]) - np.arctan2(person[1], person[0]) + np.pi,
-                                     2 * np.pi) - np.pi
+                aside = (
+                    np.remainder(np.arctan2(ray[:, 1], ray[:, 0]) - np.arctan2(person[1], person[0]) + np.pi, 2 * np.pi)
+                    - np.pi
+                )
                 height_m = side.viewpoint[2] + range_m * ray[:, 2] / np.hypot(ray[:, 0], ray[:, 1])
                 on = (np.abs(aside) * range_m < 0.25) & (height_m > -1.0) & (height_m < 0.7)
                 rows = ((height_m[on] + 1.0) / 1.7 * 255).astype(int)

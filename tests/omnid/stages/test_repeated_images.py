@@ -57,7 +57,7 @@ def test_a_camera_freezes_and_lives_again() -> None:
 @pytest.mark.parametrize("buffers", range(2, KEPT + 1))
 def test_a_driver_that_hands_out_its_buffers_in_turn_is_frozen(buffers: int) -> None:
     flags, repeated = seen([*range(100, 120), *list(range(buffers)) * 5])
-    assert repeated.frozen and not any(flags[: 20 + buffers]) and all(flags[20 + 2 * buffers:])
+    assert repeated.frozen and not any(flags[: 20 + buffers]) and all(flags[20 + 2 * buffers :])
 
 
 def test_one_pixel_that_differs_is_a_new_image() -> None:
@@ -76,8 +76,11 @@ def frames(lower: Iterable[int], upper: Iterable[int]) -> list[Frame]:
     def shot(camera: Camera, index: int, number: int) -> Frame:
         return Frame(index, 10**12 + index * PERIOD_NS, camera, "png", cv2.imencode(".png", image(number))[1])
 
-    return [frame for index, (low, up) in enumerate(zip(lower, upper, strict=True))
-            for frame in (shot("lower", index, low), shot("upper", index, up + 10**6))]
+    return [
+        frame
+        for index, (low, up) in enumerate(zip(lower, upper, strict=True))
+        for frame in (shot("lower", index, low), shot("upper", index, up + 10**6))
+    ]
 
 
 @pytest.mark.parametrize("dead", [("lower",), ("upper",), ("lower", "upper")])
@@ -90,8 +93,14 @@ def test_pairs_of_a_frozen_camera_are_left_out(rig: Rig, dead: tuple[Camera, ...
     assert pairing.frozen == list(dead)
     made = [pair for frame in [*shots[40:]] if (pair := pairing.process(frame)) is not None]
     assert [pair is not None for pair in during[1::2]] == [True] * 10 + [False] * 10 and len(made) == 10
-    assert pairing.counts == {"pairs": 20, "unpaired_lower": 0, "unpaired_upper": 0, "broken": 0,
-                              "repeated_lower": 10 * ("lower" in dead), "repeated_upper": 10 * ("upper" in dead)}
+    assert pairing.counts == {
+        "pairs": 20,
+        "unpaired_lower": 0,
+        "unpaired_upper": 0,
+        "broken": 0,
+        "repeated_lower": 10 * ("lower" in dead),
+        "repeated_upper": 10 * ("upper" in dead),
+    }
     assert [pair.seq for pair in made] == list(range(10, 20)) and pairing.frozen == []
 
 

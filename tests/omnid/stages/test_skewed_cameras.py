@@ -25,8 +25,15 @@ def skewed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Rig]:
     """Write a log of fast driving whose upper images are 25 ms later; return it and its rig."""
     folder = tmp_path_factory.mktemp("skewed")
     run = build("two_walls", seed=32, size=256, pairs=14)
-    write_log(folder, run.rig, run.poses, run.scene, sensor=run.sensor, seed=32,
-              readout=Readout(speed=2.0, skew_ms=(25.0, 25.0)))
+    write_log(
+        folder,
+        run.rig,
+        run.poses,
+        run.scene,
+        sensor=run.sensor,
+        seed=32,
+        readout=Readout(speed=2.0, skew_ms=(25.0, 25.0)),
+    )
     return folder / "log.mcap", read_rig(folder / "rig.toml")
 
 
@@ -39,8 +46,9 @@ def test_a_drifted_rig_is_reported_and_motion_is_not(skewed: tuple[Path, Rig], t
 
 def test_exchanged_cameras_are_refused_and_nothing_is_written(skewed: tuple[Path, Rig], tmp_path: Path) -> None:
     log, rig = skewed
-    options = ReplayOptions(rig=rig, topics=(rig.topics[1], rig.topics[0]), tum=tmp_path / "a.tum",
-                            record=tmp_path / "a.mcap")
+    options = ReplayOptions(
+        rig=rig, topics=(rig.topics[1], rig.topics[0]), tum=tmp_path / "a.tum", record=tmp_path / "a.mcap"
+    )
     with pytest.raises(RigContradictedError, match="other way round"):
         run_log(log, Config(), options)
     assert not list(tmp_path.iterdir())

@@ -112,8 +112,9 @@ def test_points_project_to_the_pixels_they_were_matched_at() -> None:
     for mounted, rows in ((run.rig.lower, row), (run.rig.upper, below)):
         seen = mounted.camera.project(se3.apply(mounted.T_cam_rig, depth.points))
         tables = remap_tables(run.rig, mounted, rig_geometry.cylinder)
-        expected = np.column_stack([cv2.remap(t, column.astype(np.float32), rows.astype(np.float32),
-                                              cv2.INTER_LINEAR).ravel() for t in tables])
+        expected = np.column_stack(
+            [cv2.remap(t, column.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR).ravel() for t in tables]
+        )
         assert np.abs(seen - expected).max() < 0.05
 
 
@@ -127,7 +128,8 @@ def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) 
     inner = np.zeros(shape, bool)
     inner[10:-80] = True
     depth = DenseStereo(rig_geometry, replace(CONFIG.stereo, min_range_m=min_range_m)).compute(
-        Panoramas(0, 0, wrapped(lower), wrapped(upper), inner))
+        Panoramas(0, 0, wrapped(lower), wrapped(upper), inner)
+    )
     right = np.abs(depth.disparity - 60) < 1
     assert (right.sum() > 5000) == found
 
@@ -183,8 +185,14 @@ def test_the_variance_of_a_point_follows_from_its_disparity(rig_geometry: Geomet
     np.testing.assert_allclose(np.sqrt(depth.variance_m2), moved, rtol=0.01)
 
 
-def odometry(T: np.ndarray, *, state: str = "tracking", covariance: np.ndarray | None = None, seq: int = 0,
-             depth: StereoDepth | None = None) -> OdometryUpdate:
+def odometry(
+    T: np.ndarray,
+    *,
+    state: str = "tracking",
+    covariance: np.ndarray | None = None,
+    seq: int = 0,
+    depth: StereoDepth | None = None,
+) -> OdometryUpdate:
     zero = np.zeros((6, 6))
     cov = zero if covariance is None else covariance
     velocity = np.array([1.0, 2, 3, 0.1, 0.2, 0.3])
@@ -278,8 +286,9 @@ def dropped(rig_geometry: Geometry, frames: list[Frame], slow: type) -> dict[str
                 assert complete.wait(60.0), "the poses waited for the bus"
 
     sinks = Sinks({"statistics": statistics, "complete": Complete()}, bus=SlowBus())
-    wire(graph, paired(graph, rig_geometry, frames)[1], front_end(rig_geometry), CONFIG, sinks,
-         RunParts(map_every_s=0.5))
+    wire(
+        graph, paired(graph, rig_geometry, frames)[1], front_end(rig_geometry), CONFIG, sinks, RunParts(map_every_s=0.5)
+    )
     graph.run()
     assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}

@@ -50,8 +50,7 @@ def unpaired(pair: Synchronise) -> tuple[int, int]:
 def test_a_pair_has_the_lower_stamp_and_both_images(pair: Synchronise) -> None:
     dark = cv2.imencode(".jpg", np.zeros((SIZE, SIZE), np.uint8))[1].tobytes()
     for index, order in enumerate((("lower", "upper"), ("upper", "lower"))):
-        (found,) = made(pair, *(shot(c, index, 3 * MS * (c == "upper"), dark if c == "upper" else JPEG)
-                                for c in order))  # type: ignore[arg-type]
+        (found,) = made(pair, *(shot(c, index, 3 * MS * (c == "upper"), dark if c == "upper" else JPEG) for c in order))  # type: ignore[arg-type]
         assert (found.seq, found.stamp_ns) == (index, shot("lower", index).stamp_ns)
         assert found.lower.mean() > 80 and found.upper.mean() < 5
 
@@ -135,8 +134,11 @@ def test_cameras_that_never_match_keep_few_frames(pair: Synchronise) -> None:
 
 
 def test_a_broken_image_counts_and_its_partner_is_unpaired(pair: Synchronise) -> None:
-    frames = [frame for index in range(6) for frame in
-              (shot("lower", index, data=JPEG[:100] if index % 2 else JPEG), shot("upper", index))]
+    frames = [
+        frame
+        for index in range(6)
+        for frame in (shot("lower", index, data=JPEG[:100] if index % 2 else JPEG), shot("upper", index))
+    ]
     assert [p.seq for p in made(pair, *frames)] == [0, 1, 2]
     pair.finish()
     assert pair.counts["broken"] == 3 and "lower frame 1" in pair.fault and unpaired(pair) == (0, 3)
@@ -215,8 +217,12 @@ def test_free_running_cameras_make_a_pair_of_every_image(free: Synchronise, skew
 
 
 def test_free_running_cameras_lose_only_images_without_a_partner(free: Synchronise) -> None:
-    taken = [shot(c, index, 14 * MS * (c == "upper")) for index in range(60) for c in ("lower", "upper")
-             if (c, index) not in (("lower", 20), ("upper", 31))]
+    taken = [
+        shot(c, index, 14 * MS * (c == "upper"))
+        for index in range(60)
+        for c in ("lower", "upper")
+        if (c, index) not in (("lower", 20), ("upper", 31))
+    ]
     found = made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))
     free.finish()
     assert len(found) == 58 and unpaired(free) == (1, 1)

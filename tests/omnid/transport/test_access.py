@@ -28,18 +28,59 @@ def openssl(*words: str) -> None:
 
 
 def authority(folder: Path, name: str) -> None:
-    openssl("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
-            "-subj", f"/CN={name}", "-keyout", str(folder / f"{name}.key"), "-out", str(folder / f"{name}.pem"))
+    openssl(
+        "req",
+        "-x509",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:prime256v1",
+        "-nodes",
+        "-days",
+        "2",
+        "-subj",
+        f"/CN={name}",
+        "-keyout",
+        str(folder / f"{name}.key"),
+        "-out",
+        str(folder / f"{name}.pem"),
+    )
 
 
 def certificate(folder: Path, name: str, signer: str) -> None:
     request, extra = folder / f"{name}.csr", folder / f"{name}.ext"
     extra.write_text("subjectAltName=IP:127.0.0.1,DNS:localhost\n")
-    openssl("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-subj", f"/CN={name}",
-            "-keyout", str(folder / f"{name}.key"), "-out", str(request))
-    openssl("x509", "-req", "-in", str(request), "-days", "2", "-CA", str(folder / f"{signer}.pem"), "-CAkey",
-            str(folder / f"{signer}.key"), "-CAcreateserial", "-extfile", str(extra),
-            "-out", str(folder / f"{name}.pem"))
+    openssl(
+        "req",
+        "-newkey",
+        "ec",
+        "-pkeyopt",
+        "ec_paramgen_curve:prime256v1",
+        "-nodes",
+        "-subj",
+        f"/CN={name}",
+        "-keyout",
+        str(folder / f"{name}.key"),
+        "-out",
+        str(request),
+    )
+    openssl(
+        "x509",
+        "-req",
+        "-in",
+        str(request),
+        "-days",
+        "2",
+        "-CA",
+        str(folder / f"{signer}.pem"),
+        "-CAkey",
+        str(folder / f"{signer}.key"),
+        "-CAcreateserial",
+        "-extfile",
+        str(extra),
+        "-out",
+        str(folder / f"{name}.pem"),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +95,23 @@ def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def robot(credentials: Path, **more: object) -> BusConfig:
-    own = {"tls_ca": credentials / "ca.pem", "tls_listen_key": credentials / "robot.key",
-           "tls_listen_certificate": credentials / "robot.pem"}
+    own = {
+        "tls_ca": credentials / "ca.pem",
+        "tls_listen_key": credentials / "robot.key",
+        "tls_listen_certificate": credentials / "robot.pem",
+    }
     return BusConfig(listen=(free_endpoint("tls"),), tls_mutual=True, **{k: str(v) for k, v in own.items()}, **more)
 
 
 def visitor(credentials: Path, endpoint: str, name: str | None) -> BusConfig:
-    own = {} if name is None else {"tls_connect_key": str(credentials / f"{name}.key"),
-                                   "tls_connect_certificate": str(credentials / f"{name}.pem")}
+    own = (
+        {}
+        if name is None
+        else {
+            "tls_connect_key": str(credentials / f"{name}.key"),
+            "tls_connect_certificate": str(credentials / f"{name}.pem"),
+        }
+    )
     return BusConfig(connect=(endpoint,), tls_ca=str(credentials / "ca.pem"), **own)
 
 
@@ -102,8 +152,11 @@ def asks_to_arm(driver: Driver) -> bool:
 @needs_openssl
 def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(credentials: Path) -> None:
     config = robot(credentials, command_names=("driver",))
-    with (commands_to(config) as received, Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest,
-          Robot(settings=visitor(credentials, config.listen[0], "driver")) as driver):
+    with (
+        commands_to(config) as received,
+        Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest,
+        Robot(settings=visitor(credentials, config.listen[0], "driver")) as driver,
+    ):
         refused, accepted = guest.driver(), driver.driver()
         wait_until(lambda: refused.stop() is None and bool(received))
         wait_until(lambda: asks_to_arm(accepted) and "cmd/arm" in received)
@@ -159,10 +212,12 @@ def test_drops_messages_that_others_publish_under_the_robots_name() -> None:
         received: list[bytes] = []
         listener.on_message(lambda topic, payload, _: received.append(payload))
         with plain_client(config.listen[0]) as forger:
+
             def forge_and_publish() -> bool:
                 forger.put("omnid/odom", b"forged")
                 bus.publish("odom", odometry(1))
                 return len(received) > 5
+
             wait_until(forge_and_publish)
     assert set(received) == {odometry(1)}
 

@@ -154,8 +154,7 @@ def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
     with script(ROUTER, router), contextlib.ExitStack() as stack:
         first = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)))))
         warnings, commands = list[str](), list[str]()
-        second = stack.enter_context(contextlib.closing(
-            Bus(BusConfig(listen=(), connect=(router,)), warnings.append)))
+        second = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)), warnings.append)))
         assert len(warnings) == 1 and "change bus.robot" in warnings[0] and "\n" not in warnings[0]
         second.subscribe_commands(lambda request: commands.append(request.topic), {})
         assert second.status().level == ERROR and not second.is_unique and commands == ["cmd/stop"]
@@ -191,8 +190,12 @@ def test_with_users_only_the_robot_declares_tokens_below_its_name(tmp_path: Path
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), users_file=str(users)))) as bus:
         commands: list[str] = []
         bus.subscribe_commands(lambda request: commands.append(request.topic), {})
-        with session(mode="client", connect__endpoints=[endpoint], transport__auth__usrpwd__user="eve",
-                     transport__auth__usrpwd__password="secret") as stranger:
+        with session(
+            mode="client",
+            connect__endpoints=[endpoint],
+            transport__auth__usrpwd__user="eve",
+            transport__auth__usrpwd__password="secret",
+        ) as stranger:
             held = stranger.liveliness().declare_token("omnid/alive/x")
             stranger.put("omnid/cmd/mark", b"")
             wait_until(lambda: commands == ["cmd/mark"])
@@ -248,11 +251,17 @@ def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:
     """Two robots start as clients without a router, which connects them later."""
     router, warnings = free_endpoint(), list[str]()
     with contextlib.ExitStack() as stack:
-        first, second = (stack.enter_context(contextlib.closing(
-            Bus(BusConfig(mode="client", connect=(router,)), warnings.append))) for _ in range(2))
+        first, second = (
+            stack.enter_context(contextlib.closing(Bus(BusConfig(mode="client", connect=(router,)), warnings.append)))
+            for _ in range(2)
+        )
         connection = stack.enter_context(script(ROUTER, router))
-        wait_until(lambda: bool([bus.connect() for bus in (first, second)])
-                   and first.status().level == second.status().level == ERROR)
+        wait_until(
+            lambda: (
+                bool([bus.connect() for bus in (first, second)])
+                and first.status().level == second.status().level == ERROR
+            )
+        )
         assert "bus.robot" in first.status().message and first.status().values["same_name"] == "1"
         assert len(warnings) == 2
         connection.kill()

@@ -21,8 +21,9 @@ def refused(**knobs: Any) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("knob", ["config", "tls_ca", "tls_listen_key", "tls_connect_certificate", "users_file",
-                                  "password_file"])
+@pytest.mark.parametrize(
+    "knob", ["config", "tls_ca", "tls_listen_key", "tls_connect_certificate", "users_file", "password_file"]
+)
 def test_a_missing_file_is_named(knob: str, tmp_path: Path) -> None:
     error = refused(**{knob: str(tmp_path / "nowhere")})
     assert f"bus.{knob}" in error and "nowhere" in error and "No such file" in error
@@ -42,14 +43,17 @@ def test_a_key_must_be_pem_and_users_have_passwords(tmp_path: Path) -> None:
     assert "user:password" in refused(users_file=str(path))
 
 
-@pytest.mark.parametrize(("knobs", "other"), [
-    ({"mode": "client"}, "bus.connect"),
-    ({"user": "ada"}, "bus.password_file"),
-    ({"listen": ("tls/127.0.0.1:1",)}, "bus.tls_listen_key"),
-    ({"tls_mutual": True}, "bus.tls_ca"),
-    ({"command_names": ("driver",)}, "bus.tls_mutual"),
-    ({"command_users": ("ada",)}, "bus.users_file"),
-])
+@pytest.mark.parametrize(
+    ("knobs", "other"),
+    [
+        ({"mode": "client"}, "bus.connect"),
+        ({"user": "ada"}, "bus.password_file"),
+        ({"listen": ("tls/127.0.0.1:1",)}, "bus.tls_listen_key"),
+        ({"tls_mutual": True}, "bus.tls_ca"),
+        ({"command_names": ("driver",)}, "bus.tls_mutual"),
+        ({"command_users": ("ada",)}, "bus.users_file"),
+    ],
+)
 def test_a_missing_knob_is_named(knobs: dict[str, Any], other: str) -> None:
     assert other in refused(**knobs)
 
@@ -67,23 +71,35 @@ def test_default_is_local_without_multicast_and_denies_writing() -> None:
     assert setting(BusConfig(), "access_control")["default_permission"] == "deny"
 
 
-@pytest.mark.parametrize(("ros2", "stops", "commands"), [
-    ("off", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
-    ("ros2dds", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
-    ("rmw_zenoh", ["robot7/cmd/stop", "5/robot7/cmd/stop/**"], ["robot7/cmd/**", "5/robot7/cmd/**"]),
-])
+@pytest.mark.parametrize(
+    ("ros2", "stops", "commands"),
+    [
+        ("off", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
+        ("ros2dds", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
+        ("rmw_zenoh", ["robot7/cmd/stop", "5/robot7/cmd/stop/**"], ["robot7/cmd/**", "5/robot7/cmd/**"]),
+    ],
+)
 @pytest.mark.parametrize("names", [(), ("boss",)])
-def test_everybody_may_stop_and_only_named_programs_command(ros2: str, stops: list[str], commands: list[str],
-                                                           names: tuple[str, ...]) -> None:
+def test_everybody_may_stop_and_only_named_programs_command(
+    ros2: str, stops: list[str], commands: list[str], names: tuple[str, ...]
+) -> None:
     """The rules as they stand, for each way to ROS 2; another key cannot be written."""
     rules = access_control(BusConfig(robot="robot7", ros2=ros2, ros2_domain=5, command_names=names))
-    written = {rule["id"]: rule["key_exprs"] for rule in rules["rules"]
-               if rule["permission"] == "allow" and "ingress" in rule["flows"] and "put" in rule["messages"]}
+    written = {
+        rule["id"]: rule["key_exprs"]
+        for rule in rules["rules"]
+        if rule["permission"] == "allow" and "ingress" in rule["flows"] and "put" in rule["messages"]
+    }
     assert written == {"stop": stops, "command": commands} and rules["default_permission"] == "deny"
     subjects = {policy["id"]: (policy["rules"], policy["subjects"]) for policy in rules["policies"]}
     assert "stop" in subjects["all"][0] and subjects["all"][1] == ["everybody"]
-    asked = [(rule["id"], rule["key_exprs"]) for rule in rules["rules"] if rule["flows"] == ["ingress"]
-             and "query" in rule["messages"] and any("@request" in key for key in rule["key_exprs"])]
+    asked = [
+        (rule["id"], rule["key_exprs"])
+        for rule in rules["rules"]
+        if rule["flows"] == ["ingress"]
+        and "query" in rule["messages"]
+        and any("@request" in key for key in rule["key_exprs"])
+    ]
     assert asked == [("request", ["robot7/@request/*"])], "a star does not match what begins with @"
     assert subjects["some"] == (["command", "request"], ["name-0"] if names else ["everybody"])
 

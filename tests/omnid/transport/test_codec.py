@@ -146,8 +146,7 @@ def test_point_cloud() -> None:
 
 
 def test_a_point_cloud_is_transformed_with_little_extra_memory() -> None:
-    """The map's cloud is published every two seconds and grows for hours; memory once taken stays with the process.
-    """
+    """The map's cloud is published every two seconds and grows for hours; memory once taken stays with the process."""
     rng = np.random.default_rng(2)
     points, confidence = rng.normal(size=(50_000, 3)).astype(np.float32), rng.random(50_000, np.float32)
 
@@ -182,7 +181,8 @@ def test_point_cloud_needs_a_confidence_for_each_point() -> None:
 
 def test_diagnostics() -> None:
     payload = codec.diagnostics_cdr(
-        STAMP_NS, [codec.DiagnosticStatus("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})])
+        STAMP_NS, [codec.DiagnosticStatus("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})]
+    )
     (status,) = read(payload, codec.DIAGNOSTICS_SCHEMA).status
     assert (status.level, status.name, status.message) == (1, "omnid/odometry", "degraded")
     assert [(pair.key, pair.value) for pair in status.values] == [("inliers", "12"), ("fps", "9.8")]

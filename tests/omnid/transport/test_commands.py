@@ -276,8 +276,7 @@ def test_a_request_to_arm_is_validated_like_commands(accepted: AcceptedCommands)
         answer = accepted.receive("cmd/arm", bad)
         assert answer is not None and not answer.done and answer.text.partition(";")[0] in receiver.refused
     assert len(accepted.arms) == 1
-    assert receiver.refused == {"malformed": 2, "too old": 1, "no stamp": 1, "stamp in the future": 1,
-                                "too long": 1}
+    assert receiver.refused == {"malformed": 2, "too old": 1, "no stamp": 1, "stamp in the future": 1, "too long": 1}
 
 
 def test_is_not_armed_beside_a_robot_of_the_same_name() -> None:
@@ -325,7 +324,10 @@ def test_the_topic_names_the_source(accepted: AcceptedCommands) -> None:
     for key in ("cmd/twist", "cmd/operator/twist", "cmd/planner/twist", "cmd/autopilot/twist", "cmd/planner/stop"):
         accepted.receive(key, twist(), "somebody")
     assert [(command.source, command.sender) for command in accepted.commands] == [
-        ("operator", "somebody"), ("operator", "somebody"), ("planner", "somebody")]
+        ("operator", "somebody"),
+        ("operator", "somebody"),
+        ("planner", "somebody"),
+    ]
     assert accepted.receiver.refused == {"unknown topic": 2} and accepted.stops == 0
 
 
@@ -350,9 +352,16 @@ def test_only_a_false_with_a_fresh_stamp_says_that_a_contact_has_ended(topic: st
     accepted = AcceptedCommands()
     fresh_ns, old_ns = now_ns(), now_ns(-60.0)
     for payload, sent_ns, expected in (
-            (bool_cdr(True), fresh_ns, True), (bool_cdr(True), 0, True), (bool_cdr(True), old_ns, True),
-            (bool_cdr(False), old_ns, True), (bool_cdr(False), 0, True), (b"off", fresh_ns, True),
-            (b"", fresh_ns, True), (bytes(5000), fresh_ns, True), (bool_cdr(False), fresh_ns, False)):
+        (bool_cdr(True), fresh_ns, True),
+        (bool_cdr(True), 0, True),
+        (bool_cdr(True), old_ns, True),
+        (bool_cdr(False), old_ns, True),
+        (bool_cdr(False), 0, True),
+        (b"off", fresh_ns, True),
+        (b"", fresh_ns, True),
+        (bytes(5000), fresh_ns, True),
+        (bool_cdr(False), fresh_ns, False),
+    ):
         accepted.receive(topic, payload, "bumper board", sent_ns)
         assert accepted.contacts.pop() == (contact, expected), payload[:8]
     assert accepted.receiver.refused == {"too old": 1, "no stamp": 1, "malformed": 2, "too long": 1}

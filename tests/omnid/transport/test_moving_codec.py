@@ -23,8 +23,9 @@ def test_the_bytes_are_those_of_ros(count: int, frame: str) -> None:
     points = np.array([[1.5, -0.25, 0, 0, 0.75, 0.25, 0.2, 0.5]] * count, "<f4").reshape(count, 8)
     header = ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(STAMP_NS, 10**9)), frame)
     fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, 7, 1) for i, name in enumerate(FIELDS)]
-    cloud = ros.sensor_msgs__msg__PointCloud2(header, 1, count, fields, False, 32, 32 * count,
-                                              points.reshape(-1).view(np.uint8), True)
+    cloud = ros.sensor_msgs__msg__PointCloud2(
+        header, 1, count, fields, False, 32, 32 * count, points.reshape(-1).view(np.uint8), True
+    )
     expected = bytes(STORE.serialize_cdr(cloud, codec.POINT_CLOUD_SCHEMA))
     assert moving_cdr(STAMP_NS, frame, [PERSON] * count) == expected
 

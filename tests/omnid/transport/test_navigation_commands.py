@@ -78,7 +78,8 @@ def test_requests_are_passed_on() -> None:
     verbs = [received.send("navigation", string_cdr(verb), time.time_ns()).request for verb in NavigationVerb]
     assert verbs == list(NavigationVerb)
     assert received.send("route", string_cdr("repeat hall loops=2"), time.time_ns()).request == RouteRequest(
-        RouteAction.REPEAT, "hall", False, 2)
+        RouteAction.REPEAT, "hall", False, 2
+    )
     assert not received.lines and received.receiver.accepted == 6
 
 
@@ -97,10 +98,12 @@ def test_a_goal_of_another_time_is_refused_and_a_halt_is_not(age_s: float) -> No
 
 
 @pytest.mark.parametrize("synchronised", [True, False])
-@pytest.mark.parametrize(("topic", "text"), [("route", "repeat hall"), ("route", "teach hall"),
-                                             ("navigation", "resume")])
-def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(topic: str, text: str, synchronised: bool
-                                                                       ) -> None:
+@pytest.mark.parametrize(
+    ("topic", "text"), [("route", "repeat hall"), ("route", "teach hall"), ("navigation", "resume")]
+)
+def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(
+    topic: str, text: str, synchronised: bool
+) -> None:
     received, now_ns = Received(synchronised=synchronised), time.time_ns()
     assert received.send(topic, string_cdr(text)) is None and "no stamp" in received.lines[0]
     assert received.send(topic, string_cdr(f"{text} stamp=0")) is None
@@ -121,16 +124,24 @@ def test_requests_of_another_clock_that_are_recorded_and_sent_again_are_refused(
     assert received.send("route", recorded) is not None
 
 
-@pytest.mark.parametrize(("topic", "payload"), [
-    ("goal", goal_cdr(PlanarGoal(1, "map", math.nan, 0.0, 0.0))),
-    ("goal", goal_cdr(PlanarGoal(1, "map", math.inf, 0.0, 0.0))),
-    ("goal", goal_cdr(PlanarGoal(1, "map", 2e6, 0.0, 0.0))),
-    ("goal", goal_cdr(PlanarGoal(1, "base_link", 1.0, 0.0, 0.0))),
-    ("goal", goal_cdr(PlanarGoal(1, "", 1.0, 0.0, 0.0))),
-    ("goal", b""), ("goal", b"\0" * 4097), ("path", b"\0" * (LONGEST_PAYLOAD + 1)),
-    ("path", path_cdr(1, "map", np.zeros((10_001, 2)))),
-    ("path", path_cdr(1, "map", [[0.0, 0.0], [0.0, math.nan]])),
-    ("navigation", string_cdr("dance")), ("route", string_cdr("teach ../../etc/passwd")), ("route", b"teach a")])
+@pytest.mark.parametrize(
+    ("topic", "payload"),
+    [
+        ("goal", goal_cdr(PlanarGoal(1, "map", math.nan, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "map", math.inf, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "map", 2e6, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "base_link", 1.0, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "", 1.0, 0.0, 0.0))),
+        ("goal", b""),
+        ("goal", b"\0" * 4097),
+        ("path", b"\0" * (LONGEST_PAYLOAD + 1)),
+        ("path", path_cdr(1, "map", np.zeros((10_001, 2)))),
+        ("path", path_cdr(1, "map", [[0.0, 0.0], [0.0, math.nan]])),
+        ("navigation", string_cdr("dance")),
+        ("route", string_cdr("teach ../../etc/passwd")),
+        ("route", b"teach a"),
+    ],
+)
 def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
     received = Received(synchronised=False)
     assert received.send(topic, payload) is None
@@ -141,8 +152,12 @@ def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
 
 def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
     rng, received = random.Random(4), Received(synchronised=False)
-    good = {"goal": goal(1), "path": path_cdr(1, "map", [[0, 0], [1, 0], [2, 1]]), "route": string_cdr("repeat a"),
-            "navigation": string_cdr("cancel")}
+    good = {
+        "goal": goal(1),
+        "path": path_cdr(1, "map", [[0, 0], [1, 0], [2, 1]]),
+        "route": string_cdr("repeat a"),
+        "navigation": string_cdr("cancel"),
+    }
     for _ in range(2000):
         topic = rng.choice(list(good))
         damaged = bytearray(good[topic])

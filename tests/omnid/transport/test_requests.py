@@ -62,8 +62,11 @@ def test_a_request_without_an_answer_is_an_error() -> None:
             program.driver().arm(timeout_s=0.3)
         assert [request.topic for request in received] == ["cmd/arm"]
     endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), Robot(connect=(endpoint,)) as program, \
-            pytest.raises(OmnidError, match="no robot 'omnid' takes such requests"):
+    with (
+        contextlib.closing(Bus(BusConfig(listen=(endpoint,)))),
+        Robot(connect=(endpoint,)) as program,
+        pytest.raises(OmnidError, match="no robot 'omnid' takes such requests"),
+    ):
         program.driver().arm()
 
 
@@ -104,8 +107,11 @@ def test_large_requests_are_dropped_before_they_wait() -> None:
 def test_queries_of_a_link_are_bounded_before_they_reach_a_ring() -> None:
     """A listener in the place of the ring counts what zenoh lets through; another link is not in its way."""
     endpoint, count = free_endpoint(), [0]
-    with open_session(BusConfig(listen=(endpoint,))) as daemon, Robot(connect=(endpoint,)) as one, \
-            Robot(connect=(endpoint,)) as other:
+    with (
+        open_session(BusConfig(listen=(endpoint,))) as daemon,
+        Robot(connect=(endpoint,)) as one,
+        Robot(connect=(endpoint,)) as other,
+    ):
 
         def take(query: zenoh.Query) -> None:
             count[0] += 1
@@ -122,8 +128,9 @@ def test_queries_of_a_link_are_bounded_before_they_reach_a_ring() -> None:
 
 
 def test_requests_that_wait_take_bounded_memory() -> None:
-    with zenoh.open(zenoh.Config.from_json5('{mode: "peer", listen: {endpoints: []}, scouting: {multicast: '
-                                            '{enabled: false}}}')) as session:
+    with zenoh.open(
+        zenoh.Config.from_json5('{mode: "peer", listen: {endpoints: []}, scouting: {multicast: {enabled: false}}}')
+    ) as session:
         queries = session.declare_queryable("x", zenoh.handlers.FifoChannel(2 * MOST_OPEN))
         waiting = [session.get("x", timeout=30.0) for _ in range(2 * MOST_OPEN)]
         requests = OpenRequests()

@@ -26,34 +26,53 @@ from omnid.transport.requests import Request
 from omnid.transport.topics import PUBLISHED, command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
 
-ODOMETRY_KEY = ("0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
-                "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0")
+ODOMETRY_KEY = (
+    "0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
+    "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"
+)
 HASHES = {  # as published by ROS 2's own type description service, first digits
-    "std_msgs/msg/String": "df668c74", "nav_msgs/msg/Odometry": "3cc97dc7", "geometry_msgs/msg/PoseStamped": "10f3786d",
-    "sensor_msgs/msg/PointCloud2": "9198cabf", "tf2_msgs/msg/TFMessage": "e369d0f0",
-    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36ef", "sensor_msgs/msg/CompressedImage": "15640771",
+    "std_msgs/msg/String": "df668c74",
+    "nav_msgs/msg/Odometry": "3cc97dc7",
+    "geometry_msgs/msg/PoseStamped": "10f3786d",
+    "sensor_msgs/msg/PointCloud2": "9198cabf",
+    "tf2_msgs/msg/TFMessage": "e369d0f0",
+    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36ef",
+    "sensor_msgs/msg/CompressedImage": "15640771",
     "geometry_msgs/msg/TwistStamped": "5f0fcd4f",
 }
 TOPICS = {
-    "/omnid/cloud": "sensor_msgs/msg/PointCloud2", "/omnid/drive": "geometry_msgs/msg/TwistStamped",
+    "/omnid/cloud": "sensor_msgs/msg/PointCloud2",
+    "/omnid/drive": "geometry_msgs/msg/TwistStamped",
     "/omnid/map": "nav_msgs/msg/OccupancyGrid",
     "/omnid/moving": "sensor_msgs/msg/PointCloud2",
     "/omnid/scan": "sensor_msgs/msg/LaserScan",
-    "/omnid/odom": "nav_msgs/msg/Odometry", "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
+    "/omnid/odom": "nav_msgs/msg/Odometry",
+    "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
     "/omnid/map_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "/omnid/pose": "geometry_msgs/msg/PoseStamped", "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
-    "/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage", "/omnid/path": "nav_msgs/msg/Path",
+    "/omnid/pose": "geometry_msgs/msg/PoseStamped",
+    "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/omnid/path": "nav_msgs/msg/Path",
     "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
-    "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped", "/omnid/cmd/stop": "std_msgs/msg/Empty",
-    "/omnid/cmd/arm": "std_msgs/msg/Header", "/omnid/cmd/planner/twist": "geometry_msgs/msg/TwistStamped",
+    "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped",
+    "/omnid/cmd/stop": "std_msgs/msg/Empty",
+    "/omnid/cmd/arm": "std_msgs/msg/Header",
+    "/omnid/cmd/planner/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/planner/heading": "geometry_msgs/msg/Vector3Stamped",
-    "/omnid/navigation": "diagnostic_msgs/msg/DiagnosticArray", "/omnid/plan": "nav_msgs/msg/Path",
-    "/omnid/cmd/goal": "geometry_msgs/msg/PoseStamped", "/omnid/cmd/path": "nav_msgs/msg/Path",
-    "/omnid/cmd/navigation": "std_msgs/msg/String", "/omnid/cmd/route": "std_msgs/msg/String",
+    "/omnid/navigation": "diagnostic_msgs/msg/DiagnosticArray",
+    "/omnid/plan": "nav_msgs/msg/Path",
+    "/omnid/cmd/goal": "geometry_msgs/msg/PoseStamped",
+    "/omnid/cmd/path": "nav_msgs/msg/Path",
+    "/omnid/cmd/navigation": "std_msgs/msg/String",
+    "/omnid/cmd/route": "std_msgs/msg/String",
     "/omnid/cmd/map": "std_msgs/msg/String",
-    "/omnid/cmd/bumper": "std_msgs/msg/Bool", "/omnid/cmd/cliff": "std_msgs/msg/Bool",
-    "/omnid/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/imu": "sensor_msgs/msg/Imu",
-    "/omnid/cmd/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/cmd/imu": "sensor_msgs/msg/Imu",
+    "/omnid/cmd/bumper": "std_msgs/msg/Bool",
+    "/omnid/cmd/cliff": "std_msgs/msg/Bool",
+    "/omnid/wheel_odom": "nav_msgs/msg/Odometry",
+    "/omnid/imu": "sensor_msgs/msg/Imu",
+    "/omnid/cmd/wheel_odom": "nav_msgs/msg/Odometry",
+    "/omnid/cmd/imu": "sensor_msgs/msg/Imu",
     "/omnid/cmd/joint_states": "sensor_msgs/msg/JointState",
 }
 COMMANDS = command_topics(("planner",))
@@ -91,7 +110,8 @@ def test_tokens_are_those_of_rmw_zenoh() -> None:
     assert node.publisher(3, "/site/robot/odom", codec.ODOMETRY_SCHEMA) == (
         "@ros2_lv/5/aac3178e146ba6f1fc6e6a4085e77f21/0/3/MP/%/%/robot/%site%robot%odom/"
         "nav_msgs::msg::dds_::Odometry_/RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0/"
-        "::,10:,:,:,,")
+        "::,10:,:,:,,"
+    )
     assert len({ros2.gid_of(node.publisher(i, "/a", codec.ODOMETRY_SCHEMA)) for i in range(3)}) == 3
 
 
@@ -117,9 +137,11 @@ def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
 def tokens(endpoint: str, pattern: str, expected: int) -> set[str]:
     found: set[str] = set()
     with client(endpoint) as session:
+
         def complete() -> bool:
             found.update(str(reply.ok.key_expr) for reply in session.liveliness().get(pattern) if reply.ok)
             return len(found) >= expected
+
         wait_until(complete)
     return found
 
@@ -130,8 +152,9 @@ def test_all_topics_are_announced_to_rmw_zenoh() -> None:
         bus.subscribe_commands(lambda *_: None, COMMANDS)
         found = [token.split("/") for token in tokens(endpoint, "@ros2_lv/3/**", len(TOPICS) + 1)]
     announced = {parts[9].replace("%", "/"): (parts[5], parts[10]) for parts in found if parts[5] != "NN"}
-    assert announced == {topic: ("MS" if "/cmd/" in topic else "MP", ros2.dds_type(schema))
-                         for topic, schema in TOPICS.items()}
+    assert announced == {
+        topic: ("MS" if "/cmd/" in topic else "MP", ros2.dds_type(schema)) for topic, schema in TOPICS.items()
+    }
     assert len({parts[4] for parts in found}) == len(TOPICS) + 1, "entity numbers are unique"
     assert [parts[5:] for parts in found if parts[5] == "NN"] == [["NN", "%", "%", "omnid"]]
 
@@ -152,17 +175,28 @@ def test_receives_a_twist_from_ros() -> None:
 def test_joins_the_router_of_ros_where_that_holds_the_endpoint(mode: str) -> None:
     endpoint, lines, received, poses = free_endpoint(), list[str](), list[Request](), list[bytes]()
     config = BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3)
-    with (script(ROUTER, endpoint), contextlib.closing(Bus(config, lines.append)) as bus,
-          client(endpoint, mode) as session):
+    with (
+        script(ROUTER, endpoint),
+        contextlib.closing(Bus(config, lines.append)) as bus,
+        client(endpoint, mode) as session,
+    ):
         assert lines == [f"the zenoh router at {endpoint} is joined as a client: who may connect is decided there"]
         assert bus.status().values["mode"] == "client" and bus.needs_router
         bus.subscribe_commands(received.append, COMMANDS)
         key, twist = ros2.data_key(3, "/omnid/cmd/twist", "geometry_msgs/msg/Twist"), bytes(52)
         attachment = ros2.attachment(1, 5, bytes(16))
-        odom = session.declare_subscriber(ros2.data_key(3, "/omnid/odom", codec.ODOMETRY_SCHEMA),
-                                          lambda sample: poses.append(sample.payload.to_bytes()))
-        wait_until(lambda: session.put(key, twist, attachment=attachment) is None
-                   and bus.publish("odom", odometry(1)) is None and bool(received) and bool(poses))
+        odom = session.declare_subscriber(
+            ros2.data_key(3, "/omnid/odom", codec.ODOMETRY_SCHEMA),
+            lambda sample: poses.append(sample.payload.to_bytes()),
+        )
+        wait_until(
+            lambda: (
+                session.put(key, twist, attachment=attachment) is None
+                and bus.publish("odom", odometry(1)) is None
+                and bool(received)
+                and bool(poses)
+            )
+        )
         odom.undeclare()
     assert received[0][:2] == ("cmd/twist", twist) and poses[0] == odometry(1)
 
@@ -182,15 +216,22 @@ def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
         bus.subscribe_commands(lambda *_: None, COMMANDS)
         found = {token.split("/", 3)[3] for token in tokens(endpoint, "@/*/@ros2_lv/**", len(TOPICS))}
         odom, tf = (session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in ("omnid/odom", "tf"))
-        wait_until(lambda: bus.publish("odom", odometry(1)) is None and bus.publish("/tf", b"tf") is None
-                   and odom.try_recv() is not None and tf.try_recv() is not None)
+        wait_until(
+            lambda: (
+                bus.publish("odom", odometry(1)) is None
+                and bus.publish("/tf", b"tf") is None
+                and odom.try_recv() is not None
+                and tf.try_recv() is not None
+            )
+        )
     assert "MP/omnid§odom/nav_msgs§msg§Odometry/:1:0:0,10" in found
     assert "MP/tf/tf2_msgs§msg§TFMessage/:1:0:0,10" in found
     assert "MS/omnid§cmd§twist/geometry_msgs§msg§TwistStamped/:1:0:0,10" in found
 
 
-@pytest.mark.parametrize(("mode", "key"), [
-    ("rmw_zenoh", ros2.data_key(0, "/tf_static", codec.TRANSFORM_SCHEMA)), ("ros2dds", "tf_static")])
+@pytest.mark.parametrize(
+    ("mode", "key"), [("rmw_zenoh", ros2.data_key(0, "/tf_static", codec.TRANSFORM_SCHEMA)), ("ros2dds", "tf_static")]
+)
 def test_late_subscribers_of_ros_receive_the_static_frames(mode: str, key: str) -> None:
     """A subscriber that is transient local in ROS 2 is an AdvancedSubscriber with history of zenoh."""
     endpoint = free_endpoint()
@@ -200,16 +241,24 @@ def test_late_subscribers_of_ros_receive_the_static_frames(mode: str, key: str) 
         with client(endpoint) as session:
             history, came = ext.HistoryConfig(detect_late_publishers=True, max_samples=1), list[bytes]()
             subscriber = ext.declare_advanced_subscriber(
-                session, key, lambda sample: came.append(sample.payload.to_bytes()), history=history)
+                session, key, lambda sample: came.append(sample.payload.to_bytes()), history=history
+            )
             wait_until(lambda: bool(came))
             bus.publish("/tf_static", b"refined")
             wait_until(lambda: len(came) == 2)
             subscriber.undeclare()
-        quality, pattern = (ros2.TRANSIENT_LOCAL, "@ros2_lv/**") if mode == "rmw_zenoh" else \
-            (ros2.BRIDGE_TRANSIENT_LOCAL, "@/*/@ros2_lv/**")
+        quality, pattern = (
+            (ros2.TRANSIENT_LOCAL, "@ros2_lv/**")
+            if mode == "rmw_zenoh"
+            else (ros2.BRIDGE_TRANSIENT_LOCAL, "@/*/@ros2_lv/**")
+        )
         publishers = tokens(endpoint, pattern, len(PUBLISHED))
-    kept = {topic for topic in ("tf_static", "map", "tf", "map_pose") for token in publishers
-            if re.search(f"[%/§]{topic}/", token) and token.endswith("/" + quality)}
+    kept = {
+        topic
+        for topic in ("tf_static", "map", "tf", "map_pose")
+        for token in publishers
+        if re.search(f"[%/§]{topic}/", token) and token.endswith("/" + quality)
+    }
     assert came == [b"frames", b"refined"] and kept == {"tf_static", "map"}
 
 
@@ -242,13 +291,29 @@ time.sleep(30)
 
 def listed(router: str) -> set[str]:
     """Return the lines of its list; peers discover each other a moment after they have found the router."""
-    result = subprocess.run([f"{SDK}/bin/zenoh-ros2", "--no-daemon", "--router", router.removeprefix("tcp/"),
-                           "--timeout", "3", "topic", "list", "-t"], capture_output=True, text=True, timeout=60)
+    result = subprocess.run(
+        [
+            f"{SDK}/bin/zenoh-ros2",
+            "--no-daemon",
+            "--router",
+            router.removeprefix("tcp/"),
+            "--timeout",
+            "3",
+            "topic",
+            "list",
+            "-t",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
     return set(result.stdout.splitlines())
 
 
-@pytest.mark.skipif(not SDK or shutil.which(f"{SDK}/bin/zenoh-ros2") is None,
-                    reason="needs zenoh-ros2-sdk in a virtual environment that OMNID_ZENOH_ROS2 names")
+@pytest.mark.skipif(
+    not SDK or shutil.which(f"{SDK}/bin/zenoh-ros2") is None,
+    reason="needs zenoh-ros2-sdk in a virtual environment that OMNID_ZENOH_ROS2 names",
+)
 def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
     """zenoh-ros2-sdk 0.1.8: `topic list -t` and a subscriber."""
     endpoint = free_endpoint()
@@ -258,11 +323,23 @@ def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
         bus = stack.enter_context(contextlib.closing(Bus(config)))
         bus.subscribe_commands(lambda *_: None, COMMANDS)
         wait_until(lambda: listed(endpoint) >= {f"{topic} [{schema}]" for topic, schema in TOPICS.items()})
-        (tmp_path / "Odometry.msg").write_text("std_msgs/Header header\nstring child_frame_id\n"
-                                               "geometry_msgs/PoseWithCovariance pose\n"
-                                               "geometry_msgs/TwistWithCovariance twist\n")
-        echo = subprocess.Popen([f"{SDK}/bin/python", "-c", ECHO, endpoint, str(tmp_path / "Odometry.msg"),
-                                 ros2.type_hash(codec.ODOMETRY_SCHEMA)], stdout=subprocess.PIPE, text=True)
+        (tmp_path / "Odometry.msg").write_text(
+            "std_msgs/Header header\nstring child_frame_id\n"
+            "geometry_msgs/PoseWithCovariance pose\n"
+            "geometry_msgs/TwistWithCovariance twist\n"
+        )
+        echo = subprocess.Popen(
+            [
+                f"{SDK}/bin/python",
+                "-c",
+                ECHO,
+                endpoint,
+                str(tmp_path / "Odometry.msg"),
+                ros2.type_hash(codec.ODOMETRY_SCHEMA),
+            ],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         stack.callback(echo.wait)
         stack.callback(echo.kill)
         assert echo.stdout is not None

@@ -23,8 +23,9 @@ SIGMA = np.array([0.01, np.nan, np.nan, 0.02], np.float32)
 def test_the_bytes_are_those_of_ros(frame: str) -> None:
     step = math.pi / 2
     header = ros.std_msgs__msg__Header(ros.builtin_interfaces__msg__Time(*divmod(STAMP_NS, 10**9)), frame)
-    scan = ros.sensor_msgs__msg__LaserScan(header, step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, 0.0, 6.0,
-                                           RANGES, SIGMA)
+    scan = ros.sensor_msgs__msg__LaserScan(
+        header, step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, 0.0, 6.0, RANGES, SIGMA
+    )
     assert scan_cdr(STAMP_NS, frame, RANGES, SIGMA, (0.0, 6.0)) == bytes(STORE.serialize_cdr(scan, SCAN_SCHEMA))
 
 

@@ -38,8 +38,9 @@ def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
 
 
 def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
-    message = ros.sensor_msgs__msg__JointState(header_message(stamp_ns, ""), names, np.zeros(len(names)),
-                                               np.array(velocities), np.zeros(0))
+    message = ros.sensor_msgs__msg__JointState(
+        header_message(stamp_ns, ""), names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
+    )
     return message_cdr(message, JOINT_SCHEMA)
 
 
@@ -62,9 +63,14 @@ def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
     """No stamp, absurd or infinite rates, another source in use, damaged bytes: counted, one line for each topic."""
     taken: list[MotionSample] = []
     sensors = receiver(taken, lines)
-    bad = [wheel_cdr(WHEELS, 0), wheel_cdr(WheelSample(1, 1000.0, 0.0), OFFSET_NS),
-           wheel_cdr(WheelSample(1, np.inf, 0.0), OFFSET_NS), wheel_cdr(WheelSample(1, np.nan, 0.0), OFFSET_NS),
-           wheel_cdr(WHEELS, OFFSET_NS) + bytes(10_000), b""]
+    bad = [
+        wheel_cdr(WHEELS, 0),
+        wheel_cdr(WheelSample(1, 1000.0, 0.0), OFFSET_NS),
+        wheel_cdr(WheelSample(1, np.inf, 0.0), OFFSET_NS),
+        wheel_cdr(WheelSample(1, np.nan, 0.0), OFFSET_NS),
+        wheel_cdr(WHEELS, OFFSET_NS) + bytes(10_000),
+        b"",
+    ]
     for payload in bad:
         sensors.receive(WHEEL_ODOM, payload)
     assert taken == [] and sensors.refused[WHEEL_ODOM] == len(bad) and len(lines) == 1
@@ -76,10 +82,13 @@ def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
 def test_damaged_bytes_never_raise_and_give_finite_samples(lines: list[str]) -> None:
     rng, taken = random.Random(3), list[MotionSample]()
     sensors = receiver(taken, lines)
-    for topic, payload in ((WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)), (IMU, gyro_cdr(GYRO, OFFSET_NS + 1)),
-                           (JOINT_STATES, joint_cdr(["left", "right"], [1.0, 2.0]))):
+    for topic, payload in (
+        (WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)),
+        (IMU, gyro_cdr(GYRO, OFFSET_NS + 1)),
+        (JOINT_STATES, joint_cdr(["left", "right"], [1.0, 2.0])),
+    ):
         for _ in range(2000):
-            damaged = bytearray(payload[:rng.randrange(len(payload) + 1)] if rng.random() < 0.3 else payload)
+            damaged = bytearray(payload[: rng.randrange(len(payload) + 1)] if rng.random() < 0.3 else payload)
             for _ in range(rng.randrange(1, 6)):
                 if damaged:
                     damaged[rng.randrange(len(damaged))] = rng.randrange(256)

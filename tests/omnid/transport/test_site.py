@@ -86,10 +86,12 @@ def status(text: str) -> bytes:
 
 @needs_openssl
 def test_ada_drives_bob_stops_and_no_robot_speaks_for_another(site: Path) -> None:
-    with (robot(site, "one", "hall/one") as (bus, received),
-          Robot(settings=settings(site, "ada", "hall/one"), timeout_s=10) as ada,
-          Robot(settings=settings(site, "bob", "hall/one"), timeout_s=10) as bob,
-          Robot(settings=settings(site, "two", "hall/one"), timeout_s=10) as other):
+    with (
+        robot(site, "one", "hall/one") as (bus, received),
+        Robot(settings=settings(site, "ada", "hall/one"), timeout_s=10) as ada,
+        Robot(settings=settings(site, "bob", "hall/one"), timeout_s=10) as bob,
+        Robot(settings=settings(site, "two", "hall/one"), timeout_s=10) as other,
+    ):
         drivers = {name: person.driver() for name, person in (("ada", ada), ("bob", bob), ("two", other))}
         wait_until(lambda: drivers["ada"].twist(0.1, 0.0) is None and "cmd/twist" in received)
         wait_until(lambda: drivers["bob"].stop() is None and "cmd/stop" in received)
@@ -129,14 +131,25 @@ def test_a_wrong_password_and_no_password_are_refused(site: Path) -> None:
 @needs_openssl
 def test_the_last_state_of_a_robot_that_is_off_is_kept(site: Path) -> None:
     keeper, client = settings(site, "bob", "hall/two"), site / "keeper.json5"
-    client.write_text(json.dumps({
-        "mode": "client", "connect": {"endpoints": list(keeper.connect)}, "scouting": {"multicast": {"enabled": False}},
-        "transport": {"auth": {"usrpwd": {"user": "bob", "password": "secret of bob"}},
-                      "link": {"tls": {"root_ca_certificate": keeper.tls_ca}}}}))
+    client.write_text(
+        json.dumps(
+            {
+                "mode": "client",
+                "connect": {"endpoints": list(keeper.connect)},
+                "scouting": {"multicast": {"enabled": False}},
+                "transport": {
+                    "auth": {"usrpwd": {"user": "bob", "password": "secret of bob"}},
+                    "link": {"tls": {"root_ca_certificate": keeper.tls_ca}},
+                },
+            }
+        )
+    )
     with script(block("python"), str(client)):
-        with (robot(site, "two", "hall/two") as (bus, _),
-              Robot(settings=settings(site, "ada", "hall/two"), timeout_s=10) as ada,
-              ada.subscribe(Diagnostics) as reports):
+        with (
+            robot(site, "two", "hall/two") as (bus, _),
+            Robot(settings=settings(site, "ada", "hall/two"), timeout_s=10) as ada,
+            ada.subscribe(Diagnostics) as reports,
+        ):
             wait_until(lambda: bus.publish("status", status("the last")) is None and reports.newest() is not None)
             time.sleep(0.5)
         with Robot(settings=settings(site, "ada", "hall/two"), timeout_s=10) as later:

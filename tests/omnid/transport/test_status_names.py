@@ -22,9 +22,19 @@ def test_time_keys_round_trip() -> None:
     assert status_names.parsed_time_key("rate_hz") is None and status_names.parsed_time_key("_ms") is None
 
 
-@pytest.mark.parametrize(("text", "number", "count"), [
-    ("12", 12.0, 12), ("0", 0.0, 0), ("-3", -3.0, None), ("1.5", 1.5, None), ("nan", None, None), ("inf", None, None),
-    ("", None, None), ("12 of 40", None, None)])
+@pytest.mark.parametrize(
+    ("text", "number", "count"),
+    [
+        ("12", 12.0, 12),
+        ("0", 0.0, 0),
+        ("-3", -3.0, None),
+        ("1.5", 1.5, None),
+        ("nan", None, None),
+        ("inf", None, None),
+        ("", None, None),
+        ("12 of 40", None, None),
+    ],
+)
 def test_values_are_numbers_or_nothing(text: str, number: float | None, count: int | None) -> None:
     assert status_names.number(text) == number and status_names.count(text) == count
 

@@ -64,8 +64,10 @@ def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:
 def test_nothing_else_stops_and_no_answer_is_longer_than_its_request() -> None:
     endpoint = free_endpoint()
     host, port = next(iter(addresses((endpoint,))))
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, \
-            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+    with (
+        contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+    ):
         commands: list[str] = []
         bus.subscribe_commands(lambda request: commands.append(request.topic), {}, lambda: True)
         good = b"omnid stop 1 0123456789abcdef omnid" + b" " * 8

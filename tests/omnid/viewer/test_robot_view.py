@@ -40,8 +40,13 @@ pytestmark = pytest.mark.usefixtures("default_signals")
 def viewing(home: Path, *words: object) -> Iterator[subprocess.Popen[str]]:
     """Run `omnid view` with a home folder of its own."""
     environment = os.environ | {"HOME": str(home), "XDG_CONFIG_HOME": str(home / "config")}
-    with subprocess.Popen([sys.executable, "-m", "omnid", "view", *map(str, words)], stdout=subprocess.PIPE,
-                          stderr=subprocess.PIPE, text=True, env=environment) as process:
+    with subprocess.Popen(
+        [sys.executable, "-m", "omnid", "view", *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    ) as process:
         try:
             yield process
         finally:
@@ -52,16 +57,22 @@ def publish(bus: Bus, number: int) -> None:
     """Publish a pose, an image, a map and a status; some are damaged."""
     stamp_ns, T = START_NS + number * 10**7, se3.transform(np.eye(3), [0.01 * number, 0.5, 0.0])
     pose = codec.odometry_cdr(stamp_ns, T, 1e-6 * np.eye(6), np.zeros(6), np.eye(6))
-    bus.publish("odom", pose if number % 7 else b"nonsense",
-                PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes())
+    bus.publish(
+        "odom",
+        pose if number % 7 else b"nonsense",
+        PoseAttachment(number, "degraded", 0, 50, 60, time.time_ns()).to_bytes(),
+    )
     bus.publish("map_pose", codec.pose_with_covariance_cdr(stamp_ns, se3.exp([0.2, 0, 0, 0, 0, 0]) @ T, np.eye(6)))
     bus.publish("cloud", map_codec.point_cloud_cdr(stamp_ns, "odom", np.ones((5, 3)), np.ones(5)))
     statuses = [DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.5"})]
     bus.publish("status", codec.diagnostics_cdr(stamp_ns, statuses))
     jpeg = cv2.imencode(".jpg", np.zeros((8, 16), np.uint8))[1]
     pixels = {"inliers": np.array([[3.0, 4.0], [5.0, 6.0]]), "rejected": np.ones((1, 2)), "new": np.zeros((0, 2))}
-    bus.publish("panorama", image_cdr(Frame(number, stamp_ns, "lower", "jpeg", jpeg), stamp_ns)[1],
-                features_to_bytes(pixels) if number % 5 else b"nonsense")
+    bus.publish(
+        "panorama",
+        image_cdr(Frame(number, stamp_ns, "lower", "jpeg", jpeg), stamp_ns)[1],
+        features_to_bytes(pixels) if number % 5 else b"nonsense",
+    )
 
 
 def test_draws_the_messages_of_a_robot(tmp_path: Path) -> None:

@@ -14,17 +14,16 @@ def report(*statuses: DiagnosticStatus) -> Diagnostics:
 
 def test_plots_latencies_of_the_stages_that_make_a_pose() -> None:
     entries = report(
-        DiagnosticStatus(
-            stage_name("odometry"), 0, "", {"work_p50_ms": "30.50", "work_p99_ms": "58", "rate_hz": "10"}
-        ),
+        DiagnosticStatus(stage_name("odometry"), 0, "", {"work_p50_ms": "30.50", "work_p99_ms": "58", "rate_hz": "10"}),
         DiagnosticStatus(stage_name("watchdog"), 0, "", {"work_p50_ms": "1"}),
-        DiagnosticStatus(
-            ODOMETRY, 0, "tracking", {"capture_to_pose_p50_ms": "74", "capture_to_pose_p99_ms": "146"}
-        ),
+        DiagnosticStatus(ODOMETRY, 0, "tracking", {"capture_to_pose_p50_ms": "74", "capture_to_pose_p99_ms": "146"}),
         DiagnosticStatus(WHEELS, 0, "", {"tick_late_p50_ms": "nonsense", "tick_late_p99_ms": "inf"}),
     )
     assert dict(status_plots.latencies(entries)) == {
-        ("odometry",): 30.5, ("odometry", "capture_to_pose p50"): 74.0, ("odometry", "capture_to_pose p99"): 146.0}
+        ("odometry",): 30.5,
+        ("odometry", "capture_to_pose p50"): 74.0,
+        ("odometry", "capture_to_pose p99"): 146.0,
+    }
 
 
 def test_reads_state_and_landmarks() -> None:

@@ -24,8 +24,9 @@ def test_an_ellipsoid_has_the_axes_of_the_covariance() -> None:
     np.testing.assert_allclose(squared, style.SIGMAS**2, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("sigma_m", "magnified"),
-                         [(0.5, 1), (0.017, 1), (0.016, 10), (1e-3, 100), (1e-6, 1000), (0, 1)])
+@pytest.mark.parametrize(
+    ("sigma_m", "magnified"), [(0.5, 1), (0.017, 1), (0.016, 10), (1e-3, 100), (1e-6, 1000), (0, 1)]
+)
 def test_small_ellipsoids_are_magnified(sigma_m: float, magnified: int) -> None:
     found = style.ellipsoid(sigma_m**2 * np.eye(3))
     assert found is not None and found.magnified == magnified

@@ -118,8 +118,12 @@ def made(path: Path, robots: tuple[str, ...] = ("rover",)) -> Path:
     for robot in robots:
         for number, state in enumerate(("tracking", "tracking", "lost")):
             stamp_ns, T = START_NS + number * 10**8, se3.transform(np.eye(3), [0.1 * number, 0.0, 0.0])
-            writer.write(f"/{robot}/odom", codec.ODOMETRY_SCHEMA,
-                         codec.odometry_cdr(stamp_ns, T, 1e-4 * np.eye(6), np.zeros(6), np.eye(6)), stamp_ns)
+            writer.write(
+                f"/{robot}/odom",
+                codec.ODOMETRY_SCHEMA,
+                codec.odometry_cdr(stamp_ns, T, 1e-4 * np.eye(6), np.zeros(6), np.eye(6)),
+                stamp_ns,
+            )
             statuses = [DiagnosticStatus(ODOMETRY, 0, state, {"inliers": str(number), "tracked": "9"})]
             payload = codec.diagnostics_cdr(stamp_ns, statuses)
             writer.write(f"/{robot}/status", codec.DIAGNOSTICS_SCHEMA, payload, stamp_ns)
@@ -153,15 +157,18 @@ def test_shows_one_of_several_robots(tmp_path: Path, omnid: Command) -> None:
     assert omnid("view", log, "-o", out, "--robot", "digger").out.startswith("3 poses")
 
 
-@pytest.mark.parametrize(("words", "expected"), [
-    (("--web", "-o", "x.rrd"), "-o and --web"),
-    (("--replay",), "--replay"),
-    (("--port", "9090"), "--web"),
-    (("--web", "--port", "65535"), "65534"),
-    (("--seconds", "-1"), "--seconds"),
-    (("log.mcap", "--connect", "tcp/127.0.0.1:1"), "--connect"),
-    (("log.mcap", "--seconds", "3"), "--seconds"),
-])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--web", "-o", "x.rrd"), "-o and --web"),
+        (("--replay",), "--replay"),
+        (("--port", "9090"), "--web"),
+        (("--web", "--port", "65535"), "65534"),
+        (("--seconds", "-1"), "--seconds"),
+        (("log.mcap", "--connect", "tcp/127.0.0.1:1"), "--connect"),
+        (("log.mcap", "--seconds", "3"), "--seconds"),
+    ],
+)
 def test_refuses_contradictory_options(words: tuple[str, ...], expected: str, omnid: Command) -> None:
     assert expected in omnid.refused("view", *words)
 
@@ -184,8 +191,6 @@ def test_without_a_display_the_alternatives_are_named(
     assert "display" in error and "-o FILE.rrd" in error and "--web" in error
 
 
-def test_without_rerun_the_installation_is_named(
-    scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_rerun_the_installation_is_named(scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert f"{sys.executable} -m pip install 'rerun-sdk" in omnid.refused("view", scene / "log.mcap", "-o", "x.rrd")

@@ -43,15 +43,19 @@ class WebServer:
         """The header of a program that knows the token."""
         return {"Authorization": f"Bearer {self.token}"}
 
-    def request(self, path: str, method: str = "GET", headers: Mapping[str, str] | None = None,
-                body: str | None = None) -> HttpAnswer:
+    def request(
+        self, path: str, method: str = "GET", headers: Mapping[str, str] | None = None, body: str | None = None
+    ) -> HttpAnswer:
         """Send one request over a connection of its own."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=PATIENCE_S)
         try:
             connection.request(method, path, body, dict(headers or {}))
             answer = connection.getresponse()
-            return HttpAnswer(answer.status, {name.lower(): value for name, value in answer.getheaders()},
-                              answer.read().decode("utf-8", "replace"))
+            return HttpAnswer(
+                answer.status,
+                {name.lower(): value for name, value in answer.getheaders()},
+                answer.read().decode("utf-8", "replace"),
+            )
         finally:
             connection.close()
 
@@ -68,8 +72,13 @@ class WebServer:
 
     def live(self, headers: Mapping[str, str] | None = None, origin: str | None = None) -> ClientConnection:
         """Open the websocket."""
-        return connect(f"ws://{self.host}/live", additional_headers=headers, origin=origin,  # type: ignore[arg-type]
-                       compression=None, open_timeout=PATIENCE_S)
+        return connect(
+            f"ws://{self.host}/live",
+            additional_headers=headers,
+            origin=origin,  # type: ignore[arg-type]
+            compression=None,
+            open_timeout=PATIENCE_S,
+        )
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
         """Send a signal; return the exit code and stderr."""
@@ -106,13 +115,17 @@ class Shown:
             message: dict[str, Any] = json.loads(data)
         else:
             length = int.from_bytes(data[:4], "big")
-            message = {**json.loads(data[4:4 + length]), "body": data[4 + length:]}
+            message = {**json.loads(data[4 : 4 + length]), "body": data[4 + length :]}
         self.newest[message["type"]] = message
         self._live.send("ok")
         return message
 
-    def until(self, kind: str, action: Callable[[], object] = lambda: None,
-              holds: Callable[[dict[str, Any]], object] = lambda _: True) -> dict[str, Any]:
+    def until(
+        self,
+        kind: str,
+        action: Callable[[], object] = lambda: None,
+        holds: Callable[[dict[str, Any]], object] = lambda _: True,
+    ) -> dict[str, Any]:
         """Repeat an action and take messages until one of a kind is there for which a condition holds; return it."""
         end_s = time.monotonic() + PATIENCE_S
         while kind not in self.newest or not holds(self.newest[kind]):

@@ -19,68 +19,114 @@ BEARER = {"authorization": f"Bearer {TOKEN}"}
 OWN = {"origin": f"http://{HOST}"}
 
 
-def reason(access: Access, *headers: dict[str, str], path: str = "/metrics", method: str = "GET",
-           kind: str = "http") -> str:
+def reason(
+    access: Access, *headers: dict[str, str], path: str = "/metrics", method: str = "GET", kind: str = "http"
+) -> str:
     """Return the reason of a refusal, empty where the request enters; later headers replace earlier ones."""
     merged = {"host": HOST}
     for more in headers:
         merged |= more
-    scope: dict[str, Any] = {"type": kind, "path": path, "method": method,
-                             "headers": [(k.encode(), v.encode("latin-1")) for k, v in merged.items() if v]}
+    scope: dict[str, Any] = {
+        "type": kind,
+        "path": path,
+        "method": method,
+        "headers": [(k.encode(), v.encode("latin-1")) for k, v in merged.items() if v],
+    }
     refusal = access.refusal(scope)
     return "" if refusal is None else refusal.reason
 
 
-@pytest.mark.parametrize(("access", "host", "enters"), [
-    (LOCAL, HOST, True), (LOCAL, "localhost", True), (LOCAL, "[::1]:8447", True), (LOCAL, "LOCALHOST:9000", True),
-    (LOCAL, "evil.example", False), (LOCAL, "192.168.1.7:8447", False), (LOCAL, "127.0.0.1.evil.example", False),
-    (LOCAL, "localhost@evil.example", False), (LOCAL, "", False), (LOCAL, "a b", False),
-    (NETWORK, "192.168.1.7:8447", True), (NETWORK, "[fe80::1]:8447", True), (NETWORK, "rover.local:8447", True),
-    (NETWORK, "evil.example:8447", False), (NETWORK, "192.168.1.7.evil.example", False),
-])
+@pytest.mark.parametrize(
+    ("access", "host", "enters"),
+    [
+        (LOCAL, HOST, True),
+        (LOCAL, "localhost", True),
+        (LOCAL, "[::1]:8447", True),
+        (LOCAL, "LOCALHOST:9000", True),
+        (LOCAL, "evil.example", False),
+        (LOCAL, "192.168.1.7:8447", False),
+        (LOCAL, "127.0.0.1.evil.example", False),
+        (LOCAL, "localhost@evil.example", False),
+        (LOCAL, "", False),
+        (LOCAL, "a b", False),
+        (NETWORK, "192.168.1.7:8447", True),
+        (NETWORK, "[fe80::1]:8447", True),
+        (NETWORK, "rover.local:8447", True),
+        (NETWORK, "evil.example:8447", False),
+        (NETWORK, "192.168.1.7.evil.example", False),
+    ],
+)
 def test_only_own_names_are_answered(access: Access, host: str, enters: bool) -> None:
     assert reason(access, BEARER, {"host": host}) == ("" if enters else "unknown host")
 
 
-@pytest.mark.parametrize(("headers", "expected"), [
-    ({}, "no token"), (COOKIE, ""), (BEARER, ""),
-    ({"authorization": "Bearer wrong-wrong-wrong"}, "wrong token"),
-    ({"authorization": f"Basic {TOKEN}"}, "wrong token"),
-    ({"authorization": "Bearer "}, "wrong token"), ({"authorization": "Bearer \xe4\xf6"}, "wrong token"),
-    ({**COOKIE, "authorization": "Bearer wrong"}, "wrong token"),
-    ({"cookie": f"omnid_8447={TOKEN}"}, "wrong token"), ({"cookie": "omnid_8447="}, "wrong token"),
-    ({"cookie": "omnid_8447=\xe4"}, "wrong token"),
-    ({"cookie": f"omnid_1={LOCAL.new_cookie(Role.ALL)}"}, "no token"), ({"cookie": ";;=;"}, "no token"),
-])
+@pytest.mark.parametrize(
+    ("headers", "expected"),
+    [
+        ({}, "no token"),
+        (COOKIE, ""),
+        (BEARER, ""),
+        ({"authorization": "Bearer wrong-wrong-wrong"}, "wrong token"),
+        ({"authorization": f"Basic {TOKEN}"}, "wrong token"),
+        ({"authorization": "Bearer "}, "wrong token"),
+        ({"authorization": "Bearer \xe4\xf6"}, "wrong token"),
+        ({**COOKIE, "authorization": "Bearer wrong"}, "wrong token"),
+        ({"cookie": f"omnid_8447={TOKEN}"}, "wrong token"),
+        ({"cookie": "omnid_8447="}, "wrong token"),
+        ({"cookie": "omnid_8447=\xe4"}, "wrong token"),
+        ({"cookie": f"omnid_1={LOCAL.new_cookie(Role.ALL)}"}, "no token"),
+        ({"cookie": ";;=;"}, "no token"),
+    ],
+)
 def test_the_token_or_its_cookie_is_needed(headers: dict[str, str], expected: str) -> None:
     assert reason(LOCAL, headers) == expected
     assert reason(LOCAL, headers, OWN, kind="websocket", path="/live") == expected
 
 
 @pytest.mark.parametrize("kind", ["http", "websocket"])
-@pytest.mark.parametrize(("headers", "expected"), [
-    (OWN, ""), ({"origin": f"https://{HOST}"}, ""), ({"origin": "http://evil.example"}, "cross-site"),
-    ({"origin": "http://127.0.0.1:3000"}, "cross-site"), ({"origin": "null"}, "cross-site"),
-    ({"origin": f"http://{HOST}.evil.example"}, "cross-site"), ({"origin": f"ftp://{HOST}"}, "cross-site"),
-    ({}, "no origin"), (BEARER, ""), ({**OWN, "sec-fetch-site": "same-origin"}, ""),
-    ({**OWN, "sec-fetch-site": "same-site"}, "cross-site"), ({**OWN, "sec-fetch-site": "cross-site"}, "cross-site"),
-    ({**BEARER, "origin": "http://evil.example"}, "cross-site"),
-])
+@pytest.mark.parametrize(
+    ("headers", "expected"),
+    [
+        (OWN, ""),
+        ({"origin": f"https://{HOST}"}, ""),
+        ({"origin": "http://evil.example"}, "cross-site"),
+        ({"origin": "http://127.0.0.1:3000"}, "cross-site"),
+        ({"origin": "null"}, "cross-site"),
+        ({"origin": f"http://{HOST}.evil.example"}, "cross-site"),
+        ({"origin": f"ftp://{HOST}"}, "cross-site"),
+        ({}, "no origin"),
+        (BEARER, ""),
+        ({**OWN, "sec-fetch-site": "same-origin"}, ""),
+        ({**OWN, "sec-fetch-site": "same-site"}, "cross-site"),
+        ({**OWN, "sec-fetch-site": "cross-site"}, "cross-site"),
+        ({**BEARER, "origin": "http://evil.example"}, "cross-site"),
+    ],
+)
 def test_commands_and_websockets_come_from_the_own_page(kind: str, headers: dict[str, str], expected: str) -> None:
     assert reason(LOCAL, COOKIE, headers, kind=kind, method="POST", path="/stop") == expected
 
 
-@pytest.mark.parametrize(("path", "mode", "expected"), [
-    ("/", "navigate", ""), ("/", "cors", "cross-site"), ("/recordings", "navigate", "cross-site"),
-    ("/metrics", "no-cors", "cross-site"), ("/static/page.js", "no-cors", "cross-site"),
-])
+@pytest.mark.parametrize(
+    ("path", "mode", "expected"),
+    [
+        ("/", "navigate", ""),
+        ("/", "cors", "cross-site"),
+        ("/recordings", "navigate", "cross-site"),
+        ("/metrics", "no-cors", "cross-site"),
+        ("/static/page.js", "no-cors", "cross-site"),
+    ],
+)
 def test_other_sites_may_only_link_to_the_page(path: str, mode: str, expected: str) -> None:
     assert reason(LOCAL, COOKIE, {"sec-fetch-site": "cross-site", "sec-fetch-mode": mode}, path=path) == expected
 
 
 def test_a_header_that_comes_twice_is_not_accepted() -> None:
-    scope = {"type": "http", "path": "/metrics", "method": "GET",
-             "headers": [(b"host", HOST.encode()), (b"host", b"evil.example"), (b"authorization", b"Bearer x")]}
+    scope = {
+        "type": "http",
+        "path": "/metrics",
+        "method": "GET",
+        "headers": [(b"host", HOST.encode()), (b"host", b"evil.example"), (b"authorization", b"Bearer x")],
+    }
     refusal = LOCAL.refusal(scope)
     assert refusal is not None and refusal.reason == "unknown host"
 
@@ -99,10 +145,16 @@ def test_tokens_differ_and_the_file_keeps_one(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o777 == 0o600 and token_of(path) == token != token_of(None)
 
 
-@pytest.mark.parametrize(("text", "mode", "message"), [
-    (f"{TOKEN}\n", 0o644, "chmod 600"), ("short\n", 0o600, "16 to 256"), ("", 0o600, "16 to 256"),
-    ("a" * 300, 0o600, "16 to 256"), ("has a space in it here\n", 0o600, "16 to 256"),
-])
+@pytest.mark.parametrize(
+    ("text", "mode", "message"),
+    [
+        (f"{TOKEN}\n", 0o644, "chmod 600"),
+        ("short\n", 0o600, "16 to 256"),
+        ("", 0o600, "16 to 256"),
+        ("a" * 300, 0o600, "16 to 256"),
+        ("has a space in it here\n", 0o600, "16 to 256"),
+    ],
+)
 def test_unfit_token_files_are_refused(tmp_path: Path, text: str, mode: int, message: str) -> None:
     path = tmp_path / "token"
     path.write_text(text)
@@ -120,8 +172,10 @@ def scope(path: str, method: str, **headers: str) -> dict[str, Any]:
 
 def test_the_token_for_stops_may_see_and_stop_and_nothing_else() -> None:
     access = Access(TOKEN, LOCAL.hosts, False, "omnid_8447", "stop-stop-stop-stop")
-    for headers in ({"authorization": "Bearer stop-stop-stop-stop"},
-                    {"cookie": f"omnid_8447={access.new_cookie(Role.STOP)}", **OWN}):
+    for headers in (
+        {"authorization": "Bearer stop-stop-stop-stop"},
+        {"cookie": f"omnid_8447={access.new_cookie(Role.STOP)}", **OWN},
+    ):
         for path, method in (("/", "GET"), ("/metrics", "GET"), ("/stop", "POST"), ("/robot/ab/stop", "POST")):
             assert access.refusal(scope(path, method, **headers)) is None
         for path in ("/arm", "/route", "/navigation", "/map", "/robot/ab/arm", "/recordings/1/report"):

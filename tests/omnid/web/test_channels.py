@@ -14,7 +14,7 @@ def follow(path: LivePath, shown: list[list[float]], seen: int) -> int:
     """Apply the next message as the page does; return the version that is seen then."""
     message = json.loads(path.message(seen))
     assert message["from"] <= len(shown)
-    shown[message["from"]:] = message["points"]
+    shown[message["from"] :] = message["points"]
     return path.version
 
 

@@ -46,8 +46,9 @@ class Robots:
             pose = PoseAttachment(self._seq, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
             bus.publish("odom", odometry(self._seq), pose)
             stopped = self.stops[name] > 1 and name in self.obeys
-            wheels = DiagnosticStatus(WHEELS, 1, HOSTILE, {"armed": "0", "disarmed_by": ASKED} if stopped
-                                      else {"armed": "1"})
+            wheels = DiagnosticStatus(
+                WHEELS, 1, HOSTILE, {"armed": "0", "disarmed_by": ASKED} if stopped else {"armed": "1"}
+            )
             entries = [DiagnosticStatus(BUS, 0, "open", {}), *([wheels] if name != "camera-only" else [])]
             bus.publish("status", codec.diagnostics_cdr(10**18, entries))
 
@@ -67,9 +68,19 @@ def rows(fleet: tuple[WebServer, Robots]) -> dict[str, dict[str, Any]]:
     """Return the entries of all robots by name, once all are there with wheels and poses."""
     server, robots = fleet
     with server.live(server.bearer) as live:
-        message = Shown(live).until("fleet", robots.publish, lambda found: len(found["robots"]) == len(NAMES) and all(
-            row["rate_hz"] and row["x_m"] is not None and (row["armed"] is not None or row["name"] == "camera-only")
-            for row in found["robots"]))
+        message = Shown(live).until(
+            "fleet",
+            robots.publish,
+            lambda found: (
+                len(found["robots"]) == len(NAMES)
+                and all(
+                    row["rate_hz"]
+                    and row["x_m"] is not None
+                    and (row["armed"] is not None or row["name"] == "camera-only")
+                    for row in found["robots"]
+                )
+            ),
+        )
     text = json.dumps(message)
     assert "onerror" in text and "\\u001b" not in text
     return {row["name"]: row for row in message["robots"]}

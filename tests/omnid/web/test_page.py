@@ -69,14 +69,21 @@ def browser() -> Iterator[Any]:
 def opened(browser: Any, server: WebServer, size: str = "desk", scheme: str = "light") -> Iterator[Any]:
     """Yield the page at a size; fail for errors in it and for requests to other hosts."""
     width, height = SIZES[size]
-    context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme,
-                                  has_touch=size == "phone")
+    context = browser.new_context(
+        viewport={"width": width, "height": height}, color_scheme=scheme, has_touch=size == "phone"
+    )
     page = context.new_page()
     problems: list[str] = []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.on("console", lambda line: problems.append(line.text) if "Content Security Policy" in line.text else None)
-    page.on("request", lambda request: problems.append(request.url)
-            if not request.url.startswith((f"http://{server.host}/", f"ws://{server.host}/", "blob:")) else None)
+    page.on(
+        "request",
+        lambda request: (
+            problems.append(request.url)
+            if not request.url.startswith((f"http://{server.host}/", f"ws://{server.host}/", "blob:"))
+            else None
+        ),
+    )
     page.goto(server.url)
     page.wait_for_function("() => document.getElementById('state').textContent !== 'connecting'", timeout=WAIT_MS)
     try:
@@ -98,8 +105,9 @@ def screenshot(page: Any, name: str) -> None:
 
 def shows(page: Any, element: str, text: str) -> None:
     """Wait until an element holds a text."""
-    page.wait_for_function("([id, text]) => document.getElementById(id).textContent.includes(text)",
-                           arg=[element, text], timeout=WAIT_MS)
+    page.wait_for_function(
+        "([id, text]) => document.getElementById(id).textContent.includes(text)", arg=[element, text], timeout=WAIT_MS
+    )
 
 
 def arm(page: Any, press: Callable[..., None]) -> None:
@@ -123,8 +131,10 @@ def expect_it_fits(page: Any, size: str) -> None:
 
 def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, course: Path) -> None:
     more = ("--set", "bus.panorama_hz=2", "--set", "record.enabled=true", "--set", f"record.folder={tmp_path / 'rec'}")
-    with robot(course, tmp_path, *MANUAL, *more) as (daemon, operator, base), \
-            served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", tmp_path / "rec") as server:
+    with (
+        robot(course, tmp_path, *MANUAL, *more) as (daemon, operator, base),
+        served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", tmp_path / "rec") as server,
+    ):
         operator.drive(0.3)
         for size, scheme in (("phone", "light"), ("desk", "dark")):
             with opened(browser, server, size, scheme) as page:
@@ -174,8 +184,13 @@ def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
     endpoint = free_endpoint()
     ranges = (1.5 + np.abs(np.sin(np.linspace(0, 9, 360)))).astype(np.float32)
     digits = "".join(str(number % 5) for number in range(36))
-    coverage = {"pairs": "7", "needed": "15", "lower_coverage": digits, "upper_coverage": digits[::-1],
-                "missing": "8 more positions; both cameras: no board at 1 to 4 o'clock"}
+    coverage = {
+        "pairs": "7",
+        "needed": "15",
+        "lower_coverage": digits,
+        "upper_coverage": digits[::-1],
+        "missing": "8 more positions; both cameras: no board at 1 to 4 o'clock",
+    }
     calibration = DiagnosticStatus(CALIBRATION, 0, "hold it still", coverage)
     with contextlib.ExitStack() as ends:
         bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
@@ -183,8 +198,10 @@ def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
         for size, scheme in (("phone", "light"), ("desk", "dark")):
             with opened(browser, server, size, scheme) as page:
                 end_s = time.monotonic() + PATIENCE_S
-                while not ("nearest obstacle" in page.inner_text("#pose")
-                           and page.locator("#calibration-upper path.seen").count()):
+                while not (
+                    "nearest obstacle" in page.inner_text("#pose")
+                    and page.locator("#calibration-upper path.seen").count()
+                ):
                     assert time.monotonic() < end_s
                     pose = PoseAttachment(8, "tracking", 0, 50, 60, time.time_ns())
                     bus.publish("odom", odometry(8), pose.to_bytes())
@@ -208,7 +225,8 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
         server = ends.enter_context(served("--connect", endpoint))
         publishing = threading.Event()
         thread = threading.Thread(
-            target=lambda: [navigator.publish() for _ in iter(lambda: publishing.wait(0.1), True)])
+            target=lambda: [navigator.publish() for _ in iter(lambda: publishing.wait(0.1), True)]
+        )
         thread.start()
         ends.callback(thread.join)
         ends.callback(publishing.set)
@@ -216,8 +234,9 @@ def test_routes_are_taught_and_repeated(browser: Any) -> None:
             with opened(browser, server, size) as page:
                 navigator.state = "driving"
                 shows(page, "navigation", "route dock: driving, 3.5 m left")
-                buttons = {name: page.locator(f"#route-{name}")
-                           for name in ("teach", "repeat", "stop", "pause", "resume")}
+                buttons = {
+                    name: page.locator(f"#route-{name}") for name in ("teach", "repeat", "stop", "pause", "resume")
+                }
                 page.wait_for_function("() => !document.getElementById('route-pause').disabled", timeout=WAIT_MS)
                 assert [name for name, button in buttons.items() if button.is_enabled()] == ["repeat", "stop", "pause"]
                 navigator.state = "idle"
@@ -270,11 +289,27 @@ def rests(page: Any) -> bool:
 @pytest.mark.parametrize(("size", "scheme"), [("phone", "light"), ("desk", "dark")])
 def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, scheme: str) -> None:
     endpoint = free_endpoint()
-    command = [sys.executable, "-m", "omnid", "simulate", "room", "--no-people", "--size", "320",
-               "--set", f'bus.listen=["{endpoint}"]', "--set", "live.status_s=0.5",
-               "--set", "controller.collision.unknown=slow"]  # such small images show little of the floor
-    with started(command, 0) as daemon, served("--connect", endpoint) as server, \
-            opened(browser, server, size, scheme) as page:
+    command = [
+        sys.executable,
+        "-m",
+        "omnid",
+        "simulate",
+        "room",
+        "--no-people",
+        "--size",
+        "320",
+        "--set",
+        f'bus.listen=["{endpoint}"]',
+        "--set",
+        "live.status_s=0.5",
+        "--set",
+        "controller.collision.unknown=slow",
+    ]  # such small images show little of the floor
+    with (
+        started(command, 0) as daemon,
+        served("--connect", endpoint) as server,
+        opened(browser, server, size, scheme) as page,
+    ):
         shows(page, "state", "tracking")
         shows(page, "well", "All is well. Arm it to drive.")
         assert page.locator("#goal").is_disabled() and page.get_attribute("#stick", "aria-disabled") == "true"
@@ -360,8 +395,11 @@ def test_the_page_of_all_robots(browser: Any) -> None:
 
 def test_text_of_the_robot_is_never_html(browser: Any) -> None:
     endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, served("--connect", endpoint) as server, \
-            opened(browser, server) as page:
+    with (
+        contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus,
+        served("--connect", endpoint) as server,
+        opened(browser, server) as page,
+    ):
         entries = [DiagnosticStatus(f"{HOSTILE}{number}", 2, HOSTILE, {HOSTILE: HOSTILE}) for number in range(3)]
         end_s = time.monotonic() + 20
         while "onerror" not in page.inner_text("#warnings") or "script" not in page.text_content("#parts"):
@@ -395,6 +433,7 @@ def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: P
 
 def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
     with served("--connect", free_endpoint()) as server:
+
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
                 self.send_response(200)
@@ -423,7 +462,10 @@ def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
                 evil.wait_for_function("() => document.title.startsWith('tried')", timeout=WAIT_MS)
                 assert evil.title() == "tried no rejected"
         metrics = server.request("/metrics", headers=server.bearer).text
-        counted = {line.split('"')[1]: int(line.rsplit(" ", 1)[1]) for line in metrics.splitlines()
-                   if line.startswith("omnid_web_refused_total")}
+        counted = {
+            line.split('"')[1]: int(line.rsplit(" ", 1)[1])
+            for line in metrics.splitlines()
+            if line.startswith("omnid_web_refused_total")
+        }
         assert counted["cross-site"] >= 8, metrics
         assert "omnid_web_stops_total 0" in metrics and "omnid_web_arms_total 0" in metrics

@@ -38,8 +38,10 @@ def test_recordings_are_listed_and_reported(server: WebServer, recordings: Path,
         found = listed(server)
     assert set(found) == {"images_20261122T050000Z_001.mcap", "cut.mcap.part", r"<b>\xff\n.mcap", "now.mcap.part"}
     assert found["images_20261122T050000Z_001.mcap"]["size_bytes"] == sample.stat().st_size
-    assert (found["now.mcap.part"]["state"], found["cut.mcap.part"]["state"]) == ("being written",
-                                                                                  "cut: omnid log recover")
+    assert (found["now.mcap.part"]["state"], found["cut.mcap.part"]["state"]) == (
+        "being written",
+        "cut: omnid log recover",
+    )
     odd_key = found[r"<b>\xff\n.mcap"]["key"]
     answer = server.request(f"/recordings/{odd_key}/report", "POST", server.bearer)
     text = json.loads(answer.text)["text"]
@@ -64,5 +66,7 @@ def test_a_program_that_fails_otherwise_is_one_line_without_its_traceback(
     recordings = Recordings(tmp_path, tmp_path)
     with pytest.raises(OmnidError) as refused:
         asyncio.run(recordings.report(recordings.list()[0].key))
-    assert str(refused.value) == (r"omnid: the report about one\x1b.mcap failed (exit code 1): run `omnid report` "
-                                  "on it to see why")
+    assert str(refused.value) == (
+        r"omnid: the report about one\x1b.mcap failed (exit code 1): run `omnid report` "
+        "on it to see why"
+    )

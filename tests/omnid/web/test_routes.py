@@ -77,8 +77,14 @@ def answer(robot: tuple[WebServer, Navigator], path: str, text: str) -> dict[str
 
 def test_requests_reach_the_robot_and_its_answer_the_page(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
-    for path, text in (("/route", "teach dock"), ("/route", "finish"), ("/route", "repeat dock"), ("/route", "stop"),
-                       ("/navigation", "pause"), ("/navigation", "resume")):
+    for path, text in (
+        ("/route", "teach dock"),
+        ("/route", "finish"),
+        ("/route", "repeat dock"),
+        ("/route", "stop"),
+        ("/navigation", "pause"),
+        ("/navigation", "resume"),
+    ):
         assert answer(robot, path, text) == {"done": True, "text": f"does {text}"}
         assert navigator.asked[-1] == text
     refused = answer(robot, "/route", "repeat lost")
@@ -96,10 +102,17 @@ def test_the_map_is_saved_when_it_is_asked_for(robot: tuple[WebServer, Navigator
     assert server.request("/map", "POST", {**server.bearer, "Origin": "http://evil.example"}).status == 403
 
 
-@pytest.mark.parametrize(("path", "text"), [
-    ("/route", ""), ("/route", "teach ../../etc/passwd"), ("/route", "repeat dock loops=-1"), ("/route", "x" * 5000),
-    ("/navigation", "stop everything"), ("/navigation", "\x00\xff"),
-])
+@pytest.mark.parametrize(
+    ("path", "text"),
+    [
+        ("/route", ""),
+        ("/route", "teach ../../etc/passwd"),
+        ("/route", "repeat dock loops=-1"),
+        ("/route", "x" * 5000),
+        ("/navigation", "stop everything"),
+        ("/navigation", "\x00\xff"),
+    ],
+)
 def test_other_texts_never_leave_the_server(robot: tuple[WebServer, Navigator], path: str, text: str) -> None:
     server, navigator = robot
     before = len(navigator.asked)
@@ -125,8 +138,15 @@ def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[We
     assert answer(robot, "/goal", f"1 2 {server_ms(server)}")["done"] and navigator.goals[-1].heading_rad is None
     count = len(navigator.goals)
     now_ms = server_ms(server)
-    for text in ("1 2", "1 2 3", f"nan 2 {now_ms}", f"1e9 2 {now_ms}", f"1 2 {now_ms - 2000}",
-                 f"1 2 {now_ms + 60_000}", ""):
+    for text in (
+        "1 2",
+        "1 2 3",
+        f"nan 2 {now_ms}",
+        f"1e9 2 {now_ms}",
+        f"1 2 {now_ms - 2000}",
+        f"1 2 {now_ms + 60_000}",
+        "",
+    ):
         assert not answer(robot, "/goal", text)["done"], text
     assert len(navigator.goals) == count
 
@@ -134,24 +154,37 @@ def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[We
 def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
     limits = VelocityLimits()
-    assert answer(robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"] or answer(
-        robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"]  # the first one may wait for the limits
+    assert (
+        answer(robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"]
+        or answer(robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"]
+    )  # the first one may wait for the limits
     wait_until(lambda: navigator.twists)
-    assert navigator.twists[-1] == pytest.approx((FIRST_SHARE * limits.velocity_mps,
-                                                  -0.5 * FIRST_SHARE * limits.yaw_rate_radps))
+    assert navigator.twists[-1] == pytest.approx(
+        (FIRST_SHARE * limits.velocity_mps, -0.5 * FIRST_SHARE * limits.yaw_rate_radps)
+    )
     assert "another page drives" in answer(robot, "/drive", f"1 0 {server_ms(server)} b2")["text"]
     # 1. A request that waited in a network moves nothing; a release always counts.
     count = len(navigator.twists)
     assert "too slow" in answer(robot, "/drive", f"1 0 {server_ms(server) - 1500} a1")["text"]
     assert "too slow" in answer(robot, "/drive", f"1 0 {server_ms(server) + 60_000} a1")["text"]
     assert answer(robot, "/drive", f"0 0 {server_ms(server) - 1500} a1") == {
-        "done": True, "text": "the stick is released: it stands"}
+        "done": True,
+        "text": "the stick is released: it stands",
+    }
     wait_until(lambda: len(navigator.twists) > count)
     assert navigator.twists[count:] == [(0.0, 0.0)]
     # 2. Anything else is refused, and so are requests of other sites.
     now_ms = server_ms(server)
-    for text in (f"1.5 0 {now_ms} a1", f"0 -1.01 {now_ms} a1", f"nan 0 {now_ms} a1", f"1 0 {now_ms}", "1 0 -1 a1",
-                 f"1 0 {now_ms} <b>", "", f"1 0 {now_ms} a1 b"):
+    for text in (
+        f"1.5 0 {now_ms} a1",
+        f"0 -1.01 {now_ms} a1",
+        f"nan 0 {now_ms} a1",
+        f"1 0 {now_ms}",
+        "1 0 -1 a1",
+        f"1 0 {now_ms} <b>",
+        "",
+        f"1 0 {now_ms} a1 b",
+    ):
         assert not answer(robot, "/drive", text)["done"], text
     body = f"1 0 {server_ms(server)} a1"
     assert server.request("/drive", "POST", body=body).status == 403

@@ -82,10 +82,18 @@ def test_every_answer_has_the_headers_that_protect_the_page(server: WebServer, p
         assert server.token not in answer.text
 
 
-@pytest.mark.parametrize(("method", "path"), [
-    ("POST", "/stop"), ("POST", "/arm"), ("GET", "/metrics"), ("GET", "/recordings"),
-    ("GET", "/recordings/0/report"), ("POST", "/recordings/0/report"), ("GET", "/static/page.js"),
-])
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("POST", "/stop"),
+        ("POST", "/arm"),
+        ("GET", "/metrics"),
+        ("GET", "/recordings"),
+        ("GET", "/recordings/0/report"),
+        ("POST", "/recordings/0/report"),
+        ("GET", "/static/page.js"),
+    ],
+)
 def test_nothing_is_answered_without_token_or_for_another_site(server: WebServer, method: str, path: str) -> None:
     origin = {"Origin": f"http://{server.host}"}
     assert server.request(path, method, origin).status == 401
@@ -98,10 +106,19 @@ def test_commands_are_posts(server: WebServer) -> None:
     assert [server.request(path, headers=server.bearer).status for path in ("/stop", "/arm", "/login")] == [405] * 3
 
 
-@pytest.mark.parametrize("path", [
-    "/static/../access.py", "/static/%2e%2e/access.py", "/static/..%2faccess.py", "/static//etc/passwd", "/static/",
-    "/recordings/..%2f..%2fetc%2fpasswd/report", "/recordings/%00/report", "/%ff%fe",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/static/../access.py",
+        "/static/%2e%2e/access.py",
+        "/static/..%2faccess.py",
+        "/static//etc/passwd",
+        "/static/",
+        "/recordings/..%2f..%2fetc%2fpasswd/report",
+        "/recordings/%00/report",
+        "/%ff%fe",
+    ],
+)
 def test_no_other_file_can_be_read(server: WebServer, path: str) -> None:
     answer = server.request(path, headers=server.bearer)
     assert answer.status in (404, 409) and "import" not in answer.text and "root:" not in answer.text
@@ -111,8 +128,13 @@ def test_websockets_need_token_and_origin(server: WebServer) -> None:
     cookie, origin = server.cookie(), f"http://{server.host}"
     with server.live(cookie, origin) as live:
         assert Shown(live).until("state")["robot"] == "rover"
-    for headers, other in ((None, origin), (cookie, "http://evil.example"), (cookie, "null"), (cookie, None),
-                           ({"Cookie": "omnid=1"}, origin)):
+    for headers, other in (
+        (None, origin),
+        (cookie, "http://evil.example"),
+        (cookie, "null"),
+        (cookie, None),
+        ({"Cookie": "omnid=1"}, origin),
+    ):
         with pytest.raises(InvalidStatus) as refused:
             server.live(headers, other)
         assert refused.value.response.status_code == 403
@@ -155,12 +177,14 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         shown = Shown(live)
         state = shown.until("state", run, lambda found: found["pose"] and found["wheels"] and found["alive"])
         assert state["state"] == "tracking" and state["pose"]["inliers"] == 50 and not state["wheels"]["armed"]
-        assert state["warnings"] == [{"level": 1, "name": "wheels", "message": "not armed: a stop was asked for",
-                                      "remedy": "omnid arm"}]
+        assert state["warnings"] == [
+            {"level": 1, "name": "wheels", "message": "not armed: a stop was asked for", "remedy": "omnid arm"}
+        ]
         parts = shown.until("parts", run, lambda found: found["parts"])
         assert [part["name"] for part in parts["parts"]] == ["wheels", "bus"]
         assert shown.until("path", run, lambda found: found["points"])["points"][-1][0] == pytest.approx(
-            state["pose"]["x_m"], abs=5.0)
+            state["pose"]["x_m"], abs=5.0
+        )
         received = shown.until("map", run, lambda found: found["width"])
         cells = np.frombuffer(zlib.decompress(received["body"]), np.uint8).reshape(40, 30)
         assert (cells[1:, 0] == 2).all() and (cells[0, 1:] == 1).all() and (cells[1:, 1:] == 0).all()
@@ -343,13 +367,20 @@ def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_si
         assert server.end(signal.SIGINT) == (0, "")
 
 
-@pytest.mark.parametrize(("words", "expected"), [
-    (("--listen", "nonsense"), "HOST:PORT"), (("--listen", "127.0.0.1:99999"), "HOST:PORT"),
-    (("--listen", "192.0.2.1:0"), "another address"), (("--host", "http://x"), "--host"),
-    (("--robot", "a b"), "bus.robot"), (("--connect", "nonsense"), "bus.connect"),
-    (("--tls-key", "key.pem"), "--tls-certificate"), (("--token-file", "/nowhere/token"), "--token-file"),
-    (("--tls-key", "/nowhere", "--tls-certificate", "/nowhere"), "--tls-certificate"),
-])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("--listen", "nonsense"), "HOST:PORT"),
+        (("--listen", "127.0.0.1:99999"), "HOST:PORT"),
+        (("--listen", "192.0.2.1:0"), "another address"),
+        (("--host", "http://x"), "--host"),
+        (("--robot", "a b"), "bus.robot"),
+        (("--connect", "nonsense"), "bus.connect"),
+        (("--tls-key", "key.pem"), "--tls-certificate"),
+        (("--token-file", "/nowhere/token"), "--token-file"),
+        (("--tls-key", "/nowhere", "--tls-certificate", "/nowhere"), "--tls-certificate"),
+    ],
+)
 def test_wrong_options_are_refused(words: tuple[str, ...], expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     listen = () if "--listen" in words else ("--listen", "127.0.0.1:0")
     assert expected in Command(capsys).refused("web", *listen, *words)
@@ -362,8 +393,9 @@ def test_a_taken_port_is_refused(server: WebServer, capsys: pytest.CaptureFixtur
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
 def test_tls(tmp_path: Path) -> None:
     authority(tmp_path, "page")
-    with served("--connect", free_endpoint(), "--tls-certificate", tmp_path / "page.pem", "--tls-key",
-                tmp_path / "page.key") as server:
+    with served(
+        "--connect", free_endpoint(), "--tls-certificate", tmp_path / "page.pem", "--tls-key", tmp_path / "page.key"
+    ) as server:
         assert server.url.startswith("https://")
         half = socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S)
         half.sendall(b"\x16\x03\x01")  # the first bytes of a handshake that does not go on
@@ -388,8 +420,12 @@ def test_the_journal_gets_no_token(tmp_path: Path) -> None:
     refused = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, env=environment, text=True)
     assert refused.returncode == 2 and "the journal would keep it: name a --token-file" in refused.stderr
     token = tmp_path / "token"
-    with os.fdopen(reader) as journal, subprocess.Popen([*command, "--token-file", token], stdout=writer,
-                                                        stderr=subprocess.DEVNULL, env=environment) as process:
+    with (
+        os.fdopen(reader) as journal,
+        subprocess.Popen(
+            [*command, "--token-file", token], stdout=writer, stderr=subprocess.DEVNULL, env=environment
+        ) as process,
+    ):
         line = journal.readline()
         process.kill()
         os.close(writer)
@@ -416,14 +452,22 @@ def test_on_the_network_a_warning_says_that_the_token_can_be_read() -> None:
 
 def test_hostile_http_does_no_harm(server: WebServer) -> None:
     host = server.host.encode()
-    requests = (b"\x16\x03\x01\x02\x00\x01\x00", b"GET / HTTP/1.1\r\n\r\n",
-                b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
-                b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n", b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 50_000,
-                b"POST /login HTTP/1.1\r\nHost: " + host + b"\r\nOrigin: http://" + host
-                + b"\r\nContent-Length: 99999999999\r\n\r\ntoken=" + b"a" * 10_000,
-                b"GET /live HTTP/1.1\r\nHost: " + host + b"\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n",
-                b"OPTIONS * HTTP/1.1\r\nHost: " + host + b"\r\n\r\n",
-                b"GET /%00%ff%2e%2e HTTP/1.1\r\nHost: \xff\r\n\r\n")
+    requests = (
+        b"\x16\x03\x01\x02\x00\x01\x00",
+        b"GET / HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: a\r\nHost: b\r\n\r\n",
+        b"GET /" + b"a" * 100_000 + b" HTTP/1.1\r\n",
+        b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * 50_000,
+        b"POST /login HTTP/1.1\r\nHost: "
+        + host
+        + b"\r\nOrigin: http://"
+        + host
+        + b"\r\nContent-Length: 99999999999\r\n\r\ntoken="
+        + b"a" * 10_000,
+        b"GET /live HTTP/1.1\r\nHost: " + host + b"\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n",
+        b"OPTIONS * HTTP/1.1\r\nHost: " + host + b"\r\n\r\n",
+        b"GET /%00%ff%2e%2e HTTP/1.1\r\nHost: \xff\r\n\r\n",
+    )
     for request in requests:
         with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE_S) as connection:
             try:

@@ -39,13 +39,17 @@ def euler_matrix(parameters: Array) -> Array:
 def euler_parameters(M: Array) -> Array:
     """Return (rx, ry, rz, tx, ty, tz) [rad, m] of M (4, 4), the inverse of eq. (7) for pitches below a right angle."""
     R = M[:3, :3]
-    angles = (np.arctan2(R[2, 1], R[2, 2]), np.arctan2(-R[2, 0], np.hypot(R[2, 1], R[2, 2])),
-              np.arctan2(R[1, 0], R[0, 0]))
+    angles = (
+        np.arctan2(R[2, 1], R[2, 2]),
+        np.arctan2(-R[2, 0], np.hypot(R[2, 1], R[2, 2])),
+        np.arctan2(R[1, 0], R[0, 0]),
+    )
     return np.concatenate([angles, M[:3, 3]])
 
 
-def consensus(a: Array, b: Array, rng: np.random.Generator, threshold_m: float, hypotheses: int = HYPOTHESES
-              ) -> tuple[Array, Flags]:
+def consensus(
+    a: Array, b: Array, rng: np.random.Generator, threshold_m: float, hypotheses: int = HYPOTHESES
+) -> tuple[Array, Flags]:
     """Return the motion M (4, 4), b = M a, with the largest consensus set within threshold_m, and its flags (N,).
 
     Three pairs of points (N, 3) give a hypothesis. The paper finds it by Gauss-Newton on eq. (9); the closed form has

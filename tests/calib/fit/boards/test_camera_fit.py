@@ -38,16 +38,20 @@ def seen_by(camera: OmniCamera, count: int = 10, noise_px: float = 0.0, seed: in
     if camera is LENS:
         elevation = (10.0, 75.0)
     rng = np.random.default_rng(seed)
-    poses = board_poses_around_camera(camera, BOARD, MASK, count, seed=seed, distance_m=(0.12, 0.3),
-                                      elevation_deg=elevation)
-    return [BoardView(f"view{k}", camera.project(se3.apply(T, BOARD.points)) + noise_px * rng.standard_normal((42, 2)))
-            for k, T in enumerate(poses)]
+    poses = board_poses_around_camera(
+        camera, BOARD, MASK, count, seed=seed, distance_m=(0.12, 0.3), elevation_deg=elevation
+    )
+    return [
+        BoardView(f"view{k}", camera.project(se3.apply(T, BOARD.points)) + noise_px * rng.standard_normal((42, 2)))
+        for k, T in enumerate(poses)
+    ]
 
 
 def turned_apart_rad(one: OmniCamera, other: OmniCamera) -> float:
     """Return the largest angle between two cameras' rays after alignment of their frames."""
-    pixels = np.array([(394 + r * np.cos(a), 381 + r * np.sin(a)) for r in np.linspace(80, 340, 9)
-                       for a in np.arange(0, 6.2, 0.5)])
+    pixels = np.array(
+        [(394 + r * np.cos(a), 381 + r * np.sin(a)) for r in np.linspace(80, 340, 9) for a in np.arange(0, 6.2, 0.5)]
+    )
     a, b = one.lift(pixels), other.lift(pixels)
     seen = np.isfinite(a[:, 0]) & np.isfinite(b[:, 0])
     a, b = a[seen], b[seen]
@@ -126,8 +130,10 @@ def test_rejects_outlier_views_by_name() -> None:
 
 def test_hidden_corners_have_no_effect() -> None:
     views = seen_by(OMNI)
-    holed = [replace(view, pixels=np.where(np.arange(42)[:, None] % 9 == k % 9, np.nan, view.pixels))
-             for k, view in enumerate(views)]
+    holed = [
+        replace(view, pixels=np.where(np.arange(42)[:, None] % 9 == k % 9, np.nan, view.pixels))
+        for k, view in enumerate(views)
+    ]
     assert turned_apart_rad(fit_camera(holed, BOARD, SIZE, "omni").camera, OMNI) < 1e-5
 
 
@@ -161,8 +167,9 @@ def rendered() -> tuple[CameraCalibration, CameraCalibration]:
 
     renderer = BoardRenderer.of(BOARD, OMNI, MASK)
     poses = board_poses_around_camera(OMNI, BOARD, MASK, 8, seed=3, distance_m=(0.12, 0.28))
-    images = {str(k): renderer.render_board(T, seed=k, sensor=Sensor(noise_sigma=1.0)).image
-              for k, T in enumerate(poses)}
+    images = {
+        str(k): renderer.render_board(T, seed=k, sensor=Sensor(noise_sigma=1.0)).image for k, T in enumerate(poses)
+    }
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
     assert len(views) == 8
     both = []

@@ -24,12 +24,15 @@ NOMINAL = UnifiedCamera(1.0, (-207.0, 207.0), MASK.center, SIZE)
 TILTED = MirrorCamera(207.0, MASK.center, SIZE, tilt_rad=(0.007, -0.005), conic=0.01, ellipticity=0.01)
 
 
-def views(camera: MirrorCamera | UnifiedCamera, count: int = 12, noise_px: float = 0.05, seed: int = 0
-          ) -> list[BoardView]:
+def views(
+    camera: MirrorCamera | UnifiedCamera, count: int = 12, noise_px: float = 0.05, seed: int = 0
+) -> list[BoardView]:
     rng = np.random.default_rng(seed)
     poses = board_poses_around_camera(NOMINAL, BOARD, MASK, count, seed=seed, distance_m=(0.2, 0.45))
-    return [BoardView(f"view{k}", camera.project(se3.apply(T, BOARD.points)) + noise_px * rng.standard_normal((42, 2)))
-            for k, T in enumerate(poses)]
+    return [
+        BoardView(f"view{k}", camera.project(se3.apply(T, BOARD.points)) + noise_px * rng.standard_normal((42, 2)))
+        for k, T in enumerate(poses)
+    ]
 
 
 @pytest.mark.slow

@@ -33,8 +33,10 @@ def read_images(shared_data: Path) -> Images:
 def reference(shared_data: Path, key: str) -> tuple[dict[str, Any], list[BoardView], Array]:
     """Return OCamCalib's numbers, its corners as views, and its errors by image."""
     numbers = json.loads((shared_data / "vmr_board" / "reference.json").read_text())[key]
-    views = [BoardView(entry["image"], np.column_stack([entry["col_1based"], entry["row_1based"]]) - 1.0)
-             for entry in numbers["images"]]
+    views = [
+        BoardView(entry["image"], np.column_stack([entry["col_1based"], entry["row_1based"]]) - 1.0)
+        for entry in numbers["images"]
+    ]
     # From the toolbox's order of corners to Board.points: x varies fastest.
     order = np.lexsort((numbers["Xt_mm"], numbers["Yt_mm"]))
     reordered = [BoardView(view.name, view.pixels[order]) for view in views]
@@ -55,17 +57,21 @@ def test_both_models_fit_real_images_and_are_consistent(shared_data: Path) -> No
     views = [found.view for name, image in images.items() if (found := find_board(image, BOARD, name)).view]
     assert len(views) == 10
     known = [view for view in views if view]
-    ocam, omni = (refine_camera_calibration(fit_camera(known, BOARD, SIZE, model), images, model, "mirror")
-                  for model in BOTH)
+    ocam, omni = (
+        refine_camera_calibration(fit_camera(known, BOARD, SIZE, model), images, model, "mirror") for model in BOTH
+    )
     assert ocam.rejected == omni.rejected == ()
     assert ocam.fit.mean_px < 0.285 and omni.fit.mean_px < 0.285
     assert ray_angles_deg(ocam, omni).max() < 0.1
 
 
-@pytest.mark.parametrize(("key", "mean_px", "apart_deg"), [
-    pytest.param("ocam_std", 0.4705, 0.35, marks=pytest.mark.slow), ("ocam_subpix", 0.305, 0.2)])
-def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(shared_data: Path, key: str, mean_px: float,
-                                                                      apart_deg: float) -> None:
+@pytest.mark.parametrize(
+    ("key", "mean_px", "apart_deg"),
+    [pytest.param("ocam_std", 0.4705, 0.35, marks=pytest.mark.slow), ("ocam_subpix", 0.305, 0.2)],
+)
+def test_fits_the_toolbox_corners_with_less_error_than_the_toolbox(
+    shared_data: Path, key: str, mean_px: float, apart_deg: float
+) -> None:
     numbers, views, errors = reference(shared_data, key)
     found = fit_camera(views, BOARD, SIZE)
     assert found.fit.mean_px < mean_px < numbers["stored_mean_err_px"]

@@ -21,8 +21,10 @@ from tests.simulation.boards import board_poses_around_rig
 LOWER = UnifiedCamera(0.93, (-205.0, 206.2), (394.2, 380.9), (780, 768))
 UPPER = UnifiedCamera(0.97, (-207.0, 206.2), (391.2, 382.9), (780, 768))
 T_UPPER_LOWER = se3.transform(se3.rotation_exp([0.02, -0.015, 0.3]), [0.004, -0.006, 0.18])
-RIG = Rig(MountedCamera(LOWER, np.eye(4), Mask(LOWER.center, 60.0, 372.0)),
-          MountedCamera(UPPER, T_UPPER_LOWER, Mask(UPPER.center, 60.0, 372.0)))
+RIG = Rig(
+    MountedCamera(LOWER, np.eye(4), Mask(LOWER.center, 60.0, 372.0)),
+    MountedCamera(UPPER, T_UPPER_LOWER, Mask(UPPER.center, 60.0, 372.0)),
+)
 ODD, EVEN, SQUARE = Board(7, 6, 0.03), Board(8, 6, 0.03), Board(6, 6, 0.03)
 
 
@@ -64,8 +66,9 @@ def test_sigmas_are_consistent_with_errors() -> None:
     found = [fit_rig(pairs(ODD, noise_px=0.1, seed=seed), ODD, (LOWER, UPPER)) for seed in range(12)]
     length = float(np.linalg.norm(T_UPPER_LOWER[:3, 3]))
     baseline = np.array([(rig.baseline_m - length) / rig.baseline_sigma_m for rig in found])
-    turn = np.array([se3.log(rig.T_upper_lower @ se3.inverse(T_UPPER_LOWER))[3:] / rig.motion_sigma[3:]
-                     for rig in found])
+    turn = np.array(
+        [se3.log(rig.T_upper_lower @ se3.inverse(T_UPPER_LOWER))[3:] / rig.motion_sigma[3:] for rig in found]
+    )
     assert 0.5 < np.sqrt(np.mean(baseline**2)) < 1.6 and 0.6 < np.sqrt(np.mean(turn**2)) < 1.4
 
 
@@ -74,8 +77,10 @@ def test_calibrates_polynomial_cameras() -> None:
     T_POLY = se3.transform(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
     views = []
     for k, T in enumerate(board_poses_around_rig(RIG, ODD, 10)):
-        seen = [BoardView(f"p{k}", poly.project(se3.apply(T_POLY @ m.T_cam_rig @ T, ODD.points)))
-                for m in (RIG.lower, RIG.upper)]
+        seen = [
+            BoardView(f"p{k}", poly.project(se3.apply(T_POLY @ m.T_cam_rig @ T, ODD.points)))
+            for m in (RIG.lower, RIG.upper)
+        ]
         if all(np.isfinite(one.pixels).all() for one in seen):
             views.append(PairView(f"p{k}", (seen[0], seen[1])))
     start = replace(poly, center_row_column=(382.0, 393.0))
@@ -112,8 +117,9 @@ def test_refuses_ambiguous_board_orientations() -> None:
 def test_refuses_too_few_pairs() -> None:
     with pytest.raises(CalibError, match="expected at least 4 instants at which both cameras saw the board, found 3"):
         fit_rig(pairs(ODD)[:3], ODD, (LOWER, UPPER))
-    exchanged = [replace(view, seen=(view.seen[0], pairs(ODD, 10, seed=9)[k].seen[1]))
-                 for k, view in enumerate(pairs(ODD)[:4])]
+    exchanged = [
+        replace(view, seen=(view.seen[0], pairs(ODD, 10, seed=9)[k].seen[1])) for k, view in enumerate(pairs(ODD)[:4])
+    ]
     with pytest.raises(CalibError, match="expected at least 4 consistent pairs of views"):
         fit_rig(exchanged, ODD, (LOWER, UPPER))
 

@@ -35,8 +35,12 @@ def selected(seen: list[PairView]) -> SelectedRig:
         one = [board for view in seen if (board := view.seen[side]) is not None]
         sides.append(select_calibration(one, BOARD, PERFECT.lower.camera.size, "ocam"))
     assert sides[0].polynomial and sides[1].polynomial
-    return select_rig(seen, BOARD, (sides[0].calibration.camera, sides[1].calibration.camera),
-                      (sides[0].polynomial, sides[1].polynomial))
+    return select_rig(
+        seen,
+        BOARD,
+        (sides[0].calibration.camera, sides[1].calibration.camera),
+        (sides[0].polynomial, sides[1].polynomial),
+    )
 
 
 @pytest.mark.slow

@@ -43,7 +43,8 @@ def drive(truth: Rig, seed: int, noise_px: float = NOISE_PX) -> tuple[DriveState
     pixels = project(truth, camera, in_rig) + noise_px * rng.standard_normal((len(keyframe), 2))
     seen = np.isfinite(pixels).all(axis=1) & (np.linalg.norm(in_rig, axis=1) > 0.7)
     return DriveState(T_rig_odom, points, np.zeros(0), KeyframeMotion.still(KEYFRAMES)), DriveObservations(
-        keyframe[seen], landmark[seen], camera[seen], pixels[seen])
+        keyframe[seen], landmark[seen], camera[seen], pixels[seen]
+    )
 
 
 def disturbed(rig: Rig, rng: np.random.Generator) -> Rig:
@@ -125,8 +126,10 @@ def test_tangential_terms_are_found_and_chosen_by_landmarks_held_out(truth: Rig)
     assert isinstance(truth.lower.camera, UnifiedCamera)
     camera = replace(truth.lower.camera, distortion=(0.0, 0.0, 0.004, 0.002))
     points = problem_points(truth, state, observations)
-    bent, straight = (project(rig, observations.camera, points)
-                      for rig in (replace(truth, lower=replace(truth.lower, camera=camera)), truth))
+    bent, straight = (
+        project(rig, observations.camera, points)
+        for rig in (replace(truth, lower=replace(truth.lower, camera=camera)), truth)
+    )
     observations = replace(observations, pixels=observations.pixels + bent - straight)
     parameters = RigParameters.about(truth, ("p1", "p2"))
     prior = np.eye(len(parameters.names)) / 3.0**2
@@ -148,13 +151,18 @@ def test_delay_of_the_upper_camera_and_line_time_are_found(truth: Rig) -> None:
     """The upper camera is exposed 12 ms late, rows follow by 30 us; the rig turns and drives at changing speed."""
     rng = np.random.default_rng(6)
     state, observations = drive(truth, 6)
-    twist = np.column_stack([rng.uniform(-0.7, 0.7, (KEYFRAMES, 2)), np.zeros((KEYFRAMES, 3)),
-                             rng.uniform(-0.8, 0.8, KEYFRAMES)])
+    twist = np.column_stack(
+        [rng.uniform(-0.7, 0.7, (KEYFRAMES, 2)), np.zeros((KEYFRAMES, 3)), rng.uniform(-0.8, 0.8, KEYFRAMES)]
+    )
     motion = KeyframeMotion(twist, np.full(KEYFRAMES, 5e-3))
     delay_s = np.where(observations.camera == 1, 12e-3, 0.0) + 30e-6 * observations.pixels[:, 1]
     points = problem_points(truth, state, observations)
-    moving = np.array([se3.apply(se3.exp(-t * v), p[None])[0]
-                       for t, v, p in zip(delay_s, twist[observations.keyframe], points, strict=True)])
+    moving = np.array(
+        [
+            se3.apply(se3.exp(-t * v), p[None])[0]
+            for t, v, p in zip(delay_s, twist[observations.keyframe], points, strict=True)
+        ]
+    )
     pixels = project(truth, observations.camera, moving) + NOISE_PX * rng.standard_normal((len(points), 2))
     seen = np.isfinite(pixels).all(axis=1)
     kept, used = replace(observations, pixels=pixels).only(seen)
@@ -175,13 +183,17 @@ def test_rays_of_both_cameras_meet_after_adjusting_pairs(truth: Rig) -> None:
     points = np.column_stack([range_m * np.cos(azimuth), range_m * np.sin(azimuth), rng.uniform(-0.8, 0.8, count)])
     landmark, camera = (part.ravel() for part in np.mgrid[:count, :2])
     pixels = project(truth, camera, points[landmark]) + NOISE_PX * rng.standard_normal((2 * count, 2))
-    pixels[:count // 5] += rng.uniform(-5, 5, (count // 5, 2))
+    pixels[: count // 5] += rng.uniform(-5, 5, (count // 5, 2))
     seen = np.isfinite(pixels).all(axis=1)
     seen &= np.isin(landmark, np.flatnonzero(np.bincount(landmark[seen], minlength=count) == 2))
     observed, used = DriveObservations(0 * landmark, landmark, camera, pixels).only(seen)
     parameters = RigParameters.about(disturbed(truth, rng))
-    state = DriveState(np.eye(4)[None], points[used] * rng.uniform(0.9, 1.1, (len(used), 1)),
-                       np.zeros(len(parameters.names)), KeyframeMotion.still(1))
+    state = DriveState(
+        np.eye(4)[None],
+        points[used] * rng.uniform(0.9, 1.1, (len(used), 1)),
+        np.zeros(len(parameters.names)),
+        KeyframeMotion.still(1),
+    )
     before = ray_gaps_px(parameters.rig, observed)
     after = ray_gaps_px(parameters.at(adjust_pairs(parameters, state, observed, PRIOR)), observed)
     assert np.median(after) < 1.5 * NOISE_PX < 0.3 * np.median(before)
@@ -189,8 +201,10 @@ def test_rays_of_both_cameras_meet_after_adjusting_pairs(truth: Rig) -> None:
 
 def ray_gaps_px(rig: Rig, observed: DriveObservations) -> Array:
     """Return the distances of upper pixels from the epipolar planes of the lower ones, in pixels of the horizon."""
-    lower, upper = (mounted.camera.lift(observed.pixels[observed.camera == side]) @ mounted.T_cam_rig[:3, :3]
-                    for side, mounted in enumerate((rig.lower, rig.upper)))
+    lower, upper = (
+        mounted.camera.lift(observed.pixels[observed.camera == side]) @ mounted.T_cam_rig[:3, :3]
+        for side, mounted in enumerate((rig.lower, rig.upper))
+    )
     normal = np.cross(rig.upper.viewpoint - rig.lower.viewpoint, lower)
     sines = (normal * upper).sum(axis=1) / np.linalg.norm(normal, axis=1)
     return np.abs(sines) * 138.0
@@ -201,8 +215,11 @@ def test_rays_that_do_not_meet_in_one_point_are_found(truth: Rig) -> None:
     state, observations = drive(truth, 8)
     waves = np.array([[4e-4, 8e-4, -1.2e-3, -1.4e-3, 6e-4], [-3e-4, 1e-3, -4e-4, -1e-3, 5e-4]])
     points = problem_points(truth, state, observations)
-    pixels = observations.pixels + project(truth, observations.camera, points, waves) - project(
-        truth, observations.camera, points)
+    pixels = (
+        observations.pixels
+        + project(truth, observations.camera, points, waves)
+        - project(truth, observations.camera, points)
+    )
     observations = replace(observations, pixels=pixels)
     parameters = RigParameters.about(truth, waves=True)
     prior = np.diag([*np.diag(PRIOR), *np.ones(10)])
@@ -212,11 +229,17 @@ def test_rays_that_do_not_meet_in_one_point_are_found(truth: Rig) -> None:
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
 
 
-@pytest.mark.parametrize(("held_out", "expected"), [
-    ((0.2, 0.05, 0.0499), ("p1", "p2")), ((0.2, 0.199, 0.1985), ()), ((0.2, 0.1, 0.05), ("k1", "p1", "p2")),
-])
-def test_the_fewest_terms_that_no_more_improve_are_chosen(held_out: tuple[float, ...], expected: tuple[str, ...]
-                                                          ) -> None:
+@pytest.mark.parametrize(
+    ("held_out", "expected"),
+    [
+        ((0.2, 0.05, 0.0499), ("p1", "p2")),
+        ((0.2, 0.199, 0.1985), ()),
+        ((0.2, 0.1, 0.05), ("k1", "p1", "p2")),
+    ],
+)
+def test_the_fewest_terms_that_no_more_improve_are_chosen(
+    held_out: tuple[float, ...], expected: tuple[str, ...]
+) -> None:
     scores = [DriveModelScore(terms, error) for terms, error in zip(DISTORTIONS, held_out, strict=True)]
     assert best_model(scores).distortion == expected
 
@@ -228,6 +251,8 @@ def test_observations_that_are_alike_leave_more_to_the_prior(truth: Rig) -> None
     begin = replace(state, steps=np.zeros(15))
     free = adjust_drive(parameters, begin, observations, PRIOR)
     prior = np.diag(1 / (2 * np.diag(free.covariance)))
-    once, ten = (np.abs(adjust_drive(parameters, begin, observations, prior, alike=alike).state.steps).sum()
-                 for alike in (1.0, 10.0))
+    once, ten = (
+        np.abs(adjust_drive(parameters, begin, observations, prior, alike=alike).state.steps).sum()
+        for alike in (1.0, 10.0)
+    )
     assert ten < 0.7 * once < 0.7 * np.abs(free.state.steps).sum()

@@ -28,8 +28,9 @@ def depth_m(box: Box, points: Complex | complex) -> Array:
     return np.where(outside > 0.0, outside, np.maximum(dx, dy))
 
 
-def sweep(motion: tuple[float, float], points: Sequence[complex], longest_s: float, step_s: float = 0.0
-          ) -> tuple[Array, Complex]:
+def sweep(
+    motion: tuple[float, float], points: Sequence[complex], longest_s: float, step_s: float = 0.0
+) -> tuple[Array, Complex]:
     """Return times [s] and, for each of them, points that stand in the axes of the base, (times, points)."""
     v, w = motion
     fastest_mps = abs(v) + abs(w) * (max(abs(point) for point in points) + abs(v) * longest_s)

@@ -47,11 +47,19 @@ def test_the_time_is_that_of_a_sweep() -> None:
     assert met > 25 and missed > 50
 
 
-@pytest.mark.parametrize(("motion", "point", "expected"), [
-    (Twist(0.5), (0.8, 0.1), 1.0), (Twist(-0.5), (-0.7, 0.1), 1.0), (Twist(0.5), (0.8, 0.3), math.inf),
-    (Twist(0.5), (-0.8, 0.0), math.inf), (Twist(0.0, 1.0), (0.2, 2.0), math.inf), (Twist(), (0.4, 0.0), math.inf),
-    (Twist(), (-0.4, 0.0), math.inf), (Twist(1.0), (1.3, 0.0), 1.0),
-])
+@pytest.mark.parametrize(
+    ("motion", "point", "expected"),
+    [
+        (Twist(0.5), (0.8, 0.1), 1.0),
+        (Twist(-0.5), (-0.7, 0.1), 1.0),
+        (Twist(0.5), (0.8, 0.3), math.inf),
+        (Twist(0.5), (-0.8, 0.0), math.inf),
+        (Twist(0.0, 1.0), (0.2, 2.0), math.inf),
+        (Twist(), (0.4, 0.0), math.inf),
+        (Twist(), (-0.4, 0.0), math.inf),
+        (Twist(1.0), (1.3, 0.0), 1.0),
+    ],
+)
 def test_the_time_by_hand(motion: Twist, point: tuple[float, float], expected: float) -> None:
     assert contact_s(OUTLINE, motion, *point) == pytest.approx(expected)
 

@@ -39,9 +39,16 @@ def with_unknown(low_deg: float, high_deg: float, rest: float = math.inf) -> tup
     return tuple(math.nan if low_deg <= k - 179.5 <= high_deg else rest for k in range(360))
 
 
-def after(ranges: tuple[float, ...], motion: Twist = AHEAD, settings: CollisionSettings = SETTINGS, *,
-          free: tuple[float, ...] = (), moving: tuple[MovingPoint, ...] = (), age_s: float = 0.1,
-          unwatched: tuple[bool, ...] = ()) -> tuple[Twist, str]:
+def after(
+    ranges: tuple[float, ...],
+    motion: Twist = AHEAD,
+    settings: CollisionSettings = SETTINGS,
+    *,
+    free: tuple[float, ...] = (),
+    moving: tuple[MovingPoint, ...] = (),
+    age_s: float = 0.1,
+    unwatched: tuple[bool, ...] = (),
+) -> tuple[Twist, str]:
     """Return the allowed motion and the reason, before a new ring."""
     monitor = CollisionMonitor(settings, 1.5)
     monitor.set_ring(ControllerRing(10 * S, ranges, free, moving, unwatched))
@@ -68,7 +75,8 @@ def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -
     allowed, reason = after(with_points((distance_m, 0.0)), AHEAD, settings)
     expected = (distance_m - settings.front_m - settings.stop_m) / settings.time_s
     assert allowed.velocity_mps == pytest.approx(min(0.5, expected), rel=0.01) and (reason == monitor_module.NEAR) == (
-        expected < 0.5)
+        expected < 0.5
+    )
 
 
 def test_a_stopped_base_does_not_creep_on_when_the_ring_changes_by_a_cell() -> None:
@@ -85,8 +93,13 @@ def test_a_stopped_base_does_not_creep_on_when_the_ring_changes_by_a_cell() -> N
 
 def test_a_stopped_base_obeys_another_direction_and_a_slow_command() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, slow_m=0.0), 1.5)
-    for distance_m, motion, moves in ((0.405, AHEAD, False), (0.44, AHEAD, False), (0.44, Twist(0.03), True),
-                                      (0.405, AHEAD, False), (0.44, Twist(-0.4), True)):
+    for distance_m, motion, moves in (
+        (0.405, AHEAD, False),
+        (0.44, AHEAD, False),
+        (0.44, Twist(0.03), True),
+        (0.405, AHEAD, False),
+        (0.44, Twist(-0.4), True),
+    ):
         monitor.set_ring(ControllerRing(10 * S, with_points((distance_m, 0.0))))
         assert (monitor.step(10 * S, motion).velocity_mps != 0) == moves
 
@@ -232,8 +245,13 @@ def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
     rng = random.Random(3)
     reasons = set()
     for _ in range(2000):
-        ranges = rng.choice((with_unknown(-20, 20), with_points((rng.uniform(-2, 2), rng.uniform(-2, 2))),
-                             tuple(rng.choice((math.inf, math.nan, rng.uniform(0.05, 3.0))) for _ in range(360))))
+        ranges = rng.choice(
+            (
+                with_unknown(-20, 20),
+                with_points((rng.uniform(-2, 2), rng.uniform(-2, 2))),
+                tuple(rng.choice((math.inf, math.nan, rng.uniform(0.05, 3.0))) for _ in range(360)),
+            )
+        )
         moving = tuple(MovingPoint(*(rng.uniform(-2, 2) for _ in range(4)), 0.2) for _ in range(rng.randrange(3)))
         motion = Twist(rng.uniform(-1, 1), rng.uniform(-2, 2))
         allowed, reason = after(ranges, motion, moving=moving, age_s=rng.uniform(-0.2, 1.0))
@@ -258,5 +276,7 @@ def test_a_moving_obstacle_has_gone_on_since_the_images_of_the_ring(age_s: float
     seen_before = after(FREE_RING, moving=(MovingPoint(x, y, 0.0, speed_mps, 0.3),), age_s=age_s)
     seen_now = after(FREE_RING, moving=(MovingPoint(x, y + speed_mps * age_s, 0.0, speed_mps, 0.3),), age_s=0.0)
     assert seen_before == seen_now and seen_now[1] == monitor_module.MOVING
-    assert seen_before[0].velocity_mps < after(FREE_RING, moving=(MovingPoint(x, y, 0.0, speed_mps, 0.3),),
-                                               age_s=0.0)[0].velocity_mps
+    assert (
+        seen_before[0].velocity_mps
+        < after(FREE_RING, moving=(MovingPoint(x, y, 0.0, speed_mps, 0.3),), age_s=0.0)[0].velocity_mps
+    )

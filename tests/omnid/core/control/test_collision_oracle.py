@@ -34,10 +34,19 @@ def azimuth_rad(sector: int, count: int = SECTORS) -> float:
 
 
 def any_settings(rng: random.Random, **changes: object) -> CollisionSettings:
-    numbers = {"front_m": rng.uniform(0.1, 0.5), "rear_m": rng.uniform(0.1, 0.5),
-               "half_width_m": rng.uniform(0.1, 0.35), "stop_m": rng.uniform(0.05, 0.2),
-               "side_m": rng.uniform(0.02, 0.1), "time_s": rng.uniform(0.4, 2.5), "slow_m": 0.0, "slow_side_m": 0.0,
-               "slow_mps": 9.0, "stale_s": 10.0, "unknown": "ignore"}
+    numbers = {
+        "front_m": rng.uniform(0.1, 0.5),
+        "rear_m": rng.uniform(0.1, 0.5),
+        "half_width_m": rng.uniform(0.1, 0.35),
+        "stop_m": rng.uniform(0.05, 0.2),
+        "side_m": rng.uniform(0.02, 0.1),
+        "time_s": rng.uniform(0.4, 2.5),
+        "slow_m": 0.0,
+        "slow_side_m": 0.0,
+        "slow_mps": 9.0,
+        "stale_s": 10.0,
+        "unknown": "ignore",
+    }
     return CollisionSettings(**{**numbers, **changes})  # type: ignore[arg-type]
 
 
@@ -55,8 +64,11 @@ def outline_of(settings: CollisionSettings) -> Box:
 def stop_box(settings: CollisionSettings, v: float) -> Box:
     """Return the outline with the distance to keep ahead, on the side of the motion, and at the sides."""
     front_m, rear_m, half_width_m = outline_of(settings)
-    return (front_m + settings.stop_m * (v > TURN_MPS), rear_m + settings.stop_m * (v < -TURN_MPS),
-            half_width_m + settings.side_m)
+    return (
+        front_m + settings.stop_m * (v > TURN_MPS),
+        rear_m + settings.stop_m * (v < -TURN_MPS),
+        half_width_m + settings.side_m,
+    )
 
 
 def driven(monitor: CollisionMonitor, rng: random.Random, ring_ns: int, now_ns: int) -> tuple[complex, float]:
@@ -78,10 +90,10 @@ def travelled(motion: Pair, time_s: float, place: complex, yaw: float) -> tuple[
     return place, yaw
 
 
-def add_ahead(ranges: list[float], motion: Pair, settings: CollisionSettings, rng: random.Random,
-              now: tuple[complex, float]) -> None:
-    """Put an obstacle where the front or the rear of the base will be within the time that it keeps, or shortly after.
-    """
+def add_ahead(
+    ranges: list[float], motion: Pair, settings: CollisionSettings, rng: random.Random, now: tuple[complex, float]
+) -> None:
+    """Put an obstacle where the front or the rear of the base will be within the time that it keeps, or soon after."""
     place, yaw = travelled(motion, rng.uniform(0.0, 1.3 * settings.time_s), *now)
     end_m = settings.stop_m + settings.front_m if motion[0] >= 0 else -settings.stop_m - settings.rear_m
     point = place + complex(end_m, rng.uniform(-0.9, 0.9) * settings.half_width_m) * cmath.exp(1j * yaw)
@@ -89,8 +101,9 @@ def add_ahead(ranges: list[float], motion: Pair, settings: CollisionSettings, rn
         ranges[math.floor((cmath.phase(point) / math.tau + 0.5) * SECTORS) % SECTORS] = abs(point)
 
 
-def share_before(settings: CollisionSettings, braking_mps2: float, motion: Pair, points: Sequence[complex],
-                 grow_m: float) -> float:
+def share_before(
+    settings: CollisionSettings, braking_mps2: float, motion: Pair, points: Sequence[complex], grow_m: float
+) -> float:
     """Return the share of a motion that keeps time and braking distance before points that stand."""
     v, _ = motion
     box = stop_box(settings, v)
@@ -119,16 +132,24 @@ def is_clear(settings: CollisionSettings, motion: Pair, points: Sequence[complex
         return True
     box = stop_box(settings, motion[0])
     inside = [point for point in points if swept_outline.depth_m(box, point) <= 0.0]
-    return bool((np.abs(swept_outline.depth_m(box, np.array(points))) > 3 * SLACK_M).all() and all(
-        abs(swept_outline.approach_mps(outline_of(settings), motion, point)) > 1e-3 for point in inside))
+    return bool(
+        (np.abs(swept_outline.depth_m(box, np.array(points))) > 3 * SLACK_M).all()
+        and all(abs(swept_outline.approach_mps(outline_of(settings), motion, point)) > 1e-3 for point in inside)
+    )
 
 
 def seen_from(place: complex, yaw: float, points: Sequence[complex]) -> list[complex]:
     return [(point - place) * cmath.exp(-1j * yaw) for point in points]
 
 
-def check(settings: CollisionSettings, braking_mps2: float, motion: Pair, points: Sequence[complex], found: float,
-          least: float = 0.0) -> float:
+def check(
+    settings: CollisionSettings,
+    braking_mps2: float,
+    motion: Pair,
+    points: Sequence[complex],
+    found: float,
+    least: float = 0.0,
+) -> float:
     """Compare the share that was found with that of the sweep; return the latter."""
     low, high = (max(least, share_before(settings, braking_mps2, motion, points, by_m)) for by_m in (SLACK_M, -SLACK_M))
     assert low - 0.01 <= found <= high + 0.01, (settings, braking_mps2, motion, points, low, found, high)
@@ -244,8 +265,15 @@ def test_beside_parts_where_the_images_show_nothing_there_is_room_of_a_hand() ->
 def test_a_base_is_slow_while_something_is_in_the_slow_polygon() -> None:
     rng, slow = random.Random(3), 0
     for _ in range(400):
-        settings = any_settings(rng, slow_m=rng.uniform(0.1, 1.0), slow_side_m=rng.uniform(0.0, 0.5), slow_mps=0.2,
-                                time_s=0.2, stop_m=0.01, side_m=0.0)
+        settings = any_settings(
+            rng,
+            slow_m=rng.uniform(0.1, 1.0),
+            slow_side_m=rng.uniform(0.0, 0.5),
+            slow_mps=0.2,
+            time_s=0.2,
+            stop_m=0.01,
+            side_m=0.0,
+        )
         v, w = motion = any_motion(rng)
         sector, range_m = rng.randrange(SECTORS), rng.uniform(0.6, 1.6)
         point = cmath.rect(range_m, azimuth_rad(sector))
@@ -255,8 +283,9 @@ def test_a_base_is_slow_while_something_is_in_the_slow_polygon() -> None:
         monitor.set_ring(ControllerRing(S, tuple(range_m if k == sector else math.inf for k in range(SECTORS))))
         ahead_m = point.real if v > 0 else -point.real
         far_m = settings.slow_m + (settings.front_m if v > 0 else settings.rear_m)
-        is_near = (abs(v) > 0.2 and 0.0 <= ahead_m <= far_m
-                   and abs(point.imag) <= settings.half_width_m + settings.slow_side_m)
+        is_near = (
+            abs(v) > 0.2 and 0.0 <= ahead_m <= far_m and abs(point.imag) <= settings.half_width_m + settings.slow_side_m
+        )
         corner_m = math.hypot(max(settings.front_m, settings.rear_m), settings.half_width_m)
         share = min(1.0, 0.2 / max(abs(v), abs(w) * corner_m)) if is_near else 1.0
         allowed = monitor.step(S, Twist(v, w))
@@ -287,15 +316,19 @@ def test_moving_obstacles_are_where_they_will_be() -> None:
         monitor = CollisionMonitor(settings, 5.0)
         ring_ns, age_s = 50 * S, rng.randrange(0, 10) / 10
         place, yaw = driven(monitor, rng, ring_ns, ring_ns + round(age_s * S))
-        obstacle = MovingPoint(*(rng.uniform(-2.0, 2.0) for _ in range(2)),
-                               *(rng.uniform(-1.0, 1.0) for _ in range(2)), rng.uniform(0.1, 0.4))
+        obstacle = MovingPoint(
+            *(rng.uniform(-2.0, 2.0) for _ in range(2)),
+            *(rng.uniform(-1.0, 1.0) for _ in range(2)),
+            rng.uniform(0.1, 0.4),
+        )
         times, paths = swept_outline.sweep((v, w), [0j, 1 + 0j], settings.time_s + 1e-6, 1e-3)
         expected, margin_m = 1.0, math.inf
         for step in range(math.ceil(settings.time_s / 0.1)):
             at = min(100 * step, len(times) - 1)
             at_s = age_s + 0.1 * step
-            [now] = seen_from(place, yaw, [complex(obstacle.x_m + obstacle.vx_mps * at_s,
-                                                   obstacle.y_m + obstacle.vy_mps * at_s)])
+            [now] = seen_from(
+                place, yaw, [complex(obstacle.x_m + obstacle.vx_mps * at_s, obstacle.y_m + obstacle.vy_mps * at_s)]
+            )
             # In the axes of the base now, the base then has its origin where a point that stands at 0 is seen from it.
             turned = paths[at, 1] - paths[at, 0]
             then = paths[at, 0] + now * turned

@@ -70,10 +70,13 @@ def test_a_heading_jumps_where_the_base_cannot_have_turned_so_far() -> None:
         brake_rad = 0.3 + limits.yaw_acceleration_radps2 * passed_s**2 / 2
         base_rad, bound_rad = rng.choice(((0.0, turn_rad), (before.yaw_rate_radps * passed_s, brake_rad)))
         heading_rad = before.heading_rad + base_rad + rng.choice((-1, 1)) * (bound_rad + rng.choice((-0.01, 0.01, 0.3)))
-        pose = before._replace(stamp_ns=before.stamp_ns + round(passed_s * 1e9),
-                               heading_rad=math.remainder(heading_rad, math.tau))
-        terms = (between_rad(pose.heading_rad, before.heading_rad) - turn_rad,
-                 between_rad(pose.heading_rad, before.heading_rad + before.yaw_rate_radps * passed_s) - brake_rad)
+        pose = before._replace(
+            stamp_ns=before.stamp_ns + round(passed_s * 1e9), heading_rad=math.remainder(heading_rad, math.tau)
+        )
+        terms = (
+            between_rad(pose.heading_rad, before.heading_rad) - turn_rad,
+            between_rad(pose.heading_rad, before.heading_rad + before.yaw_rate_radps * passed_s) - brake_rad,
+        )
         law = law_with(before)
         law.set_pose(pose)
         law.step(before.stamp_ns + 2, TICK_S)

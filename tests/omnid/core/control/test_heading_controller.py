@@ -24,8 +24,9 @@ LIMITS = CONTROLLER.limits
 NOT_FINITE = (math.nan, math.inf, -math.inf)
 
 
-def turn(setpoint: Setpoint, heading_rad: float, seconds: float, controller: HeadingController = CONTROLLER
-         ) -> list[float]:
+def turn(
+    setpoint: Setpoint, heading_rad: float, seconds: float, controller: HeadingController = CONTROLLER
+) -> list[float]:
     """Return the unwrapped headings of a unicycle that starts from a stop; the measured ones are wrapped."""
     motion, headings = Twist(), [heading_rad]
     for _ in range(round(seconds / DT_S)):

@@ -41,8 +41,9 @@ class World:
     steps_s: float = POSE_S
 
 
-def run(wish: Wish, seconds: float, world: World | None = None, settings: MotionSettings | None = None
-        ) -> tuple[MotionMonitor, list[tuple[float, bool, str]]]:
+def run(
+    wish: Wish, seconds: float, world: World | None = None, settings: MotionSettings | None = None
+) -> tuple[MotionMonitor, list[tuple[float, bool, str]]]:
     """Return the monitor, and time, doubt and reason of each tick."""
     world, rng = world or World(), random.Random(7)
     monitor, commanded, wheels = MotionMonitor(settings or MotionSettings()), Twist(), Twist()
@@ -53,8 +54,10 @@ def run(wish: Wish, seconds: float, world: World | None = None, settings: Motion
         commanded = LIMITS.step(wish(now_s), commanded, TICK_S)
         monitor.add_command(round(now_s * NS), commanded)
         share = 1 - math.exp(-TICK_S / world.lag_s)
-        wheels = Twist(wheels.velocity_mps + share * (commanded.velocity_mps - wheels.velocity_mps),
-                       wheels.yaw_rate_radps + share * (commanded.yaw_rate_radps - wheels.yaw_rate_radps))
+        wheels = Twist(
+            wheels.velocity_mps + share * (commanded.velocity_mps - wheels.velocity_mps),
+            wheels.yaw_rate_radps + share * (commanded.yaw_rate_radps - wheels.yaw_rate_radps),
+        )
         monitor.add_report(round(now_s * NS), world.reported(now_s, Motion(*_pair(wheels))))
         if now_s >= len(waiting) * world.steps_s:
             moved = Motion(world.grip * wheels.velocity_mps, world.grip * wheels.yaw_rate_radps, 0.01, 0.01)
@@ -100,40 +103,71 @@ def no_images(at_s: float, motion: Motion) -> Motion:
     return Motion(0.0, 0.0, 1.0, 1.0) if 2 < at_s < 6 else motion
 
 
-@pytest.mark.parametrize(("wish", "world"), [
-    (steady(0.0), World()),
-    (steady(0.6, 1.2), World()),
-    (steady(-0.5), World(lag_s=0.3)),
-    (steady(0.05, 0.1), World()),
-    (alternating, World()),
-    (alternating, World(lag_s=0.3, steps_s=0.25)),
-    (steady(0.5, 0.8), World(grip=0.65)),
-    (steady(0.5, 0.8), World(grip=1.3)),
-    (steady(0.5), World(seen=bumps)),
-    (steady(0.5), World(seen=no_images)),
-    (steady(0.5), World(reported=lambda *_: Motion(0.0, 0.0))),
-    (steady(0.5, 0.5), World(reported=lambda _, motion: motion._replace(yaw_rate_radps=math.nan))),
-    (steady(0.3), World(noise_mps=0.06)),
-], ids=["rest", "fast", "slow wheels", "creeping", "to and fro", "to and fro, 4 Hz", "slip", "wheels too large",
-        "bumps", "no pose", "wheels that report nothing", "wheels that hold a heading", "noise"])
+@pytest.mark.parametrize(
+    ("wish", "world"),
+    [
+        (steady(0.0), World()),
+        (steady(0.6, 1.2), World()),
+        (steady(-0.5), World(lag_s=0.3)),
+        (steady(0.05, 0.1), World()),
+        (alternating, World()),
+        (alternating, World(lag_s=0.3, steps_s=0.25)),
+        (steady(0.5, 0.8), World(grip=0.65)),
+        (steady(0.5, 0.8), World(grip=1.3)),
+        (steady(0.5), World(seen=bumps)),
+        (steady(0.5), World(seen=no_images)),
+        (steady(0.5), World(reported=lambda *_: Motion(0.0, 0.0))),
+        (steady(0.5, 0.5), World(reported=lambda _, motion: motion._replace(yaw_rate_radps=math.nan))),
+        (steady(0.3), World(noise_mps=0.06)),
+    ],
+    ids=[
+        "rest",
+        "fast",
+        "slow wheels",
+        "creeping",
+        "to and fro",
+        "to and fro, 4 Hz",
+        "slip",
+        "wheels too large",
+        "bumps",
+        "no pose",
+        "wheels that report nothing",
+        "wheels that hold a heading",
+        "noise",
+    ],
+)
 def test_what_robots_do_is_no_contradiction(wish: Wish, world: World) -> None:
     _, history = run(wish, 60.0, world)
     assert [entry for entry in history if entry[1] or entry[2]] == []
 
 
-@pytest.mark.parametrize(("wish", "world", "expected"), [
-    (steady(0.3), World(seen=still), NOT_SEEN),
-    (steady(-0.3), World(seen=still), NOT_SEEN),
-    (steady(0.0, 0.8), World(seen=still), NOT_SEEN),
-    (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=4 * m.velocity_mps)), NOT_COMMANDED),
-    (steady(0.3), World(seen=lambda _, m: m._replace(yaw_rate_radps=0.5)), NOT_COMMANDED),
-    (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=-m.velocity_mps)), NOT_SEEN),
-    (steady(0.3), World(seen=lambda at_s, m: still(at_s, m) if at_s > 5 else m), NOT_SEEN),
-    (steady(0.3), World(reported=lambda at_s, m: Motion(0.0, 0.0) if at_s > 2 else m), NOT_FOLLOWED),
-    (steady(0.2), World(reported=lambda at_s, m: Motion(2.0, 0.0)), NOT_FOLLOWED),
-    (steady(0.2), World(reported=lambda _, m: Motion(m.velocity_mps, 1.0)), NOT_FOLLOWED),
-], ids=["images stand", "in reverse", "turning", "too far", "rotation", "the other way", "images stand later",
-        "wheels stand", "wheels run away", "wheels turn"])
+@pytest.mark.parametrize(
+    ("wish", "world", "expected"),
+    [
+        (steady(0.3), World(seen=still), NOT_SEEN),
+        (steady(-0.3), World(seen=still), NOT_SEEN),
+        (steady(0.0, 0.8), World(seen=still), NOT_SEEN),
+        (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=4 * m.velocity_mps)), NOT_COMMANDED),
+        (steady(0.3), World(seen=lambda _, m: m._replace(yaw_rate_radps=0.5)), NOT_COMMANDED),
+        (steady(0.3), World(seen=lambda _, m: m._replace(velocity_mps=-m.velocity_mps)), NOT_SEEN),
+        (steady(0.3), World(seen=lambda at_s, m: still(at_s, m) if at_s > 5 else m), NOT_SEEN),
+        (steady(0.3), World(reported=lambda at_s, m: Motion(0.0, 0.0) if at_s > 2 else m), NOT_FOLLOWED),
+        (steady(0.2), World(reported=lambda at_s, m: Motion(2.0, 0.0)), NOT_FOLLOWED),
+        (steady(0.2), World(reported=lambda _, m: Motion(m.velocity_mps, 1.0)), NOT_FOLLOWED),
+    ],
+    ids=[
+        "images stand",
+        "in reverse",
+        "turning",
+        "too far",
+        "rotation",
+        "the other way",
+        "images stand later",
+        "wheels stand",
+        "wheels run away",
+        "wheels turn",
+    ],
+)
 def test_a_contradiction_slows_down_and_then_stops(wish: Wish, world: World, expected: str) -> None:
     slowed_s, stopped_s, reason = stopped_after(run(wish, 12.0, world)[1])
     assert reason == expected and slowed_s < stopped_s

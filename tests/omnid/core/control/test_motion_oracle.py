@@ -96,16 +96,23 @@ class Account:
 
 def wrong(rng: random.Random, motion: Pair) -> Pair:
     """Return another motion: a part of it, too much of it, its opposite, or nothing that is known."""
-    return tuple(rng.choice((value, value, rng.uniform(-0.5, 2.5) * value, value + rng.gauss(0.0, 0.4), math.nan))
-                 for value in motion)  # type: ignore[return-value]
+    return tuple(
+        rng.choice((value, value, rng.uniform(-0.5, 2.5) * value, value + rng.gauss(0.0, 0.4), math.nan))
+        for value in motion
+    )  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_monitor_is_its_description(seed: int) -> None:
     rng, slowed, reasons = random.Random(seed), 0, set()
     for _ in range(12):
-        settings = replace(MotionSettings(), delay_s=rng.uniform(0.1, 0.6), slip=rng.uniform(0.1, 0.7),
-                           stop_m=rng.uniform(0.1, 0.3), stop_rad=rng.uniform(0.3, 0.9))
+        settings = replace(
+            MotionSettings(),
+            delay_s=rng.uniform(0.1, 0.6),
+            slip=rng.uniform(0.1, 0.7),
+            stop_m=rng.uniform(0.1, 0.3),
+            stop_rad=rng.uniform(0.3, 0.9),
+        )
         monitor, account = MotionMonitor(settings), Account(settings)
         motion = asked = seen = reported = (0.0, 0.0)
         sigmas = (0.0, 0.0)

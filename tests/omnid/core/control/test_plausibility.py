@@ -22,5 +22,6 @@ def test_a_degraded_pose_slows_down_to_its_share_of_the_limits(side: int) -> Non
         assert plausibility.slowed_by == (POSE_DEGRADED if state == "degraded" else "")
         slowed = plausibility.slowed(fast, LIMITS)
         assert (slowed.velocity_mps, slowed.yaw_rate_radps) == pytest.approx(
-            (expected.velocity_mps, expected.yaw_rate_radps))
+            (expected.velocity_mps, expected.yaw_rate_radps)
+        )
         assert plausibility.slowed(slow, LIMITS) == slow, "within the share already"

@@ -89,8 +89,14 @@ def test_the_table_has_every_reason_once() -> None:
 
 def test_only_faults_disarm() -> None:
     """Faults of the robot, not the wishes of its operator."""
-    kept = {safety_rules.ENDS, safety_rules.ASKED, safety_rules.POSE_JUMPED, safety_rules.NOT_ARMED, safety_rules.IDLE,
-            safety_rules.COMMAND_STALE}
+    kept = {
+        safety_rules.ENDS,
+        safety_rules.ASKED,
+        safety_rules.POSE_JUMPED,
+        safety_rules.NOT_ARMED,
+        safety_rules.IDLE,
+        safety_rules.COMMAND_STALE,
+    }
     assert {rule.reason for rule in safety_rules.RULES if not rule.disarms} == kept
     for reason in CAUSES.keys() - kept:
         everything = replace(GOOD, armed=False, **CAUSES[reason])  # type: ignore[arg-type]

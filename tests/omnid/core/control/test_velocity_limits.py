@@ -74,8 +74,7 @@ def test_brakes_to_zero_before_it_accelerates_backwards() -> None:
 
 
 def integrated(wanted: Twist, last: Twist, dt_s: float, steps: int = 2000) -> Twist:
-    """Return the motion after a time by small steps, each of which may brake, or speed up, or turn faster by its part.
-    """
+    """Return the motion after a time by small steps, each of which may brake, or speed up, or turn faster by a part."""
     step_s, v, w = dt_s / steps, last.velocity_mps, last.yaw_rate_radps
     goal_mps, goal_radps = max(-0.8, min(0.8, wanted.velocity_mps)), max(-1.5, min(1.5, wanted.yaw_rate_radps))
     for _ in range(steps):

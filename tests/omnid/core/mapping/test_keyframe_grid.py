@@ -60,5 +60,7 @@ def test_it_grows_and_is_bounded() -> None:
     found = grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0]}, far), T_BASE_RECT)
     assert found.cell_m > 0.05 and found.cells.size <= MAX_CELLS and grid.redrawn == 2
     small = scan_of(box((-1, -1), (1, 1)), PATH[0]).astype(np.float16)
-    assert same(grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
-                grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT))
+    assert same(
+        grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
+        grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
+    )

@@ -14,8 +14,10 @@ PATH = np.array([pose(x, 0.2 * x, 0.3 * x) for x in np.arange(-1.5, 1.5, 0.3)])
 
 
 def at(grid: Grid, x: float, y: float) -> int:
-    column, row = (int(np.floor(value / grid.cell_m)) - round(corner / grid.cell_m)
-                   for value, corner in zip((x, y), grid.corner, strict=True))
+    column, row = (
+        int(np.floor(value / grid.cell_m)) - round(corner / grid.cell_m)
+        for value, corner in zip((x, y), grid.corner, strict=True)
+    )
     return int(grid.cells[row, column])
 
 

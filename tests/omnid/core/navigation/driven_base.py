@@ -41,8 +41,15 @@ class DrivenBase:
 
     has_ring = False  # else nothing looks for obstacles
 
-    def __init__(self, navigator: Navigator, seed: int, *, start: tuple[float, float, float] = (0.0, 0.0, 0.0),
-                 pose_hz: float = 10.0, T_map_odom: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        navigator: Navigator,
+        seed: int,
+        *,
+        start: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        pose_hz: float = 10.0,
+        T_map_odom: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
         self.navigator = navigator
         self.rng = np.random.default_rng(seed)
         self.pose = np.array(start)
@@ -74,9 +81,17 @@ class DrivenBase:
         """Return the pose as it is estimated now."""
         noisy = self.pose + self.rng.normal(0, [0.003, 0.003, 0.002])
         state = MapState.LOCALIZED if self.localised else MapState.ODOMETRY_ONLY
-        return Situation(round(self.t_s * 1e9), noisy, self.v + self.rng.normal(0, 0.01),
-                         self.w + self.rng.normal(0, 0.01), self.state, self.resets, self.wheels,
-                         MapPosition(self.T_map_odom, state, 0.02), obstacle_m=self.obstacle_m)
+        return Situation(
+            round(self.t_s * 1e9),
+            noisy,
+            self.v + self.rng.normal(0, 0.01),
+            self.w + self.rng.normal(0, 0.01),
+            self.state,
+            self.resets,
+            self.wheels,
+            MapPosition(self.T_map_odom, state, 0.02),
+            obstacle_m=self.obstacle_m,
+        )
 
     def tick(self) -> Navigation | None:
         """Advance by TICK_S; return the answer of the navigation where a pose has come."""
@@ -88,8 +103,10 @@ class DrivenBase:
             answer = self._at_pose(now)
         now_ns = round(self.t_s * 1e9)
         motion = self.law.step(now_ns, TICK_S).motion
-        left, right = (gain * (motion.velocity_mps + side * motion.yaw_rate_radps * TRACK_M / 2)
-                       for gain, side in zip(self._gain, (-1, 1), strict=True))
+        left, right = (
+            gain * (motion.velocity_mps + side * motion.yaw_rate_radps * TRACK_M / 2)
+            for gain, side in zip(self._gain, (-1, 1), strict=True)
+        )
         self.v += (0.5 * (left + right) * self.slip - self.v) * TICK_S / LAG_S
         self.w += ((right - left) / TRACK_M * self.slip - self.w) * TICK_S / LAG_S
         v = self.v * (1 + 0.03 * self.rng.standard_normal())
@@ -100,15 +117,22 @@ class DrivenBase:
 
     def _at_pose(self, now: Situation) -> Navigation:
         answer = self.navigator.step(now._replace(wheels=self.wheels))
-        self.law.set_pose(ControllerPose(now.stamp_ns, float(now.pose[2]), now.yaw_rate_radps, now.state,
-                                         now.speed_mps, resets=now.resets))
+        self.law.set_pose(
+            ControllerPose(
+                now.stamp_ns, float(now.pose[2]), now.yaw_rate_radps, now.state, now.speed_mps, resets=now.resets
+            )
+        )
         if answer.setpoint is not None:
             self.law.set_command(TimedSetpoint(round(self.t_s * 1e9), answer.setpoint, PLANNER))
         self.samples.append(Sample(self.t_s, self.pose.copy(), self.v, self.w, answer))
         return answer
 
-    def run(self, seconds: float, until: Callable[[Navigation], bool] = lambda answer: answer.state.is_end,
-            rest_s: float = 1.0) -> Navigation:
+    def run(
+        self,
+        seconds: float,
+        until: Callable[[Navigation], bool] = lambda answer: answer.state.is_end,
+        rest_s: float = 1.0,
+    ) -> Navigation:
         """Drive until the navigation ends, then rest_s on; return the last answer. AssertionError after the time."""
         end_s = self.t_s + seconds
         while self.t_s < end_s:

@@ -23,9 +23,16 @@ def to_goal(base: DrivenBase, x: float, y: float, heading: float | None) -> None
     base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
 
 
-@pytest.mark.parametrize(("goal", "seeds"), [
-    ((10.0, 0.0, 0.0), range(4)), ((3.0, 2.0, math.pi / 2), range(4, 8)), ((-2.0, -1.0, 0.3), range(8, 12)),
-    ((0.0, 0.0, math.pi), range(12, 14)), ((0.06, 0.03, 0.0), range(14, 18))])
+@pytest.mark.parametrize(
+    ("goal", "seeds"),
+    [
+        ((10.0, 0.0, 0.0), range(4)),
+        ((3.0, 2.0, math.pi / 2), range(4, 8)),
+        ((-2.0, -1.0, 0.3), range(8, 12)),
+        ((0.0, 0.0, math.pi), range(12, 14)),
+        ((0.06, 0.03, 0.0), range(14, 18)),
+    ],
+)
 def test_reaches_goals_within_3_cm_and_1_degree(goal: tuple[float, float, float], seeds: range) -> None:
     for seed in seeds:
         base = DrivenBase(Navigator(NavigationSettings()), seed)

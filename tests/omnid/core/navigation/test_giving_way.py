@@ -33,8 +33,14 @@ def person(x_m: float, y_m: float) -> Box:
 class BaseAmongOthers(BaseAmongBoxes):
     """A base among walls and one box that moves as the test says."""
 
-    def __init__(self, walls: tuple[Box, ...], other: Callable[[BaseAmongOthers], Box | None], seed: int,
-                 settings: NavigationSettings = SETTINGS, path: DrivePath | None = None) -> None:
+    def __init__(
+        self,
+        walls: tuple[Box, ...],
+        other: Callable[[BaseAmongOthers], Box | None],
+        seed: int,
+        settings: NavigationSettings = SETTINGS,
+        path: DrivePath | None = None,
+    ) -> None:
         self.walls, self.other = walls, other
         super().__init__(Navigator(settings), seed)
         path = path or DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
@@ -52,8 +58,11 @@ class BaseAmongOthers(BaseAmongBoxes):
     def began_to_give_way(self) -> list[float]:
         """Return the times at which it began to drive back."""
         gives = [sample.navigation.reason == GIVES_WAY for sample in self.samples]
-        return [sample.t_s for before, now, sample in zip([False, *gives], gives, self.samples, strict=False)
-                if now and not before]
+        return [
+            sample.t_s
+            for before, now, sample in zip([False, *gives], gives, self.samples, strict=False)
+            if now and not before
+        ]
 
 
 class Walker:
@@ -135,8 +144,9 @@ def test_comes_again_when_the_way_is_free_or_to_look(is_open: bool, expected_s: 
 def test_goes_back_only_as_far_as_it_is_free() -> None:
     """Somebody has come behind the base: it never comes near."""
     behind_m = 0.8
-    base = BaseAmongOthers((*CORRIDOR, person(3.0, 0.0)),
-                           lambda base: person(behind_m, 0.0) if base.t_s > 10.0 else None, 5)
+    base = BaseAmongOthers(
+        (*CORRIDOR, person(3.0, 0.0)), lambda base: person(behind_m, 0.0) if base.t_s > 10.0 else None, 5
+    )
     base.run(60, lambda _: base.t_s > 50)
     later = [float(sample.pose[0]) for sample in base.samples if sample.t_s > 10.0]
     assert min(later) > behind_m + 0.2 + 0.2, "outline of both"
@@ -160,8 +170,9 @@ def test_stops_at_the_next_place_where_others_can_pass() -> None:
 def test_goes_back_around_a_corner_and_comes_again() -> None:
     path = drive_path([(0.0, 0.0), (1.5, 0.0), (1.5, 4.0)])
     gone = [False]
-    base = BaseAmongOthers(((2.05, -0.6, 2.25, 5.0), (0.75, 0.7, 0.95, 5.0)),
-                           lambda _: None if gone[0] else person(1.5, 2.2), 8, path=path)
+    base = BaseAmongOthers(
+        ((2.05, -0.6, 2.25, 5.0), (0.75, 0.7, 0.95, 5.0)), lambda _: None if gone[0] else person(1.5, 2.2), 8, path=path
+    )
     base.run(90, lambda _: bool(base.began_to_give_way()) and base.states[-1] is NavigationState.BLOCKED)
     assert base.pose[1] < 0.3 and base.pose[0] < 1.2, "round the corner"
     gone[0] = True

@@ -60,8 +60,10 @@ class BaseAmongBoxes(DrivenBase):
         now = super().seen()
         ranges = self.boxes.ring(self.pose) + self.rng.normal(0, 0.01, 360)
         seen = np.isfinite(ranges)
-        points = self.pose[:2] + (ranges * np.array([np.cos(AZIMUTHS + self.pose[2]),
-                                                     np.sin(AZIMUTHS + self.pose[2])])).T[seen]
+        points = (
+            self.pose[:2]
+            + (ranges * np.array([np.cos(AZIMUTHS + self.pose[2]), np.sin(AZIMUTHS + self.pose[2])])).T[seen]
+        )
         self.law.set_ring(ControllerRing(now.stamp_ns, tuple(ranges.tolist())))
         near_m = float(ranges[seen & (np.abs(AZIMUTHS) < 1.7)].min(initial=math.inf)) - OUTLINE.half_width_m
         return now._replace(obstacles=points, obstacle_m=near_m)
@@ -81,10 +83,17 @@ def clearance_m(base: BaseAmongBoxes) -> float:
     return min(base.boxes.clearance_m(sample.pose[:2]) for sample in base.samples) - OUTLINE.half_width_m
 
 
-@pytest.mark.parametrize("boxes", [
-    Boxes((2.5, -0.2, 2.9, 0.2)), Boxes((2.5, -1.2, 2.8, 0.1)), Boxes((2.5, -0.1, 2.8, 1.2)),
-    Boxes((1.6, -0.6, 1.8, 0.3), (3.2, -0.3, 3.4, 0.6)), Boxes((2.0, -0.15, 3.2, 0.15)),
-    Boxes((2.4, -0.2, 2.8, 0.2), (-1.0, 1.2, 7.0, 1.4), (-1.0, -1.4, 7.0, -1.2))])
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        Boxes((2.5, -0.2, 2.9, 0.2)),
+        Boxes((2.5, -1.2, 2.8, 0.1)),
+        Boxes((2.5, -0.1, 2.8, 1.2)),
+        Boxes((1.6, -0.6, 1.8, 0.3), (3.2, -0.3, 3.4, 0.6)),
+        Boxes((2.0, -0.15, 3.2, 0.15)),
+        Boxes((2.4, -0.2, 2.8, 0.2), (-1.0, 1.2, 7.0, 1.4), (-1.0, -1.4, 7.0, -1.2)),
+    ],
+)
 def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
     base = drive(boxes, 1)
     assert base.run(90, rest_s=0.3).state is NavigationState.REACHED
@@ -95,9 +104,14 @@ def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
     assert max(offsets) < SETTINGS.corridor_m + 0.1
 
 
-@pytest.mark.parametrize("boxes", [
-    Boxes((2.5, -3.0, 2.7, 3.0)), Boxes((2.5, -0.7, 2.7, 0.7), (1.5, 0.7, 2.7, 0.9), (1.5, -0.9, 2.7, -0.7)),
-    Boxes((4.8, -0.2, 5.2, 0.2))])
+@pytest.mark.parametrize(
+    "boxes",
+    [
+        Boxes((2.5, -3.0, 2.7, 3.0)),
+        Boxes((2.5, -0.7, 2.7, 0.7), (1.5, 0.7, 2.7, 0.9), (1.5, -0.9, 2.7, -0.7)),
+        Boxes((4.8, -0.2, 5.2, 0.2)),
+    ],
+)
 def test_waits_where_there_is_no_way_and_says_so(boxes: Boxes) -> None:
     base = drive(boxes, 1)
     base.run(90, lambda answer: answer.state is NavigationState.BLOCKED)

@@ -66,11 +66,17 @@ class BaseAmongPeople(BaseAmongBoxes):
         if self.t_s - self.ring_s >= RING_S - 1e-6:
             self.ring_s = self.t_s
             T = se3.transform(se3.rotation_exp([0, 0, self.pose[2]]), [*self.pose[:2], 0.0])
-            self.moving = self.tracker.update(now.stamp_ns, T, ranges.astype(np.float32),
-                                              np.full(360, 0.01, np.float32))
-            points = tuple(MovingPoint(*relative(self.pose, np.array([m.x_m, m.y_m, 0.0]))[:2].tolist(),
-                                       *(T[:2, :2].T @ (m.vx_mps, m.vy_mps)).tolist(), m.radius_m)
-                           for m in self.moving)
+            self.moving = self.tracker.update(
+                now.stamp_ns, T, ranges.astype(np.float32), np.full(360, 0.01, np.float32)
+            )
+            points = tuple(
+                MovingPoint(
+                    *relative(self.pose, np.array([m.x_m, m.y_m, 0.0]))[:2].tolist(),
+                    *(T[:2, :2].T @ (m.vx_mps, m.vy_mps)).tolist(),
+                    m.radius_m,
+                )
+                for m in self.moving
+            )
             self.law.set_ring(ControllerRing(now.stamp_ns, tuple(ranges.tolist()), moving=points))
         seen = np.isfinite(ranges)
         obstacles = self.pose[:2] + ranges[seen, None] * directions[seen]

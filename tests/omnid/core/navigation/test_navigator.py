@@ -50,7 +50,7 @@ def test_cancel_stops_at_once_and_then_gives_the_wheels_free() -> None:
     while len(answers) <= STOPS + 1:
         answer = base.tick()
         answers += [answer] if answer else []
-    assert all(a.setpoint is not None and a.setpoint.velocity_mps == 0.0 for a in answers[1:STOPS + 1])
+    assert all(a.setpoint is not None and a.setpoint.velocity_mps == 0.0 for a in answers[1 : STOPS + 1])
     assert answers[-1].setpoint is None and answers[-1].state is NavigationState.CANCELLED
     rest(base, 1.0)
     assert_stands(base)
@@ -162,17 +162,29 @@ def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
     assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
 
 
-@pytest.mark.parametrize(("change", "frame", "words"), [
-    ({"wheels": WheelState(False, True, "not armed since the start")}, "odom", "omnid arm"),
-    ({"state": TrackingState.LOST}, "odom", "odometry is lost"),
-    ({"in_map": None}, "map", "not localised"),
-    ({"in_map": MapPosition(np.zeros(3), MapState.ODOMETRY_ONLY, 0.01)}, "map", "not localised"),
-    ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, 0.5)}, "map", "uncertain by 0.50 m"),
-    ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, math.nan)}, "map", "uncertain"),
-    ({"in_map": None}, "odom", "")])
+@pytest.mark.parametrize(
+    ("change", "frame", "words"),
+    [
+        ({"wheels": WheelState(False, True, "not armed since the start")}, "odom", "omnid arm"),
+        ({"state": TrackingState.LOST}, "odom", "odometry is lost"),
+        ({"in_map": None}, "map", "not localised"),
+        ({"in_map": MapPosition(np.zeros(3), MapState.ODOMETRY_ONLY, 0.01)}, "map", "not localised"),
+        ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, 0.5)}, "map", "uncertain by 0.50 m"),
+        ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, math.nan)}, "map", "uncertain"),
+        ({"in_map": None}, "odom", ""),
+    ],
+)
 def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: str) -> None:
-    now = Situation(0, np.zeros(3), 0.0, 0.0, TrackingState.TRACKING, 0, WheelState(True, False),
-                    MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02))._replace(**change)  # type: ignore[arg-type]
+    now = Situation(
+        0,
+        np.zeros(3),
+        0.0,
+        0.0,
+        TrackingState.TRACKING,
+        0,
+        WheelState(True, False),
+        MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02),
+    )._replace(**change)  # type: ignore[arg-type]
     refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
     assert words in refusal and bool(refusal) == bool(words) and "\n" not in refusal
     assert "no pose" in refusal_to_drive(None, NavigationFrame(frame), 0.3)
@@ -180,8 +192,9 @@ def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: 
 
 def test_nothing_is_sent_before_a_request() -> None:
     base = DrivenBase(Navigator(SETTINGS), 2)
-    assert rest(base, 1.0) == Navigation(None, NavigationState.IDLE, "", pytest.approx(math.nan, nan_ok=True),
-                                         pytest.approx(math.nan, nan_ok=True))
+    assert rest(base, 1.0) == Navigation(
+        None, NavigationState.IDLE, "", pytest.approx(math.nan, nan_ok=True), pytest.approx(math.nan, nan_ok=True)
+    )
     assert base.navigator.resume(base.seen()).startswith("nothing is under way")
     base.navigator.cancel("x")
     base.navigator.pause("x")

@@ -18,26 +18,54 @@ from omnid.core.navigation.requests import (
 from omnid.errors import OmnidError
 
 
-@pytest.mark.parametrize(("text", "expected"), [
-    ("teach hall", RouteRequest(RouteAction.TEACH, "hall")),
-    ("teach hall replace", RouteRequest(RouteAction.TEACH, "hall", replace=True)),
-    ("finish", RouteRequest(RouteAction.FINISH)),
-    ("stop", RouteRequest(RouteAction.STOP)),
-    ("repeat hall", RouteRequest(RouteAction.REPEAT, "hall")),
-    ("  repeat  hall-2 reverse  loops=12 ", RouteRequest(RouteAction.REPEAT, "hall-2", True, 12)),
-    ("repeat hall loops=3", RouteRequest(RouteAction.REPEAT, "hall", False, 3)),
-    ("repeat hall from=here", RouteRequest(RouteAction.REPEAT, "hall")),
-    ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True))])
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("teach hall", RouteRequest(RouteAction.TEACH, "hall")),
+        ("teach hall replace", RouteRequest(RouteAction.TEACH, "hall", replace=True)),
+        ("finish", RouteRequest(RouteAction.FINISH)),
+        ("stop", RouteRequest(RouteAction.STOP)),
+        ("repeat hall", RouteRequest(RouteAction.REPEAT, "hall")),
+        ("  repeat  hall-2 reverse  loops=12 ", RouteRequest(RouteAction.REPEAT, "hall-2", True, 12)),
+        ("repeat hall loops=3", RouteRequest(RouteAction.REPEAT, "hall", False, 3)),
+        ("repeat hall from=here", RouteRequest(RouteAction.REPEAT, "hall")),
+        ("repeat hall from=start loops=2", RouteRequest(RouteAction.REPEAT, "hall", False, 2, True)),
+    ],
+)
 def test_requests_about_routes(text: str, expected: RouteRequest) -> None:
     assert route_request(text) == expected
 
 
-@pytest.mark.parametrize("text", [
-    "", "teach", "repeat a from=", "repeat a from=here from=start", "repeat a from=end",
-    "teach a b", "teach a replace replace", "teach ../etc", "teach /x", "teach .hidden", "repeat", "repeat a loops=0",
-    "repeat a loops=", "repeat a loops=10001", "repeat a loops=1 loops=2", "repeat a reverse reverse",
-    "repeat a backwards", "finish now", "stop all",
-    "TEACH a", "teach \N{SNOWMAN}", "teach " + "a" * 65, "repeat a" + " " * 500, "delete a", "repeat a\0"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "teach",
+        "repeat a from=",
+        "repeat a from=here from=start",
+        "repeat a from=end",
+        "teach a b",
+        "teach a replace replace",
+        "teach ../etc",
+        "teach /x",
+        "teach .hidden",
+        "repeat",
+        "repeat a loops=0",
+        "repeat a loops=",
+        "repeat a loops=10001",
+        "repeat a loops=1 loops=2",
+        "repeat a reverse reverse",
+        "repeat a backwards",
+        "finish now",
+        "stop all",
+        "TEACH a",
+        "teach \N{SNOWMAN}",
+        "teach " + "a" * 65,
+        "repeat a" + " " * 500,
+        "delete a",
+        "repeat a\0",
+    ],
+)
 def test_other_texts_are_refused_in_one_line(text: str) -> None:
     with pytest.raises(OmnidError) as error:
         route_request(text)
@@ -53,8 +81,22 @@ def test_verbs(verb: NavigationVerb) -> None:
 
 def test_no_text_raises_another_error() -> None:
     rng = random.Random(3)
-    words = ["teach", "repeat", "stop", "finish", "reverse", "loops=", "loops=2", "a", "..", "/", "\0", "\n", "é",
-             "9" * 400]
+    words = [
+        "teach",
+        "repeat",
+        "stop",
+        "finish",
+        "reverse",
+        "loops=",
+        "loops=2",
+        "a",
+        "..",
+        "/",
+        "\0",
+        "\n",
+        "é",
+        "9" * 400,
+    ]
     for _ in range(3000):
         text = " ".join(rng.choices(words, k=rng.randint(0, 6)))
         for parse in (route_request, navigation_verb, route_name):

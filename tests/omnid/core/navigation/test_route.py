@@ -35,7 +35,7 @@ class Map:
     """Keyframes along a way; `move` does to them what an optimisation does."""
 
     def __init__(self, poses: Array) -> None:
-        self.poses = {k: pose for k, pose in enumerate(poses[::round(SPACING_M / 0.02)])}
+        self.poses = {k: pose for k, pose in enumerate(poses[:: round(SPACING_M / 0.02)])}
         self.stamps = {k: 1000 + 7 * k for k in self.poses}
 
     def __call__(self, id: int) -> KeyframePose | None:
@@ -73,7 +73,7 @@ def test_points_are_apart_and_keep_the_way() -> None:
 
 @pytest.mark.parametrize("last", range(6))
 def test_a_route_ends_where_the_robot_stood_when_it_was_finished(last: int) -> None:
-    poses = way()[:500 + last]
+    poses = way()[: 500 + last]
     standing = np.repeat(poses[-1:], 5, axis=0) + np.array([0.0, 0.0, math.radians(4)])
     route = taught(np.vstack([poses, standing]), places := Map(poses))
     np.testing.assert_allclose(route.poses[-1], standing[-1], atol=1e-6)
@@ -206,8 +206,10 @@ def test_in_a_way_there_and_back_the_heading_decides_where_it_begins() -> None:
     back = np.column_stack([np.arange(4, 0, -0.02), np.full(200, 0.05), np.full(200, math.pi)])
     poses = np.vstack([there, back])
     route = taught(poses, Map(poses))
-    one, other = (repeated_paths(route, Map(poses), np.array([2.0, 0.0, heading]), loops=1, reverse=False)[0].length_m
-                  for heading in (0.0, math.pi))
+    one, other = (
+        repeated_paths(route, Map(poses), np.array([2.0, 0.0, heading]), loops=1, reverse=False)[0].length_m
+        for heading in (0.0, math.pi)
+    )
     assert one == pytest.approx(6.0, abs=0.3) and other == pytest.approx(2.0, abs=0.3)
 
 

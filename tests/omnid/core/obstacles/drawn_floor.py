@@ -25,8 +25,10 @@ def plain(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
 
 def worn(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     """Return grey levels of a floor whose stains are little stronger than noise."""
-    return np.asarray(120.0 + 3.0 * (np.sin(31 * x_m + 3) * np.sin(23 * y_m) + np.sin(17 * x_m - 29 * y_m)
-                                     + np.sin(13 * x_m + 37 * y_m)))
+    return np.asarray(
+        120.0
+        + 3.0 * (np.sin(31 * x_m + 3) * np.sin(23 * y_m) + np.sin(17 * x_m - 29 * y_m) + np.sin(13 * x_m + 37 * y_m))
+    )
 
 
 def stains(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
@@ -50,20 +52,23 @@ class Pole:
     grey: float = 190.0
 
 
-def panoramas(floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, pole: Pole | None = None,
-              seed: int = 4) -> tuple[PaddedPanorama, PaddedPanorama]:
+def panoramas(
+    floor: Pattern, wall_m: float, wall: Pattern, drop_m: float = 0.0, pole: Pole | None = None, seed: int = 4
+) -> tuple[PaddedPanorama, PaddedPanorama]:
     """Return the lower and the upper panorama of a floor with a round wall; wall: grey of azimuth and height.
 
     drop_m: the floor is so much lower than the base says. seed: of the noise.
     """
     rng = np.random.default_rng(seed)
-    lower, upper = (_drawn(height + drop_m, floor, wall_m, wall, pole, rng)
-                    for height in (HEIGHT_M, HEIGHT_M + BASELINE_M))
+    lower, upper = (
+        _drawn(height + drop_m, floor, wall_m, wall, pole, rng) for height in (HEIGHT_M, HEIGHT_M + BASELINE_M)
+    )
     return lower, upper
 
 
-def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, pole: Pole | None,
-           rng: np.random.Generator) -> PaddedPanorama:
+def _drawn(
+    height_m: float, floor: Pattern, wall_m: float, wall: Pattern, pole: Pole | None, rng: np.random.Generator
+) -> PaddedPanorama:
     columns, rows = np.meshgrid(np.arange(CYLINDER.width), np.arange(CYLINDER.height))
     rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
     with np.errstate(divide="ignore"):

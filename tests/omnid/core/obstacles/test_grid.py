@@ -45,8 +45,9 @@ SEEDS = range(5)  # of the noise: pairs from one place differ by it
 Pairs = list[ColumnEvidence]
 
 
-def evidence(floor: Pattern, wall: Pattern, drop_m: float = 0.0, wall_m: float = WALL_M, pole: Pole | None = None
-             ) -> Pairs:
+def evidence(
+    floor: Pattern, wall: Pattern, drop_m: float = 0.0, wall_m: float = WALL_M, pole: Pole | None = None
+) -> Pairs:
     return [COLUMNS.evidence(*panoramas(floor, wall_m, wall, drop_m, pole, seed)) for seed in SEEDS]
 
 
@@ -106,8 +107,9 @@ def test_floor_at_another_height_is_unknown(grid: ObstacleGrid, drop_m: float) -
 
 def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: Pairs) -> None:
     assert after(grid, seen, 20).free_m.min() > 0.6
-    dark = seen[0]._replace(surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor,
-                            level=np.zeros_like(seen[0].level))
+    dark = seen[0]._replace(
+        surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor, level=np.zeros_like(seen[0].level)
+    )
     seconds = 3 * FRESH_NS * 1e-9 + seen[0].nearest_floor_m / FLOOD_MPS
     ring = after(grid, [dark], int(seconds * 1e9 / PERIOD_NS) + 1, first=20)
     assert ring.free_m.max() < 0.45
@@ -123,16 +125,18 @@ def test_nothing_comes_in_through_a_narrow_gap(grid: ObstacleGrid, seen: Pairs, 
     away = np.hypot(x, y)
     ring = (away > 8) & (away < 12) & ~((x > 0) & (y >= 0) & (y < gap_cells))
     grid._odds[FLOOR][ring], grid._free_ns[ring] = PRIOR[FLOOR], NEVER
-    dark = seen[0]._replace(surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor,
-                            level=np.zeros_like(seen[0].level))
+    dark = seen[0]._replace(
+        surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor, level=np.zeros_like(seen[0].level)
+    )
     after(grid, [dark], 40, first=20)
     is_free = grid._odds[FLOOR][(away > 5) & (away < 7)] > FREE_ODDS
     assert is_free.any() != comes_in and is_free.all() != comes_in
 
 
 @pytest.mark.parametrize(("range_m", "free_m"), [(1.3, 1.35), (0.8, 0.4)])
-def test_what_comes_into_view_ends_the_free_floor_until_it_goes(grid: ObstacleGrid, seen: Pairs, range_m: float,
-                                                                free_m: float) -> None:
+def test_what_comes_into_view_ends_the_free_floor_until_it_goes(
+    grid: ObstacleGrid, seen: Pairs, range_m: float, free_m: float
+) -> None:
     """A plain column 0.4 m wide, where floor was. What hides the nearest floor in view may stand nearer as well."""
     assert after(grid, seen, 20).free_m[AHEAD].min() > 1.4
     person = evidence(stains, striped, pole=Pole(range_m, 0.4))
@@ -142,14 +146,14 @@ def test_what_comes_into_view_ends_the_free_floor_until_it_goes(grid: ObstacleGr
     assert after(grid, seen, 25, first=45).free_m[AHEAD].min() > 1.4
 
 
-def test_floor_is_kept_too_near_to_be_seen_as_long_as_the_way_to_it_is_watched(grid: ObstacleGrid, seen: Pairs
-                                                                             ) -> None:
+def test_floor_is_kept_too_near_to_be_seen_as_long_as_the_way_to_it_is_watched(grid: ObstacleGrid, seen: Pairs) -> None:
     assert after(grid, seen, 60).free_m.min() > seen[0].nearest_floor_m - 0.2
 
 
 @pytest.mark.parametrize(("wall", "is_known"), [(striped, True), (plain, False)])
-def test_floor_before_a_wall_too_near_for_floor_is_kept_where_the_wall_is_seen(grid: ObstacleGrid, wall: Pattern,
-                                                                              is_known: bool) -> None:
+def test_floor_before_a_wall_too_near_for_floor_is_kept_where_the_wall_is_seen(
+    grid: ObstacleGrid, wall: Pattern, is_known: bool
+) -> None:
     """As beside the walls of a corridor: a person who came between would hide the wall; a plain one shows nothing."""
     near_m = 0.75
     found = evidence(stains, wall, wall_m=near_m)

@@ -30,8 +30,9 @@ def ring(x_m: float, people: list[tuple[float, float]], rng: np.random.Generator
     return (ranges + 0.01 * ranges**2 * rng.standard_normal(SECTORS)).astype(np.float32)
 
 
-def tracked(path: list[tuple[float, float]] | None, speed_mps: float = 0.0, seed: int = 1, steps: int = 25
-            ) -> list[tuple[MovingObstacle, ...]]:
+def tracked(
+    path: list[tuple[float, float]] | None, speed_mps: float = 0.0, seed: int = 1, steps: int = 25
+) -> list[tuple[MovingObstacle, ...]]:
     """Return the moving obstacles of a drive; path: the places of a person."""
     rng, tracker, found = np.random.default_rng(seed), MovingTracker(), []
     for i in range(steps):
@@ -78,5 +79,8 @@ def test_surfaces_are_joined_across_the_seam() -> None:
     ranges[104] = 3.0
     sigma = np.full(SECTORS, 0.01, np.float32)
     assert sorted(sectors.tolist() for sectors in surfaces(ranges, sigma)) == [
-        [100, 101, 103], [104], [357, 358, 359, 0, 1]]
+        [100, 101, 103],
+        [104],
+        [357, 358, 359, 0, 1],
+    ]
     assert surfaces(np.full(SECTORS, np.nan, np.float32), sigma) == []

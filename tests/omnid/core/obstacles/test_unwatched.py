@@ -38,9 +38,9 @@ def test_a_viewpoint_beside_the_origin_covers_near_and_far_directions() -> None:
 def test_spans_are_named_counter_clockwise_from_ahead() -> None:
     """Across ahead, across the seam behind, all around and none."""
     unwatched = Unwatched(CYLINDER, np.eye(4))
-    (begin, end), = unwatched.spans_deg(AHEAD)
+    ((begin, end),) = unwatched.spans_deg(AHEAD)
     assert begin in (341, 342) and end in (18, 19)
-    (begin, end), = unwatched.spans_deg(np.roll(AHEAD, TILE_COLUMNS // 2))
+    ((begin, end),) = unwatched.spans_deg(np.roll(AHEAD, TILE_COLUMNS // 2))
     assert begin in (161, 162) and end in (198, 199)
     assert unwatched.spans_deg(np.ones(TILE_COLUMNS, bool)) == [(0, 360)]
     assert unwatched.spans_deg(np.zeros(TILE_COLUMNS, bool)) == []

@@ -43,8 +43,9 @@ def sensed(frame: StereoFrame, motion: SensedMotion | None) -> StereoFrame:
     return replace(frame, sensed=motion)
 
 
-def dark(odometry: VisualOdometry, cameras: RenderedCameras, steps: int, motion: SensedMotion | None = AHEAD
-         ) -> list[OdometryEstimate]:
+def dark(
+    odometry: VisualOdometry, cameras: RenderedCameras, steps: int, motion: SensedMotion | None = AHEAD
+) -> list[OdometryEstimate]:
     return [odometry.process(sensed(cameras.darkness(100 + k), motion), PERIOD_S) for k in range(steps)]
 
 
@@ -69,8 +70,9 @@ def test_wheels_carry_the_pose_through_the_dark(cameras: RenderedCameras) -> Non
 
 
 @pytest.mark.parametrize("limits", [OdometryLimits(bridge_s=0.55), OdometryLimits(bridge_sigma_m=0.0055)])
-def test_the_pose_is_lost_after_the_limit_of_time_or_uncertainty(cameras: RenderedCameras, limits: OdometryLimits
-                                                                 ) -> None:
+def test_the_pose_is_lost_after_the_limit_of_time_or_uncertainty(
+    cameras: RenderedCameras, limits: OdometryLimits
+) -> None:
     found = dark(started(cameras, limits), cameras, 8)
     assert [estimate.state for estimate in found] == [DEGRADED] * 5 + [LOST] * 3
     assert np.sqrt(found[-1].covariance[0, 0]) > 0.1
@@ -88,8 +90,10 @@ def test_another_view_after_the_dark_starts_a_new_map_and_odom_goes_on(cameras: 
     dark(odometry, cameras, 6)
     elsewhere = replace(cameras, scene=corridor(7))
     limits = OdometryLimits()
-    there = [odometry.process(sensed(elsewhere.frame(200 + k, PATH[10 + k]), AHEAD), PERIOD_S)
-             for k in range(limits.restart_after + 2)]
+    there = [
+        odometry.process(sensed(elsewhere.frame(200 + k, PATH[10 + k]), AHEAD), PERIOD_S)
+        for k in range(limits.restart_after + 2)
+    ]
     assert there[-1].state == TRACKING and there[-1].resets == 0
     assert LOST not in {estimate.state for estimate in there}
     assert motion_errors(there[-1].T_odom_rect, along(21))[0] < 0.02

@@ -98,7 +98,9 @@ def test_refuses_a_match_in_another_column_or_above_the_point() -> None:
 
 
 def rows_in_upper(
-    pair: tuple[PaddedPanorama, PaddedPanorama], points: NDArray[np.float64], guess: NDArray[np.float64],
+    pair: tuple[PaddedPanorama, PaddedPanorama],
+    points: NDArray[np.float64],
+    guess: NDArray[np.float64],
     klt: KltSettings,
 ) -> NDArray[np.float64]:
     """Rows (N,) where the guessed rows are in the columns of the points."""

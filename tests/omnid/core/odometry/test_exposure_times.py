@@ -35,8 +35,12 @@ def rolling(line_s: float) -> NDArray[np.float32]:
     return (line_s * image_rows).astype(np.float32)
 
 
-TIMES = [PixelTimes(0.015), PixelTimes(-0.02), PixelTimes(0.0, rolling(26e-6), rolling(26e-6)),
-         PixelTimes(0.01, rolling(26e-6), rolling(20e-6))]
+TIMES = [
+    PixelTimes(0.015),
+    PixelTimes(-0.02),
+    PixelTimes(0.0, rolling(26e-6), rolling(26e-6)),
+    PixelTimes(0.01, rolling(26e-6), rolling(20e-6)),
+]
 
 
 def seen(points: Array, times: PixelTimes, twist: Array) -> tuple[Array, Array]:
@@ -104,8 +108,10 @@ def test_velocity_and_pose_are_estimated_together() -> None:
     shift = Exposure(times, believed, MODEL).shift(points)
     views = np.column_stack([lower + shift.lower, upper[:, 1] + shift.upper[:, 1]])
     shared = SharedError(shift.by_motion[:, :3], SIGMA**2)
-    fixed, free = (gauss_newton(points, np.zeros((len(points), 3, 3)), views, np.eye(4), MODEL, shared=error)
-                   for error in (None, shared))
+    fixed, free = (
+        gauss_newton(points, np.zeros((len(points), 3, 3)), views, np.eye(4), MODEL, shared=error)
+        for error in (None, shared)
+    )
     errors = [np.abs(se3.log(result.T)).max() for result in (fixed, free)]
     assert errors[1] < 0.2 * errors[0]
     assert np.abs(believed.twist + free.shared - TWIST).max() < 0.02

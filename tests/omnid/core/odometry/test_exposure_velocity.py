@@ -20,8 +20,10 @@ def driven(pairs: int, heave_m: float, tilt_rad: float) -> tuple[np.ndarray, np.
     rng = np.random.default_rng(5)
     time_s = DT_S * np.arange(pairs + 1)
     shaken = rng.standard_normal((pairs + 1, 3)) * [heave_m, tilt_rad, tilt_rad]
-    poses = [se3.transform(se3.rotation_exp(np.array([x, y, 0])), np.array([0.2 * t + 0.02 * t**2, 0, z]))
-             for t, (z, x, y) in zip(time_s, shaken, strict=True)]
+    poses = [
+        se3.transform(se3.rotation_exp(np.array([x, y, 0])), np.array([0.2 * t + 0.02 * t**2, 0, z]))
+        for t, (z, x, y) in zip(time_s, shaken, strict=True)
+    ]
     steps = [se3.inverse(a) @ b for a, b in pairwise(poses)]
     motion_filter, errors, sigmas = MotionFilter(), [], []
     velocity = ExposureVelocity(motion_filter)

@@ -29,8 +29,9 @@ DISPARITY_PX = 8
 def stereo_frame(lower: Image) -> StereoFrame:
     """A frame with the same disparity everywhere; its disparity image is empty."""
     upper = np.roll(lower, DISPARITY_PX, axis=0)
-    return StereoFrame(1, wrapped(lower), wrapped(upper), np.full(lower.shape, np.nan, np.float32),
-                       np.ones(lower.shape, bool))
+    return StereoFrame(
+        1, wrapped(lower), wrapped(upper), np.full(lower.shape, np.nan, np.float32), np.ones(lower.shape, bool)
+    )
 
 
 def map_of(lower: Image, keyframe_image: Image) -> LocalMap:

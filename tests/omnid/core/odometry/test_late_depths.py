@@ -84,8 +84,18 @@ def test_later_disparities_wait_for_their_velocity(velocity: RigVelocity | None,
     points = se3.apply(se3.inverse(T_odom_rect), store.table.points)
     seen, exposure = corrected(view(points, MODEL.cylinder, MODEL.baseline_m))
     J = exposure.derivatives(seen)
-    estimate = PoseEstimate(T_odom_rect, np.eye(6), 60, 60, 60, np.arange(len(store)), seen, seen[:, :2],
-                            np.full(len(seen), 1e-6), assumed=AssumedMotion(WRONG, J[:, 2] - J[:, 1]))
+    estimate = PoseEstimate(
+        T_odom_rect,
+        np.eye(6),
+        60,
+        60,
+        60,
+        np.arange(len(store)),
+        seen,
+        seen[:, :2],
+        np.full(len(seen), 1e-6),
+        assumed=AssumedMotion(WRONG, J[:, 2] - J[:, 1]),
+    )
     before = store.table
     late.seen(store.table.id, estimate)
     assert store.table is before
@@ -103,10 +113,14 @@ def test_disparities_of_an_instant_correct_the_map_at_once() -> None:
     exact = views(60)
     store, late = with_keyframe(exact)
     late.clear()
-    seen = view(se3.apply(se3.inverse(POSE), se3.apply(POSE, triangulate(exact, MODEL.cylinder, MODEL.baseline_m))),
-                MODEL.cylinder, MODEL.baseline_m)
-    estimate = PoseEstimate(POSE, np.eye(6), 60, 60, 60, np.arange(len(store)), seen, seen[:, :2],
-                            np.full(len(seen), 1e-6))
+    seen = view(
+        se3.apply(se3.inverse(POSE), se3.apply(POSE, triangulate(exact, MODEL.cylinder, MODEL.baseline_m))),
+        MODEL.cylinder,
+        MODEL.baseline_m,
+    )
+    estimate = PoseEstimate(
+        POSE, np.eye(6), 60, 60, 60, np.arange(len(store)), seen, seen[:, :2], np.full(len(seen), 1e-6)
+    )
     before = abs(scale_error(store, exact))
     late.seen(store.table.id, estimate)
     assert abs(scale_error(store, exact)) < 0.9 * before
@@ -119,8 +133,9 @@ def test_the_noise_of_new_views_contains_that_of_the_motion() -> None:
     exact = views(20)
     found, exposure = corrected(exact)
     noise = np.zeros((len(exact), 3, 3))
-    new = NewLandmarks(exact[:, :2], found, np.zeros((len(exact), 2)), noise,
-                       AssumedMotion(WRONG, exposure.derivatives(found)))
+    new = NewLandmarks(
+        exact[:, :2], found, np.zeros((len(exact), 2)), noise, AssumedMotion(WRONG, exposure.derivatives(found))
+    )
     expected = exposure.corrected(exact[:, :2], found[:, 2])[1]
     np.testing.assert_allclose(new.whole_noise, expected, rtol=0.1, atol=1e-6)
     final = replace(new, assumed=AssumedMotion(NO_VELOCITY, np.zeros((len(exact), 3, 0))))

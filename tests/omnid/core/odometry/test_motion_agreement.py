@@ -46,8 +46,9 @@ def speeds(turns: bool) -> tuple[Array, Array]:
     return speed, rate
 
 
-def driven(errors: Errors, seconds: float, *, turns: bool = True, stops_s: float = np.inf, seed: int = 1
-           ) -> list[tuple[float, Witness]]:
+def driven(
+    errors: Errors, seconds: float, *, turns: bool = True, stops_s: float = np.inf, seed: int = 1
+) -> list[tuple[float, Witness]]:
     """Return the result after each pair of a drive."""
     rng, agreement = np.random.default_rng(seed), MotionAgreement()
     speed, rate = speeds(turns)
@@ -69,8 +70,12 @@ def driven(errors: Errors, seconds: float, *, turns: bool = True, stops_s: float
                 agreement.add([GyroSample(ns(t_s), 0.0, 0.0, float(shown))], 0.0)
         span = np.array([end_s - PAIR_S, end_s]) - errors.images_late_s
         distance, turn = np.diff(at(span, way))[0], np.diff(at(span, angle))[0]
-        agreement.add_step(ns(end_s - PAIR_S), ns(end_s), errors.images_scale * float(distance) + rng.normal(0, 0.001),
-                           float(turn) + rng.normal(0, 0.001))
+        agreement.add_step(
+            ns(end_s - PAIR_S),
+            ns(end_s),
+            errors.images_scale * float(distance) + rng.normal(0, 0.001),
+            float(turn) + rng.normal(0, 0.001),
+        )
         found.append((float(end_s), agreement.result))
     return found
 
@@ -85,9 +90,18 @@ def first(found: list[tuple[float, Witness]], *, is_fault: bool) -> tuple[float,
     return next((at_s, result) for at_s, result in found if result.reason and result.is_fault >= is_fault)
 
 
-@pytest.mark.parametrize("errors", [
-    Errors(), Errors(images_late_s=0.15), Errors(images_late_s=-0.1), Errors(wheels_scale=1.04, wheels_turn=0.95),
-    Errors(gyro_scale=1.02), Errors(images_scale=0.97), Errors(wheels_late_s=0.1, has_gyro=False)])
+@pytest.mark.parametrize(
+    "errors",
+    [
+        Errors(),
+        Errors(images_late_s=0.15),
+        Errors(images_late_s=-0.1),
+        Errors(wheels_scale=1.04, wheels_turn=0.95),
+        Errors(gyro_scale=1.02),
+        Errors(images_scale=0.97),
+        Errors(wheels_late_s=0.1, has_gyro=False),
+    ],
+)
 @pytest.mark.parametrize("turns", [True, False])
 def test_honest_accounts_agree(errors: Errors, turns: bool) -> None:
     """Wheels and gyros are some percent off, and clocks a tenth of a second."""

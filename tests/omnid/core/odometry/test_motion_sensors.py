@@ -56,8 +56,13 @@ def samples(errors: SensorErrors, start_s: float, end_s: float, rng: np.random.G
     times_s = np.arange(start_s, end_s - 1e-9, WHEEL_S)
     for t_s, speed, rate in zip(times_s, *velocity(times_s), strict=True):
         stamp_ns = START_NS + round((t_s - errors.wheel_offset_s) * 1e9)
-        found.append(WheelSample(stamp_ns, speed / errors.distance + errors.noise * rng.normal(0, 0.002),
-                                 rate / errors.turn + errors.noise * rng.normal(0, 0.004)))
+        found.append(
+            WheelSample(
+                stamp_ns,
+                speed / errors.distance + errors.noise * rng.normal(0, 0.002),
+                rate / errors.turn + errors.noise * rng.normal(0, 0.004),
+            )
+        )
     times_s = np.arange(start_s, end_s - 1e-9, GYRO_S)
     for t_s, turn in zip(times_s, velocity(times_s)[1], strict=True):
         rates = np.array([0, 0, turn]) + errors.bias_radps + errors.noise * rng.normal(0, 0.003, 3)
@@ -186,8 +191,14 @@ def test_a_wheel_that_slips_in_the_dark_is_noticed_by_the_gyro() -> None:
         found = []
         for step_end in np.arange(moving + PAIR_S, moving + seconds, PAIR_S):
             new = samples(SensorErrors(), step_end - PAIR_S, step_end, rng)
-            sensors.add([replace(sample, yaw_rate_radps=sample.yaw_rate_radps + slip)
-                         if isinstance(sample, WheelSample) else sample for sample in new])
+            sensors.add(
+                [
+                    replace(sample, yaw_rate_radps=sample.yaw_rate_radps + slip)
+                    if isinstance(sample, WheelSample)
+                    else sample
+                    for sample in new
+                ]
+            )
             found.append(sensors.between(*stamps(step_end)))  # a single step may be a bump
         assert all(sensed is not None and sensed.is_complete == (slip == 0) for sensed in found[1:])
         moving += seconds
@@ -198,8 +209,13 @@ def test_wheels_that_do_not_tell_their_turn_need_a_gyro() -> None:
     for gyro in (True, False):
         rng, sensors = np.random.default_rng(4), MotionSensors(T_RECT_BASE)
         new = samples(SensorErrors(), 0.0, 2.0, rng)
-        sensors.add([replace(sample, yaw_rate_radps=np.nan) if isinstance(sample, WheelSample) else sample
-                     for sample in new if gyro or isinstance(sample, WheelSample)])
+        sensors.add(
+            [
+                replace(sample, yaw_rate_radps=np.nan) if isinstance(sample, WheelSample) else sample
+                for sample in new
+                if gyro or isinstance(sample, WheelSample)
+            ]
+        )
         sensed = sensors.between(*stamps(1.5))
         assert sensed is not None and np.isfinite(sensed.twist).all() and np.isfinite(sensed.covariance).all()
         assert sensed.is_complete == gyro

@@ -27,8 +27,9 @@ from tests.simulation.paths import planar_poses
 Array = NDArray[np.float64]
 
 PERIOD_S = 0.1
-PATH = planar_poses(np.array([[0.05 * k, 0] for k in range(5)] + [[0.2, 0.05 * k] for k in range(5)]),
-                    np.repeat([0.0, np.pi / 2], 5))  # a turn on the spot between two pairs, in the middle
+PATH = planar_poses(
+    np.array([[0.05 * k, 0] for k in range(5)] + [[0.2, 0.05 * k] for k in range(5)]), np.repeat([0.0, np.pi / 2], 5)
+)  # a turn on the spot between two pairs, in the middle
 
 
 def truth(k: int) -> Array:
@@ -182,8 +183,9 @@ def test_a_long_darkness_is_lost_and_ends_with_relocalisation(
 
 def test_relocalises_at_a_keyframe_where_tracking_finds_nothing(cameras: RenderedCameras) -> None:
     """A tracker that reaches a pixel far does not find the way back; the keyframe tells it, and the gap is closed."""
-    odometry = VisualOdometry(cameras.model, KltSettings(iterations=1, levels=0), OdometryLimits(),
-                              Relocaliser(cameras.model))
+    odometry = VisualOdometry(
+        cameras.model, KltSettings(iterations=1, levels=0), OdometryLimits(), Relocaliser(cameras.model)
+    )
     run(odometry, [cameras.frame(k, PATH[0]) for k in range(3)])
     run(odometry, [cameras.darkness(100 + k) for k in range(6)], first=False)
     (T_world_rig,) = planar_poses(np.array([[0.3, -0.3]]), np.array([0.45]))
@@ -261,16 +263,15 @@ def test_dark_from_the_start_is_lost_until_there_is_light(
 
 
 def test_the_same_frames_give_the_same_bytes(cameras: RenderedCameras, frames: list[StereoFrame]) -> None:
-    first, second = (
-        run(visual_odometry(cameras.model, OdometryLimits()), frames)[-1] for _ in range(2)
-    )
+    first, second = (run(visual_odometry(cameras.model, OdometryLimits()), frames)[-1] for _ in range(2))
     assert first.T_odom_rect.tobytes() == second.T_odom_rect.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()
 
 
 @pytest.mark.parametrize(("inliers", "is_near", "is_good"), [(160, True, True), (107, True, False), (107, False, True)])
-def test_few_inliers_near_a_guess_call_for_a_wider_search(cameras: RenderedCameras, inliers: int, is_near: bool,
-                                                          is_good: bool) -> None:
+def test_few_inliers_near_a_guess_call_for_a_wider_search(
+    cameras: RenderedCameras, inliers: int, is_near: bool, is_good: bool
+) -> None:
     """In a dim log 107 of some 290 landmarks in view confirmed a pose that was 33 mm off."""
     estimate = PoseEstimate(np.eye(4), np.eye(6), visible=290, tracked=inliers + 43, inliers=inliers)
     assert visual_odometry(cameras.model, OdometryLimits())._is_good(estimate, is_near) == is_good

@@ -19,8 +19,12 @@ HALF = TEMPLATE_PX // 2
 def test_patches_far_from_where_they_were_predicted_are_refused() -> None:
     image = wrapped(texture(3))
     pixels = np.array([[100, 50], [200, 60]])
-    templates = np.array([image.panorama[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
-                          for column, row in pixels.tolist()])
+    templates = np.array(
+        [
+            image.panorama[row - HALF : row + HALF + 1, column - HALF : column + HALF + 1]
+            for column, row in pixels.tolist()
+        ]
+    )
     one = np.zeros(2, np.intp)
     near, far = (align(templates, image, pixels + offset, one) for offset in (0.4, 5.0))
     assert near.found.all() and not far.found.any()

@@ -17,8 +17,9 @@ REACH_PX = 2
 CELL_PX = WINDOW_PX + 2 * REACH_PX
 
 
-def patches(count: int, shift: Array, *, gain: float = 1.0, offset: float = 0.0, contrast: float = 30.0,
-            noise: float = 0.0) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+def patches(
+    count: int, shift: Array, *, gain: float = 1.0, offset: float = 0.0, contrast: float = 30.0, noise: float = 0.0
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Return templates (N, CELL, CELL) of a random texture, and cells in which it lies at a shift."""
     rng = np.random.default_rng(4)
     side = CELL_PX + 16
@@ -71,8 +72,10 @@ def test_the_covariance_is_that_of_the_errors() -> None:
         noise = rng.standard_normal((2, 400, CELL_PX + 8, CELL_PX + 8)).astype(np.float32)
         smooth = np.array([[cv2.GaussianBlur(cell, (0, 0), 0.5) for cell in image] for image in noise])
         smooth = smooth[:, :, 4:-4, 4:-4] * sigma / smooth.std()
-        noisy = [np.clip(np.rint(image + n), 0, 255).astype(np.uint8)
-                 for image, n in zip((templates, cells), smooth, strict=True)]
+        noisy = [
+            np.clip(np.rint(image + n), 0, 255).astype(np.uint8)
+            for image, n in zip((templates, cells), smooth, strict=True)
+        ]
         fit = fit_patches(noisy[0], noisy[1], ONE_IMAGE, sigma)
         squared = np.einsum("ni,nij,nj->n", error(fit), np.linalg.inv(fit.covariance[fit.fits]), error(fit))
         assert fit.fits.mean() > 0.8

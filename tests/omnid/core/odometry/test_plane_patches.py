@@ -28,9 +28,12 @@ def texture(points: Array) -> Array:
     """Return the grey levels of points (..., 3) on the wall: waves of 6 to 25 cm."""
     y, z = points[..., 1], points[..., 2]
     rng = np.random.default_rng(3)
-    waves = [np.sin(2 * np.pi * (y * np.cos(a) + z * np.sin(a)) / length + phase)
-             for length, a, phase in zip(np.geomspace(0.06, 0.25, 24), rng.uniform(0, np.pi, 24),
-                                         rng.uniform(0, 6, 24), strict=True)]
+    waves = [
+        np.sin(2 * np.pi * (y * np.cos(a) + z * np.sin(a)) / length + phase)
+        for length, a, phase in zip(
+            np.geomspace(0.06, 0.25, 24), rng.uniform(0, np.pi, 24), rng.uniform(0, 6, 24), strict=True
+        )
+    ]
     return 128 + 18 * np.sum(waves, axis=0)
 
 
@@ -86,8 +89,10 @@ def test_patches_of_a_wall_are_the_pixels_of_the_other_view(upper: bool) -> None
     current = panorama(se3.inverse(T_CURR_REF), MODEL.baseline_m if upper else 0.0)
     exact = templates_of((points, slopes), pixels, seen, upper=upper)
     half = TEMPLATE_PX // 2
-    shown = [current.image[row - half : row + half + 1, PAD_PX + column - half : PAD_PX + column + half + 1]
-             for column, row in np.rint(seen).astype(int).tolist()]
+    shown = [
+        current.image[row - half : row + half + 1, PAD_PX + column - half : PAD_PX + column + half + 1]
+        for column, row in np.rint(seen).astype(int).tolist()
+    ]
     contrast = np.std([patch.astype(float) for patch in shown], axis=(1, 2)).mean()
     assert np.abs(exact.astype(float) - shown).mean() < 0.04 * contrast
     # Upright surfaces in the place of the wall are something else, and shift the patches.
@@ -153,6 +158,17 @@ def test_a_place_that_is_unknown_has_no_template() -> None:
     centres, shift = np.array([[40.0, 30], [np.nan, 30], [40, 30], [1e9, 30], [0.0, 59]]), np.zeros((5, 2))
     shift[2, 1] = np.nan
     templates = np.empty((5, TEMPLATE_PX, TEMPLATE_PX), np.uint8)
-    plane_kernels.sample(image, np.arange(5), centres, np.tile([2.0, 0, 0], (5, 1)), np.zeros((5, 2)),
-                         np.tile(np.eye(4), (5, 1, 1)), 0.2, 0.0, 200.0, shift, templates)
+    plane_kernels.sample(
+        image,
+        np.arange(5),
+        centres,
+        np.tile([2.0, 0, 0], (5, 1)),
+        np.zeros((5, 2)),
+        np.tile(np.eye(4), (5, 1, 1)),
+        0.2,
+        0.0,
+        200.0,
+        shift,
+        templates,
+    )
     assert (templates[[0, 4]] == 90).all() and not templates[1:4].any()

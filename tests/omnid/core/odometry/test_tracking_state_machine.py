@@ -51,8 +51,11 @@ TRANSITIONS = [
     (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0), TrackingStatus(DEGRADED)),
     (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0, elsewhere=True), FIX),
     (TrackingStatus(DEGRADED, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0, carried=True), FIX),
-    (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(NOT_STARTED, 0.0),
-     TrackingStatus(LOST, 0, 0, 5 * DT_S)),
+    (
+        TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True),
+        FrameFacts(NOT_STARTED, 0.0),
+        TrackingStatus(LOST, 0, 0, 5 * DT_S),
+    ),
 ]
 
 

@@ -58,8 +58,10 @@ def laps(seed: int, nodes: int, per_lap: int, loops: int, wrong: float) -> Laps:
     second = np.clip(first + per_lap * laps_later + rng.integers(-2, 3, loops), 0, nodes - 1)
     right = np.arange(loops) >= round(wrong * loops)
     found = measured(rng, truth, first, second, SIGMA_LOOP, is_loop=True)
-    xi = np.concatenate([rng.uniform(-1, 1, (loops, 3)), rng.uniform(-0.1, 0.1, (loops, 2)),
-                         rng.uniform(-np.pi, np.pi, (loops, 1))], axis=1)
+    xi = np.concatenate(
+        [rng.uniform(-1, 1, (loops, 3)), rng.uniform(-0.1, 0.1, (loops, 2)), rng.uniform(-np.pi, np.pi, (loops, 1))],
+        axis=1,
+    )
     elsewhere = np.array([rng.integers(0, nodes) for _ in range(loops)], np.intp)
     b = np.where(right, second, elsewhere)
     T = np.where(right[:, None, None], found.T_a_b, se3.exp(xi))
@@ -67,8 +69,14 @@ def laps(seed: int, nodes: int, per_lap: int, loops: int, wrong: float) -> Laps:
     return Laps(truth, odometry, PoseEdges(pairs, T, found.covariance, np.ones(loops, bool)), right)
 
 
-def measured(rng: np.random.Generator, truth: Array, a: NDArray[np.intp], b: NDArray[np.intp], sigma: Array,
-             is_loop: bool = False) -> PoseEdges:
+def measured(
+    rng: np.random.Generator,
+    truth: Array,
+    a: NDArray[np.intp],
+    b: NDArray[np.intp],
+    sigma: Array,
+    is_loop: bool = False,
+) -> PoseEdges:
     """Return edges with noise of those standard deviations (6,)."""
     exact = se3.inverse(truth[a]) @ truth[b]
     covariance = np.broadcast_to(np.diag(sigma**2), (len(a), 6, 6)).copy()

@@ -14,8 +14,11 @@ from tests.omnid.core.mapping.rooms import pose
 from tests.omnid.formats.place_maps import RIG, some_places
 
 T_PLAN_MAP = se3.transform(se3.rotation_exp([0, 0, 2.2]), [10.0, -4.0, 1.5])
-SEEN = {5: Landmark("5", 5, 0.2, (1.0, 2.0, 0.5), 0.3), 6: Landmark("6", 6, 0.2, (-3.0, 0.5, 1.0), None),
-        7: Landmark("7", 7, 0.2, (2.0, -4.0, 0.2), -2.0)}
+SEEN = {
+    5: Landmark("5", 5, 0.2, (1.0, 2.0, 0.5), 0.3),
+    6: Landmark("6", 6, 0.2, (-3.0, 0.5, 1.0), None),
+    7: Landmark("7", 7, 0.2, (2.0, -4.0, 0.2), -2.0),
+}
 
 
 def on_plan(mark: Landmark) -> Landmark:

@@ -14,8 +14,11 @@ from tests.omnid.formats.place_maps import some_places
 
 BY_ODOMETRY = np.diag([3e-4] * 3 + [1e-4] * 3) ** 2  # of each keyframe more than of the one before
 BY_LOOP = np.diag([0.01] * 3 + [0.004] * 3) ** 2
-ERRORS = [np.array([0.03, 0.03, -0.03, 0.011, 0.01, 0.0]), np.array([-0.03, -0.02, 0.03, -0.011, -0.009, 0.0]),
-          np.array([0.02, 0.03, -0.03, 0.011, 0.01, 0.0])]
+ERRORS = [
+    np.array([0.03, 0.03, -0.03, 0.011, 0.01, 0.0]),
+    np.array([-0.03, -0.02, 0.03, -0.011, -0.009, 0.0]),
+    np.array([0.02, 0.03, -0.03, 0.011, 0.01, 0.0]),
+]
 
 
 def driven(count: int = 12) -> PlaceMap:
@@ -23,8 +26,9 @@ def driven(count: int = 12) -> PlaceMap:
     places = some_places(count, features=4)
     places.links = []
     for id in range(count):
-        places.keyframes[id] = replace(places.keyframes[id], session=0, T_odom_rect=places.poses[id],
-                                       covariance=(id + 1) * BY_ODOMETRY)
+        places.keyframes[id] = replace(
+            places.keyframes[id], session=0, T_odom_rect=places.poses[id], covariance=(id + 1) * BY_ODOMETRY
+        )
         if id:
             places.links.append(Link(id - 1, id, se3.inverse(places.poses[id - 1]) @ places.poses[id], BY_ODOMETRY))
     return places

@@ -34,8 +34,9 @@ def frames(cameras: RenderedCameras) -> list[StereoFrame]:
     return [cameras.frame(100 + k, T) for k, T in enumerate(POSES)]
 
 
-def odometry(frames: Sequence[StereoFrame], poses: Array = POSES, resets: int = 0, start: int = 0
-             ) -> list[OdometryFrame]:
+def odometry(
+    frames: Sequence[StereoFrame], poses: Array = POSES, resets: int = 0, start: int = 0
+) -> list[OdometryFrame]:
     """The frames with poses that drift, from the identity on."""
     found, T, covariance = [], np.eye(4), np.zeros((6, 6))
     for k, stereo in enumerate(frames):
@@ -43,8 +44,18 @@ def odometry(frames: Sequence[StereoFrame], poses: Array = POSES, resets: int = 
             step = se3.inverse(poses[k - 1]) @ poses[k] @ DRIFT
             A = se3.adjoint(se3.inverse(step))
             T, covariance = T @ step, A @ covariance @ A.T + COVARIANCE
-        found.append(OdometryFrame(stereo, (start + k) * 200_000_000, T, covariance, False, resets, True,
-                                   lambda: np.full(SECTORS, np.nan, np.float32)))
+        found.append(
+            OdometryFrame(
+                stereo,
+                (start + k) * 200_000_000,
+                T,
+                covariance,
+                False,
+                resets,
+                True,
+                lambda: np.full(SECTORS, np.nan, np.float32),
+            )
+        )
     return found
 
 
@@ -66,12 +77,14 @@ def test_loops_halve_the_error_and_odom_never_jumps(
     localiser, drive = deepcopy(out), odometry(frames)
     found = run(MapLocaliser(cameras.model, PlaceLimits()), drive)
     # The same frames give the same bytes.
-    for a, b in zip(run(localiser, drive[len(OUT):]), found[len(OUT):], strict=True):
+    for a, b in zip(run(localiser, drive[len(OUT) :]), found[len(OUT) :], strict=True):
         assert a.T_map_odom.tobytes() == b.T_map_odom.tobytes() and a.covariance.tobytes() == b.covariance.tobytes()
     truth = [se3.inverse(POSES[0]) @ T for T in POSES]
     by_odometry = [motion_errors(frame.T_odom_rect, T)[0] for frame, T in zip(drive, truth, strict=True)]
-    in_map = [motion_errors(pose.T_map_odom @ frame.T_odom_rect, T)[0]
-              for pose, frame, T in zip(found, drive, truth, strict=True)]
+    in_map = [
+        motion_errors(pose.T_map_odom @ frame.T_odom_rect, T)[0]
+        for pose, frame, T in zip(found, drive, truth, strict=True)
+    ]
     assert by_odometry[-1] > 0.1 and in_map[-1] < 0.3 * by_odometry[-1]
     assert localiser.counts["loops"] >= 5 and localiser.counts["rejected"] == 0
     # The map's end error lies within what the covariance says, which is far less than that of odometry.
@@ -97,7 +110,7 @@ def test_keyframes_are_limited_by_time(cameras: RenderedCameras, frames: list[St
 def test_an_idle_localiser_follows_odometry_and_keeps_nothing(frames: list[StereoFrame], out: MapLocaliser) -> None:
     localiser = deepcopy(out)
     before = localiser.counts
-    for frame in odometry(frames)[len(OUT):]:
+    for frame in odometry(frames)[len(OUT) :]:
         pose = localiser.process(frame, idle=True)
     assert localiser.counts == before and pose.state is MapState.ODOMETRY_ONLY
     assert np.array_equal(pose.T_map_odom, np.eye(4))
@@ -112,8 +125,9 @@ def test_carried_away_it_finds_itself_in_the_map_again(frames: list[StereoFrame]
     again = odometry([frames[k] for k in there], POSES[there], resets=1, start=1000)
     found = run(localiser, again)
     assert found[0].state is MapState.ODOMETRY_ONLY and found[-1].state is MapState.LOCALIZED
-    error_m, error_rad = motion_errors(found[-1].T_map_odom @ again[-1].T_odom_rect,
-                                       se3.inverse(POSES[0]) @ POSES[there[-1]])
+    error_m, error_rad = motion_errors(
+        found[-1].T_map_odom @ again[-1].T_odom_rect, se3.inverse(POSES[0]) @ POSES[there[-1]]
+    )
     assert error_m < 0.25 and error_rad < 0.05  # the drift of the drive there
 
 
@@ -141,8 +155,7 @@ def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it(
     drive = odometry(frames[back], POSES[back])
     found = run(second, drive)
     assert found[-1].state is MapState.LOCALIZED and len(second.places) > kept
-    error_m, _ = motion_errors(found[-1].T_map_odom @ drive[-1].T_odom_rect,
-                               se3.inverse(POSES[0]) @ POSES[back][-1])
+    error_m, _ = motion_errors(found[-1].T_map_odom @ drive[-1].T_odom_rect, se3.inverse(POSES[0]) @ POSES[back][-1])
     assert error_m < 0.25
     assert {k.session for k in second.places.keyframes.values()} == {0, 1}
 

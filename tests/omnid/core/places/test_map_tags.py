@@ -32,8 +32,9 @@ COVARIANCE = np.diag([0.002] * 3 + [0.01] * 3) ** 2
 def hung(scene: Scene, at: tuple[float, float, float] = AT) -> Scene:
     """The scene with a tag, a little before its left wall."""
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    image = cv2.copyMakeBorder(cv2.aruco.generateImageMarker(family, TAG.id, 360), *[80] * 4, cv2.BORDER_CONSTANT,
-                               value=255)
+    image = cv2.copyMakeBorder(
+        cv2.aruco.generateImageMarker(family, TAG.id, 360), *[80] * 4, cv2.BORDER_CONSTANT, value=255
+    )
     half = EDGE_M / 2 + QUIET_M
     corner = np.array([at[0] - half, at[1], at[2] + half])
     return Scene((*scene.rectangles, Rectangle(corner, np.array([2 * half, 0, 0]), np.array([0, 0, -2 * half]), image)))
@@ -74,8 +75,10 @@ def mapped(cameras: RenderedCameras, frames: list[StereoFrame]) -> MapLocaliser:
 def exactly(frames: list[StereoFrame], start: int = 0) -> list[OdometryFrame]:
     """The frames with the poses that they were seen from."""
     there = POSES[NEAR]
-    return [replace(frame, T_odom_rect=se3.inverse(there[0]) @ T)
-            for frame, T in zip(odometry(frames, there, start=start), there, strict=True)]
+    return [
+        replace(frame, T_odom_rect=se3.inverse(there[0]) @ T)
+        for frame, T in zip(odometry(frames, there, start=start), there, strict=True)
+    ]
 
 
 def true_tag() -> Array:
@@ -85,8 +88,7 @@ def true_tag() -> Array:
 
 
 def errors_at_the_end(found: list[MapPose], drive: list[OdometryFrame]) -> tuple[float, float]:
-    return motion_errors(found[-1].T_map_odom @ drive[-1].T_odom_rect,
-                         se3.inverse(POSES[NEAR][0]) @ POSES[NEAR][-1])
+    return motion_errors(found[-1].T_map_odom @ drive[-1].T_odom_rect, se3.inverse(POSES[NEAR][0]) @ POSES[NEAR][-1])
 
 
 def test_a_tag_is_a_landmark_of_the_map(known: PlaceMap) -> None:
@@ -138,8 +140,9 @@ def test_a_tag_that_hangs_in_two_places_tells_none(
 ) -> None:
     places = deepcopy(known)
     elsewhere = se3.exp([-3.0, 0, 0, 0, 0, 0])
-    places.tags.add([TagView(view.keyframe, view.tag, elsewhere @ view.T_rect_tag, view.covariance)
-                     for view in places.tags.views])
+    places.tags.add(
+        [TagView(view.keyframe, view.tag, elsewhere @ view.T_rect_tag, view.covariance) for view in places.tags.views]
+    )
     localiser = MapLocaliser(tagged.model, PlaceLimits(), places)
     found = run(localiser, exactly(rebuilt, start=1000))
     assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY}
@@ -155,15 +158,30 @@ def test_a_tag_closes_a_loop_of_a_drive_that_drifts(
     on = [*[se3.exp([0.2, 0, 0, 0, 0, 0]) @ DRIFT] * 12, *[se3.exp([-0.2, 0, 0, 0, 0, 0]) @ DRIFT] * 12]
     for k, step in enumerate(on):
         drifted = drifted @ step
-        localiser.process(replace(drive[-1], T_odom_rect=drifted, stamp_ns=(50 + k) * 200_000_000, lost=False,
-                                  covariance=(k + 1) * COVARIANCE,
-                                  stereo=tagged.darkness(600), is_keyframe=False))
+        localiser.process(
+            replace(
+                drive[-1],
+                T_odom_rect=drifted,
+                stamp_ns=(50 + k) * 200_000_000,
+                lost=False,
+                covariance=(k + 1) * COVARIANCE,
+                stereo=tagged.darkness(600),
+                is_keyframe=False,
+            )
+        )
     steps = [se3.inverse(a) @ b for a, b in zip(POSES[NEAR][::-1], POSES[NEAR][::-1][1:], strict=False)]
     back: list[OdometryFrame] = []
     for k, step in enumerate([np.eye(4), *steps]):
         drifted = drifted @ step
-        back.append(replace(drive[0], T_odom_rect=drifted, stamp_ns=(100 + k) * 200_000_000,
-                            covariance=30 * COVARIANCE, stereo=rebuilt[::-1][k]))
+        back.append(
+            replace(
+                drive[0],
+                T_odom_rect=drifted,
+                stamp_ns=(100 + k) * 200_000_000,
+                covariance=30 * COVARIANCE,
+                stereo=rebuilt[::-1][k],
+            )
+        )
     found = run(localiser, back)
     truth = np.eye(4)  # the way back ends where the map begins
     assert motion_errors(drifted, truth)[0] > 0.09

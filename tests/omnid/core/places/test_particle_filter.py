@@ -18,8 +18,10 @@ Array = NDArray[np.float64]
 CORNERED = np.concatenate([box((-3, -2), (4, 2.5)), box((2.5, 1), (4, 2.5)), box((-3, -2), (-2, -0.5))])
 SYMMETRIC = box((-3, -2), (3, 2))
 # In the place of one of its short walls: a passage.
-DOOR = np.array([[[3, -2], [3, -0.6]], [[3, 0.6], [3, 2]], [[3, 0.6], [9, 0.6]], [[3, -0.6], [9, -0.6]],
-                 [[9, -0.6], [9, 0.6]]], float)
+DOOR = np.array(
+    [[[3, -2], [3, -0.6]], [[3, 0.6], [3, 2]], [[3, 0.6], [9, 0.6]], [[3, -0.6], [9, -0.6]], [[9, -0.6], [9, 0.6]]],
+    float,
+)
 NOISE_M = 0.03
 
 

@@ -11,9 +11,16 @@ from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceK
 
 def keyframe(number: int, features: int = 10) -> PlaceKeyframe:
     """A keyframe with random evidence."""
-    return PlaceKeyframe(number, 0, number, np.eye(4), np.eye(6), np.zeros((16, 128), np.int8),
-                         np.full(360, np.nan, np.float16),
-                         PlaceFeatures(np.zeros((features, 128), np.uint8), np.zeros((features, 3), np.float32)))
+    return PlaceKeyframe(
+        number,
+        0,
+        number,
+        np.eye(4),
+        np.eye(6),
+        np.zeros((16, 128), np.int8),
+        np.full(360, np.nan, np.float16),
+        PlaceFeatures(np.zeros((features, 128), np.uint8), np.zeros((features, 3), np.float32)),
+    )
 
 
 def pose(number: float) -> np.ndarray:

@@ -39,8 +39,19 @@ def places(twins: RenderedCameras) -> PlaceMap:
     x = np.concatenate([X, X + PERIOD_M])
     for number, T in enumerate(planar_poses(np.column_stack([x, 0 * x]), 0 * x)):
         frame = twins.frame(number, T)
-        places.add(PlaceKeyframe(number, 0, number, T, np.eye(6), thumbnail(frame.lower),
-                                 np.full(360, np.nan, np.float16), describe(frame)), T)
+        places.add(
+            PlaceKeyframe(
+                number,
+                0,
+                number,
+                T,
+                np.eye(6),
+                thumbnail(frame.lower),
+                np.full(360, np.nan, np.float16),
+                describe(frame),
+            ),
+            T,
+        )
     return places
 
 

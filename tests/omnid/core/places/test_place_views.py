@@ -53,8 +53,10 @@ def test_the_grid_shows_the_room_where_the_base_sees_it() -> None:
 
 
 def test_the_base_begins_at_the_origin() -> None:
-    np.testing.assert_allclose(base_poses(places(), RIG)[0] @ [0, 0, 0, 1],
-                               RIG.T_base_rect @ pose(0, 0.1, 0) @ se3.inverse(RIG.T_base_rect) @ [0, 0, 0, 1])
+    np.testing.assert_allclose(
+        base_poses(places(), RIG)[0] @ [0, 0, 0, 1],
+        RIG.T_base_rect @ pose(0, 0.1, 0) @ se3.inverse(RIG.T_base_rect) @ [0, 0, 0, 1],
+    )
     assert base_poses(PlaceMap(), RIG).shape == (0, 4, 4)
 
 

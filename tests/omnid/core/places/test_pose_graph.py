@@ -38,8 +38,9 @@ def test_wrong_loops_that_agree_with_each_other_do_not_bend_the_odometry() -> No
     """As in two corridors that look the same, 15 m apart."""
     run = laps(4, nodes=400, per_lap=100, loops=30, wrong=0.0)
     pairs = np.column_stack([np.arange(5, 25), np.arange(55, 75)])
-    twins = PoseEdges(pairs, np.tile(np.eye(4), (20, 1, 1)), np.tile(np.diag(SIGMA_LOOP**2), (20, 1, 1)),
-                      np.ones(20, bool))
+    twins = PoseEdges(
+        pairs, np.tile(np.eye(4), (20, 1, 1)), np.tile(np.diag(SIGMA_LOOP**2), (20, 1, 1)), np.ones(20, bool)
+    )
     accepted = loops_of(optimise(run.start, joined(run.edges, twins)))
     assert not accepted[30:].any()
     assert accepted[:30].mean() > 0.9
@@ -96,8 +97,12 @@ def test_nodes_that_no_edge_joins_to_the_map_stay_and_are_known_as_such() -> Non
 def test_derivatives_are_those_of_the_residuals() -> None:
     rng = np.random.default_rng(9)
     T = se3.exp(rng.normal(scale=[1, 1, 1, 0.4, 0.4, 0.4], size=(2, 6)))
-    edge = PoseEdges(np.array([[0, 1]]), (se3.inverse(T[:1]) @ T[1:]) @ se3.exp([[0.1, 0, 0, 0, 0.1, 0.1]]),
-                     np.diag(SIGMA_LOOP**2)[None], np.zeros(1, bool))
+    edge = PoseEdges(
+        np.array([[0, 1]]),
+        (se3.inverse(T[:1]) @ T[1:]) @ se3.exp([[0.1, 0, 0, 0, 0.1, 0.1]]),
+        np.diag(SIGMA_LOOP**2)[None],
+        np.zeros(1, bool),
+    )
     W = np.linalg.inv(np.linalg.cholesky(edge.covariance))
     residual, J = linearised(T, edge, W)
     for node in (0, 1):

@@ -34,8 +34,9 @@ def test_signatures_are_similar_at_any_heading(frames: list[StereoFrame]) -> Non
 
 
 @pytest.mark.parametrize("other", [1, 2])
-def test_a_place_is_recognised_aside_and_turned(cameras: RenderedCameras, frames: list[StereoFrame], other: int
-                                                ) -> None:
+def test_a_place_is_recognised_aside_and_turned(
+    cameras: RenderedCameras, frames: list[StereoFrame], other: int
+) -> None:
     there, here = describe(frames[0]), describe(frames[other])
     found = recognise(here, there, 7, float(YAWS[other]), cameras.model)
     assert found is not None and found.id == 7 and found.inliers >= 20 and found.sectors >= 4

@@ -24,8 +24,19 @@ def saved(walls: Array, path: Array = MAPPED) -> PlaceMap:
     places = PlaceMap()
     for id, T in enumerate(path):
         nothing = PlaceFeatures(np.zeros((0, 128), np.uint8), np.zeros((0, 3), np.float32))
-        places.add(PlaceKeyframe(id, 0, id, T, np.eye(6), np.zeros((16, 128), np.int8),
-                                 scan_of(walls, T, 0.02, id).astype(np.float16), nothing), T)
+        places.add(
+            PlaceKeyframe(
+                id,
+                0,
+                id,
+                T,
+                np.eye(6),
+                np.zeros((16, 128), np.int8),
+                scan_of(walls, T, 0.02, id).astype(np.float16),
+                nothing,
+            ),
+            T,
+        )
     return places
 
 
@@ -36,8 +47,16 @@ def poses(cameras: RenderedCameras, walls: Array, limits: PlaceLimits) -> list[M
     found = []
     for number, T in enumerate(OUT):
         T_odom_rect = se3.inverse(OUT[0]) @ T
-        frame = OdometryFrame(stereo, number * 300_000_000, T_odom_rect, number * 1e-6 * np.eye(6), False, 0, True,
-                              lambda T=T, number=number: scan_of(walls, T, 0.02, 100 + number))
+        frame = OdometryFrame(
+            stereo,
+            number * 300_000_000,
+            T_odom_rect,
+            number * 1e-6 * np.eye(6),
+            False,
+            0,
+            True,
+            lambda T=T, number=number: scan_of(walls, T, 0.02, 100 + number),
+        )
         found.append(localiser.process(frame))
     return found
 
@@ -55,9 +74,21 @@ def test_the_shape_of_the_room_gives_the_pose(cameras: RenderedCameras) -> None:
 def test_two_proposed_poses_are_ambiguous_until_moving_tells_them_apart() -> None:
     """Two halls of one shape with a passage between them, in which an alcove lies nearer to one of them."""
     halls = np.concatenate([np.delete(SYMMETRIC, 1, axis=0), np.delete(SYMMETRIC + np.array([10, 0]), 3, axis=0)])
-    passage = np.array([[[3, -2], [3, -0.6]], [[3, 0.6], [3, 2]], [[3, 0.6], [7, 0.6]], [[7, -2], [7, -0.6]],
-                        [[7, 0.6], [7, 2]], [[3, -0.6], [3.4, -0.6]], [[3.4, -0.6], [3.4, -1.8]],
-                        [[3.4, -1.8], [4.9, -1.8]], [[4.9, -1.8], [4.9, -0.6]], [[4.9, -0.6], [7, -0.6]]], float)
+    passage = np.array(
+        [
+            [[3, -2], [3, -0.6]],
+            [[3, 0.6], [3, 2]],
+            [[3, 0.6], [7, 0.6]],
+            [[7, -2], [7, -0.6]],
+            [[7, 0.6], [7, 2]],
+            [[3, -0.6], [3.4, -0.6]],
+            [[3.4, -0.6], [3.4, -1.8]],
+            [[3.4, -1.8], [4.9, -1.8]],
+            [[4.9, -1.8], [4.9, -0.6]],
+            [[4.9, -0.6], [7, -0.6]],
+        ],
+        float,
+    )
     walls = np.concatenate([halls, passage])
     truth = np.concatenate([drive(pose(-1.0, 0.4, 0.3), 12, 0.6), drive(pose(-0.9, 0.0, 0.0), 24, 0.0)])
     localiser = ScanLocaliser(saved(walls, drive(pose(-2.0, 0.0, 0.0), 65, 0.0)))

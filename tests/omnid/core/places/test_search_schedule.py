@@ -59,8 +59,10 @@ def test_a_recognition_is_checked_in_a_frame_that_has_moved() -> None:
     schedule = SearchSchedule(LIMITS)
     assert schedule.search_is_due(0, np.eye(4), is_unknown=False, is_pending=False)
     schedule.begin(0, np.eye(4))
-    asked = [schedule.search_is_due(S, forward(x_m), is_unknown=False, is_pending=pending)
-             for x_m, pending in ((0.2, False), (0.05, True), (0.2, True))]
+    asked = [
+        schedule.search_is_due(S, forward(x_m), is_unknown=False, is_pending=pending)
+        for x_m, pending in ((0.2, False), (0.05, True), (0.2, True))
+    ]
     assert asked == [False, False, True]
     assert not schedule.search_is_due(SEARCH_NS - 1, forward(0.2), is_unknown=True, is_pending=True)
     np.testing.assert_allclose(schedule.motion_since(forward(0.2)), forward(0.2))

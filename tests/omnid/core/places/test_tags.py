@@ -34,8 +34,9 @@ def panorama(tags: list[tuple[int, Array, float]], viewpoint_m: float, seed: int
     image = np.full((CYLINDER.height, CYLINDER.width), 120.0)
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     for id, T_rect_tag, edge_m in tags:
-        printed = cv2.copyMakeBorder(cv2.aruco.generateImageMarker(family, id, SIDE_PX), *[QUIET_PX] * 4,
-                                     cv2.BORDER_CONSTANT, value=255)
+        printed = cv2.copyMakeBorder(
+            cv2.aruco.generateImageMarker(family, id, SIDE_PX), *[QUIET_PX] * 4, cv2.BORDER_CONSTANT, value=255
+        )
         middle = round(float(CYLINDER.pixels(T_rect_tag[:3, 3][None])[0, 0]))
         columns, rows = np.meshgrid(np.arange(middle - WINDOW_PX, middle + WINDOW_PX), np.arange(CYLINDER.height))
         rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))

@@ -119,7 +119,7 @@ def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) 
 
 def test_few_places_give_no_finding_however_often(true: tuple[RigHealth, Collector]) -> None:
     places = true[1][::3]
-    assert monitor_after(true, places[:MIN_PLACES - 1] * 8).finding is None
+    assert monitor_after(true, places[: MIN_PLACES - 1] * 8).finding is None
     found = monitor_after(true, places[:MIN_PLACES] * 6).finding
     assert found is not None and found.state is RigState.FITS and found.tried <= MIN_PLACES * POINTS
 
@@ -178,12 +178,16 @@ def started(true: tuple[RigHealth, Collector], pairs: Sequence[Panoramas]) -> Ri
     return health
 
 
-def test_the_drive_overrules_the_start_except_for_exchanged_cameras(rooms: Path, true: tuple[RigHealth, Collector]
-                                                                    ) -> None:
+def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
+    rooms: Path, true: tuple[RigHealth, Collector]
+) -> None:
     _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
     exchanged = [replace(one, lower=one.upper, upper=one.lower) for one in true[1]]
-    for first, later, state in ((wrong, true[1], RigState.FITS), (true[1], wrong, RigState.BROKEN),
-                                (exchanged, true[1], RigState.EXCHANGED)):
+    for first, later, state in (
+        (wrong, true[1], RigState.FITS),
+        (true[1], wrong, RigState.BROKEN),
+        (exchanged, true[1], RigState.EXCHANGED),
+    ):
         health = started(true, first[:4])
         begun = health.state
         for number, one in enumerate(later):
@@ -227,8 +231,10 @@ def test_darkness_is_no_alarm(true: tuple[RigHealth, Collector], gain: float, no
     rng = np.random.default_rng(4)
 
     def dark(one: Panoramas) -> Panoramas:
-        images = [np.clip(w.image * gain + 8 + noise * rng.standard_normal(w.image.shape), 0, 255).astype(np.uint8)
-                  for w in (one.lower, one.upper)]
+        images = [
+            np.clip(w.image * gain + 8 + noise * rng.standard_normal(w.image.shape), 0, 255).astype(np.uint8)
+            for w in (one.lower, one.upper)
+        ]
         return replace(one, lower=replace(one.lower, image=images[0]), upper=replace(one.upper, image=images[1]))
 
     status = rig_status(monitor_after(true, [dark(one) for one in true[1]]), None)

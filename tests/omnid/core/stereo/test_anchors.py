@@ -28,8 +28,10 @@ def test_line_difference_is_the_mean_of_the_pixels_on_the_line() -> None:
         column, row = (np.array(first) + along[:, None] * (np.array(last) - first)).T
         c, r = column.astype(int), row.astype(int)
         u, v = column - c, row - r
-        picked.append((image[r, c] * (1 - u) + image[r, c + 1] * u) * (1 - v)
-                      + (image[r + 1, c] * (1 - u) + image[r + 1, c + 1] * u) * v)
+        picked.append(
+            (image[r, c] * (1 - u) + image[r, c + 1] * u) * (1 - v)
+            + (image[r + 1, c] * (1 - u) + image[r + 1, c + 1] * u) * v
+        )
     expected = np.abs(picked[0] - picked[1]).mean()
     assert line_difference((lower, upper), start, end, 32)[0] == pytest.approx(expected, abs=1.0)
 

@@ -131,8 +131,9 @@ class RenderedRoom:
         """Return the true disparities (N,) of pixels of the lower panorama."""
         rows, columns = np.divmod(pixels, self._shape[1])
         rays = self._cylinder.rays(np.stack([columns - PAD_PX, rows], axis=1).astype(float)) @ self._R
-        ahead = np.where(rays > 0, [self.HALF_M, self.HALF_M, self.HEIGHT_M - self.EYE_M],
-                         [self.HALF_M, self.HALF_M, self.EYE_M])
+        ahead = np.where(
+            rays > 0, [self.HALF_M, self.HALF_M, self.HEIGHT_M - self.EYE_M], [self.HALF_M, self.HALF_M, self.EYE_M]
+        )
         distance = (ahead / np.maximum(np.abs(rays), 1e-9)).min(axis=1)
         return np.asarray(self._cylinder.focal_px * self._baseline_m / distance)
 
@@ -233,8 +234,9 @@ def test_the_search_follows_columns_that_have_moved() -> None:
     """A pair that was not exposed at once: near points appear aside in the upper panorama, by a known shift."""
     lower, aside_px = texture(21, SHAPE, 1.2), 2.0
     upper = np.roll(turned(lower, aside_px), SHIFT_PX, axis=0)
-    expected = ColumnShift(np.full(SHAPE, aside_px / 2, np.float32),
-                       np.full(SHAPE, aside_px / 2 / SHIFT_PX, np.float32))
+    expected = ColumnShift(
+        np.full(SHAPE, aside_px / 2, np.float32), np.full(SHAPE, aside_px / 2 / SHIFT_PX, np.float32)
+    )
     matcher = Matcher(SHAPE, MatchingSettings(disparities=DISPARITIES))
     errors = [np.abs(matcher.match(lower, upper, middle(), aside=aside)[1] - SHIFT_PX) for aside in (expected, None)]
     assert len(errors[0]) > 500 and np.mean(errors[0] < 0.2) > 0.85

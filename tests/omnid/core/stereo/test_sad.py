@@ -19,8 +19,11 @@ def literal_sad(lower: Image, upper: Image, column: int, row: int, disparity: in
     """Return eq. (1), computed pixel by pixel."""
     half = WINDOW_PX // 2
     window = range(-half, half + 1)
-    return sum(abs(int(lower[row + j, column + i]) - int(upper[row + disparity + j, column + i]))
-               for i in window for j in window)
+    return sum(
+        abs(int(lower[row + j, column + i]) - int(upper[row + disparity + j, column + i]))
+        for i in window
+        for j in window
+    )
 
 
 @pytest.fixture(scope="module")
@@ -86,8 +89,9 @@ def test_minima_lie_inside_the_range_and_below_the_limit() -> None:
     expected = np.zeros(costs.shape, bool)
     expected[2, 0] = expected[1, 1] = expected[3, 1] = expected[1, 2] = True
     np.testing.assert_array_equal(local_minima(costs, 100), expected)
-    np.testing.assert_array_equal(local_minima(costs, np.array([1, 2, 3, 9], np.uint16)),
-                                  expected & (costs <= [1, 2, 3, 9]))
+    np.testing.assert_array_equal(
+        local_minima(costs, np.array([1, 2, 3, 9], np.uint16)), expected & (costs <= [1, 2, 3, 9])
+    )
 
 
 @pytest.mark.parametrize("fraction", [-0.45, -0.2, 0.0, 0.3, 0.5])

@@ -39,8 +39,10 @@ class Cameras:
 
     def images(self, moved_px: int = 0) -> dict[Side, Image]:
         """Return both images."""
-        return {side: self._noisy(np.roll(self.scene, (shift, moved_px), (0, 1)))
-                for side, shift in zip(SIDES, (0, 8), strict=True)}
+        return {
+            side: self._noisy(np.roll(self.scene, (shift, moved_px), (0, 1)))
+            for side, shift in zip(SIDES, (0, 8), strict=True)
+        }
 
     def update(self, images: dict[Side, Image]) -> TileStates:
         """Return the states after a pair, 0.1 s after the one before."""

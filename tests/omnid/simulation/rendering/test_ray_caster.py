@@ -18,10 +18,24 @@ SIZE = 192
 SQUARES, SQUARE_M, DISTANCE_M = 4, 0.36, 1.1
 RIGS = {
     "straight": make_rig(size=SIZE),
-    "misaligned": make_rig(size=SIZE, scale=0.9, baseline_m=0.24, misaligned_deg=(5, -4, 31), offset_mm=(12, -20),
-                        lower_misaligned_deg=(-3, 6, -50), lower_offset_mm=(40, 25), centre_px=(2.3, -1.6)),
-    "xi 0.8, distorted": make_rig(size=SIZE, xi=0.8, distortion=(-0.03, 0.004, 0.002, -0.003), centre_px=(-1.2, 2.7),
-                                  misaligned_deg=(2, 3, 20), lower_misaligned_deg=(-1, 2, 70)),
+    "misaligned": make_rig(
+        size=SIZE,
+        scale=0.9,
+        baseline_m=0.24,
+        misaligned_deg=(5, -4, 31),
+        offset_mm=(12, -20),
+        lower_misaligned_deg=(-3, 6, -50),
+        lower_offset_mm=(40, 25),
+        centre_px=(2.3, -1.6),
+    ),
+    "xi 0.8, distorted": make_rig(
+        size=SIZE,
+        xi=0.8,
+        distortion=(-0.03, 0.004, 0.002, -0.003),
+        centre_px=(-1.2, 2.7),
+        misaligned_deg=(2, 3, 20),
+        lower_misaligned_deg=(-1, 2, 70),
+    ),
 }
 POSE = se3.exp([0.31, -0.22, 1.17, 0.05, -0.04, 0.7])
 
@@ -137,6 +151,7 @@ def test_a_ray_traced_mirror_sees_what_all_tiles_would_show(monkeypatch: pytest.
     run = build("rooms", 3, SIZE, 5)
     mounted = with_real_mirrors(run.rig, 3).lower
     culled = render(run.scene, mounted, run.poses[2])
-    monkeypatch.setattr(ray_caster, "tiles_that_see", lambda table, corners, *_: np.ones(
-        (len(table.angles), len(corners)), bool))
+    monkeypatch.setattr(
+        ray_caster, "tiles_that_see", lambda table, corners, *_: np.ones((len(table.angles), len(corners)), bool)
+    )
     np.testing.assert_array_equal(culled, render(run.scene, mounted, run.poses[2]))

@@ -20,8 +20,9 @@ from tests.simulation.paths import planar_poses
 Array = NDArray[np.float64]
 
 MOTION = se3.exp([0.1, -0.05, 0.02, 0.05, -0.1, 1.6])
-PATH = planar_poses(np.array([[0.05 * k, 0] for k in range(4)] + [[0.15, 0.05 * k] for k in range(4)]),
-                    np.repeat([0.0, np.pi / 2], 4))
+PATH = planar_poses(
+    np.array([[0.05 * k, 0] for k in range(4)] + [[0.15, 0.05 * k] for k in range(4)]), np.repeat([0.0, np.pi / 2], 4)
+)
 
 
 def cloud(count: int, seed: int = 0) -> Array:
@@ -38,9 +39,12 @@ def test_the_matrix_is_rz_ry_rx_as_eq_7_writes_it() -> None:
     rx, ry, rz, *t = parameters = np.array([0.3, -0.5, 2.2, 1.0, 2.0, 3.0])
     sx, sy, sz = np.sin([rx, ry, rz])
     cx, cy, cz = np.cos([rx, ry, rz])
-    written = [[cy * cz, -cx * sz + sx * sy * cz, sx * sz + cx * sy * cz, t[0]],
-               [cy * sz, cx * cz + sx * sy * sz, -sx * cz + cx * sy * sz, t[1]],
-               [-sy, sx * cy, cx * cy, t[2]], [0, 0, 0, 1]]
+    written = [
+        [cy * cz, -cx * sz + sx * sy * cz, sx * sz + cx * sy * cz, t[0]],
+        [cy * sz, cx * cz + sx * sy * sz, -sx * cz + cx * sy * sz, t[1]],
+        [-sy, sx * cy, cx * cy, t[2]],
+        [0, 0, 0, 1],
+    ]
     np.testing.assert_allclose(euler_matrix(parameters), written, atol=1e-12)
     np.testing.assert_allclose(euler_parameters(euler_matrix(parameters)), parameters, atol=1e-12)
 
