@@ -13,7 +13,8 @@ from calib.boards.board import BoardView
 from omnid.calibration.coverage import HOURS, NEEDED_PAIRS, RINGS, CameraCoverage, finite_corners
 from omnid.calibration.image_pairs import SIDES
 from omnid.calibration.live_boards import LiveBoards, PairOutcome
-from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.codec import OK
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import CALIBRATION, Key
 
 ROWS: Final = 11  # of a disc; a letter is twice as high as wide

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 from omnid.stages.floor import CameraFloor
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
+from omnid.transport.codec import OK, WARN
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import FLOOR, Key
 
 

@@ -12,7 +12,8 @@ from omnid.core.stereo.tiles import SIDES, Side, TileStates
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import nothing
 from omnid.stages.geometry import Geometry
-from omnid.transport.codec import ERROR, OK, STALE, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, STALE
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import IMAGES, lost_parts_key
 
 LIVE = "all parts are live"

@@ -8,7 +8,8 @@ from drivers.imu.witmotion import WitMotionGyro
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET, MotionSensors
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.odometry import OdometryStage
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
+from omnid.transport.codec import OK, WARN
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.sensor_receiver import SensorReceiver
 from omnid.transport.status_names import MOTION, REFUSED_PREFIX
 

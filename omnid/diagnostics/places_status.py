@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from omnid.stages.places import Places
 from omnid.tracking_state import MapState
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import PLACES, Key
 
 

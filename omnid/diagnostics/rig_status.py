@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 from omnid.core.rig.driving_views import VIEWS
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.rig.rig_state import RigState
-from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, WARN
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import RIG, Key
 
 LEVELS: Final = MappingProxyType(

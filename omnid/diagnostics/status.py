@@ -18,8 +18,9 @@ from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, STALE, WARN
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import Key, time_key
 
 MAX_SKEW_DRIFT_NS: Final = 3_000_000  # of the skew between the cameras: their clocks do not run alike

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Final
 
 from omnid.engine.thread_times import ThreadShares
-from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.codec import OK
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import THREADS, Key
 
 MOST_THREADS: Final = 40  # names in a status, those of the largest shares: it is sent each second

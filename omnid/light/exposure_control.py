@@ -13,7 +13,8 @@ from omnid.config import CamerasConfig
 from omnid.light.exposure_law import STEP_S, ExposureLaw, ExposureState
 from omnid.light.grey_levels import GreyLevels, UsefulArea
 from omnid.messages import FramePair
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
+from omnid.transport.codec import OK, WARN
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import EXPOSURE, Key
 
 PERIOD_SHARE: Final = 0.9  # of the images' period, for the longest exposure: the rest reads the image out

@@ -16,7 +16,8 @@ from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import CLEAR, fitted
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.codec import OK
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Pose
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import STAGE_PREFIX, THREADS, Key, number, short_name
 
 _LEVELS: Final = ("", "warning", "ERROR", "stale")

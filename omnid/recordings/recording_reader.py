@@ -26,12 +26,11 @@ from omnid.transport.codec import (
     ODOMETRY_SCHEMA,
     POINT_CLOUD_SCHEMA,
     TWIST_SCHEMA,
-    OdometryRecord,
-    TwistRecord,
     odometry_from_cdr,
     twist_from_cdr,
 )
 from omnid.transport.decode import Cloud, Diagnostics, PoseInMap, decode_cloud, decode_diagnostics, decode_map_pose
+from omnid.transport.records import OdometryRecord, TwistRecord
 from omnid.transport.scan_codec import SCAN_SCHEMA, Scan, decode_scan
 
 ODOMETRY: Final = "odom"

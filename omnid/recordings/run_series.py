@@ -21,8 +21,8 @@ from omnid.recordings.recording_reader import DRIVE, ODOMETRY, STATUS, Recording
 from omnid.recordings.series_differences import Series
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.codec import OdometryRecord, TwistRecord
 from omnid.transport.decode import Diagnostics
+from omnid.transport.records import OdometryRecord, TwistRecord
 from omnid.transport.status_names import Key
 
 STATES: Final = tuple(TrackingState)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.report.downsampling import Corner, Downsampled, path_trace
-from omnid.transport.codec import OdometryRecord
 from omnid.transport.decode import PoseInMap
+from omnid.transport.records import OdometryRecord
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from omnid.formats.tum import POSITION_LIMIT_M, Trajectory
 from omnid.report.downsampling import Corner, Downsampled, path_trace
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events
 from omnid.tracking_state import TrackingState
-from omnid.transport.codec import OdometryRecord
+from omnid.transport.records import OdometryRecord
 
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded

@@ -25,8 +25,8 @@ from omnid.report.events import Events
 from omnid.report.map_poses import MapPoseHistory
 from omnid.report.poses import PoseHistory
 from omnid.report.status_history import StatusHistory
-from omnid.transport.codec import OdometryRecord, TwistRecord
 from omnid.transport.decode import Cloud, Diagnostics, PoseInMap
+from omnid.transport.records import OdometryRecord, TwistRecord
 
 MAX_EARLY: Final = 64  # status messages before the first pose
 MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging

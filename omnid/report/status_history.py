@@ -9,8 +9,8 @@ from omnid.report.downsampling import Downsampled
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events, without_digits
 from omnid.report.poses import STATES, UNKNOWN
 from omnid.transport import status_names
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import CAPTURE_TO_POSE, TICK_LATE, WORK, Key, short_name, time_key
 
 MAX_ENTRIES: Final = 64

@@ -15,7 +15,7 @@ from omnid.engine.graph import Graph, Stream
 from omnid.runs.live_cameras import LiveCamera, OpenCamera, first_frames
 from omnid.runs.sensor_sources import MotionSource
 from omnid.runs.session import CAMERAS, Session
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 
 
 class LiveRobot(Protocol):

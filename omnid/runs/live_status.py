@@ -19,7 +19,7 @@ from omnid.runs.systemd import Service, StatusLine
 from omnid.sinks.encoder import status_report
 from omnid.sinks.recorder import Recorder
 from omnid.transport.bus import Bus
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 
 StatusPublisher: TypeAlias = Callable[[list[DiagnosticStatus]], None]
 

@@ -11,8 +11,9 @@ from omnid.core.places.place_map import PlaceMap
 from omnid.errors import OmnidError
 from omnid.runs.place_maps import RunPlaces
 from omnid.stages.places import Places
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK
 from omnid.transport.navigation_codec import string_from_cdr
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import MOST_OPEN, Answer, Request
 from omnid.transport.status_names import MAP_FILE, Key
 from omnid.transport.topics import SAVE_MAP

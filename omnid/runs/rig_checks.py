@@ -26,7 +26,7 @@ from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 
 # Pairs that are read before a replay: ten seconds of a log at 30 Hz. In the dark the run goes on checking.
 MOST_PAIRS: Final = 300

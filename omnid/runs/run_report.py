@@ -20,7 +20,7 @@ from omnid.runs.pipeline import WiredStages
 from omnid.runs.session import Session
 from omnid.sinks.pose_collector import MapPoseCollector
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 
 READER_DROPS: Final = ("late", "duplicate", "broken", "broken_records")
 PAIRING_DROPS: Final = ("unpaired", "repeated")  # begin the names of its counts

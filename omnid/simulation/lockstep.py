@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Generic, Literal, TypeAlias, TypeVar
+from typing import Final, Literal, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -36,6 +36,7 @@ from omnid.runs.pipeline import NavigationParts, RunParts, Sinks, WiredStages, w
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
 from omnid.simulation.cameras import CAMERAS, SimulatedCameras
+from omnid.simulation.lockstep_parts import LockstepRequests, Take
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
 from omnid.simulation.world import World
@@ -296,39 +297,6 @@ class _Lockstep:
             due_ns = self._vehicle.now_ns + self._delay_ns
             command = TimedSetpoint(due_ns, update.setpoint, PLANNER, NAVIGATION_SENDER)
             self._vehicle.post(due_ns, lambda: self._vehicle.controller.set_command(command))
-
-
-class LockstepRequests:
-    """Requests to the navigation, as a source that never waits: it gives those that came since its last turn."""
-
-    def __init__(self) -> None:
-        self._waiting: list[NavigationCommand] = []
-        self._ended = False
-
-    def put(self, command: NavigationCommand) -> None:
-        """Add a request."""
-        self._waiting.append(command)
-
-    def end(self) -> None:
-        """End `batches`."""
-        self._ended = True
-
-    def batches(self) -> Iterator[list[NavigationCommand]]:
-        """Yield the requests of each turn, mostly none."""
-        while not self._ended:
-            taken, self._waiting = self._waiting, []
-            yield taken
-
-
-class Take(Generic[T]):
-    """A sink that calls a function."""
-
-    def __init__(self, take: Callable[[T], None]) -> None:
-        self._take = take
-
-    def process(self, message: T, /) -> None:
-        """Take a message."""
-        self._take(message)
 
 
 def _newest(messages: list[T]) -> T | None:

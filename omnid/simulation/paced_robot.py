@@ -35,7 +35,8 @@ from omnid.simulation.realtime import MOST_POSES, SAMPLES
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
-from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.codec import OK
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
 
 Array = NDArray[np.float64]

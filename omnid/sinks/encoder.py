@@ -20,6 +20,7 @@ from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, map_codec, navigation_codec
 from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.moving_codec import moving_cdr
+from omnid.transport.records import DiagnosticStatus, FrameTransform
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
 
@@ -100,7 +101,7 @@ class Encoder:
         )
         yield OutgoingMessage("odom", codec.ODOMETRY_SCHEMA, pose)
         yield OutgoingMessage("pose", codec.POSE_SCHEMA, codec.pose_stamped_cdr(stamp_ns, T_odom_base))
-        edge = codec.FrameTransform("odom", "base_link", T_odom_base)
+        edge = FrameTransform("odom", "base_link", T_odom_base)
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
         yield from self._motion(odometry)
 
@@ -121,7 +122,7 @@ class Encoder:
         T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
         pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
         yield OutgoingMessage("map_pose", codec.MAP_POSE_SCHEMA, pose)
-        edge = codec.FrameTransform("map", "odom", T_map_odom)
+        edge = FrameTransform("map", "odom", T_map_odom)
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
 
     def _map(self, update: MapUpdate) -> Iterator[OutgoingMessage]:
@@ -155,7 +156,7 @@ class StateReports:
     def _in_map(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
         if update.state != self._last_in_map:
             self._last_in_map = update.state
-            status = codec.DiagnosticStatus(
+            status = DiagnosticStatus(
                 PLACES,
                 codec.ERROR if update.state is MapState.LOST else codec.OK,
                 update.state,
@@ -174,11 +175,11 @@ class StateReports:
                 Key.INLIERS: str(odometry.inliers),
                 Key.TRACKED: str(odometry.tracks),
             }
-            status = codec.DiagnosticStatus(ODOMETRY, level, odometry.state, values)
+            status = DiagnosticStatus(ODOMETRY, level, odometry.state, values)
             yield status_report(odometry.stamp_ns + self._offset_ns, [status])
 
 
-def status_report(stamp_ns: int, statuses: Sequence[codec.DiagnosticStatus]) -> OutgoingMessage:
+def status_report(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> OutgoingMessage:
     """Return statuses as one encoded message."""
     return OutgoingMessage("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns, statuses))
 

@@ -6,7 +6,8 @@ import math
 
 from omnid.messages import NavigationUpdate
 from omnid.navigation_state import NavigationState
-from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, WARN
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import NAVIGATION, Key
 
 _LEVELS = {

@@ -17,8 +17,9 @@ from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.driven_path import DrivenPath
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
 from omnid.sinks.static_frames import StaticFrames
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK
 from omnid.transport.image_codec import image_cdr, image_topic
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import RECORDING
 
 Recorded: TypeAlias = Frame | Outgoing

@@ -7,7 +7,8 @@ from typing import Final
 
 from calib import se3
 from omnid.sinks.encoder import Encoder, OutgoingMessage
-from omnid.transport.codec import TRANSFORM_SCHEMA, FrameTransform, transform_cdr
+from omnid.transport.codec import TRANSFORM_SCHEMA, transform_cdr
+from omnid.transport.records import FrameTransform
 
 TF_STATIC: Final = "/tf_static"
 

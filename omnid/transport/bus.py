@@ -17,12 +17,13 @@ from omnid.engine.poller import Poller
 from omnid.errors import OmnidError
 from omnid.transport import status_names
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.transport.codec import ERROR, OK, WARN, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK, WARN
 from omnid.transport.command_intake import PERIOD_S, CommandIntake, RequestCallback
 from omnid.transport.intake import QUERY, Intake, floods
 from omnid.transport.namesakes import Namesakes
 from omnid.transport.open_requests import OpenRequests
 from omnid.transport.publishers import RosGraph, TopicPublisher
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Answer, Request
 from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener

@@ -6,10 +6,8 @@ Arrays in SI units; p_a = T_a_b @ p_b; covariances in the order x y z rx ry rz, 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from functools import cache, lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,6 +18,7 @@ from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
+from omnid.transport.records import DiagnosticStatus, FrameTransform, HeadingRecord, OdometryRecord, TwistRecord
 
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
 POSE_SCHEMA = "geometry_msgs/msg/PoseStamped"
@@ -56,56 +55,7 @@ Frames = tuple[str, str]
 Cartesian = ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ros.geometry_msgs__msg__Quaternion
 
 
-@dataclass(frozen=True, slots=True)
-class OdometryRecord:
-    """Content of a nav_msgs/msg/Odometry message."""
-
-    stamp_ns: int
-    T_odom_base: Array  # (4, 4)
-    covariance: Array  # (6, 6) of the pose, in odom axes
-    velocity: Array  # (6,) [m/s, rad/s] in the base frame
-    velocity_covariance: Array  # (6, 6)
-    frames: Frames  # (parent, child)
-
-
-@dataclass(frozen=True, slots=True)
-class FrameTransform:
-    """One edge of the frame tree: p_parent = T_parent_child @ p_child."""
-
-    parent: str
-    child: str
-    T_parent_child: Array  # (4, 4)
-
-
-class TwistRecord(NamedTuple):
-    """Content of a TwistStamped of a ground robot."""
-
-    stamp_ns: int
-    frame: str
-    velocity_mps: float
-    yaw_rate_radps: float
-
-
-class HeadingRecord(NamedTuple):
-    """Content of a Vector3Stamped that commands a heading."""
-
-    stamp_ns: int
-    frame: str
-    velocity_mps: float
-    heading_rad: float
-
-
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus
-
-
-@dataclass(frozen=True, slots=True)
-class DiagnosticStatus:
-    """Status of one part of the robot; names and keys: omnid.transport.status_names."""
-
-    name: str
-    level: int  # OK ...
-    message: str
-    values: Mapping[str, str]
 
 
 @cache

@@ -16,8 +16,9 @@ from rosbags.typesys.stores import ros2_humble as ros
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec, map_codec, status_names
-from omnid.transport.codec import NS_PER_S, DiagnosticStatus
+from omnid.transport.codec import NS_PER_S
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import Key
 
 ALIGNED = 0.999_999  # w of a quaternion that is taken for no rotation

@@ -8,8 +8,8 @@ from typing import Final, Protocol
 from omnid.plain_text import plain
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
 
 STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from omnid.transport import status_names
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import PREFIX, Key
 
 _OF_PART: Final = {

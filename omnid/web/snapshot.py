@@ -14,8 +14,9 @@ from calib import se3
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState
 from omnid.plain_text import plain
-from omnid.transport.codec import OK, DiagnosticStatus
+from omnid.transport.codec import OK
 from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import Scan
 from omnid.transport.status_names import PLACES, STAGE_PREFIX, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header

@@ -21,8 +21,8 @@ import zenoh
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.client_session import open_client
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from tests.benchmark.results import Column, ResultTable
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint
 

@@ -30,7 +30,8 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.cli import main as run_command
 from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.localisation import MapLocaliser, OdometryFrame
+from omnid.core.places.localisation import MapLocaliser
+from omnid.core.places.map_pose import OdometryFrame
 from omnid.core.places.place_map import PlaceMap
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.place_file import read_places

@@ -33,9 +33,9 @@ from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
 from omnid.settings_dump import dump
 from omnid.transport import codec
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import decode_diagnostics, decode_pose
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import pairs
 from tests.faults.mutation import mutated

@@ -17,6 +17,7 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec, map_codec
 from omnid.transport.image_codec import image_cdr, image_topic
+from omnid.transport.records import DiagnosticStatus, FrameTransform
 from omnid.transport.status_names import ODOMETRY, Key
 
 START_NS = 1_700_000_000 * 10**9 + 123_456_789
@@ -88,7 +89,7 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, st
         (
             "/tf",
             codec.TRANSFORM_SCHEMA,
-            codec.transform_cdr(stamp_ns, [codec.FrameTransform("odom", "base_link", T)]),
+            codec.transform_cdr(stamp_ns, [FrameTransform("odom", "base_link", T)]),
             {
                 "transforms": [
                     {
@@ -115,7 +116,7 @@ def _messages(stamp_ns: int, numbers: np.random.Generator) -> list[tuple[str, st
 
 
 def _status(stamp_ns: int) -> tuple[str, str, bytes, dict[str, Any]]:
-    status = codec.DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
+    status = DiagnosticStatus(ODOMETRY, 1, "über 90 °C", {Key.INLIERS: "3"})
     message = {
         "header": _header(stamp_ns, ""),
         "status": [

@@ -21,9 +21,9 @@ from omnid.client import Answer, Cloud, Diagnostics, Driver, Map, Pose, Robot, s
 from omnid.errors import OmnidError
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map, decode_pose
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, wait_until
 

@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec
+from omnid.transport.records import OdometryRecord
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 60.0  # timeout of a wait on a loaded machine; not a measured time
@@ -117,7 +118,7 @@ class Operator:
         }
         for key, value in settings.items():
             config.insert_json5(key, json.dumps(value))
-        self.poses: list[codec.OdometryRecord] = []
+        self.poses: list[OdometryRecord] = []
         self.states: dict[str, Any] = {}  # newest status by name
         self.messages: set[tuple[str, str]] = set()  # part and message, all there were
         self._session = zenoh.open(config)

@@ -9,7 +9,8 @@ from mcap.reader import make_reader
 
 from calib import se3
 from omnid.formats.tum import Trajectory, read_tum
-from omnid.transport.codec import OdometryRecord, odometry_from_cdr
+from omnid.transport.codec import odometry_from_cdr
+from omnid.transport.records import OdometryRecord
 from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE

@@ -12,22 +12,27 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.forecast import Forecast, Pace, yielding
+from omnid.core.navigation.grid_ways import (
+    CELL_M,
+    FAR_M,
+    HALF_CELLS,
+    descent,
+    grid_distances,
+    neighbours,
+    to_cells,
+    wave_front,
+)
 from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-CELL_M: Final = 0.05
-HALF_CELLS: Final = 64  # of the grid about the base: 3.2 m to each side
 AHEAD_M: Final = 2.0  # of the path, in which obstacles are looked for
 REJOIN_M: Final = 0.3  # of free path that the detour ends on, behind the obstacle
 REJOIN_WITHIN_M: Final = 3.0  # of the way: within the grid
@@ -47,8 +52,6 @@ NEAR_M: Final = 1.5  # of obstacles that arcs are tested against
 NEARER_M: Final = 0.005
 CLEARANCE_WEIGHT_M: Final = 0.4
 MARGIN_M: Final = 0.02  # beside the room that the collision monitor demands
-# Way left where no way leads to the path; so that it is never chosen: longer than any way in the grid.
-FAR_M: Final = 1e3
 # Cosine of the direction beyond which an obstacle is behind; 100 degrees; by trial on development seeds.
 BEHIND_SHARE: Final = -0.17
 
@@ -80,7 +83,7 @@ class LocalPlanner:
         self._width_m = collision.half_width_m
         self._front_m = collision.front_m
         self._avoiding = False
-        self._edges = _neighbours()
+        self._edges = neighbours()
         speeds = np.append(np.linspace(0.0, SHARE * settings.pursuit.velocity_mps, SPEEDS), BACK_MPS)
         rates = np.linspace(-settings.pursuit.yaw_rate_radps, settings.pursuit.yaw_rate_radps, YAW_RATES)
         self._v, self._w = (grid.ravel() for grid in np.meshgrid(speeds, rates))
@@ -169,20 +172,20 @@ class LocalPlanner:
         """Return the best arc; None without one."""
         settings = self._settings
         corner = pose[:2] - HALF_CELLS * CELL_M
-        room_m = _grid_distances(obstacles, corner)
+        room_m = grid_distances(obstacles, corner)
         own_m = max(0.0, float(room_m[HALF_CELLS, HALF_CELLS]) - CELL_M)
         least_m = min(self._half_m + 0.5 * settings.clearance_m, own_m)
-        is_free = (room_m > least_m) & (_grid_distances(path, corner) <= settings.corridor_m)
+        is_free = (room_m > least_m) & (grid_distances(path, corner) <= settings.corridor_m)
         is_free[HALF_CELLS, HALF_CELLS] = True
         # Ways through narrow places count as longer ones.
         wide_m = self._half_m + 3 * settings.clearance_m
         narrow = 1.0 + NARROW * np.clip((wide_m - room_m) / wide_m, 0, 1)
-        left_m = _wave_front(self._edges, is_free, narrow, _cells(goal[None], corner)[0])
+        left_m = wave_front(self._edges, is_free, narrow, to_cells(goal[None], corner)[0])
         if left_m is None or left_m[HALF_CELLS, HALF_CELLS] >= FAR_M:
             return None
         c, s = math.cos(pose[2]), math.sin(pose[2])
         places = pose[:2] + np.stack([c * self._arc_x - s * self._arc_y, s * self._arc_x + c * self._arc_y], axis=-1)
-        cells = _cells(places, corner)
+        cells = to_cells(places, corner)
         clear_m = room_m[cells[..., 1], cells[..., 0]].min(axis=1)
         rows, columns = cells[:, -1, 1], cells[:, -1, 0]
         way_m = left_m[rows, columns]
@@ -190,7 +193,7 @@ class LocalPlanner:
         if moving is not None:
             is_open &= self._lets_pass(places, moving)
         # The heading at the end against the way down the distances.
-        down = _descent(left_m, rows, columns)
+        down = descent(left_m, rows, columns)
         off = np.abs(np.remainder(pose[2] + self._turned[:, -1] - down + np.pi, 2 * np.pi) - np.pi)
         cost = way_m + HEADING_M_PER_RAD * off + BACK_WEIGHT_M * (self._v < 0)
         cost += CLEARANCE_WEIGHT_M * np.clip((wide_m - clear_m) / wide_m, 0, 1)
@@ -268,69 +271,3 @@ def _rejoin(ways: Array, is_blocked: NDArray[np.bool_], first_m: float) -> int |
         if not is_blocked[k : k + span].any() and (ways[k] - first_m >= REJOIN_M or k == len(ways) - 1):
             return min(int(k) + span // 2, len(ways) - 1)
     return None
-
-
-def _cells(points: Array, corner: Array) -> NDArray[np.intp]:
-    """Return columns and rows (..., 2) of points (..., 2), those beyond the grid at its border."""
-    return np.clip(((points - corner) / CELL_M).round(), 0, 2 * HALF_CELLS).astype(np.intp)
-
-
-def _grid_distances(points: Array, corner: Array) -> Array:
-    """Return the distance of each cell to the nearest point [m]."""
-    size = 2 * HALF_CELLS + 1
-    inside = ((points >= corner) & (points <= corner + 2 * HALF_CELLS * CELL_M)).all(axis=1)
-    grid = np.ones((size, size), np.uint8)
-    cells = _cells(points[inside], corner)
-    grid[cells[:, 1], cells[:, 0]] = 0
-    if not len(cells):
-        return np.full((size, size), FAR_M)
-    return np.asarray(cv2.distanceTransform(grid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M, np.float64)
-
-
-class _Neighbours(NamedTuple):
-    """Edges between neighbouring cells of the grid, in the order of their first cell."""
-
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    length_m: Array
-
-
-def _neighbours() -> _Neighbours:
-    """Return the edges to the eight cells around each cell."""
-    size = 2 * HALF_CELLS + 1
-    rows, columns, steps = np.meshgrid(np.arange(size), np.arange(size), np.arange(8), indexing="ij")
-    dy = np.array([-1, -1, -1, 0, 0, 1, 1, 1])[steps]
-    dx = np.array([-1, 0, 1, -1, 1, -1, 0, 1])[steps]
-    inside = (rows + dy >= 0) & (rows + dy < size) & (columns + dx >= 0) & (columns + dx < size)
-    first = (rows * size + columns)[inside]
-    second = ((rows + dy) * size + columns + dx)[inside]
-    return _Neighbours(first.astype(np.int32), second.astype(np.int32), CELL_M * np.hypot(dx, dy)[inside])
-
-
-def _wave_front(edges: _Neighbours, is_free: NDArray[np.bool_], weight: Array, goal: NDArray[np.intp]) -> Array | None:
-    """Return the weighted way from each free cell to the goal [m], FAR_M without one; None if the goal is not free."""
-    column, row = int(goal[0]), int(goal[1])
-    if not is_free[row, column]:
-        return None
-    free = is_free.ravel()
-    usable = free[edges.first] & free[edges.second]
-    counts = np.bincount(edges.first[usable], minlength=free.size)
-    lengths = edges.length_m[usable] * weight.ravel()[edges.first[usable]]
-    graph = csr_matrix(
-        (lengths, edges.second[usable], np.concatenate([[0], np.cumsum(counts)])), shape=(free.size, free.size)
-    )
-    found = dijkstra(graph, indices=row * len(is_free) + column)
-    return np.asarray(np.where(np.isfinite(found), found, FAR_M).reshape(is_free.shape))
-
-
-def _descent(left_m: Array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
-    """Return the direction [rad] in which the way left falls most, over some cells."""
-    best, direction = np.full(len(rows), np.inf), np.zeros(len(rows))
-    reach, limit = 4, len(left_m) - 1
-    for k in range(16):
-        angle = 2 * math.pi * k / 16
-        r = np.clip(rows + round(reach * math.sin(angle)), 0, limit)
-        c = np.clip(columns + round(reach * math.cos(angle)), 0, limit)
-        lower = left_m[r, c] < best
-        best, direction = np.where(lower, left_m[r, c], best), np.where(lower, angle, direction)
-    return direction

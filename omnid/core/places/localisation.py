@@ -6,8 +6,7 @@ MapLocaliser.process is the algorithm, one frame at a time. Odometry stays as it
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.keyframe_grid import KeyframeScans
-from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.ageing import Ageing
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
@@ -23,6 +21,7 @@ from omnid.core.places.features import describe
 from omnid.core.places.hypotheses import Hypotheses, Hypothesis, length_m
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.map_parts import MapParts
+from omnid.core.places.map_pose import NO_KEYFRAME, MapPose, OdometryFrame
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_search import Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition
@@ -37,38 +36,12 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
-NO_KEYFRAME: Final = -1  # in place of an id; ids are never negative
 TIES: Final = 50  # newest keyframes that are kept where the map stays as it is, so that memory is bounded
 # Largest error of odometry, and its growth with the path; by trial on development seeds.
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # by trial on development seeds
 TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
 RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class OdometryFrame:
-    """A frame with its pose by odometry."""
-
-    stereo: StereoFrame
-    stamp_ns: int
-    T_odom_rect: Array  # (4, 4)
-    covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
-    lost: bool
-    resets: int  # gaps of unknown motion so far
-    is_keyframe: bool  # its dense depth is known
-    scan: Callable[[], NDArray[np.float32]]  # returns the nearest obstacles by azimuth, see mapping/range_scan.py
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MapPose:
-    """Pose of odom in the map, and of the frame."""
-
-    T_map_odom: Array  # (4, 4) of the rectified frame of the first pair
-    covariance: Array  # (6, 6) of T_map_rect, [t; r] in the rectified frame
-    state: MapState
-    keyframe: int  # id of the newest keyframe of the run; NO_KEYFRAME: none since the last gap
-    T_keyframe_rect: Array  # (4, 4) of the frame in it, by odometry
 
 
 class MapLocaliser:
@@ -143,21 +116,19 @@ class MapLocaliser:
     @property
     def counts(self) -> dict[str, int]:
         """Sizes and counters, for the status."""
-        return (
-            {
-                "keyframes": len(self.places),
-                "map_kb": self.places.nbytes // 1000,
-                "loops": self.places.loops,
-                "dropped": self.places.dropped,
-                "aged": self.ageing.aged,
-                "rejected": self.correction.rejected,
-                "unjoined": max(0, len(self._parts) - 1),
-                "ambiguous": self.search.ambiguous,
-                "refused": self.search.refused,
-            }
-            | self._counts_of_tags()
-            | ({} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous})
-        )
+        return {
+            "keyframes": len(self.places),
+            "map_kb": self.places.nbytes // 1000,
+            "loops": self.places.loops,
+            "dropped": self.places.dropped,
+            "aged": self.ageing.aged,
+            "rejected": self.correction.rejected,
+            "unjoined": max(0, len(self._parts) - 1),
+            "ambiguous": self.search.ambiguous,
+            "refused": self.search.refused,
+            **self._counts_of_tags(),
+            **({} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous}),
+        }
 
     def _counts_of_tags(self) -> dict[str, int]:
         if self._tags is None:

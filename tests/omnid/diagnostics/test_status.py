@@ -29,8 +29,9 @@ from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.synchronise import Synchronise
 from omnid.transport import codec
-from omnid.transport.codec import ERROR, OK, STALE, WARN, DiagnosticStatus, diagnostics_cdr
+from omnid.transport.codec import ERROR, OK, STALE, WARN, diagnostics_cdr
 from omnid.transport.commands import CommandReceiver
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import ODOMETRY, Key, landmark_counts, short_name

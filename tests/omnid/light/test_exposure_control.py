@@ -14,7 +14,8 @@ from omnid.config import CamerasConfig
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
 from omnid.messages import FramePair
-from omnid.transport.codec import OK, WARN, DiagnosticStatus
+from omnid.transport.codec import OK, WARN
+from omnid.transport.records import DiagnosticStatus
 from tests.simulation.recipes import mild_rig
 
 PERIOD_NS = 50_000_000

@@ -19,8 +19,8 @@ from omnid.monitor.fleet import MAX_ROBOTS, FleetState, fleet_table, show
 from omnid.monitor.robot_state import ReceivedMessage
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import WHEELS
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script
 

@@ -23,8 +23,8 @@ from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import Screen, load_line, load_table, status_table, summary_line
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import BUS, SIMULATION, THREADS, WHEELS, Key
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, wait_until
 from tests.replay.command import Command, rows

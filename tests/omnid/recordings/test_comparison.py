@@ -18,6 +18,7 @@ from omnid.recordings.run_series import read_run_series
 from omnid.recordings.series_differences import Series, gaps, pose_excess
 from omnid.recordings.settings_differences import table_differences
 from omnid.transport import codec
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY
 from tests.drivers.logs.mcap_logs import START_NS
 
@@ -58,7 +59,7 @@ class Recording:
 
     def state(self, index: int, state: str, resets: int = 0) -> None:
         """Add a change of the state."""
-        status = codec.DiagnosticStatus(ODOMETRY, 0, state, {"state": state, "resets": str(resets)})
+        status = DiagnosticStatus(ODOMETRY, 0, state, {"state": state, "resets": str(resets)})
         self.add("status", codec.DIAGNOSTICS_SCHEMA, codec.diagnostics_cdr(stamp_ns(index), [status]), index)
 
     def drive(self, index: int, velocity_mps: float) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from calib import se3
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec, map_codec
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, Key
 
 START_NS = 1_700_000_000 * 10**9

@@ -26,7 +26,7 @@ from omnid.report.report import report_html
 from omnid.report.report_data import ReportData, collect_report_data
 from omnid.report.truth_comparison import compare_with_truth
 from omnid.runs.log_rig import attached_rig
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, camera_name, stage_name
 from tests.omnid.report.recorded_logs import (
     T_odom_base,

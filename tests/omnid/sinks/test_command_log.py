@@ -16,6 +16,7 @@ from omnid.runs.record import open_recorder
 from omnid.sinks.command_log import command_recorder, logged_command
 from omnid.transport import codec
 from omnid.transport.commands import LONGEST_PAYLOAD
+from omnid.transport.records import TwistRecord
 from omnid.transport.topics import command_topics
 
 TOPICS = command_topics(("operator", "planner"))
@@ -26,7 +27,7 @@ def test_a_plain_twist_is_recorded_as_what_the_topic_holds() -> None:
     plain = codec.twist_stamped_cdr(NOW_NS, "", 0.4, 0.5)[-48:]  # the six numbers
     message = logged_command("cmd/twist", b"\0\1\0\0" + plain, TOPICS)
     assert message is not None
-    assert codec.twist_from_cdr(message.payload) == codec.TwistRecord(0, "", 0.4, 0.5)
+    assert codec.twist_from_cdr(message.payload) == TwistRecord(0, "", 0.4, 0.5)
     assert logged_command("cmd/twist", b"\7\7\0\0" + plain, TOPICS) is None
 
 

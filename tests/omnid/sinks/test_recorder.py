@@ -25,8 +25,9 @@ from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.record import open_recorder, record
 from omnid.sinks.encoder import Encoder, MapEncoding, status_report
 from omnid.sinks.recorder import Recorder
-from omnid.transport.codec import ERROR, OK, DiagnosticStatus
+from omnid.transport.codec import ERROR, OK
 from omnid.transport.image_codec import image_cdr, image_topic
+from omnid.transport.records import DiagnosticStatus
 from tests.drivers.logs.mcap_logs import STORE, jpeg
 from tests.omnid.small_pair import small_depth
 

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec, map_codec
+from omnid.transport.records import DiagnosticStatus, FrameTransform
 from tests.omnid.allocations import taken
 
 STAMP_NS = 1_700_000_123_987_654_321
@@ -123,7 +124,7 @@ def test_pose_stamped() -> None:
 
 
 def test_transforms() -> None:
-    edges = [codec.FrameTransform("map", "odom", np.eye(4)), codec.FrameTransform("odom", "base_link", T_ODOM_BASE)]
+    edges = [FrameTransform("map", "odom", np.eye(4)), FrameTransform("odom", "base_link", T_ODOM_BASE)]
     message = read(codec.transform_cdr(STAMP_NS, edges), codec.TRANSFORM_SCHEMA)
     names = [(edge.header.frame_id, edge.child_frame_id) for edge in message.transforms]
     shift = message.transforms[1].transform.translation
@@ -181,7 +182,7 @@ def test_point_cloud_needs_a_confidence_for_each_point() -> None:
 
 def test_diagnostics() -> None:
     payload = codec.diagnostics_cdr(
-        STAMP_NS, [codec.DiagnosticStatus("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})]
+        STAMP_NS, [DiagnosticStatus("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})]
     )
     (status,) = read(payload, codec.DIAGNOSTICS_SCHEMA).status
     assert (status.level, status.name, status.message) == (1, "omnid/odometry", "degraded")
@@ -190,7 +191,7 @@ def test_diagnostics() -> None:
 
 def test_diagnostic_level_must_exist() -> None:
     with pytest.raises(OmnidError, match="level 4"):
-        codec.diagnostics_cdr(STAMP_NS, [codec.DiagnosticStatus("omnid", 4, "", {})])
+        codec.diagnostics_cdr(STAMP_NS, [DiagnosticStatus("omnid", 4, "", {})])
 
 
 def test_twist_stamped() -> None:

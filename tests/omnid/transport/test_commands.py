@@ -19,6 +19,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.transport import codec
 from omnid.transport.codec import bool_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
+from omnid.transport.records import TwistRecord
 from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import StampRule
 
@@ -337,7 +338,7 @@ def test_the_arrival_is_that_of_the_message_not_of_its_decoding(
     """A stop that arrives while the command is decoded voids it."""
     decoded_ns: list[int] = []
 
-    def decode(payload: bytes) -> codec.TwistRecord:
+    def decode(payload: bytes) -> TwistRecord:
         decoded_ns.append(time.monotonic_ns())
         return codec.twist_from_cdr(payload)
 

@@ -15,7 +15,7 @@ from omnid.client import Answer, Diagnostics, Robot, Unreachable
 from omnid.config import load_config
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from omnid.transport.status_names import BUS
 from tests.omnid.transport.bus_fixtures import free_endpoint, script, wait_until

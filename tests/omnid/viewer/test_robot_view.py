@@ -24,10 +24,10 @@ from calib import se3
 from drivers.frame import Frame
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import stage_name
 from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.omnid.viewer.rrd import need_rerun, positions, rows, verified

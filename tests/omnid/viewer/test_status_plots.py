@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, WHEELS, stage_name
 from omnid.viewer import status_plots
 

@@ -14,8 +14,8 @@ from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from omnid.formats.tum import read_tum
 from omnid.transport import codec
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.image_codec import image_cdr
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.omnid.viewer.rrd import entities, need_rerun, positions, rows, verified

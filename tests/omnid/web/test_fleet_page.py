@@ -15,8 +15,8 @@ from websockets.sync.client import connect
 from omnid.core.control.safety_rules import ASKED
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
 from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer, served

@@ -6,8 +6,8 @@ import re
 
 from omnid.monitor.robot_state import RobotState
 from omnid.transport import status_names
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.decode import Diagnostics
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import (
     CALIBRATION,
     PREFIX,

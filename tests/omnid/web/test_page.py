@@ -22,8 +22,8 @@ import pytest
 
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script

@@ -16,8 +16,8 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.monitor.teleop import FIRST_SHARE
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.navigation_codec import PlanarGoal, goal_from_cdr, string_from_cdr
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.transport.topics import command_topics

@@ -29,9 +29,9 @@ from calib import se3
 from drivers.frame import Frame
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus
-from omnid.transport.codec import DiagnosticStatus
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until

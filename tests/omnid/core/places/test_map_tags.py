@@ -12,7 +12,8 @@ import pytest
 from calib import se3
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.localisation import MapLocaliser, MapPose, OdometryFrame
+from omnid.core.places.localisation import MapLocaliser
+from omnid.core.places.map_pose import MapPose, OdometryFrame
 from omnid.core.places.map_tags import MAX_VIEWS, MapTag, MapTags, TagView
 from omnid.core.places.merge import merge
 from omnid.core.places.place_map import PlaceMap

@@ -8,7 +8,8 @@ import pytest
 from calib import se3
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.localisation import MapLocaliser, MapPose, OdometryFrame
+from omnid.core.places.localisation import MapLocaliser
+from omnid.core.places.map_pose import MapPose, OdometryFrame
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.tracking_state import MapState
