@@ -1,4 +1,4 @@
-"""What the messages on the bus and in recordings hold, decoded."""
+"""Contents of the messages on the bus and in recordings, decoded."""
 
 from __future__ import annotations
 

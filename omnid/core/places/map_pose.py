@@ -1,4 +1,4 @@
-"""What the localisation in a map takes from the odometry, and what it gives."""
+"""Input of the localisation in a map, from the odometry, and its result."""
 
 from __future__ import annotations
 
