@@ -14,6 +14,7 @@ import random
 import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -30,6 +31,7 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
+from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
 
 Array = NDArray[np.float64]
@@ -50,7 +52,9 @@ CASES: Final = {
     "person crosses": 9.0,
     "edge 8 cm": 10.0,
     "edge 15 cm": 10.0,
-}
+    "edge 30 cm": 10.0,
+    "edge 50 cm": 10.0,
+} | dict.fromkeys(KINDS, 12.0)
 
 
 class Drive(NamedTuple):
@@ -146,15 +150,15 @@ def world_text(case: str, rng: random.Random) -> str:
     return "\n".join(lines) + "\n"
 
 
-def ahead(moment: Moment) -> Iterator[Request]:
-    """Arm, and hold the stick ahead."""
+def ahead(moment: Moment, speed_mps: float = SPEED_MPS) -> Iterator[Request]:
+    """Arm, and hold the stick ahead, or back at a negative speed."""
     if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
         yield "arm"
-    yield Setpoint(SPEED_MPS, heading_rad=0.0)
+    yield Setpoint(speed_mps, heading_rad=0.0)
 
 
-def run(case: str, seed: int, size_px: int, overrides: list[str]) -> Drive:
-    """Drive one seed of a case."""
+def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: float = SPEED_MPS) -> Drive:
+    """Drive one seed of a case along x, backwards at a negative speed."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
         path.write_text(world_text(case, random.Random(seed)))
@@ -162,15 +166,18 @@ def run(case: str, seed: int, size_px: int, overrides: list[str]) -> Drive:
         edges = np.zeros((0, 2, 2))
         if case.startswith("edge"):
             world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
+        if case in KINDS:
+            world = with_floating(world, case, random.Random(seed))
+        world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,
             make_robot(size_px),
-            ahead,
+            partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,
             config=load_config(None, ["places.enabled=false", *overrides]),
         )
-    return judged(done, world, edges)
+    return judged(done, world, edges, backwards=speed_mps < 0)
 
 
 def with_edge(world: World, at_m: float, drop_m: float) -> tuple[World, Array]:
@@ -197,8 +204,9 @@ def with_edge(world: World, at_m: float, drop_m: float) -> tuple[World, Array]:
     return replace(world, standing=tuple(standing)), edge
 
 
-def judged(done: SimulatedRun, world: World, edges: Array) -> Drive:
+def judged(done: SimulatedRun, world: World, edges: Array, *, backwards: bool = False) -> Drive:
     """Return the result of a run, from the truth at its ticks; edges (N, 2, 2): where the floor falls."""
+    turn_rad = math.pi if backwards else 0.0
     robot = make_robot()
     standing, people = np.concatenate([footprints(world.standing, robot.height_m), edges]), Walkers(world.people)
     to_edge_m = [clearance_m(edges, tick.pose[:2], robot.radius_m) for tick in done.ticks]
@@ -207,7 +215,8 @@ def judged(done: SimulatedRun, world: World, edges: Array) -> Drive:
     for tick in done.ticks:
         people.advance(tick.time_s, tick.pose[:2])
         segments = np.concatenate([standing, footprints(people.faces(), robot.height_m)])
-        ahead_m.append(room_ahead_m(segments, tick.pose, robot.radius_m))
+        x_m, y_m, heading_rad = tick.pose
+        ahead_m.append(room_ahead_m(segments, (x_m, y_m, heading_rad + turn_rad), robot.radius_m))
     lines = [(at_s, text) for at_s, text in done.lines if "obstacle" in text or "way ahead" in text]
     times = np.array([tick.time_s for tick in done.ticks])
     false = sum(ahead_m[int(np.argmin(np.abs(times - at_s)))] > FALSE_M for at_s, _ in lines)
@@ -218,7 +227,10 @@ def judged(done: SimulatedRun, world: World, edges: Array) -> Drive:
         for ring in done.rings
         if ahead_m[int(np.argmin(np.abs(times - (ring.stamp_ns - START_NS) * 1e-9)))] <= FALSE_M
     ]
-    unknown = sum(bool(np.isnan(ring.ranges_m[AHEAD]).mean() > 0.5) for ring in rings)
+    unknown = sum(
+        bool(np.isnan(np.roll(ring.ranges_m, len(ring.ranges_m) // 2 * backwards)[AHEAD]).mean() > 0.5)
+        for ring in rings
+    )
     driven_m = math.dist(done.ticks[0].pose[:2], done.ticks[-1].pose[:2])
     reasons = "; ".join(
         f"{at_s:.1f} s {text.removeprefix('the wheels stop: ').partition(';')[0]}" for at_s, text in lines
@@ -252,6 +264,7 @@ def main() -> None:
     parser.add_argument("case", choices=sorted(CASES))
     parser.add_argument("--seeds", type=int, nargs=2, default=(1, 3), metavar=("FIRST", "LAST"))
     parser.add_argument("--size", type=int, default=512, help="of the images, px")
+    parser.add_argument("--speed", type=float, default=SPEED_MPS, help="m/s; below 0: backwards")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     drives = []
@@ -275,7 +288,7 @@ def main() -> None:
         columns,
     )
     for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
-        drive = run(arguments.case, seed, arguments.size, arguments.overrides)
+        drive = run(arguments.case, seed, arguments.size, arguments.overrides, arguments.speed)
         drives.append(drive)
         table.add(
             arguments.case,
