@@ -70,6 +70,8 @@ def test_sets_feeds_and_reads_back_the_watchdogs() -> None:
         b"axis1.config.enable_watchdog 1")  # fmt: skip
     with pytest.raises(DriverError, match="500 ms requested, 0 ms in force"):
         result(ODriveAscii(DRIVE).connect(500), *replies("1", "0.5", "0", "0", "0.5", "0"))
+    with pytest.raises(DriverError, match="500 ms requested, 0 ms in force"):
+        result(ODriveAscii(DRIVE).connect(500), *replies("True", "0.5", "0", "False", "0.5", "0"))
     with pytest.raises(DriverError, match="500 ms requested, 400 ms in force"):
         result(ODriveAscii(DRIVE).connect(500), *replies("1", "0.4", "0", "1", "0.5", "0"))
     assert result(ODriveAscii(DRIVE).connect(500), *replies("True", "0.5", "0", "true", "0.5", "2048")) == 500
