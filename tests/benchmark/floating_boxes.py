@@ -23,26 +23,26 @@ KINDS: Final = ("bar", "table", "tines")
 
 def with_floating(world: World, kind: str, rng: random.Random) -> World:
     """Return the world with a thing of KINDS across the x axis, 2 to 3 m ahead of the origin."""
-    pictures, at_m = np.random.default_rng(rng.randrange(2**32)), rng.uniform(2.0, 3.0)
+    texture_rng, at_m = np.random.default_rng(rng.randrange(2**32)), rng.uniform(2.0, 3.0)
     if kind == "bar":
-        parts = raised_box(pictures, (at_m, 0.0, rng.uniform(0.12, 1.1)), (BAR_M, 1.4, BAR_M))
+        parts = raised_box(texture_rng, (at_m, 0.0, rng.uniform(0.12, 1.1)), (BAR_M, 1.4, BAR_M))
     elif kind == "table":
         top_m, (length, width, _) = rng.uniform(0.6, 0.8), TABLE_M
-        parts = raised_box(pictures, (at_m, 0.0, top_m), TABLE_M)
+        parts = raised_box(texture_rng, (at_m, 0.0, top_m), TABLE_M)
         for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
             at = (at_m + x * (length - LEG_M) / 2, y * (width - LEG_M) / 2, 0.0)
-            parts += raised_box(pictures, at, (LEG_M, LEG_M, top_m))
+            parts += raised_box(texture_rng, at, (LEG_M, LEG_M, top_m))
     else:
         aside_m, low_m = rng.uniform(-0.1, 0.1), rng.uniform(0.04, 0.1)
-        parts = raised_box(pictures, (at_m + TINE_M[0], aside_m, 0.0), (0.6, 0.9, 1.1))
+        parts = raised_box(texture_rng, (at_m + TINE_M[0], aside_m, 0.0), (0.6, 0.9, 1.1))
         for side in (1, -1):
-            parts += raised_box(pictures, (at_m + TINE_M[0] / 2, aside_m + side * 0.25, low_m), TINE_M)
+            parts += raised_box(texture_rng, (at_m + TINE_M[0] / 2, aside_m + side * 0.25, low_m), TINE_M)
     return replace(world, standing=(*world.standing, *parts))
 
 
-def raised_box(pictures: np.random.Generator, at: Size, size_m: Size) -> list[Rectangle]:
+def raised_box(texture_rng: np.random.Generator, at: Size, size_m: Size) -> list[Rectangle]:
     """Return a box with its lower side at the height of `at`, the middle of that side."""
     lift = np.array([0.0, 0.0, at[2]])
-    faces = [replace(face, origin=face.origin + lift) for face in box(pictures, (at[0], at[1]), size_m, 0.0)]
+    faces = [replace(face, origin=face.origin + lift) for face in box(texture_rng, (at[0], at[1]), size_m, 0.0)]
     top = faces[-1]
     return [*faces, replace(top, origin=top.origin - (0.0, 0.0, size_m[2]))]
