@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from calib.models.camera import Array
 
@@ -43,7 +43,7 @@ class ArrowSystem:
     """Normal equations [[A, B], [B^T, C]] [common; blocks] = [a; c] with K blocks of D unknowns, C block diagonal."""
 
     A: Array  # (P, P)
-    B: sparse.csr_matrix | Array  # (P, K D); an array where each block meets most common unknowns
+    B: scipy.sparse.csr_matrix | Array  # (P, K D); an array where each block meets most common unknowns
     C: Array  # (K, D, D)
     a: Array  # (P,)
     c: Array  # (K D,)
@@ -58,17 +58,17 @@ class ArrowSystem:
         """Return the system (P, P) and its right side (P,) of the common unknowns, without damping."""
         return self._reduced_by(self.inverse_blocks(), 0.0)
 
-    def inverse_blocks(self, damping: float = 0.0) -> sparse.csr_matrix:
+    def inverse_blocks(self, damping: float = 0.0) -> scipy.sparse.csr_matrix:
         """Return the inverse (K D, K D) of the damped blocks."""
         K, D, _ = self.C.shape
         damped = self.C * (1 + damping * np.eye(D)) + BLOCK_REGULARISATION * np.eye(D)
-        return sparse.bsr_matrix((np.linalg.inv(damped), np.arange(K), np.arange(K + 1)), (K * D, K * D)).tocsr()
+        return scipy.sparse.bsr_matrix((np.linalg.inv(damped), np.arange(K), np.arange(K + 1)), (K * D, K * D)).tocsr()
 
-    def _reduced_by(self, inverse: sparse.csr_matrix, damping: float) -> tuple[Array, Array]:
+    def _reduced_by(self, inverse: scipy.sparse.csr_matrix, damping: float) -> tuple[Array, Array]:
         between = self.B @ inverse
         damped = self.A + damping * np.diag(np.diag(self.A))
         share = between @ self.B.T
-        by_blocks = share.toarray() if sparse.issparse(share) else share
+        by_blocks = share.toarray() if scipy.sparse.issparse(share) else share
         return damped - by_blocks, np.asarray(self.a - between @ self.c)
 
 

@@ -19,9 +19,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from calib import se3
+from omnid.core.floor_kernels import densities, level_floors
 
 Array = NDArray[np.float64]
 
@@ -98,18 +98,20 @@ def fit_floor(points: Array, variance_m2: Array) -> FloorFit | None:
         return None
     # 2. The likeliest height of a level floor; its tilt is noise that grows with the range.
     across = np.hypot(seen.xyz[:, 0], seen.xyz[:, 1])
-    on, off = _densities(
-        seen.xyz[:, 2] + HEIGHTS_M[:, None], np.hypot(seen.sigma_m, TILT_SIGMA_RAD * across), HEIGHTS_M[:, None]
-    )
-    best = np.argmax(np.log(FIRST_PART * on + (1 - FIRST_PART) * off).sum(axis=1))
+    likelihoods = np.empty(len(HEIGHTS_M))
+    z_m = np.ascontiguousarray(seen.xyz[:, 2])
+    level_floors(z_m, np.hypot(seen.sigma_m, TILT_SIGMA_RAD * across), HEIGHTS_M, FIRST_PART, FALSE, likelihoods)
+    best = np.argmax(likelihoods)
     # 3. Height, tilt, part on the floor and noise, by the points about the floor.
     A = np.column_stack([-np.ones(len(across)), seen.xyz[:, :2]])
     q, part, scale = np.array([HEIGHTS_M[best], 0.0, 0.0]), FIRST_PART, 1.0
     prior = np.diag([0.0, TILT_SIGMA_RAD**-2, TILT_SIGMA_RAD**-2])
+    both = np.empty((2, len(across)))
     for _ in range(ITERATIONS):
         e = seen.xyz[:, 2] - A @ q
         near = np.abs(e) < SPAN_M
-        on, off = _densities(e, scale * seen.sigma_m, SPAN_M)
+        densities(e, scale * seen.sigma_m, SPAN_M, FALSE, both)
+        on, off = both
         share = np.where(near, part * on / (part * on + (1 - part) * off), 0.0)
         weight = share / (scale * seen.sigma_m) ** 2 / POINTS_ALIKE
         information = A.T @ (weight[:, None] * A) + prior
@@ -176,9 +178,3 @@ def _usable(points: Array, variance_m2: Array) -> _Points:
     kept = np.flatnonzero(sigma < LARGEST_SIGMA_M)  # False for NaN
     kept = kept[:: max(1, -(-len(kept) // MOST_POINTS))]
     return _Points(xyz[kept], sigma[kept])
-
-
-def _densities(e: Array, sigma_m: Array, span_m: Array | float) -> tuple[Array, Array]:
-    """Return the densities of points with residuals e on the floor, and of others."""
-    on = np.exp(-0.5 * (e / sigma_m) ** 2) / (math.sqrt(2 * math.pi) * sigma_m)
-    return on, ((1 - FALSE) * ndtr(e / sigma_m) + FALSE) / span_m

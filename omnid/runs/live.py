@@ -51,7 +51,7 @@ class LiveRun:
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
-        imported = started(_import_slow_modules, "imports")
+        kernels_read = started(_read_kernels, "imports")
         compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
         offset_ns = time.time_ns() - self._robot.clock_ns()
         with ExitStack() as outputs:
@@ -65,7 +65,7 @@ class LiveRun:
             )
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
-            imported()
+            kernels_read()
             prepare_kernels(self._report)
             self._connected = True
             run_places = RunPlaces(self._config, geometry, session.warn)
@@ -76,6 +76,7 @@ class LiveRun:
             if not self._robot.waits:
                 for refused in prepare(self._config.realtime):
                     session.warn(refused)
+            started(_import_rarely_used, "imports")
             try:
                 self._graph.run()
             except BaseException:
@@ -119,8 +120,14 @@ def _graph_that_waits(config: Config) -> Graph:
     return Graph(policy=LOSSLESS, depth=config.graph.depth, sinks_wait=True)
 
 
-def _import_slow_modules() -> None:
-    """Import what takes a second, while images are awaited; where that fails, the users of it raise."""
+def _read_kernels() -> None:
+    """Read the compiled functions while images are awaited; where that fails, `prepare_kernels` tells why."""
     with suppress(Exception):
         read_kept_kernels()
-        import_module("filterpy.kalman")
+
+
+def _import_rarely_used() -> None:
+    """Import what the first loop of the map and the first goal need, beside the first poses and not beside those."""
+    with suppress(Exception):
+        for name in ("scipy.sparse.linalg", "scipy.spatial"):
+            import_module(name)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,7 +26,7 @@ MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
 
 
 class Dewarp:
-    """Rectifies both images of a pair; the remap tables are computed once."""
+    """Rectifies both images of a pair."""
 
     def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
         self._noise_grey: dict[Side, float] = {}  # of each camera before its gain
@@ -33,18 +35,12 @@ class Dewarp:
         timing = timing or TimingConfig()
         rig, cylinder = geometry.rig, geometry.cylinder
         self._sector = cylinder.turn_px, cylinder.first
-        self._lower, self._upper = (remap_tables(rig, m, cylinder, config.pad_px) for m in (rig.lower, rig.upper))
-        self._blur_px = _blur_px((self._lower, self._upper))
-        both = visible(rig.lower, self._lower, config.rim_margin_px)
-        both &= visible(rig.upper, self._upper, config.rim_margin_px)
-        self._visible = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
-        self._visible.setflags(write=False)
+        self._lower, self._upper, self._blur_px, self._visible = _tables(geometry, config)
         self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
         self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
         line_s = timing.line_time_us * 1e-6 or rig.times.line_time_s
         inner = slice(config.pad_px, -config.pad_px)
-        tables = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper)]
-        self._rows_s = tables if line_s else []
+        self._rows_s = [maps[1][:, inner] * np.float32(line_s) for maps in (self._lower, self._upper) if line_s]
         if self._visible.mean() < MIN_SHARED_PART:
             raise OmnidError(
                 f"the cameras share {self._visible.mean():.1%} of the panorama, less than {MIN_SHARED_PART:.0%}: check "
@@ -79,6 +75,28 @@ class Dewarp:
         gain = gain_of(found.level_grey)
         padded = PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain, *self._sector)
         return padded, found, inner
+
+
+class _Tables(NamedTuple):
+    """The part of dewarping that follows from the geometry; the arrays are read-only."""
+
+    lower: Maps
+    upper: Maps
+    blur_px: float
+    visible: NDArray[np.bool_]  # (H, W) of both cameras
+
+
+@lru_cache(maxsize=1)
+def _tables(geometry: Geometry, config: PanoramaConfig) -> _Tables:
+    """Return the tables; a run that examines its rig first has more than one front end of the same geometry."""
+    rig, cylinder = geometry.rig, geometry.cylinder
+    lower, upper = (remap_tables(rig, mounted, cylinder, config.pad_px) for mounted in (rig.lower, rig.upper))
+    both = visible(rig.lower, lower, config.rim_margin_px)
+    both &= visible(rig.upper, upper, config.rim_margin_px)
+    shared = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
+    for table in (*lower, *upper, shared):
+        table.setflags(write=False)
+    return _Tables(lower, upper, _blur_px((lower, upper)), shared)
 
 
 def _blur_px(tables: tuple[Maps, ...]) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from calib import se3
 from calib.errors import CalibError
@@ -31,7 +31,7 @@ class _Jacobians:
     """Weighted residuals (2 M,) and their derivatives."""
 
     error: Array  # (2 M,)
-    by_pose: sparse.csr_matrix  # (2 M, 6 F) by twists of the free keyframes
+    by_pose: scipy.sparse.csr_matrix  # (2 M, 6 F) by twists of the free keyframes
     by_steps: Array  # (2 M, P)
     of_landmarks: Array  # (M, 2, 3) of each observation by its landmark
 
@@ -108,7 +108,9 @@ class DriveProblem:
         blocks = np.zeros((len(state.points), 3, 3))
         np.add.at(blocks, seen.landmark, np.swapaxes(J.of_landmarks, 1, 2) @ J.of_landmarks)
         by_point = _scattered(J.of_landmarks, seen.landmark, len(state.points))
-        coupling = sparse.vstack([J.by_pose.T @ by_point, sparse.csr_matrix((by_point.T @ J.by_steps).T)]).tocsr()
+        coupling = scipy.sparse.vstack(
+            [J.by_pose.T @ by_point, scipy.sparse.csr_matrix((by_point.T @ J.by_steps).T)]
+        ).tocsr()
         known = np.zeros(len(state.steps)) if self.held else self.prior @ state.steps
         a = np.concatenate([J.by_pose.T @ J.error, J.by_steps.T @ J.error - known])
         return ArrowSystem(A, coupling, blocks, a, np.asarray(by_point.T @ J.error))
@@ -126,8 +128,10 @@ class DriveProblem:
         # 2. Each landmark's share (C, L) in the gradient, the landmark itself eliminated.
         J, count = self._jacobians(state, scale), len(state.points)
         of_landmark = np.repeat(self.observations.landmark, 2)
-        errors = sparse.csr_matrix((J.error, (np.arange(len(J.error)), of_landmark)), (len(J.error), count))
-        own = sparse.csr_matrix((system.c, (np.arange(3 * count), np.repeat(np.arange(count), 3))), (3 * count, count))
+        errors = scipy.sparse.csr_matrix((J.error, (np.arange(len(J.error)), of_landmark)), (len(J.error), count))
+        own = scipy.sparse.csr_matrix(
+            (system.c, (np.arange(3 * count), np.repeat(np.arange(count), 3))), (3 * count, count)
+        )
         shares = np.concatenate([(J.by_pose.T @ errors).toarray(), (errors.T @ J.by_steps).T])
         shares = shares - (system.B @ system.inverse_blocks() @ own).toarray()
         # 3. The variance of the gradient between the two inverses.
@@ -182,9 +186,9 @@ class DriveProblem:
         return J
 
 
-def _scattered(J: Array, index: Indices, count: int) -> sparse.csr_matrix:
+def _scattered(J: Array, index: Indices, count: int) -> scipy.sparse.csr_matrix:
     """Return the sparse Jacobian (2 M, count * D) of blocks J (M, 2, D) at the unknown of each observation."""
     M, _, D = J.shape
     columns = np.broadcast_to(D * index[:, None, None] + np.arange(D), (M, 2, D))
     rows = np.broadcast_to(np.arange(2 * M).reshape(M, 2, 1), (M, 2, D))
-    return sparse.csr_matrix((J.ravel(), (rows.ravel(), columns.ravel())), (2 * M, count * D))
+    return scipy.sparse.csr_matrix((J.ravel(), (rows.ravel(), columns.ravel())), (2 * M, count * D))

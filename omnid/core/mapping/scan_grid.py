@@ -14,7 +14,6 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter1d
 
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.core.mapping.range_scan import SURFACE_RATIO, RangeScan, azimuths
@@ -61,8 +60,9 @@ class ScanGrid:
         odds, seen = self._odds[top:bottom, left:right], self._seen[top:bottom, left:right]
         free, hit = np.zeros(odds.shape, np.uint8), np.zeros(odds.shape, np.uint8)
         # A cell's middle is an integer for OpenCV. Sectors without range are a corner at the robot: not seen.
-        nearest = minimum_filter1d(np.where(known, scan, np.inf), 2 * EDGE_SECTORS + 1, mode="wrap")
-        nearest = np.where(known, nearest, 0.0)
+        ranges = np.where(known, scan, np.inf)
+        neighbours = [np.roll(ranges, shift) for shift in range(-EDGE_SECTORS, EDGE_SECTORS + 1)]
+        nearest = np.where(known, np.min(neighbours, axis=0), 0.0)
         seen_through = np.maximum(nearest - self._cell_m - SHORTER * nearest**2, 0.0)
         corners = np.rint((centre + seen_through[:, None] * direction - [left, top] - 0.5) * 2**SHIFT).astype(np.int32)
         cv2.fillPoly(free, [corners], 1, shift=SHIFT)

@@ -7,9 +7,8 @@ from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 Array = NDArray[np.float64]
 
@@ -68,10 +67,10 @@ def wave_front(edges: Neighbours, is_free: NDArray[np.bool_], weight: Array, goa
     usable = free[edges.first] & free[edges.second]
     counts = np.bincount(edges.first[usable], minlength=free.size)
     lengths = edges.length_m[usable] * weight.ravel()[edges.first[usable]]
-    graph = csr_matrix(
+    graph = scipy.sparse.csr_matrix(
         (lengths, edges.second[usable], np.concatenate([[0], np.cumsum(counts)])), shape=(free.size, free.size)
     )
-    found = dijkstra(graph, indices=row * len(is_free) + column)
+    found = scipy.sparse.csgraph.dijkstra(graph, indices=row * len(is_free) + column)
     return np.asarray(np.where(np.isfinite(found), found, FAR_M).reshape(is_free.shape))
 
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.kalman_filter import kalman_filter
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 
@@ -51,11 +52,9 @@ class _Cluster:
 
 class _Track:
     def __init__(self, stamp_ns: int, cluster: _Cluster) -> None:
-        from filterpy.kalman import KalmanFilter  # its import takes a second, and only moving obstacles need it
-
         self.stamp_ns = self.seen_ns = stamp_ns
         self.appearances, self.radius_m = int(cluster.appeared), cluster.radius_m
-        self._filter: Any = KalmanFilter(dim_x=4, dim_z=2)
+        self._filter = kalman_filter(dim_x=4, dim_z=2)
         self._filter.H = np.eye(2, 4)
         self._filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
         noise = SIGMA_M**2 + cluster.sigma_m**2

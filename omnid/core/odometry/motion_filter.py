@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.kalman_filter import kalman_filter
 
 Array = NDArray[np.float64]
 
@@ -25,9 +24,7 @@ class MotionFilter:
     """
 
     def __init__(self, jerk_psd: tuple[float, float] = JERK_PSD) -> None:
-        from filterpy.kalman import KalmanFilter  # its import takes a second, and only odometry needs it
-
-        self._filter: Any = KalmanFilter(dim_x=12, dim_z=6)
+        self._filter = kalman_filter(dim_x=12, dim_z=6)
         self._filter.H = np.hstack([np.eye(6), np.zeros((6, 6))])
         self._psd = np.repeat(jerk_psd, 3)
         self.reset()

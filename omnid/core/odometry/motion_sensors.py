@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
+from omnid.core.kalman_filter import kalman_filter
 from omnid.core.odometry.sensed_motion import RateHistory, SensedMotion
 
 Array = NDArray[np.float64]
@@ -54,11 +55,9 @@ class MotionSensors:
     """
 
     def __init__(self, T_rect_base: Array) -> None:
-        from filterpy.kalman import KalmanFilter  # its import takes long, and only odometry needs it
-
         self._to_rect, self._to_base = se3.adjoint(T_rect_base), se3.adjoint(se3.inverse(T_rect_base))
         self._wheels, self._gyro = RateHistory(2), RateHistory(3)
-        self._filter: Any = KalmanFilter(dim_x=len(START), dim_z=1)
+        self._filter = kalman_filter(dim_x=len(START), dim_z=1)
         self._filter.x = START[:, None].copy()
         self._filter.P = np.diag(START_SIGMA**2)
         self._zero_ns: int | None = None  # stamp of time 0

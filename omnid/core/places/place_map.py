@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from calib import se3
 from omnid.core.places.map_tags import MapTags
@@ -164,7 +164,7 @@ class PlaceMap:
     def _least_useful(self, newest: int) -> int:
         """Return the id of the keyframe that is to be dropped, not the newest."""
         ids = [id for id in self.keyframes if id != newest]
-        apart, neighbour = cKDTree(self.positions(ids)).query(self.positions(ids), k=2)
+        apart, neighbour = scipy.spatial.cKDTree(self.positions(ids)).query(self.positions(ids), k=2)
         nearest = int(apart[:, 1].argmin())
         # Where several are at one position, the second of them may be found first.
         pair = sorted({ids[nearest], *(ids[int(n)] for n in neighbour[nearest])})

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import bsr_matrix, coo_matrix, csc_matrix, diags
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from calib import se3
 
@@ -101,7 +99,7 @@ class _Graph:
         self.edges = edges
         self._W = np.linalg.inv(np.linalg.cholesky(edges.covariance))  # W S W^T = I
         self._moves = ~fixed
-        self._fixed = diags(np.repeat(np.where(fixed, 1.0, DAMPING), 6))
+        self._fixed = scipy.sparse.diags(np.repeat(np.where(fixed, 1.0, DAMPING), 6))
 
     def linearised(self, T: Array) -> tuple[Array, Array]:
         """Return residuals (M, 6) and derivatives (M, 2, 6, 6), those by fixed nodes 0."""
@@ -129,11 +127,13 @@ class _Graph:
         count = len(self.edges)
         blocks = (root[:, None, None, None] * J).reshape(-1, 6, 6)
         shape = (6 * count, 6 * len(self._moves))
-        return bsr_matrix((blocks, self.edges.pairs.ravel(), 2 * np.arange(count + 1)), shape=shape)
+        return scipy.sparse.bsr_matrix((blocks, self.edges.pairs.ravel(), 2 * np.arange(count + 1)), shape=shape)
 
     def _factorised(self, stacked: Any) -> Any:
         """Return the factorised normal equations."""
-        H = csc_matrix(stacked.T @ stacked + self._fixed)
+        from scipy.sparse.linalg import splu  # scipy itself loads no packages in packages when they are used
+
+        H = scipy.sparse.csc_matrix(stacked.T @ stacked + self._fixed)
         return splu(
             H,
             permc_spec="MMD_AT_PLUS_A",
@@ -177,6 +177,6 @@ def _weights(squared: Array, mu: float) -> Array:
 
 def _connected(pairs: Indices, fixed: Flags) -> Flags:
     """Return flags (N,) of the nodes that pairs (K, 2) of nodes join to a fixed node."""
-    joins = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(fixed), len(fixed)))
-    _, label = connected_components(joins, directed=False)
+    joins = scipy.sparse.coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(fixed), len(fixed)))
+    _, label = scipy.sparse.csgraph.connected_components(joins, directed=False)
     return np.isin(label, label[fixed])
