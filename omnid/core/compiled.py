@@ -1,110 +1,149 @@
-"""Functions compiled to machine code by numba: the one way in which loops over pixels and landmarks become fast.
+"""Functions compiled to machine code: the one way in which loops over pixels and landmarks become fast.
 
 A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only: the code
 kept on disk is made again when one of them changes (engine/kernel_store.py), and constants of other files would not be
 noticed. There is no second version in Python. Results are the same bytes in every run: no reordering of sums
 (fastmath), no threads inside. The global lock of Python is released meanwhile.
 
-numba is imported at the first compilation, not with this module: most commands compile nothing.
+numba makes the code (native_code.py); it is imported only where code is missing. What is kept runs without numba: LLVM
+loads it, and ctypes calls it. A function writes its results to arrays and returns nothing.
 """
 
 from __future__ import annotations
 
+import ctypes
+import inspect
+import operator
+import re
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final, Generic, ParamSpec, TypeVar
+
+import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# error_model: a division by zero gives inf or NaN as in numpy.
-OPTIONS: Final = {"nogil": True, "error_model": "numpy", "fastmath": False, "parallel": False}
-# Functions that only compiled functions call need no entries for Python and C, which take a tenth of all compilation.
-UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 KERNEL_FILES: Final = "*_kernels.py"
+# An argument of a signature: "f8[:, ::1]", "f8", "UniTuple(f8, 5)".
+_ARGUMENT: Final = re.compile(r"UniTuple\((?P<of>\w+), (?P<count>\d+)\)|(?P<kind>[a-z]\d)(?:\[(?P<axes>[^]]*)\])?")
 
 _declared: list[Kernel[Any, Any]] = []
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """Type of an argument: an array, a number, or a tuple of numbers."""
+
+    name: str
+    kind: str  # of the numbers, as numpy names it: f8
+    dimensions: int = 0  # of an array; 0: no array
+    is_contiguous: bool = False
+    is_written: bool = False
+    count: int = 0  # of a tuple; 0: no tuple
 
 
 class Kernel(Generic[P, R]):
     """A function that is compiled before it is called first; callable with what its signature allows."""
 
     def __init__(self, function: Callable[P, R], signature: str, writes: tuple[str, ...]) -> None:
-        self.function, self.signature, self.writes = function, signature, writes
+        self.function, self.arguments = function, tuple(_arguments(function, signature, writes))
         self._compiled: Any = None
+        self._engine: Any = None  # has the code's memory
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        """Call the function, which is compiled first if that was not done."""
+        """Call the function, which is compiled first if that was not done; TypeError for other types."""
         if self._compiled is None:
-            self.compile()
-        result: R = self._compiled(*args, **kwargs)
-        return result
+            self.load(self.code())
+        values = inspect.signature(self.function).bind(*args, **kwargs).args if kwargs else args
+        try:
+            status = self._compiled(id(np.ndarray), *values)
+        except ctypes.ArgumentError as error:
+            raise TypeError(f"{self.symbol}: {error}") from error
+        if status:
+            self._fail(status)
+        return None  # type: ignore[return-value]  # native_code.py refuses a function that returns something
+
+    @property
+    def symbol(self) -> str:
+        """Name of the function in its code."""
+        return f"{self.function.__module__}.{self.function.__qualname__}"
 
     @property
     def is_compiled(self) -> bool:
         """True once the function is compiled."""
         return self._compiled is not None
 
-    def compile(self, folder: Path | None = None) -> None:
-        """Compile the function for its signature; folder: read it from there, or write it there."""
-        dispatcher = self._dispatcher()
-        if folder is not None:
-            dispatcher._cache = _cache_in(folder, self.function)
-        dispatcher.compile(self._types())
-        dispatcher.disable_compile()  # other types are an error, not a wait of seconds
-        self._compiled = dispatcher
+    def code(self) -> bytes:
+        """Compile the function for its signature and return its code, for this processor."""
+        from omnid.core.native_code import native_code
 
-    def _dispatcher(self) -> Any:
-        import numba
+        return native_code(self.function, self.symbol, self.arguments)
 
-        return numba.njit(**OPTIONS, no_cfunc_wrapper=True)(self.function)
+    def load(self, code: bytes) -> None:
+        """Take code, which was compiled here or read from the disk."""
+        types = [ctypes.c_void_p, *map(_c_type, self.arguments)]
+        self._engine = _loaded(code)
+        self._compiled = ctypes.CFUNCTYPE(ctypes.c_int32, *types)(self._engine.get_function_address(self.symbol))
 
-    def _types(self) -> tuple[Any, ...]:
-        """Return the types of the arguments: arrays that are not written may be read-only ones."""
-        from numba.core import sigutils, types
-
-        arguments, _ = sigutils.normalize_signature(self.signature)
-        names = self.function.__code__.co_varnames
-        return tuple(
-            types.Array(kind.dtype, kind.ndim, kind.layout, readonly=name not in self.writes)
-            if isinstance(kind, types.Array)
-            else kind
-            for kind, name in zip(arguments, names, strict=False)
-        )
+    def _fail(self, status: int) -> None:
+        """Raise the error that a call has returned: the number of a wrong array below zero, or numba's above."""
+        if status > 0:
+            raise MemoryError(f"{self.symbol}: no memory for its arrays")
+        wrong = self.arguments[-1 - status]
+        layout = ", contiguous" * wrong.is_contiguous + ", writable" * wrong.is_written
+        raise TypeError(f"{self.symbol}: {wrong.name} is no array of {wrong.dimensions} axes of {wrong.kind}{layout}")
 
 
-class _Locator:
-    """Place where numba keeps a function: a folder that depends on neither path nor time of the source file.
-
-    The methods are those that numba.core.caching calls; numba's own locators name folders by the path of the source.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def from_function(self, function: object, file: str) -> _Locator:
-        return self
-
-    def get_cache_path(self) -> str:
-        return str(self._folder)
-
-    def ensure_cache_path(self) -> None:
-        self._folder.mkdir(exist_ok=True)
-
-    def get_source_stamp(self) -> str:
-        return ""
-
-    def get_disambiguator(self) -> str:
-        return ""
+def _arguments(function: Callable[..., object], signature: str, writes: tuple[str, ...]) -> Iterator[Argument]:
+    names = function.__code__.co_varnames
+    for found, name in zip(_ARGUMENT.finditer(signature), names, strict=False):
+        axes = found["axes"]
+        if axes is None:
+            yield Argument(name, found["of"] or found["kind"], count=int(found["count"] or 0))
+        else:
+            yield Argument(name, found["kind"], axes.count(",") + 1, axes.endswith("1"), name in writes)
 
 
-def _cache_in(folder: Path, function: Callable[..., object]) -> Any:
-    """Return numba's cache of a function in a folder."""
-    from numba.core import caching
+def _loaded(code: bytes) -> Any:
+    """Return LLVM's loader of this code only: inner functions of other codes may have the same names."""
+    import llvmlite.binding as llvm
 
-    in_folder = type("InFolder", (caching.CompileResultCacheImpl,), {"_locator_classes": [_Locator(folder)]})
-    return type("FolderCache", (caching.FunctionCache,), {"_impl_class": in_folder})(function)
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine(jit=True, codemodel="jitdefault")
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return engine
+
+
+@cache
+def _number(kind: str) -> Any:
+    """Return the type of ctypes of a number, which takes those of numpy, too."""
+    base = np.ctypeslib.as_ctypes_type(np.dtype(kind))
+    read: Callable[[Any], Any] = float if kind[0] == "f" else operator.index
+    return type(kind, (base,), {"from_param": classmethod(lambda _, value: base(read(value)))})
+
+
+def _c_type(argument: Argument) -> Any:
+    """Return the type by which ctypes passes an argument; the code itself checks arrays."""
+    if argument.dimensions:
+        return ctypes.py_object
+    number = _number(argument.kind)
+    if not argument.count:
+        return number
+    numbers = number.__base__ * argument.count
+    name, count = f"{argument.kind}x{argument.count}", argument.count
+
+    def from_param(_: Any, values: Any) -> Any:
+        if len(values) != count:
+            raise TypeError(f"expected {count} numbers, found {len(values)}")
+        return numbers(*values)
+
+    return type(name, (ctypes.c_void_p,), {"from_param": classmethod(from_param)})
 
 
 class Inner(Generic[P, R]):
@@ -122,15 +161,10 @@ class Inner(Generic[P, R]):
     @property
     def _numba_type_(self) -> Any:
         """The type by which numba compiles calls of this object."""
-        import numba
+        from omnid.core.native_code import inner_dispatcher
 
         if self._dispatcher is None:
-            self._dispatcher = numba.njit(**OPTIONS, **UNWRAPPED)(self.function)
-            # An argument such as 0 counts as an integer, not as a type of its own, which would be compiled once more.
-            template_for = self._dispatcher.get_call_template
-            self._dispatcher.get_call_template = lambda args, kws: template_for(
-                tuple(map(numba.types.unliteral, args)), kws
-            )
+            self._dispatcher = inner_dispatcher(self.function)
         return self._dispatcher._numba_type_
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import mmap
 import os
 import time
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,7 +27,7 @@ def prepare_kernels(report: Report) -> None:
     if _state["ready"]:
         return
     try:
-        import numba  # noqa: F401 - it tries to make executable memory
+        _make_executable_memory()
     except OSError as error:
         raise OmnidError(
             "the system allows no code that is compiled at run time: remove MemoryDenyWriteExecute= from "
@@ -68,8 +70,11 @@ class KeptKernels(NamedTuple):
 def kept_kernels(service: Path | None = None) -> KeptKernels:
     """Return what is kept in the folder of this program, or in that of the service, which belongs to another user.
 
-    Raises OSError where the system allows no code that is made at run time.
+    Raises OSError where the system allows no code that is made at run time, ImportError where numba is missing.
     """
+    _make_executable_memory()
+    if find_spec("numba") is None:
+        raise ModuleNotFoundError("No module named 'numba'", name="numba")
     folder = service or store.cache_folder()
     unusable = "" if service else store.why_unusable(folder)
     owner = folder.stat().st_uid if service else os.geteuid()
@@ -79,6 +84,11 @@ def kept_kernels(service: Path | None = None) -> KeptKernels:
             is_kept = store.is_intact(folder / store.folder_of_state(name, path).name, owner)
             counts[not unusable and is_kept] += functions
     return KeptKernels(folder, unusable, counts[True], counts[False])
+
+
+def _make_executable_memory() -> None:
+    """Make and free a page of executable memory; OSError where the system denies it."""
+    mmap.mmap(-1, mmap.PAGESIZE, prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC).close()
 
 
 def _not_ready() -> dict[str, Path]:

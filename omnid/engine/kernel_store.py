@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,6 +35,7 @@ from omnid.core.compiled import KERNEL_FILES, Kernel, declared
 MAX_FOLDERS: Final = 100  # of other states, and of files that were not compiled now
 MAX_BYTES: Final = 64 << 20  # of a folder that is read: a larger one is none of ours
 DIGESTS: Final = "digests.json"
+CODE: Final = ".o"  # end of the names of files with the code of one function
 UNFINISHED: Final = "making-"  # begin of the names of folders that are being filled
 _IMPORTED: Final = re.compile(r"^(?:from|import) (omnid\.core\.\S*_kernels)\b", re.MULTILINE)
 _OWN_ONLY: Final = 0o022  # bits of a mode by which others could write: what is read here is run
@@ -73,15 +75,15 @@ def is_ready(name: str) -> bool:
 def folder_of_state(name: str, path: Path) -> Path:
     """Return the folder for the code of this file and those that it imports, of these versions and this processor."""
     import llvmlite.binding as llvm
-    import numba
-    import numpy as np
 
     digest = hashlib.sha256()
     processor = platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     environment = sorted((key, value) for key, value in os.environ.items() if key.startswith("NUMBA_"))
-    digest.update(repr((sys.version, numba.__version__, np.__version__, processor, environment)).encode())
-    options = Path(omnid.core.__path__[0]) / "compiled.py"
-    for module, source in (("", options), (name, path), *sorted(imported_files(path).items())):
+    versions = [version(package) for package in ("numba", "llvmlite", "numpy")]  # numba itself is not loaded
+    digest.update(repr((sys.version, versions, processor, environment)).encode())
+    core = Path(omnid.core.__path__[0])
+    makers = (("", core / "compiled.py"), ("", core / "native_code.py"))
+    for module, source in (*makers, (name, path), *sorted(imported_files(path).items())):
         # The code contains the names of the modules.
         digest.update(repr((module, source.read_bytes())).encode())
     return cache_folder() / f"kernels-{path.stem.removesuffix('_kernels')}-{digest.hexdigest()[:20]}"
@@ -115,7 +117,14 @@ def why_unusable(folder: Path) -> str:
 def compile_into(name: str, folder: Path | None) -> None:
     """Read the functions of a file from the folder, or compile them into it; None: compile, and keep nothing."""
     for kernel in functions_of(name):
-        kernel.compile(folder)
+        kept = None if folder is None else folder / f"{kernel.__name__}{CODE}"
+        if kept is not None and kept.exists():
+            code = kept.read_bytes()
+        else:
+            code = kernel.code()
+            if kept is not None:
+                kept.write_bytes(code)
+        kernel.load(code)
 
 
 def compile_and_publish(name: str, folder: Path) -> None:

@@ -43,7 +43,7 @@ def gather(
             x = origin[0] + cell_m * (c * j - s * i)
             y = origin[1] + cell_m * (s * j + c * i)
             r = math.sqrt(x * x + y * y)
-            cells[:, i, j] = np.nan, 0.0, 0.0, 0.0
+            cells[0, i, j], cells[1, i, j], cells[2, i, j], cells[3, i, j] = np.nan, 0.0, 0.0, 0.0
             if r < cell_m or r > reach_m:
                 continue
             at = (math.pi - math.atan2(y, x)) * by_angle - 0.5

@@ -20,7 +20,6 @@ ROOT = Path(__file__).parents[3]
 PROGRAM = """
 import logging, pathlib, sys
 from omnid.engine import kernel_cache, kernel_compiler, kernel_store
-from omnid.core import compiled
 import tests.omnid.engine.sample_kernels as sample
 kernel_store.kernel_files = lambda: {sample.__name__: pathlib.Path(sample.__file__)}
 if "deny" in sys.argv:
@@ -35,9 +34,12 @@ kernel_cache.prepare_kernels(lambda level, line: print(logging.getLevelName(leve
 import numpy as np
 out = np.zeros(2)
 sample.halves(np.array([3.0, 5.0]), out)
-print(out.tolist(), sum(kernel._compiled.stats.cache_hits.total() for kernel in compiled.declared()))
+print(out.tolist(), int('numba' not in sys.modules))
 """
-READ, COMPILED_HERE = "[1.5, 2.5] 1", "[1.5, 2.5] 0"  # what the program prints where it reads code, and where not
+READ, COMPILED_HERE = (
+    "[1.5, 2.5] 1",
+    "[1.5, 2.5] 0",
+)  # what the program prints where it reads code, and where it compiles
 
 
 def started(cache: Path, *arguments: str, root: Path = ROOT) -> subprocess.Popen[str]:
@@ -96,8 +98,8 @@ def folder_in(cache: Path) -> Path:
 def test_functions_are_compiled_by_a_helper_and_kept(compiled_once: tuple[Path, str]) -> None:
     cache, printed = compiled_once
     lines = printed.splitlines()
-    assert lines[0].startswith("INFO compiling 1 functions") and lines[1].startswith("INFO compiled in ")
-    assert lines[2:] == [READ]
+    assert lines[0].startswith("INFO compiling 1 functions") and lines[-2].startswith("INFO compiled in ")
+    assert lines[-1] == READ
     kept = {path.name for path in cache.glob("kernels-*")}
     assert len(kept) == kernel_store.MAX_FOLDERS + 1 and "kernels-100" in kept and "kernels-0" not in kept
     assert not [*cache.glob("making-*")]
@@ -123,7 +125,7 @@ def test_a_copy_of_the_same_sources_compiles_nothing(cache: Path, tmp_path: Path
 
 
 def test_damaged_files_are_never_read(cache: Path) -> None:
-    code = next(folder_in(cache).rglob("*.nbc"))
+    code = next(folder_in(cache).glob("*.o"))
     damaged = bytearray(code.read_bytes())
     damaged[len(damaged) // 2] ^= 0xFF
     code.write_bytes(damaged)
