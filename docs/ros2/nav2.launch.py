@@ -4,6 +4,7 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
 SERVERS = {
     "planner_server": "nav2_planner",
@@ -17,8 +18,16 @@ VELOCITY = [("cmd_vel", "/omnid/cmd/planner/twist")]
 def generate_launch_description():
     """Return the servers, and the manager that activates them."""
     parameters = LaunchConfiguration("params_file")
+    own_time = {"use_sim_time": ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)}
     servers = [
-        Node(package=package, executable=name, name=name, parameters=[parameters], remappings=VELOCITY, output="screen")
+        Node(
+            package=package,
+            executable=name,
+            name=name,
+            parameters=[parameters, own_time],
+            remappings=VELOCITY,
+            output="screen",
+        )
         for name, package in SERVERS.items()
     ]
     manager = Node(
@@ -26,7 +35,8 @@ def generate_launch_description():
         executable="lifecycle_manager",
         name="lifecycle_manager_navigation",
         output="screen",
-        parameters=[{"autostart": True, "node_names": list(SERVERS)}],
+        parameters=[{"autostart": True, "node_names": list(SERVERS)}, own_time],
     )
     file = DeclareLaunchArgument("params_file", default_value="nav2_params.yaml")
-    return LaunchDescription([file, *servers, manager])
+    time = DeclareLaunchArgument("use_sim_time", default_value="false", description="time of omnid simulate, by /clock")
+    return LaunchDescription([file, time, *servers, manager])

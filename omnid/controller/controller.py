@@ -19,7 +19,7 @@ from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose,
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Motion
 from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport
-from omnid.core.control.safety_rules import ENDS
+from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.velocity_limits import STOP
 from omnid.engine.flow import nothing
 
@@ -168,9 +168,9 @@ class Controller:
             self._report(f"the wheels stop: {state.obstacle}; {remedy(state.obstacle)}")
 
     def _count_stop(self, reason: str) -> None:
-        """Keep the reason; count it where it ends a drive, and report it unless the end was asked for."""
+        """Keep the reason; count it where it cuts a drive short, and report it unless the end was asked for."""
         before, self.state.reason = self.state.reason, reason
-        if reason and not before:
+        if reason not in ("", IDLE) and not before:
             self.state.stops[reason] += 1
             if reason != ENDS:
                 latched = f"; {UNTIL_ARMED}" if self._law.arming.needs_request else ""

@@ -10,6 +10,7 @@ from typing import Final, TypeAlias
 from omnid.controller.link import DriveLink
 from omnid.core.control.arming import ArmAnswer
 from omnid.core.control.command_sources import PLANNER
+from omnid.core.control.safety_rules import NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
@@ -90,7 +91,15 @@ class LiveCommands:
     def _answer_arm(self, answer: ArmAnswer) -> None:
         """Pass on the controller's answer; of several requests at once it answers the newest."""
         text = answer.refusal or "armed: it obeys commands from now on"
+        if answer.refusal == NO_POSE:
+            text = f"{NO_POSE}: {self._why_no_pose()}"
         self._bus.answer(answer.id, Answer(not answer.refusal, text), also_before=ARM)
+
+    def _why_no_pose(self) -> str:
+        """Return what is missing for the first pose."""
+        if not self._session.graph.telemetry.of("pair").processed:
+            return "no images have come from the cameras (`omnid listen`, `omnid doctor`)"
+        return "the first images are being processed: try again in a moment (`omnid listen` tells what they show)"
 
 
 def _recorded(receive: Receive, record: Callable[[str, bytes], None]) -> Receive:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TypeAlias
 
 from calib.rig_file import rig_toml
+from drivers.motor import VelocityCommand
 from omnid.controller.link import DriveLink
 from omnid.core.control.command_sources import PLANNER
 from omnid.diagnostics.floor_status import floor_status
@@ -65,7 +66,7 @@ class LiveWiring:
         config, graph = session.config, session.graph
         # 1. Connections: the wheels, the bus, wheels' and gyro's samples, the recording.
         controller = robot.connect(session)
-        bus = session.open_bus(rig)
+        bus = session.open_bus(rig, gives_time=robot.waits)
         pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
         sensors = SensorSources(
             config, pairing.motion, session, controller, self._report, with_images=robot.brings_samples
@@ -83,7 +84,7 @@ class LiveWiring:
         files = RouteFiles(RouteFolder(Path(config.navigation.routes)), requests.put)
         front_end = FrontEnd(geometry, config, live_health(geometry, config, self._refined), load=lambda: ladder.level)
         live_rig = LiveRig(session, front_end, ladder, self._refined)
-        sinks = self._sinks(live_rig, bus)
+        sinks = self._sinks(live_rig, bus, own_time=robot.waits)
         if recorder is not None:
             sinks = replace(sinks, recording=RecordingSink(recorder, tuple(frames), config.record.queue))
         self._warn_of_unstated_height()
@@ -136,15 +137,19 @@ class LiveWiring:
         )
         add_status_tickers(session, StatusCollector(sources), bus, recorder)
 
-    def _sinks(self, live_rig: LiveRig, bus: Bus) -> Sinks:
-        """Return the sinks of a run that neither drives nor records."""
+    def _sinks(self, live_rig: LiveRig, bus: Bus, *, own_time: bool) -> Sinks:
+        """Return the sinks of a run that neither drives nor records; own_time: ticks of its wheels tell the time."""
         session, config = self._session, self._session.config
         poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
         return Sinks(
             poses={**poses, **live_rig.pose_sinks},
-            bus=BusSink(bus, session.encoder(self._geometry.rig, config.live.cloud_points)),
+            bus=BusSink(
+                bus,
+                session.encoder(self._geometry.rig, config.live.cloud_points),
+                clock=VelocityCommand if own_time else None,
+            ),
         )
 
     def _warn_of_unstated_height(self) -> None:

@@ -30,7 +30,7 @@ from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
-from omnid.messages import MapUpdate
+from omnid.messages import MapUpdate, OdometryUpdate
 from omnid.runs.log_rig import attached_rig
 from omnid.runs.pipeline import RecordingSink, RunParts, Sinks, wire
 from omnid.runs.place_maps import RigPlaces, RunPlaces
@@ -255,13 +255,13 @@ class _Replay:
 
     def _bus(self, session: Session, geometry: Geometry) -> BusSink | None:
         try:
-            bus = session.open_bus(geometry.rig)
+            bus = session.open_bus(geometry.rig, gives_time=True)
         except OmnidError as error:
             if not self._options.bus_optional:
                 raise
             session.warn(f"the run goes on without a bus: {error}")
             return None
-        return BusSink(bus, session.encoder(geometry.rig, self._config.record.cloud_points))
+        return BusSink(bus, session.encoder(geometry.rig, self._config.record.cloud_points), clock=OdometryUpdate)
 
     def _recorder(self, session: Session, geometry: Geometry, path: Path) -> Recorder:
         config = self._config

@@ -66,9 +66,9 @@ class Session:
                 )
         return geometry(rig, self.config.panorama)
 
-    def open_bus(self, rig: Rig) -> Bus:
-        """Open the bus; it answers queries for the configuration and the rig."""
-        bus = Bus(self.config.bus, self.warn)
+    def open_bus(self, rig: Rig, *, gives_time: bool) -> Bus:
+        """Open the bus; it answers queries for the configuration and the rig. gives_time: as Bus has it."""
+        bus = Bus(self.config.bus, self.warn, gives_time=gives_time)
         self.outputs.callback(self._close_bus, bus)
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))

@@ -7,25 +7,33 @@ import time
 import cv2
 
 from drivers.frame import Frame
+from drivers.motor import VelocityCommand
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.driven_path import DrivenPath
 from omnid.sinks.encoder import Encoder, Outgoing, StateReports
 from omnid.sinks.static_frames import StaticFrames
 from omnid.transport.bus import Bus
+from omnid.transport.codec import clock_cdr
 from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.topics import CLOCK
 
 
 class BusSink:
     """Publishes encoded messages; its inbox drops the oldest (policy NEWEST), because the bus may be slow."""
 
-    def __init__(self, bus: Bus, encode: Encoder) -> None:
+    def __init__(self, bus: Bus, encode: Encoder, clock: type[OdometryUpdate | VelocityCommand] | None = None) -> None:
+        """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
+        self._clock, self._time_ns = clock, 0
         self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
         self._static, self._path = StaticFrames(encode), DrivenPath(encode)
 
     def process(self, message: Outgoing) -> None:
         """Publish a message; a pose with its attachment, and what has changed: states, static frames, the path."""
+        if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
+            self._time_ns = message.stamp_ns
+            self._bus.publish(CLOCK, clock_cdr(message.stamp_ns + self._encode.offset_ns))
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)

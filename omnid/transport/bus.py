@@ -27,7 +27,7 @@ from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Answer, Request
 from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
-from omnid.transport.topics import PUBLISHED, STOP
+from omnid.transport.topics import CLOCK, PUBLISHED, STOP
 
 __all__ = ["Bus", "BusConfig"]
 
@@ -42,13 +42,17 @@ class Bus:
     lost: messages that could not be sent because a client has not reached its router yet.
     """
 
-    def __init__(self, config: BusConfig, warn: Callable[[str], None] = lambda _: None) -> None:
-        """Open the session, or that of a client with the first `connect`.
+    def __init__(
+        self, config: BusConfig, warn: Callable[[str], None] = lambda _: None, *, gives_time: bool = False
+    ) -> None:
+        """Open the session, or that of a client with the first `connect`. gives_time: there is a topic /clock.
 
         Raise OmnidError for a wrong configuration. Robots of the same name are reported by one call of warn and in the
         status; each time that the name is no longer unique, the subscriber of commands receives a stop.
         """
         self._config, self._warn = checked(config), warn
+        # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
+        self._topics = {name: topic for name, topic in PUBLISHED.items() if gives_time or name != CLOCK}
         self._namesakes: Namesakes | None = None
         self._searched_s = 0.0
         self._warned = False
@@ -113,9 +117,9 @@ class Bus:
 
         attachment: zenoh attachment for subscribers that know omnid. A topic with a leading '/' has no robot's name.
         """
-        if topic not in PUBLISHED:
-            raise OmnidError(f"bus key {topic!r} is not published; expected one of {', '.join(PUBLISHED)}")
-        if PUBLISHED[topic].latched:
+        if topic not in self._topics:
+            raise OmnidError(f"bus key {topic!r} is not published; expected one of {', '.join(self._topics)}")
+        if self._topics[topic].latched:
             self._newest[topic] = (payload, zenoh.Encoding.APPLICATION_CDR, attachment)
         if self._session is None:
             self.lost += 1
@@ -193,11 +197,11 @@ class Bus:
         self._namesakes = Namesakes(session, self._config, self._report_same_name)
         self._searched_s = time.monotonic()
         self._graph = graph = RosGraph(session, self._config)
-        self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in PUBLISHED}
-        for name in {*self._newest, *(name for name, topic in PUBLISHED.items() if topic.latched)}:
+        self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in self._topics}
+        for name in {*self._newest, *(name for name, topic in self._topics.items() if topic.latched)}:
             self._declare_queryable(session, name)
         for name, (payload, _, attached) in self._newest.items():  # published before the router was reached
-            if name in PUBLISHED and PUBLISHED[name].transient_local:
+            if name in self._topics and self._topics[name].transient_local:
                 self._publishers[name].put(payload, attached)
         if self._on_command is not None:
             self._declare_subscribers(session, self._on_command)

@@ -31,6 +31,7 @@ PLAIN_TWIST_SCHEMA = "geometry_msgs/msg/Twist"
 VECTOR_SCHEMA = "geometry_msgs/msg/Vector3Stamped"
 GRID_SCHEMA = "nav_msgs/msg/OccupancyGrid"
 HEADER_SCHEMA = "std_msgs/msg/Header"
+CLOCK_SCHEMA = "rosgraph_msgs/msg/Clock"
 BOOL_SCHEMA = "std_msgs/msg/Bool"
 _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
 SCHEMAS = (
@@ -44,6 +45,7 @@ SCHEMAS = (
     VECTOR_SCHEMA,
     GRID_SCHEMA,
     HEADER_SCHEMA,
+    CLOCK_SCHEMA,
 )
 
 QUATERNION_TOLERANCE = 1e-3
@@ -220,6 +222,11 @@ def heading_from_cdr(payload: bytes) -> HeadingRecord:
     return HeadingRecord(
         unchecked_stamp_ns(message.header.stamp), message.header.frame_id, message.vector.x, message.vector.z
     )
+
+
+def clock_cdr(stamp_ns: int) -> bytes:
+    """Encode the time of a run, for programs that follow it."""
+    return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)), CLOCK_SCHEMA)
 
 
 def header_cdr(stamp_ns: int, frame: str = "") -> bytes:

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 from omnid.transport import codec, motion_codec, navigation_codec
 from omnid.transport.scan_codec import SCAN_SCHEMA
 
+CLOCK: Final = "/clock"  # of runs whose time is not the computer's only
 IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
 
@@ -39,6 +40,7 @@ PUBLISHED: Final = {
     "plan": Topic(navigation_codec.PATH_SCHEMA, latched=True),
     "wheel_odom": Topic(motion_codec.WHEEL_SCHEMA),
     "imu": Topic(motion_codec.IMU_SCHEMA),
+    CLOCK: Topic(codec.CLOCK_SCHEMA, realtime=True),
 }
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"

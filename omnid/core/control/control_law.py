@@ -32,6 +32,7 @@ from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.settings import knob
 
 S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
+TO_STAND: Final = Setpoint(0.0)
 JUMP_RAD: Final = 0.3  # of the heading, beyond what the base can turn: odometry was corrected, or is wrong
 
 
@@ -233,11 +234,16 @@ class ControlLaw:
         )
 
     def _command_age_s(self, now_ns: int) -> float:
-        """Return the age of the setpoint; inf where there is none, or a void one."""
+        """Return the age of the setpoint; inf where there is none, a void one, or one to stand that is old.
+
+        Who asks the base to stand and then says nothing has finished: that is no command, rather than a stale one.
+        """
         command = self.commands.current
         if command is None or command.arrival_ns <= self._void_ns:
             return math.inf
-        return (now_ns - command.arrival_ns) * S_PER_NS
+        age_s = (now_ns - command.arrival_ns) * S_PER_NS
+        is_over = command.setpoint == TO_STAND and age_s > self._settings.deadlines.command_s
+        return math.inf if is_over else age_s
 
     def _inputs(self, now_ns: int, late_s: float, motor_failed: bool, motor_stopped: bool) -> SafetyInputs:
         pose = self._pose

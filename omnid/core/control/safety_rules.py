@@ -63,6 +63,7 @@ ASKED: Final = "a stop was asked for"
 FAILED: Final = "the motor controller failed"
 STOPPED: Final = "the motor controller had stopped by itself"
 OVERLOADED: Final = "the host is overloaded"
+NO_POSE: Final = "there is no pose yet"
 POSE_STALE: Final = "the pose is stale"
 POSE_LOST: Final = "the pose is lost"
 POSE_JUMPED: Final = "the heading of the pose has jumped"
@@ -92,6 +93,7 @@ RULES: Final = (
     Rule(MOTOR_FAULT, True, lambda now, _: now.motor_faulty),
     Rule(BATTERY_EMPTY, True, lambda now, _: now.battery_empty),
     Rule(OVERLOADED, True, lambda now, deadlines: not now.late_s <= deadlines.tick_s),
+    Rule(NO_POSE, True, lambda now, _: now.pose_age_s == float("inf")),
     Rule(POSE_STALE, True, lambda now, deadlines: not abs(now.pose_age_s) <= deadlines.pose_s),
     Rule(POSE_LOST, True, lambda now, _: now.pose_state == TrackingState.LOST),
     Rule(POSE_RESET, True, lambda now, _: now.pose_reset),

@@ -112,8 +112,14 @@ FAULTS: dict[str, Callable[[Bench], None]] = {
 
 
 def test_every_fault_of_the_table_is_tested() -> None:
-    """Contacts latch, and have a test of their own."""
-    assert set(FAULTS) == {rule.reason for rule in safety_rules.FAULTS} - LATCHING
+    """Contacts latch, and have a test of their own, as has the time before the first pose."""
+    assert set(FAULTS) == {rule.reason for rule in safety_rules.FAULTS} - LATCHING - {safety_rules.NO_POSE}
+
+
+def test_refuses_to_arm_before_the_first_pose(bench: Bench) -> None:
+    bench.arm()
+    bench.tick()
+    assert bench.controller.state.arm_answer.refusal == safety_rules.NO_POSE and not bench.controller.state.armed
 
 
 def test_is_disarmed_at_the_start(bench: Bench) -> None:

@@ -68,10 +68,10 @@ def send_both(bench: Bench) -> None:
 
 def test_does_not_move_without_a_pose_or_without_a_setpoint(bench: Bench) -> None:
     bench.tick()
-    assert bench.controller.state.reason == safety_rules.POSE_STALE
+    assert bench.controller.state.reason == safety_rules.NO_POSE
     bench.send_setpoint()
     bench.tick()
-    assert is_stop(bench.last) and bench.controller.state.reason == safety_rules.POSE_STALE
+    assert is_stop(bench.last) and bench.controller.state.reason == safety_rules.NO_POSE
     bench.send_pose()
     bench.tick()
     assert is_stop(bench.last), "the setpoint arrived before the pose"
@@ -127,6 +127,17 @@ def test_stops_where_no_more_setpoints_come(driving: Bench) -> None:
     slows_down(driving, driving.send_pose)
     assert driving.controller.state.stops == {safety_rules.COMMAND_STALE: 1}
     assert driving.controller.state.reason == safety_rules.IDLE
+
+
+@pytest.mark.parametrize("turn_radps", [0.0, 0.4])
+def test_a_drive_that_ends_by_a_setpoint_to_stand_is_not_called_cut_short(driving: Bench, turn_radps: float) -> None:
+    """A goal is reached, the stick is in its middle: then its sender is silent. One to turn on the spot is to last."""
+    driving.send_setpoint(Setpoint(0.0, None, turn_radps))
+    for _ in range(20):
+        driving.send_pose()
+        driving.tick()
+    assert is_stop(driving.last) and driving.controller.state.reason == safety_rules.IDLE
+    assert bool(driving.lines) == bool(driving.controller.state.stops) == bool(turn_radps)
 
 
 def test_a_stop_voids_setpoints_and_latches_until_armed(driving: Bench) -> None:

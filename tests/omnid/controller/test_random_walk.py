@@ -376,7 +376,7 @@ def nearer(before: float, now: float) -> bool:
 
 def walk(seed: int, mode: str, ticks: int) -> None:
     seen = Walk(seed, mode).run(ticks)
-    reasons = {rule.reason for rule in safety_rules.RULES} - {safety_rules.ENDS}
+    reasons = {rule.reason for rule in safety_rules.RULES} - {safety_rules.ENDS, safety_rules.NO_POSE}
     if mode == AUTOMATIC:
         reasons -= {safety_rules.NOT_ARMED}
     reasons |= {BLOCKED, MOVING, NEAR, RING_STALE, UNKNOWN}

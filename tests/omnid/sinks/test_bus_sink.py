@@ -52,6 +52,27 @@ def test_a_pose_comes_with_its_state_and_the_frames_of_ros() -> None:
     assert frames == [("odom", "base_link")]
 
 
+@pytest.mark.parametrize("gives_time", [False, True])
+def test_a_run_with_a_time_of_its_own_publishes_it_and_never_back(gives_time: bool) -> None:
+    endpoint, came = free_endpoint(), []
+    bus = Bus(BusConfig(listen=(endpoint,)), gives_time=gives_time)
+    with contextlib.closing(bus), Robot(connect=(endpoint,)) as robot:
+        sink = BusSink(
+            bus, Encoder(np.eye(4), MapEncoding(10), OFFSET_NS), clock=OdometryUpdate if gives_time else None
+        )
+        robot.on_message(lambda topic, payload, _: came.append((topic, payload)))
+        wait_until(lambda: sink.process(odometry(len(came) + 2)) is None and any(topic == "odom" for topic, _ in came))
+        newest = len(came) + 100
+        for seq in (newest, newest - 50, newest + 1):  # a log may step back
+            sink.process(odometry(seq))
+        wait_until(lambda: [topic for topic, _ in came].count("odom") >= 4)
+    stamps = [payload for topic, payload in came if topic == "clock"]
+    assert bool(stamps) == gives_time
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    times = [cast("Any", store.deserialize_cdr(payload, "rosgraph_msgs/msg/Clock")).clock.sec for payload in stamps]
+    assert times == sorted(set(times)) and (not times or times[-1] - OFFSET_NS // 10**9 == newest + 1)
+
+
 def panorama(payload: bytes) -> Any:
     return get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(payload, "sensor_msgs/msg/CompressedImage")
 

@@ -24,6 +24,7 @@ CAUSES: dict[str, dict[str, object]] = {  # in the order in which they are repor
     safety_rules.MOTOR_FAULT: {"motor_faulty": True},
     safety_rules.BATTERY_EMPTY: {"battery_empty": True},
     safety_rules.OVERLOADED: {"late_s": 0.26},
+    safety_rules.NO_POSE: {"pose_age_s": math.inf},
     safety_rules.POSE_STALE: {"pose_age_s": 0.51},
     safety_rules.POSE_LOST: {"pose_state": "lost"},
     safety_rules.POSE_RESET: {"pose_reset": True},
@@ -64,10 +65,10 @@ def test_reports_the_first_of_all_causes() -> None:
     assert reason_for(**everything) == safety_rules.ENDS
 
 
-def test_reports_no_command_without_a_command_and_a_stale_pose_without_a_pose() -> None:
+def test_reports_what_was_never_there_as_missing_rather_than_stale() -> None:
     assert reason_for(command_age_s=math.inf) == safety_rules.IDLE
-    assert reason_for(pose_age_s=math.inf, pose_state="") == safety_rules.POSE_STALE
-    assert reason_for(pose_age_s=math.inf, command_age_s=math.inf) == safety_rules.POSE_STALE
+    assert reason_for(pose_age_s=math.inf, pose_state="") == safety_rules.NO_POSE
+    assert reason_for(pose_age_s=math.inf, command_age_s=math.inf) == safety_rules.NO_POSE
 
 
 @pytest.mark.parametrize("name", ["pose_age_s", "command_age_s", "late_s"])
