@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 
 from calib import se3
+from omnid.api import replay
 from omnid.formats.tum import Trajectory, read_tum
+from omnid.tracking_state import TrackingState
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.records import OdometryRecord
 from omnid.transport.status_names import ODOMETRY
@@ -16,6 +19,7 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
 from tests.replay.edited import dark, images, save
+from tests.simulation import build, write_log
 
 DARK_PAIRS = 20  # pairs, 2 s
 
@@ -80,3 +84,13 @@ def test_another_scene_after_the_darkness(omnid: Command, tmp_path: Path, scene:
     assert found[-1] == ("tracking", 1)
     last = recorded(tmp_path / "out.mcap")[-1]
     assert np.sqrt(np.trace(last.covariance[:3, :3])) > 0.5  # the gap stays in the covariance
+
+
+def test_bricks_of_several_sizes_do_not_mislead(tmp_path: Path) -> None:
+    """The displacement at which the patches correlate best leads to the pose that the first guess misses."""
+    run, pairs = build("brick_corridor", 3), 4
+    write_log(tmp_path, run.rig, run.poses[:pairs], run.scene, seed=3)
+    found = replay(tmp_path / "log.mcap", tmp_path / "rig.toml")
+    moved_m = np.linalg.norm(found.T_odom_rig[:, :3, 3] - found.T_odom_rig[0, :3, 3], axis=1)
+    assert moved_m == pytest.approx(np.linalg.norm(run.poses[:pairs, :3, 3] - run.poses[0, :3, 3], axis=1), abs=0.01)
+    assert {*found.states} == {TrackingState.TRACKING}

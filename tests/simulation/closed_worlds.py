@@ -172,3 +172,27 @@ def with_people(scene: Scene, rng: Random, around: Array, count: int = 3) -> Sce
         at = (float(around[0] + distance_m * np.cos(angle)), float(around[1] + distance_m * np.sin(angle)))
         faces += box(rng, at, (0.4, 0.25, 1.7), float(rng.uniform(0, np.pi)))
     return Scene((*scene.rectangles, *faces))
+
+
+def repeating(seed: int, length_m: float, period_m: float = 0.3) -> Scene:
+    """Return a corridor that looks the same again after each period along it, on walls, floor and ceiling.
+
+    Its ends are half the length away from x = 0.
+    """
+    scene = corridor(seed, length_m, ("granite",) * 5, posters_per_8m=0)
+    back = np.array([2.0 - length_m / 2, 0.0, 0.0])
+    return Scene(
+        tuple(
+            replace(r, origin=r.origin + back, texture=_repeated(r, period_m))
+            for r in scene.rectangles
+            if not r.name.startswith("box")
+        )
+    )
+
+
+def _repeated(rectangle: Rectangle, period_m: float) -> np.ndarray:
+    """Return the texture of a rectangle, of which the first period along its width is repeated."""
+    texture, columns = rectangle.texture, round(period_m * rectangle.texture.shape[1] / rectangle.width_m)
+    return np.ascontiguousarray(
+        np.tile(texture[:, :columns], (1, -(-texture.shape[1] // columns)))[:, : texture.shape[1]]
+    )

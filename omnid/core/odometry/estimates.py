@@ -38,6 +38,15 @@ class PoseEstimate:
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
     assumed: AssumedMotion = NOTHING_ASSUMED  # by which the disparities were corrected
+    # Mean cost of a landmark in view: half of the Cauchy kernel's value, by the landmarks that count as one.
+    cost: float = 0.0
+    in_view: int = 0  # landmarks by which it is meant
+    runner_up: Array | None = None  # (6,) [t; r] of the step to a pose that explains the images nearly as well
+
+    @property
+    def spread(self) -> Array:
+        """The covariance (6, 6) that covers the runner-up as well."""
+        return self.covariance if self.runner_up is None else self.covariance + np.outer(self.runner_up, self.runner_up)
 
     @property
     def without_landmarks(self) -> PoseEstimate:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -15,6 +16,7 @@ from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShif
 from omnid.core.odometry.local_map import LocalMap, Tracks
 from omnid.core.odometry.patch_alignment import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import CONVERGED, GaussNewtonResult, SharedError, gauss_newton, ransac
+from omnid.core.odometry.pose_kernels import KERNEL_WIDTH
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.stereo_model import StereoModel
@@ -115,6 +117,7 @@ class FrameToMap:
         """
         T_odom_curr = se3.inverse(coarse.T_curr_odom)
         landmarks, _ = self._map.visible(T_odom_curr)
+        in_view = len(landmarks)
         in_curr = se3.apply(coarse.T_curr_odom, self._map.store.table.points[landmarks])
         shift = exposure.shift(in_curr)
         aligned = self._map.align(frame.lower, T_odom_curr, landmarks, shift.lower)
@@ -154,6 +157,8 @@ class FrameToMap:
             variance[kept],
             rejected,
             assumed,
+            _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
+            in_view,
         )
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
@@ -226,3 +231,15 @@ class FrameToMap:
             squared[kept] = solution.squared
             kept = squared < OUTLIER_SQUARED
         return (solution if kept.sum() >= MIN_LANDMARKS else None), kept
+
+
+def _cost(squared: Array, in_view: int) -> float:
+    """Return the mean cost of a landmark in view, by the squared errors (M,) of those that are inliers.
+
+    It is the negative logarithm of the likelihood with the Cauchy kernel, k^2 / 2 log(1 + e^2 / k^2), by the landmarks
+    that count as one; an outlier costs what the last inlier does.
+    """
+    width2 = KERNEL_WIDTH**2
+    inliers = float(np.log1p(squared / width2).sum())
+    outliers = (in_view - len(squared)) * math.log1p(OUTLIER_SQUARED / width2)
+    return width2 / 2 * (inliers + outliers) / CORRELATED_LANDMARKS / max(1, in_view)

@@ -92,6 +92,11 @@ class LocalMap:
         pixels, found = track(self._last, lower, before, predicted[:, :2], self._near_klt if near else self._coarse_klt)
         return Tracks(rows[found], pixels[found], predicted[found], len(rows), count / max(1, len(rows)))
 
+    def last_seen(self, most: int) -> tuple[PaddedPanorama | None, Indices]:
+        """Return the last panorama, and about `most` evenly chosen landmarks (M,) that were found in it."""
+        rows = np.flatnonzero(np.isfinite(self.store.table.pixels[:, 0]))
+        return self._last, rows[:: max(1, -(-len(rows) // most))]
+
     def visible(self, T_odom_rect: Array) -> tuple[Indices, Array]:
         """Return the landmarks (M,) that a pose predicts in live parts of the panorama, and their views (M, 3) [px]."""
         points = se3.apply(se3.inverse(T_odom_rect), self.store.table.points)

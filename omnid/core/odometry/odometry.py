@@ -5,6 +5,7 @@ VisualOdometry.process is the algorithm, one frame at a time. Equations and sect
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -22,6 +23,7 @@ from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
+from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, displacements, doubt_after, likeliest
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
@@ -69,6 +71,7 @@ class VisualOdometry:
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status = TrackingStatus()
         self._resets = 0
+        self._doubt: Doubt | None = None  # which of several motions was made
         self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
         self._requested: KeyframeRequest | None = None  # by the last frame, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
@@ -150,7 +153,36 @@ class VisualOdometry:
             estimate = with_more_inliers(estimate, refined)
             if self._is_good(estimate, is_near):
                 break
-        return estimate
+        return self._with_runner_up(frame, estimate, T_predicted, exposure, dt_s)
+
+    def _with_runner_up(
+        self, frame: StereoFrame, estimate: PoseEstimate | None, T_predicted: Array, exposure: Exposure, dt_s: float
+    ) -> PoseEstimate | None:
+        """Return the likeliest motion that a vehicle may have made, with its runner-up: runner_up_motions.py."""
+        if estimate is None:
+            return None
+        # 1. How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors
+        #    of steps for independent, which those of runners-up are not; wheels, which measure each step, tell more.
+        sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
+        is_measured = frame.sensed is not None and frame.sensed.is_complete
+        doubt = None if is_measured or not self._in_doubt else self._doubt
+        of_runner_up_mps = doubt.runner_up_distance_mps if doubt else 0.0
+        most_mps = min(REACH_SIGMAS * sigma_mps + of_runner_up_mps, self._limits.max_speed_mps)
+        reach_m = most_mps * self._since_fix_s(dt_s)
+        off_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
+        # 2. Displacements there from which the images look alike, and the poses to which they lead.
+        peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
+        is_good, others = self._is_good(estimate, is_near=False), []
+        for x, y in peaks:
+            if is_good and x == y == 0:
+                continue
+            T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
+            tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=True)
+            coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
+            refined = self._exposures.refine(frame, coarse, exposure, self._T_odom_rect, dt_s) if coarse else None
+            others += [refined] if refined is not None else []
+        # 3. The likeliest one, and whether another one is nearly as likely.
+        return likeliest(estimate, others, T_predicted, reach_m)
 
     def complete(self) -> None:
         """Make the last frame a keyframe if the map needs one; the next `process` does so where this is not called.
@@ -218,18 +250,24 @@ class VisualOdometry:
         if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             at_previous = self._motion.accept(
-                T_prev_curr, estimate.covariance, dt_s, exposed_at_once=frame.times.is_at_once
+                T_prev_curr, estimate.spread, dt_s, exposed_at_once=frame.times.is_at_once
             )
-            if estimate.inliers >= self._limits.good_inliers:
+            if estimate.inliers >= self._limits.good_inliers and estimate.runner_up is None:
                 self._step = T_prev_curr, estimate.covariance
         elif frame.sensed is None:
             self._motion.reset()
         self._map.late_depths.settle(at_previous)
         self._motion.found()
         self._covariance = estimate.covariance + (self._map_covariance(estimate) if len(estimate.landmarks) else 0.0)
+        self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
-        self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers))
+        self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=self._in_doubt))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
+
+    @property
+    def _in_doubt(self) -> bool:
+        """True while it is not known which of several motions was made."""
+        return self._doubt is not None and self._doubt.is_open
 
     def _refuse(
         self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, elsewhere: GapStep | None
@@ -338,7 +376,7 @@ class VisualOdometry:
     ) -> OdometryEstimate:
         return OdometryEstimate(
             self._T_odom_rect,
-            self._covariance,
+            self._covariance + (self._doubt.covariance(self._T_odom_rect) if self._doubt else 0.0),
             self._motion.velocity,
             self._motion.velocity_covariance,
             self._status.state,

@@ -4,6 +4,7 @@ NOT_STARTED ----------------------------------------------> LOST
 STARTED, ACCEPTED ----------------------------------------> TRACKING
 STARTED again after an unknown motion --------------------> DEGRADED
 ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
+ACCEPTED with a runner-up that is nearly as likely -----------> DEGRADED
 REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
 REFUSED from then on -------------------------------------> LOST, and the map is started again when
                                                             restart_after textured frames matched nothing,
@@ -36,6 +37,7 @@ class FrameFacts:
     outcome: FrameOutcome
     dt_s: float  # since the previous frame
     inliers: int = 0
+    runner_up: bool = False  # another motion explains the images nearly as well
     textured: bool = True  # the frame has enough corners for a map
     elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
     carried: bool = False  # wheels and gyro carry the pose on
@@ -68,7 +70,8 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
     if facts.outcome is FrameOutcome.ACCEPTED:
         few_inliers = facts.inliers < limits.good_inliers
         after_gap = status.refused_frames > 0 or facts.dt_s > limits.max_gap_s
-        return TrackingStatus(TrackingState.DEGRADED if few_inliers or after_gap else TrackingState.TRACKING)
+        is_doubtful = few_inliers or after_gap or facts.runner_up
+        return TrackingStatus(TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING)
 
     refused_frames = status.refused_frames + 1
     if refused_frames < limits.lost_after:

@@ -1,0 +1,208 @@
+"""Runner-up motions: displacements from which the images would look nearly the same, as along identical bricks.
+
+With the landmarks' patches A_i of the last panorama and the view pi(T^-1 p_i) of landmark i from a pose T in the new
+panorama B, the likelihood of a displacement d [m] of the pose follows
+
+    C(d) = 1/N sum_i NCC(A_i, B at pi((T exp d)^-1 p_i)).
+
+On a texture that does not repeat C has one peak; on one that repeats with the period L it has others at multiples of L.
+Displacements are horizontal, as those of a vehicle on a floor, and within the reach that is known of the velocity. The
+peaks are guesses of the pose that the odometry then estimates from and compares as it does those of the yaw.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.motion_filter import JERK_PSD, START_ACCELERATION_VARIANCE
+from omnid.core.stereo.triangulation import view
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+LANDMARKS = 120  # whose patches are compared, evenly chosen: the mean of as many correlations errs by less than 0.1
+# Side of a patch in samples, and their distance, px: as wide as the tracker's window, and blurred by as much as a step
+# of the grid moves it.
+SAMPLES, SAMPLE_PX = 7, 2
+BLUR_PX = 2.0
+# Displacement between two candidates at the median distance, px: a tracker's window without a pyramid finds its place
+# from half as far.
+STEP_PX = 5.0
+MOST_STEPS = 12  # to each side: a wider reach is searched in wider steps
+PEAKS = 3  # that are estimated from
+# Share of the mean correlation at the pose that another peak must reach to be estimated from: textures that do not
+# repeat stay below 0.37 of it on rendered logs, identical bricks reach 0.62 and more.
+PEAK_SHARE = 0.5
+MIN_PATCH_GREY = 1.0  # standard deviation of a patch's grey levels, below which it has no texture
+# Difference of the costs of two poses, the logarithm of the ratio of their likelihoods, up to which the less likely one
+# is a runner-up: a million to one.
+RUNNER_UP_COST = math.log(1e6)
+# Error of a runner-up pose as a share of its displacement: few millimetres of a period of some decimetres.
+RUNNER_UP_ERROR = 0.02
+SAME_M = 0.02  # poses that differ less are one: four sigmas of a pose that few landmarks support
+# Consecutive steps without a runner-up that end a doubt: in one of 29 the noise hid it.
+CLEAR_STEPS = 3
+# Sigmas of a predicted velocity, or of its change, within which a motion is to be expected: of the unknown velocity
+# after a start they are 5 m/s, the limit of the speed, so that no motion of a vehicle is left out.
+REACH_SIGMAS = 5.0
+# What a vehicle's velocity changes by: standard deviation of an acceleration that is not known, and the jerk's density.
+ACCELERATION_VARIANCE, JERK_DENSITY = START_ACCELERATION_VARIANCE, JERK_PSD[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """Displacement (x, y) [m] of a pose in its own axes, and the mean correlation of the patches there."""
+
+    displacement: Array  # (2,)
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Motions that were chosen from several, and what the pose would be by the others.
+
+    It is over after CLEAR_STEPS without a runner-up. Where the velocity of the first of them is that which was chosen,
+    and a vehicle cannot have changed to it from the runner-up's, the choice was right; else it stays in the covariance.
+    """
+
+    T_odom_rect: Array  # (4, 4) the pose that was chosen last
+    displacement: Array  # (6,) [t; r] from it to the one by the runners-up
+    chosen_mps: Array  # (3,) velocities of the last step in odom, as chosen and by the runner-up
+    runner_up_mps: Array
+    is_right: bool = True  # as far as is known: the velocities that were chosen follow from each other
+    clear_steps: int = 0  # consecutive ones without a runner-up
+
+    @property
+    def is_open(self) -> bool:
+        """True while it is not known which motion was made."""
+        return self.clear_steps < CLEAR_STEPS
+
+    @property
+    def runner_up_distance_mps(self) -> float:
+        """By how much the runner-up's velocity differs from the one that was chosen."""
+        return float(np.linalg.norm(self.runner_up_mps - self.chosen_mps))
+
+    def covariance(self, T_odom_rect: Array) -> Array:
+        """Return the covariance (6, 6) of a later pose by it."""
+        moved = se3.adjoint(se3.inverse(T_odom_rect) @ self.T_odom_rect) @ self.displacement
+        aside = np.repeat([RUNNER_UP_ERROR * float(np.linalg.norm(moved[:3])), 0.0], 3)
+        return np.outer(moved, moved) + np.diag(aside**2)
+
+    def after_clear_step(self, velocity_mps: Array, dt_s: float) -> Doubt | None:
+        """Return the doubt after a step of dt_s without a runner-up, by its velocity (3,) in odom; None: settled."""
+        is_right = self.is_right
+        if self.clear_steps == 0:
+            chosen, other = (np.linalg.norm(velocity_mps - each) for each in (self.chosen_mps, self.runner_up_mps))
+            is_right = self.is_right and bool(chosen <= most_change_mps(dt_s) < other)
+        after = replace(self, is_right=is_right, clear_steps=self.clear_steps + 1)
+        return after if after.is_open or not is_right else None
+
+
+def most_change_mps(dt_s: float) -> float:
+    """Return by how much a vehicle's velocity changes in a time at most: the motion filter's model, REACH_SIGMAS."""
+    return REACH_SIGMAS * math.sqrt(ACCELERATION_VARIANCE * dt_s**2 + JERK_DENSITY * dt_s**3 / 3)
+
+
+def doubt_after(before: Doubt | None, T_odom_prev: Array, estimate: PoseEstimate, dt_s: float) -> Doubt | None:
+    """Return the doubt after a step of dt_s to an estimate, which may have a runner-up."""
+    velocity = (estimate.T_odom_rect[:3, 3] - T_odom_prev[:3, 3]) / dt_s
+    if estimate.runner_up is None:
+        return None if before is None else before.after_clear_step(velocity, dt_s)
+    displacement, is_right = estimate.runner_up, True
+    if before is not None:
+        # The same mistake in each step adds up.
+        earlier = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ before.T_odom_rect) @ before.displacement
+        displacement = earlier + displacement * (1.0 if earlier[:3] @ displacement[:3] >= 0 else -1.0)
+        is_right = before.is_right and bool(np.linalg.norm(velocity - before.chosen_mps) <= most_change_mps(dt_s))
+    runner_up_mps = velocity + estimate.T_odom_rect[:3, :3] @ estimate.runner_up[:3] / dt_s
+    return Doubt(estimate.T_odom_rect, displacement, velocity, runner_up_mps, is_right)
+
+
+def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Array, reach_m: float) -> PoseEstimate:
+    """Return the most likely estimate, with the farthest of its runners-up.
+
+    others: from displacements; one that is not within reach_m [m] of the pose T_predicted is no motion of a vehicle. Of
+    estimates of one pose the one with most inliers is taken.
+    """
+    within = [each for each in others if np.linalg.norm(each.T_odom_rect[:3, 3] - T_predicted[:3, 3]) < reach_m]
+    best = min([found, *within], key=lambda estimate: estimate.cost)
+    steps = [(each, se3.log(se3.inverse(best.T_odom_rect) @ each.T_odom_rect)) for each in (found, *within)]
+    same = [each for each, step in steps if np.linalg.norm(step[:3]) <= SAME_M]
+    runners_up = [
+        step
+        for each, step in steps
+        if np.linalg.norm(step[:3]) > SAME_M
+        and (each.cost - best.cost) * min(best.in_view, each.in_view) < RUNNER_UP_COST
+        and np.linalg.norm(each.T_odom_rect[:3, 3] - T_predicted[:3, 3]) < reach_m
+    ]
+    farthest = max(runners_up, key=lambda step: float(np.linalg.norm(step[:3])), default=None)
+    return replace(max(same, key=lambda estimate: estimate.inliers), runner_up=farthest)
+
+
+def displacements(
+    local_map: LocalMap, model: StereoModel, current: PaddedPanorama, T_odom_rect: Array, reach_m: float
+) -> list[Array]:
+    """Return displacements (x, y) [m] of a pose, in its own axes, at which the last panorama's patches are seen too.
+
+    At most PEAKS, best first; the pose itself may be among them, as (0, 0). reach_m: the largest one that is searched;
+    one within a step of the grid is none.
+    """
+    before, rows = local_map.last_seen(LANDMARKS)
+    if before is None or not len(rows):
+        return []
+    table = local_map.store.table
+    points = se3.apply(se3.inverse(T_odom_rect), table.points[rows])
+    step_px = STEP_PX / model.cylinder.focal_px
+    step_m = max(step_px * float(np.median(np.hypot(points[:, 0], points[:, 1]))), reach_m / MOST_STEPS)
+    if reach_m < step_m:
+        return []
+    steps = math.ceil(reach_m / step_m)
+    offsets: Array = np.arange(-steps, steps + 1, dtype=float) * step_m
+    patches, textured = _normalised(_sampled(_blurred(before), before, table.pixels[rows]))
+    if not textured.any():
+        return []
+    blurred, scores = _blurred(current), np.empty((len(offsets), len(offsets)))
+    for a, x in enumerate(offsets):
+        moved = np.concatenate([points - (x, y, 0.0) for y in offsets])
+        seen, _ = _normalised(_sampled(blurred, current, view(moved, model.cylinder, model.baseline_m)[:, :2]))
+        each = np.einsum("gns,ns->gn", seen.reshape(len(offsets), *patches.shape), patches)
+        scores[a] = each[:, textured].mean(axis=1)
+    return [peak.displacement for peak in _peaks(scores, offsets) if peak.score > PEAK_SHARE * scores[steps, steps]]
+
+
+def _peaks(scores: Array, offsets: Array) -> list[Peak]:
+    """Return the local maxima of scores (G, G) over displacements (G,) along x and y, best first."""
+    highest = cv2.dilate(scores, np.ones((3, 3)))
+    at = np.argwhere(scores == highest)
+    found = [Peak(offsets[index], float(scores[tuple(index)])) for index in at]
+    return sorted(found, key=lambda peak: -peak.score)[:PEAKS]
+
+
+def _blurred(panorama: PaddedPanorama) -> NDArray[np.float32]:
+    return np.asarray(cv2.GaussianBlur(panorama.image.astype(np.float32), (0, 0), BLUR_PX), np.float32)
+
+
+def _sampled(image: NDArray[np.float32], panorama: PaddedPanorama, pixels: Array) -> Array:
+    """Return patches (N, S) of a blurred padded image about pixels (N, 2)."""
+    side = (np.arange(SAMPLES) - SAMPLES // 2) * SAMPLE_PX
+    columns = np.rint(panorama.padded(pixels[:, 0])).astype(np.intp)[:, None] + np.tile(side, SAMPLES)
+    rows = np.rint(pixels[:, 1]).astype(np.intp)[:, None] + np.repeat(side, SAMPLES)
+    return np.asarray(image[rows.clip(0, image.shape[0] - 1), columns.clip(0, image.shape[1] - 1)], float)
+
+
+def _normalised(patches: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Return patches (N, S) of zero mean and unit length, and flags (N,) of those with texture."""
+    patches = patches - patches.mean(axis=1, keepdims=True)
+    length = np.sqrt((patches**2).sum(axis=1))
+    textured = length > MIN_PATCH_GREY * SAMPLES
+    return patches / np.maximum(length, 1e-9)[:, None], textured

@@ -1,0 +1,97 @@
+"""Worlds that repeat: the pose is degraded and its covariance covers all motions, until something tells them apart."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
+from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.odometry import VisualOdometry
+from omnid.core.odometry.runner_up_motions import CLEAR_STEPS, Doubt, doubt_after, likeliest
+from omnid.core.odometry.sensed_motion import SensedMotion
+from omnid.core.odometry.tracking import KltSettings
+from omnid.core.places.relocalisation import Relocaliser
+from omnid.tracking_state import TrackingState
+from tests.omnid.core.scenery import RenderedCameras, motion_errors
+from tests.simulation import make_rig
+from tests.simulation.closed_worlds import repeating
+from tests.simulation.paths import planar_poses
+
+Array = NDArray[np.float64]
+
+PERIOD_S, PERIOD_M, STEP_M = 0.1, 0.3, 0.28
+NOISE = np.diag(np.repeat([5e-4, 2e-4], 3) ** 2)
+
+
+def driven(cameras: RenderedCameras, poses: Array, sensed: SensedMotion | None = None) -> list[OdometryEstimate]:
+    """Return the estimates at poses (N, 4, 4) of the rig, PERIOD_S apart."""
+    odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(), Relocaliser(cameras.model))
+    frames = [replace(cameras.frame(k, T), sensed=sensed if k else None) for k, T in enumerate(poses)]
+    return [odometry.process(frame, PERIOD_S if k else 0.0) for k, frame in enumerate(frames)]
+
+
+@pytest.fixture(scope="module")
+def alike() -> RenderedCameras:
+    return RenderedCameras.of(make_rig(size=256), repeating(1, 40.0, PERIOD_M))
+
+
+def ahead(steps: int, step_m: float) -> Array:
+    return planar_poses(np.column_stack([step_m * np.arange(steps + 1), np.zeros(steps + 1)]), np.zeros(steps + 1))
+
+
+def test_a_world_that_repeats_is_degraded_and_the_covariance_covers_all_motions(alike: RenderedCameras) -> None:
+    """Steps of nearly one period look like small ones back: the pose is wrong, and says so."""
+    poses = ahead(6, STEP_M)
+    found = driven(alike, poses)[1:]
+    for k, estimate in enumerate(found, 1):
+        error = se3.log(se3.inverse(se3.inverse(poses[0]) @ poses[k]) @ estimate.T_odom_rect)[:3]
+        assert estimate.state is TrackingState.DEGRADED, k
+        assert np.sqrt(error @ np.linalg.solve(estimate.covariance[:3, :3], error) / 3) < 2, k
+        assert abs(error[0]) > 0.9 * PERIOD_M, "this world is to mislead"
+
+
+def test_wheels_tell_which_motion_it_was(alike: RenderedCameras) -> None:
+    sensed = SensedMotion(np.array([STEP_M, 0, 0, 0, 0, 0]), NOISE, NOISE, is_complete=True)
+    poses = ahead(4, STEP_M)
+    for k, estimate in enumerate(driven(alike, poses, sensed)):
+        assert estimate.state is TrackingState.TRACKING, k
+        assert motion_errors(estimate.T_odom_rect, se3.inverse(poses[0]) @ poses[k])[0] < 0.01, k
+        assert estimate.covariance[0, 0] < 0.02**2, k
+
+
+def pose(x_m: float, cost: float, inliers: int = 100, runner_up: Array | None = None) -> PoseEstimate:
+    T = se3.exp([x_m, 0, 0, 0, 0, 0])
+    return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, inliers, cost=cost, in_view=100, runner_up=runner_up)
+
+
+def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
+    near, unlikely, far, same = pose(0.3, 0.25), pose(0.3, 0.5), pose(0.9, 0.1), pose(0.01, 0.2, inliers=120)
+    best = pose(0.0, 0.2)
+    found = likeliest(best, [near], np.eye(4), 0.5)
+    assert found.runner_up is not None and found.runner_up == pytest.approx([0.3, 0, 0, 0, 0, 0])
+    for other in (unlikely, far):
+        assert likeliest(best, [other], np.eye(4), 0.5).runner_up is None
+    assert likeliest(best, [same], np.eye(4), 0.5).inliers == 120
+    assert likeliest(unlikely, [best], np.eye(4), 0.5).T_odom_rect[0, 3] == 0
+
+
+def test_a_doubt_ends_where_clear_steps_go_on_as_was_chosen() -> None:
+    def after(clear_m: float) -> Doubt | None:
+        """Return what is left of a doubt between 0.05 and 0.35 m, after clear steps of clear_m."""
+        x_m = 0.05
+        doubt = doubt_after(None, np.eye(4), pose(x_m, 0, runner_up=np.array([PERIOD_M, 0, 0, 0, 0, 0])), PERIOD_S)
+        for _ in range(CLEAR_STEPS):
+            assert doubt is not None and doubt.is_open
+            before, x_m = pose(x_m, 0).T_odom_rect, x_m + clear_m
+            doubt = doubt_after(doubt, before, pose(x_m, 0), PERIOD_S)
+        return doubt
+
+    assert after(0.06) is None
+    wrong = after(0.34)
+    assert wrong is not None and not wrong.is_open
+    assert wrong.covariance(se3.exp([1.0, 0, 0, 0, 0, 0]))[0, 0] == pytest.approx(PERIOD_M**2, rel=1e-2)
