@@ -17,6 +17,7 @@ from calib.fit.boards.camera_selection import (
     camera_structure,
     refine_selection,
     select_calibration,
+    with_print_shape,
 )
 from calib.fit.residual_structure import ResidualStructure
 from calib.masks.stack_mask import find_mask
@@ -26,6 +27,7 @@ from calib.rig_file import write_file
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, is_log, read_images
+from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 
 # A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
@@ -56,6 +58,7 @@ class CameraResult:
         found = self.calibration
         return [
             *misfit_warning("camera", camera_structure(found)),
+            *print_shape_notes(found.shape, found.board),
             *found.warnings,
             *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
         ]
@@ -115,9 +118,13 @@ def calibrate_camera(
     report_scores(selected, "camera", progress)
     # 4. Refine the corners with the camera, and fit it again.
     selected = refine_selection(selected, images, view)
-    # 5. Find what never shows the world.
-    center = selected.calibration.camera.center
-    return CameraResult(selected, find_mask(list(images.values()), center) if with_mask else None, images)
+    # 5. If the print differs from its drawing, select and fit again with its shape.
+    bent = with_print_shape(selected, view)
+    if bent is not selected:
+        report_scores(bent, "camera, with the shape of the print", progress)
+    # 6. Find what never shows the world.
+    center = bent.calibration.camera.center
+    return CameraResult(bent, find_mask(list(images.values()), center) if with_mask else None, images)
 
 
 def report_scores(selected: SelectedCalibration, name: str, progress: Progress) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import numpy as np
 from calib import se3
 from calib.boards.board import BoardView
 from calib.boards.marker_board import AprilGrid
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.camera_file import CameraFile
 from calib.fit.boards.camera_fit import RejectedView
-from calib.fit.boards.camera_selection import ModelChoice, refine_selection, select_calibration
+from calib.fit.boards.camera_selection import ModelChoice
 from calib.fit.boards.rig_covariance import rig_covariance
-from calib.fit.boards.rig_fit import PairView, RigCalibration, Sides, fit_rig, refine_rig_calibration
+from calib.fit.boards.rig_fit import RigCalibration, fit_rig, refine_rig_calibration, rig_print_shape
+from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.masks.rim import find_rim
@@ -27,10 +30,12 @@ from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
-from omnid.calibration.camera import MAX_LOG_VIEWS, misfit_warning, report_scores
+from omnid.calibration.camera import MAX_LOG_VIEWS, misfit_warning
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
 from omnid.calibration.images import Images
+from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
+from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
 from omnid.calibration.rig_report import rig_report_html
 from omnid.errors import OmnidError
 
@@ -64,7 +69,13 @@ class RigResult:
             for side, name in enumerate(SIDES)
             for line in misfit_warning(f"{name} camera", self.calibration.structure(side))
         ]
-        return [*misfit, *self.notes, *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected)]
+        shape = print_shape_notes(self.calibration.shape, self.calibration.board)
+        return [
+            *misfit,
+            *shape,
+            *self.notes,
+            *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected),
+        ]
 
     def __str__(self) -> str:
         found = self.calibration
@@ -116,40 +127,48 @@ def calibrate_rig(
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
     single = (
-        _FittedCameras.known(cameras, views) if cameras else _fit_cameras(views, images, board, (model, view), progress)
+        FittedCameras.known(cameras, views)
+        if cameras
+        else fit_cameras(views, images, board, (model, view, AS_DRAWN), progress)
     )
     # 4. Fit the transform between the cameras, and the cameras with it.
     refined = cameras is None or refine_cameras
-    if refined:
-        selected = select_rig(single.views, board, single.cameras, single.polynomials)
-        for number, score in enumerate(selected.scores):
-            progress(f"rig: {'compared' if number else 'selected'} {score}")
-        found = selected.calibration
-    else:
-        found = fit_rig(single.views, board, single.cameras, refined)
+    found = _fit_rig(single.views, single, board, refined, AS_DRAWN, progress)
     # 5. Refine the corners with the cameras, and fit the rig again.
     found = refine_rig_calibration(found, images.sides, refined)
+    rejected = (*single.rejected, *found.rejected)
+    # 6. If the print differs from its drawing, fit the cameras and the rig again with its shape.
+    shape = rig_print_shape(found, refined)
+    if not shape.is_as_drawn:
+        progress("the board is not as drawn: once more with its shape")
+        if cameras is None:
+            single = fit_cameras(list(found.views), images, board, (model, view, shape), progress)
+            rejected = (*rejected, *single.rejected)
+        found = _fit_rig(single.views if cameras is None else found.views, single, board, refined, shape, progress)
+        rejected = (*rejected, *found.rejected)
     alone = () if refined else _views_of_one_camera(views)
-    found = replace(found, rejected=(*single.rejected, *alone, *found.rejected))
-    # 6. Compare the baseline with what it can be, and build the rig with masks and covariance.
+    found = replace(found, rejected=(*alone, *rejected))
+    # 7. Compare the baseline with what it can be, and build the rig with masks and covariance.
     notes = _check_baseline(found, board, expected_baseline_m)
     rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
     return RigResult(replace(rig, covariance=rig_covariance(found, rig)), found, images, (*notes, *unmasked))
 
 
-@dataclass(frozen=True, slots=True)
-class _FittedCameras:
-    """Both cameras, each by its own views; polynomials: cameras from which the terms of real mirrors are fitted."""
-
-    cameras: Sides
-    polynomials: tuple[OcamCamera, OcamCamera] | None
-    views: list[PairView]  # without the rejected ones
-    rejected: tuple[RejectedView, ...]
-
-    @staticmethod
-    def known(files: GivenCameras, views: list[PairView]) -> _FittedCameras:
-        """Return cameras that are known before."""
-        return _FittedCameras((files[0].camera, files[1].camera), None, views, ())
+def _fit_rig(
+    views: Sequence[PairView],
+    single: FittedCameras,
+    board: AnyBoard,
+    refined: bool,
+    shape: PrintShape,
+    progress: Progress,
+) -> RigCalibration:
+    """Fit the transform between the cameras to views, and the cameras with it if refined."""
+    if not refined:
+        return fit_rig(views, board, single.cameras, refined, shape)
+    selected = select_rig(views, board, single.cameras, single.polynomials, shape)
+    for number, score in enumerate(selected.scores):
+        progress(f"rig: {'compared' if number else 'selected'} {score}")
+    return selected.calibration
 
 
 def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
@@ -201,38 +220,6 @@ def _find_side(
     except OmnidError as error:
         raise OmnidError(f"{name} camera: {error}") from error
     return {view.name: view for view in views}
-
-
-def _fit_cameras(
-    views: list[PairView], images: PairedImages, board: AnyBoard, choice: tuple[ModelChoice, View], progress: Progress
-) -> _FittedCameras:
-    """Fit each camera to all its views; views that do not fit their camera are rejected."""
-    model, direction = choice
-    cameras, polynomials, rejected = [], list[OcamCamera](), list[RejectedView]()
-    for side, name in enumerate(SIDES):
-        seen = [own for view in views if (own := view.seen[side]) is not None]
-        height, width = images.sides[side][seen[0].name].shape if seen else (0, 0)
-        selected = select_calibration(seen, board, (width, height), model, direction)
-        report_scores(selected, f"{name} camera", progress)
-        found = refine_selection(selected, images.sides[side], direction).calibration
-        cameras.append(found.camera)
-        if selected.polynomial is not None:
-            polynomials.append(selected.polynomial)
-        rejected += [RejectedView(bad.name, f"{name} camera: {bad.reason}") for bad in found.rejected]
-        views = _without(views, side, {bad.name for bad in found.rejected})
-    general = (polynomials[0], polynomials[1]) if model == "auto" and len(polynomials) == len(SIDES) else None
-    return _FittedCameras((cameras[0], cameras[1]), general, views, tuple(rejected))
-
-
-def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView]:
-    """Remove one camera's views of the named instants; the other camera's views are kept."""
-    kept = [
-        view
-        if view.name not in names
-        else replace(view, seen=(None, view.seen[1]) if side == 0 else (view.seen[0], None))
-        for view in views
-    ]
-    return [view for view in kept if any(view.seen)]
 
 
 def _views_of_one_camera(views: list[PairView]) -> list[RejectedView]:

@@ -18,7 +18,8 @@ import numpy as np
 from calib import se3
 from calib.boards.board import Board
 from calib.fit.boards.camera_fit import fit_camera, refine_camera_calibration
-from calib.fit.boards.rig_fit import PairView, RigCalibration, fit_rig, refine_rig_calibration
+from calib.fit.boards.rig_fit import RigCalibration, fit_rig, refine_rig_calibration
+from calib.fit.boards.rig_problem import PairView
 from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig

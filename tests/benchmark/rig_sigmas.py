@@ -23,7 +23,8 @@ import numpy as np
 from calib import se3
 from calib.boards.board import BoardView
 from calib.fit.boards.camera_selection import select_calibration
-from calib.fit.boards.rig_fit import PairView, RigCalibration
+from calib.fit.boards.rig_fit import RigCalibration
+from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import (
     AZIMUTHS,

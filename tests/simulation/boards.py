@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.boards.board import Board
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.models.camera import Array, Mask, OmniCamera
 from calib.rig import MountedCamera, Rig
 from omnid.simulation.rendering.ray_caster import render_grey
@@ -53,6 +54,37 @@ def board_rectangle(board: Board, T_rig_board: Array, texture: NDArray[np.uint8]
     return Rectangle(origin, right - origin, below - origin, texture, "board")
 
 
+def print_rectangles(
+    board: Board, shape: PrintShape, T_rig_board: Array, texture: NDArray[np.uint8]
+) -> list[Rectangle]:
+    """Return the print as rectangles in the rig's frame; one about each corner and its margin if it is not flat.
+
+    A surface that is a sum of functions of x and y is met exactly by parallelograms; a twist leaves gaps of some
+    hundredths of a millimetre, between which the shape is flat.
+    """
+    if shape.is_as_drawn:
+        return [board_rectangle(board, T_rig_board, texture)]
+    # Borders of the parts in squares from the first corner: the middles of the squares, where the texture is even.
+    x, y = (
+        np.array([-1 - MARGIN_SQUARES, *np.arange(side + 1) - 0.5, side + MARGIN_SQUARES])
+        for side in (board.columns, board.rows)
+    )
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) * board.square_m
+    corners = se3.apply(T_rig_board, shape.points_of(board.points, np.column_stack([grid, np.zeros(len(grid))])))
+    corners = corners.reshape(len(y), len(x), 3)
+    column, row = (np.round((borders + 1 + MARGIN_SQUARES) * SQUARE_PX).astype(int) for borders in (x, y))
+    return [
+        Rectangle(
+            corners[j, i],
+            corners[j, i + 1] - corners[j, i],
+            corners[j + 1, i] - corners[j, i],
+            np.ascontiguousarray(texture[row[j] : row[j + 1], column[i] : column[i + 1]]),
+            "board",
+        )
+        for j, i in np.ndindex(len(y) - 1, len(x) - 1)
+    ]
+
+
 def clutter(rng: np.random.Generator, radius_m: float = 3.0) -> list[Rectangle]:
     """Return six noisy walls around the camera."""
     return six_walls(lambda: np.clip(120 + 45 * value_noise(rng, (400, 400), 60.0), 0, 255).astype(np.uint8), radius_m)
@@ -84,6 +116,7 @@ class BoardRenderer:
 
     board: Board
     mounted: MountedCamera
+    shape: PrintShape = AS_DRAWN
 
     @staticmethod
     def of(board: Board, camera: OmniCamera, mask: Mask) -> BoardRenderer:
@@ -112,11 +145,12 @@ class BoardRenderer:
             texture = frame(texture)
         texture[:, : round(texture.shape[1] * rng.uniform(0.3, 0.7))] *= shadow
         board_poses_around_camera = clutter(rng) if walls is None else walls
-        scene = Scene((board_rectangle(self.board, T_rig_board, texture.astype(np.uint8)), *board_poses_around_camera))
+        board = print_rectangles(self.board, self.shape, T_rig_board, texture.astype(np.uint8))
+        scene = Scene((*board, *board_poses_around_camera))
         ideal = render_grey(scene, self.mounted, np.eye(4), supersample)
         exposure = MountedSensor.of(sensor or Sensor(), self.mounted.visible, self.mounted.camera.size)
         T_cam_board = self.mounted.T_cam_rig @ T_rig_board
-        corners = self.mounted.camera.project(se3.apply(T_cam_board, self.board.points))
+        corners = self.mounted.camera.project(se3.apply(T_cam_board, self.shape.points(self.board.points)))
         return BoardImage(exposure.expose(ideal, rng), corners, T_cam_board)
 
 

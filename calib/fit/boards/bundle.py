@@ -6,7 +6,7 @@ Every image has its own pose, which is a block of six unknowns of the normal equ
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -47,11 +47,24 @@ CameraFactory = Callable[[Array], Projection]
 
 @dataclass(frozen=True, slots=True)
 class Observations:
-    """Observed corners: pixels (K, N, 2) in K images, NaN for unknown corners, of board points (N, 3) [m]."""
+    """Observed corners: pixels (K, N, 2) in K images, NaN for unknown corners, of board points (N, 3) [m].
+
+    modes (N, 3, S) [m]: the board's points are points + modes @ steps, with unknown steps (S,) common to all views.
+    """
 
     pixels: Array
     points: Array
     cameras: int = 1  # the points of a view are equal parts of so many cameras
+    modes: Array | None = None
+
+    @property
+    def mode_count(self) -> int:
+        """Return the number S of unknown modes of the board's shape."""
+        return 0 if self.modes is None else self.modes.shape[2]
+
+    def points_at(self, steps: Array) -> Array:
+        """Return the board's points (N, 3) [m] after steps (S,) of its modes."""
+        return self.points if self.modes is None else self.points + self.modes @ steps
 
     def select(self, chosen: Array) -> Observations:
         """Return the images of an index or mask."""
@@ -79,6 +92,8 @@ class BundleResult:
     residuals: Array  # (K, N, 2)
     covariance: Array  # (P, P), with the misfit of the model
     misfit_px: float = 0.0  # size of the smooth error of the model, most of which the parameters absorb
+    board_steps: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of the modes of the board's shape
+    board_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (S, S), with the misfit of the model
 
     @property
     def errors_px(self) -> Array:
@@ -91,9 +106,12 @@ class BundleResult:
         return float(np.nanmean(self.errors_px))
 
 
-def residuals(camera: Projection, T_cam_board: Array, observed: Observations) -> Array:
-    """Return measured minus modelled pixels (K, N, 2); NaN without a measurement, LOST_PX without a projection."""
-    cast = camera.project(se3.apply(T_cam_board, observed.points).reshape(-1, 3)).reshape(observed.pixels.shape)
+def residuals(camera: Projection, T_cam_board: Array, observed: Observations, points: Array) -> Array:
+    """Return measured minus modelled pixels (K, N, 2) of board points (N, 3).
+
+    NaN without a measurement, LOST_PX without a projection.
+    """
+    cast = camera.project(se3.apply(T_cam_board, points).reshape(-1, 3)).reshape(observed.pixels.shape)
     lost = np.isnan(cast) & np.isfinite(observed.pixels)
     return np.where(lost, LOST_PX, observed.pixels - cast)
 
@@ -109,12 +127,13 @@ def adjust_bundle(
 ) -> BundleResult:
     """Minimise the robust reprojection error over parameters (P,) and poses (K, 4, 4), from the given start values.
 
+    The steps (S,) of the board's modes, if it has any, are unknowns too, and start at 0.
     kernel_rounds: number of optimisations; 1 is enough if the start values are nearly right.
     """
     parameters = np.asarray(parameters, float)
     none = Prior(np.zeros(len(parameters)), np.full(len(parameters), np.inf))
     problem = _BoardProblem(camera_of, observed, prior or none, np.inf)
-    state = problem.state(parameters, np.asarray(T_cam_board, float))
+    state = problem.state(parameters, np.zeros(observed.mode_count), np.asarray(T_cam_board, float))
     sigma = np.inf
     for _ in range(kernel_rounds):
         sigma = min(sigma, robust_sigma(state.residuals, MIN_SIGMA_PX))
@@ -128,22 +147,29 @@ class _State:
     """One iterate of the optimisation, with its residuals."""
 
     parameters: Array  # (P,)
+    board_steps: Array  # (S,)
     poses: Array  # (K, 4, 4)
     residuals: Array  # (K, N, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class _BoardProblem:
-    """The robust reprojection error of a camera that saw boards, for one width of the kernel."""
+    """The robust reprojection error of a camera that saw boards, for one width of the kernel.
+
+    Its common unknowns are the camera's parameters (P,), then the steps (S,) of the board's modes.
+    """
 
     camera_of: CameraFactory
     observed: Observations
     prior: Prior
     kernel_px: float
 
-    def state(self, parameters: Array, poses: Array) -> _State:
+    def state(self, parameters: Array, board_steps: Array, poses: Array) -> _State:
         """Return the iterate with these parameters and poses; CalibError if there is no such camera."""
-        return _State(parameters, poses, residuals(self.camera_of(parameters), poses, self.observed))
+        points = self.observed.points_at(board_steps)
+        return _State(
+            parameters, board_steps, poses, residuals(self.camera_of(parameters), poses, self.observed, points)
+        )
 
     def scale(self, state: _State) -> float:
         """Return the width of Huber's kernel [px], which stays during a search."""
@@ -152,7 +178,10 @@ class _BoardProblem:
     def moved(self, state: _State, common: Array, blocks: Array) -> _State | None:
         """Return the state after a step; None if the parameters are not those of a camera."""
         try:
-            return self.state(state.parameters + common, se3.exp(blocks) @ state.poses)
+            P = state.parameters.size
+            return self.state(
+                state.parameters + common[:P], state.board_steps + common[P:], se3.exp(blocks) @ state.poses
+            )
         except (CalibError, np.linalg.LinAlgError):
             return None
 
@@ -163,7 +192,7 @@ class _BoardProblem:
         return float(np.nansum(huber) + self.prior.weights(scale) @ (state.parameters - self.prior.center) ** 2)
 
     def normal_equations(self, state: _State, scale: float, fields: Array | None = None) -> ArrowSystem:
-        """Return the normal equations; fields (K, N, 2, F): further unknowns after the parameters, 0 now."""
+        """Return the normal equations; fields (K, N, 2, F): further unknowns after all others, 0 now."""
         residual, weight = _huber_weights(state.residuals, scale)
         J_in, J_pose = self._jacobians(state)
         K, rows = len(residual), 2 * residual.shape[1]
@@ -174,7 +203,8 @@ class _BoardProblem:
         to_prior = prior * (state.parameters - self.prior.center)
         if fields is not None:
             J_in = np.concatenate([J_in, (root * fields).reshape(K, rows, -1)], axis=2)
-            prior, to_prior = (np.pad(part, (0, fields.shape[3])) for part in (prior, to_prior))
+        # Neither the board's shape nor the fields have a prior.
+        prior, to_prior = (np.pad(part, (0, J_in.shape[2] - len(part))) for part in (prior, to_prior))
         between = (J_in.swapaxes(1, 2) @ J_pose).swapaxes(0, 1).reshape(J_in.shape[2], 6 * K)
         return ArrowSystem(
             A=np.tensordot(J_in, J_in, axes=((0, 1), (0, 1))) + np.diag(prior),
@@ -185,8 +215,8 @@ class _BoardProblem:
         )
 
     def _jacobians(self, state: _State) -> tuple[Array, Array]:
-        """Return derivatives of modelled pixels by parameters (K, N, 2, P) and left twists of poses (K, N, 2, 6)."""
-        points = se3.apply(state.poses, self.observed.points)
+        """Return derivatives of modelled pixels by common unknowns (K, N, 2, P + S) and left twists (K, N, 2, 6)."""
+        points = se3.apply(state.poses, self.observed.points_at(state.board_steps))
         flat = points.reshape(-1, 3)
         columns = []
         for step in DIFFERENCE_STEP * np.eye(len(state.parameters)):
@@ -196,7 +226,11 @@ class _BoardProblem:
         by_point = _by_point(self.camera_of(state.parameters), flat)
         by_pose = np.concatenate([by_point, -by_point @ se3.hat(flat)], axis=-1)
         shape = points.shape[:2]
-        return by_parameter.reshape(*shape, 2, len(columns)), by_pose.reshape(*shape, 2, 6)
+        by_common = by_parameter.reshape(*shape, 2, len(columns))
+        if self.observed.modes is not None:
+            turned = np.einsum("kij,njs->knis", state.poses[:, :3, :3], self.observed.modes)
+            by_common = np.concatenate([by_common, by_point.reshape(*shape, 2, 3) @ turned], axis=3)
+        return by_common, by_pose.reshape(*shape, 2, 6)
 
 
 def _huber_weights(residual: Array, kernel_px: float) -> tuple[Array, Array]:
@@ -215,13 +249,22 @@ def _by_point(camera: Projection, points: Array) -> Array:
 
 
 def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:
-    """Return the result with the covariance of the parameters, in which the model's misfit is counted."""
+    """Return the result with the covariance of the common unknowns, in which the model's misfit is counted."""
     residual, weight = _huber_weights(state.residuals, problem.kernel_px)
-    freedom = 2 * float(weight.sum()) - state.parameters.size - 6 * len(residual)
+    P, count = state.parameters.size, state.parameters.size + state.board_steps.size
+    freedom = 2 * float(weight.sum()) - count - 6 * len(residual)
     variance = float((weight[..., None] * residual**2).sum()) / max(freedom, 1.0)
-    if not state.parameters.size:
+    if not count:
         return BundleResult(state.parameters, state.poses, state.residuals, np.zeros((0, 0)))
     fields = smooth_fields(problem.observed.pixels, problem.observed.cameras)
     system = problem.normal_equations(state, problem.kernel_px, fields).reduced()
-    covariance, misfit_px = covariance_with_misfit(*system, state.parameters.size, variance)
-    return BundleResult(state.parameters, state.poses, state.residuals, covariance, misfit_px)
+    covariance, misfit_px = covariance_with_misfit(*system, count, variance)
+    return BundleResult(
+        state.parameters,
+        state.poses,
+        state.residuals,
+        covariance[:P, :P],
+        misfit_px,
+        state.board_steps,
+        covariance[P:, P:],
+    )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.corner_refinement import refine_with_camera
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import BundleResult, Observations
 from calib.fit.boards.camera_models import FittedModel, Model, fit_model
@@ -56,6 +57,7 @@ class CameraCalibration:
     parameters: tuple[tuple[str, float, float], ...]  # name, value, standard deviation
     rejected: tuple[RejectedView, ...] = ()
     warnings: tuple[str, ...] = ()
+    shape: PrintShape = AS_DRAWN
 
     @property
     def view_errors_px(self) -> Array:
@@ -69,13 +71,15 @@ def fit_camera(
     size: tuple[int, int],
     model: Model = "ocam",
     view: View = "mirror",
+    shape: PrintShape = AS_DRAWN,
 ) -> CameraCalibration:
     """Fit a camera to board views; outlier views are rejected.
 
-    size (width, height) [px]. Raises CalibError if fewer than MIN_VIEWS remain.
+    size (width, height) [px]. shape: start value of the print's shape, whose free modes are fitted. Raises CalibError
+    if fewer than MIN_VIEWS remain.
     """
     good, rejected = consistent_views(views, board, size, view)
-    return calibrate_consistent(good, rejected, board, size, model, view)
+    return calibrate_consistent(good, rejected, board, size, model, view, shape=shape)
 
 
 def calibrate_consistent(
@@ -86,13 +90,14 @@ def calibrate_consistent(
     model: Model,
     view: View,
     ocam: FittedModel | None = None,
+    shape: PrintShape = AS_DRAWN,
 ) -> CameraCalibration:
     """Fit a camera to views of which the inconsistent ones have been rejected; see fit_camera.
 
     ocam: the ocam camera fitted to the same views, if it is known, as the start of the other models.
     """
     good, rejected = list(views), list(rejected)
-    solved = fit_model(model, observations(good, board), size, view, ocam)
+    solved = fit_model(model, observations(good, board, shape), size, view, ocam)
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(solved.fit)
         if not bad.any():
@@ -100,10 +105,17 @@ def calibrate_consistent(
         rejected += [_rejected_view(seen, solved.fit, k) for k, seen in enumerate(good) if bad[k]]
         good = [seen for k, seen in enumerate(good) if not bad[k]]
         _require(len(good), "consistent views", rejected)
-        solved = fit_model(model, observations(good, board), size, view)
+        solved = fit_model(model, observations(good, board, shape), size, view)
     warnings = _warnings(solved, observations(good, board))
     return CameraCalibration(
-        solved.camera, board, tuple(good), solved.fit, solved.parameters, tuple(rejected), warnings
+        solved.camera,
+        board,
+        tuple(good),
+        solved.fit,
+        solved.parameters,
+        tuple(rejected),
+        warnings,
+        shape.moved(solved.fit.board_steps),
     )
 
 
@@ -115,13 +127,16 @@ def refine_camera_calibration(
         replace(seen, pixels=refine_with_camera(images[seen.name], found.camera, T, (found.board, seen.pixels)))
         for seen, T in zip(found.views, found.fit.T_cam_board, strict=True)
     ]
-    again = fit_camera(views, found.board, found.camera.size, model, view)
+    again = fit_camera(views, found.board, found.camera.size, model, view, found.shape)
     return replace(again, rejected=found.rejected + again.rejected)
 
 
-def observations(views: Sequence[BoardView], board: CalibrationBoard) -> Observations:
-    """Return the observed corners of views of a board."""
-    return Observations(np.array([view.pixels for view in views]), board.points)
+def observations(
+    views: Sequence[BoardView], board: CalibrationBoard, shape: PrintShape = AS_DRAWN, *, fixed: bool = False
+) -> Observations:
+    """Return the observed corners of views of a print of a board, whose free modes are unknowns unless fixed."""
+    modes = None if fixed else shape.modes(board.points)
+    return Observations(np.array([view.pixels for view in views]), shape.points(board.points), modes=modes)
 
 
 def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.boards.board import BoardView, CalibrationBoard
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.camera_fit import (
     CameraCalibration,
@@ -20,6 +21,8 @@ from calib.fit.boards.camera_fit import (
 )
 from calib.fit.boards.camera_models import MODELS, FittedModel, Model
 from calib.fit.boards.cross_validation import held_out_error_px
+from calib.fit.boards.print_shape_fit import find_print_shape
+from calib.fit.parameterisation import parameterise
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.ocam import OcamCamera, View
 
@@ -70,17 +73,19 @@ def select_calibration(
     size: tuple[int, int],
     choice: ModelChoice = "auto",
     view: View = "mirror",
+    shape: PrintShape = AS_DRAWN,
 ) -> SelectedCalibration:
     """Calibrate a camera with every model of the choice, and select the one with the least held-out error.
 
-    Models are compared on the views that all of them accept. Raises CalibError if no model can be fitted.
+    shape: start value of the print's shape, whose free modes are fitted. Models are compared on the views that all of
+    them accept. Raises CalibError if no model can be fitted.
     """
     good, rejected = consistent_views(views, board, size, view)
     fitted, failures = dict[Model, CameraCalibration](), list[CalibError]()
     ocam: FittedModel | None = None
     for model in FIT_ORDER if choice == "auto" else (choice,):
         try:
-            found = fitted[model] = calibrate_consistent(good, rejected, board, size, model, view, ocam)
+            found = fitted[model] = calibrate_consistent(good, rejected, board, size, model, view, ocam, shape)
         except CalibError as error:
             failures.append(error)
             continue
@@ -107,6 +112,21 @@ def refine_selection(
     return replace(found, calibration=refine_camera_calibration(found.calibration, images, found.model, view))
 
 
+def with_print_shape(found: SelectedCalibration, view: View) -> SelectedCalibration:
+    """Select and fit the models again if the print differs significantly from its drawing."""
+    flat = found.calibration
+    parameters = parameterise(flat.camera)
+    observed = observations(flat.views, flat.board)
+    shape = find_print_shape(parameters.camera_at, len(parameters.names), observed, flat.fit.T_cam_board)
+    if shape.is_as_drawn:
+        return found
+    models = [score.model for score in found.scores]
+    choice: ModelChoice = models[0] if len(models) == 1 else "auto"
+    again = select_calibration(flat.views, flat.board, flat.camera.size, choice, view, shape)
+    kept = replace(again.calibration, rejected=(*flat.rejected, *again.calibration.rejected))
+    return replace(again, calibration=kept)
+
+
 def camera_structure(found: CameraCalibration) -> ResidualStructure:
     """Return the structure of a calibration's residuals."""
     pixels = observations(found.views, found.board).pixels
@@ -115,6 +135,6 @@ def camera_structure(found: CameraCalibration) -> ResidualStructure:
 
 def _score(model: Model, found: CameraCalibration, common: set[str]) -> ModelScore:
     chosen = np.array([seen.name in common for seen in found.views])
-    observed = observations(found.views, found.board)
+    observed = observations(found.views, found.board, found.shape, fixed=True)
     held_out_px = held_out_error_px(found.camera, found.fit.T_cam_board[chosen], observed.select(chosen))
     return ModelScore(model, len(found.parameters), found.fit.mean_px, held_out_px, camera_structure(found))

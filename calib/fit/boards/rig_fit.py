@@ -8,18 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.boards.board import BoardView, CalibrationBoard
 from calib.boards.corner_refinement import refine_with_camera
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
-from calib.fit.boards.bundle import BundleResult, Observations, Prior, adjust_bundle
+from calib.fit.boards.bundle import BundleResult, adjust_bundle
 from calib.fit.boards.camera_fit import RejectedView, outlier_views
 from calib.fit.boards.cross_validation import cross_validated_px
-from calib.fit.boards.relative_pose import RelativePoseInitialisation, ViewPair, initialise_relative_pose
-from calib.fit.parameterisation import WAVEFRONT_NAMES, CameraParameterisation, parameterise
+from calib.fit.boards.print_shape_fit import find_print_shape
+from calib.fit.boards.relative_pose import RelativePoseInitialisation, initialise_relative_pose
+from calib.fit.boards.rig_problem import (
+    PairView,
+    Printed,
+    RigParameterisation,
+    Sides,
+    rig_observations,
+    rig_unknowns,
+)
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array, OmniCamera
-from calib.models.ocam import has_wavefront, project_near
 
 # One pair determines the transform; with four the consensus of most shows which pair is wrong.
 MIN_PAIRS = 4
@@ -27,20 +34,8 @@ MIN_PAIRS = 4
 MAX_REJECTIONS = 10
 # Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong.
 MAX_MEAN_PX = 3.0
-# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre.
-MIRROR_NAMES, MIRROR_SIGMA_STEPS = ("s1", "s2", *WAVEFRONT_NAMES), 1.0
 MOTION_NAMES = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 Images = Mapping[str, NDArray[np.uint8]]
-# The lower and the upper camera.
-Sides = tuple[OmniCamera, OmniCamera]
-
-
-@dataclass(frozen=True, slots=True)
-class PairView:
-    """The views of a board at one instant by both cameras, or by only one of them."""
-
-    name: str
-    seen: ViewPair  # by the lower and the upper camera
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +53,7 @@ class RigCalibration:
     baseline_sigma_m: float
     covariance: Array  # (P, P) of the cameras' parameters, if refined, and of T_upper_lower (as motion_sigma)
     rejected: tuple[RejectedView, ...] = ()
+    shape: PrintShape = AS_DRAWN
 
     @property
     def baseline_m(self) -> float:
@@ -85,67 +81,18 @@ class RigCalibration:
         return residual_structure(pixels, residuals, self.board.points, camera.center)
 
 
-@dataclass(frozen=True, slots=True)
-class _PairCamera:
-    """Both cameras as one: of every 2N points of a view the lower camera projects the first N, the upper the others."""
-
-    lower: OmniCamera
-    upper: OmniCamera
-    T_upper_lower: Array
-    corners: int
-
-    def project(self, points: Array) -> Array:
-        """Return pixels (M, 2) of points (M, 3) in the lower camera's frame."""
-        both = points.reshape(-1, 2, self.corners, 3)
-        lower = project_near(self.lower, both[:, 0].reshape(-1, 3))
-        upper = project_near(self.upper, se3.apply(self.T_upper_lower, both[:, 1].reshape(-1, 3)))
-        return np.stack([pixels.reshape(-1, self.corners, 2) for pixels in (lower, upper)], axis=1).reshape(-1, 2)
-
-
-@dataclass(frozen=True, slots=True)
-class _RigParameterisation:
-    """Parameterisation of a rig: steps of both cameras, if they are refined, and of the transform between them."""
-
-    parameterisations: tuple[CameraParameterisation, CameraParameterisation]
-    refined: bool
-    T_upper_lower: Array
-    units: Array  # (6,) one step of the transform [m, rad]
-    corners: int
-
-    @property
-    def ends(self) -> tuple[int, int, int]:
-        """Return the end indices of the lower camera's, the upper camera's and the transform's steps."""
-        lower, upper = (len(side.names) if self.refined else 0 for side in self.parameterisations)
-        return lower, lower + upper, lower + upper + 6
-
-    @property
-    def prior(self) -> Prior:
-        """Return the prior of the terms of real mirrors, about 0."""
-        center, sigma = np.zeros(self.ends[-1]), np.full(self.ends[-1], np.inf)
-        for side, first in zip(self.parameterisations if self.refined else (), (0, self.ends[0]), strict=False):
-            for k, name in enumerate(side.names):
-                if name in MIRROR_NAMES:
-                    center[first + k], sigma[first + k] = -side.start[k] / side.units[k], MIRROR_SIGMA_STEPS
-        return Prior(center, sigma)
-
-    def camera(self, steps: Array) -> _PairCamera:
-        """Return both cameras at the steps."""
-        lower_end, upper_end, _ = self.ends
-        lower, upper = self.parameterisations
-        T_upper_lower = se3.exp(steps[upper_end:] * self.units) @ self.T_upper_lower
-        if not self.refined:
-            return _PairCamera(lower.base, upper.base, T_upper_lower, self.corners)
-        return _PairCamera(
-            lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]), T_upper_lower, self.corners
-        )
-
-
-def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, refined: bool = True) -> RigCalibration:
+def fit_rig(
+    views: Sequence[PairView],
+    board: CalibrationBoard,
+    cameras: Sides,
+    refined: bool = True,
+    shape: PrintShape = AS_DRAWN,
+) -> RigCalibration:
     """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
 
-    cameras: start values, or the fixed cameras if not refined. The terms of real mirrors (MIRROR_NAMES) are fitted if a
-    start value has a wavefront. Raises CalibError if fewer than MIN_PAIRS pairs are
-    consistent, or if the order of the board's corners is ambiguous.
+    cameras: start values, or the fixed cameras if not refined. shape: start value of the print's shape, whose free
+    modes are fitted. The terms of real mirrors (MIRROR_NAMES) are fitted if a start value has a wavefront. Raises
+    CalibError if fewer than MIN_PAIRS pairs are consistent, or if the order of the board's corners is ambiguous.
     """
     # 1. Relative pose initialisation; inconsistent views are rejected.
     _require(sum(_is_pair(view) for view in views), "instants at which both cameras saw the board")
@@ -153,7 +100,7 @@ def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, 
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
     good, T_lower_board = _reordered_views(views, initial, refined)
     # 2. Bundle adjustment, repeated without the views that fit much worse than the others.
-    fit, unknowns = _solve(good, board, (cameras, refined), (initial.T_upper_lower, T_lower_board))
+    fit, unknowns = _solve(good, (board, shape), (cameras, refined), (initial.T_upper_lower, T_lower_board))
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(fit)
         if not bad.any():
@@ -164,7 +111,7 @@ def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, 
         found = unknowns.camera(fit.parameters)
         fit, unknowns = _solve(
             good,
-            board,
+            (board, shape),
             ((found.lower, found.upper) if refined else cameras, refined),
             (found.T_upper_lower, fit.T_cam_board[~bad]),
         )
@@ -173,7 +120,7 @@ def fit_rig(views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, 
             f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
             "at most; did the cameras see the board at the same time, are their files the right ones?"
         )
-    return _rig_calibration(good, board, (fit, unknowns), rejected)
+    return _rig_calibration(good, (board, shape), (fit, unknowns), rejected)
 
 
 def refine_rig_calibration(
@@ -192,7 +139,7 @@ def refine_rig_calibration(
             for side, seen in enumerate(view.seen)
         )
         views.append(PairView(view.name, (lower, upper)))
-    again = fit_rig(views, found.board, cameras, refined)
+    again = fit_rig(views, found.board, cameras, refined, found.shape)
     return replace(again, rejected=found.rejected + again.rejected)
 
 
@@ -241,43 +188,33 @@ def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> Pai
 
 
 def _solve(
-    good: Sequence[PairView], board: CalibrationBoard, given: tuple[Sides, bool], start: tuple[Array, Array]
-) -> tuple[BundleResult, _RigParameterisation]:
+    good: Sequence[PairView], printed: Printed, given: tuple[Sides, bool], start: tuple[Array, Array]
+) -> tuple[BundleResult, RigParameterisation]:
     """Adjust both cameras, the transform between them, and one pose of the board for every view."""
     T_upper_lower, T_lower_board = start
-    unknowns = _unknowns(board, given, T_upper_lower, T_lower_board)
-    fit = adjust_bundle(
-        unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, _observations(good, board), prior=unknowns.prior
-    )
+    unknowns = rig_unknowns(printed[0], given, T_upper_lower, T_lower_board)
+    observed = rig_observations(good, printed)
+    fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, observed, prior=unknowns.prior)
     return fit, unknowns
 
 
-def _unknowns(
-    board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
-) -> _RigParameterisation:
-    (lower, upper), refined = given
-    reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
-    # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
-    units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)
-    sides = [parameterise(camera, wavefront=has_wavefront(camera)) for camera in (lower, upper)]
-    return _RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
-
-
-def _observations(good: Sequence[PairView], board: CalibrationBoard) -> Observations:
-    """Return the corners (K, 2N, 2) of both cameras, the lower one's first."""
-    none = np.full((len(board.points), 2), np.nan)
-    pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen]) for view in good])
-    return Observations(pixels, np.tile(board.points, (2, 1)), cameras=2)
+def rig_print_shape(found: RigCalibration, refined: bool) -> PrintShape:
+    """Return the significant part of the print's shape, of a rig that was fitted to a board as drawn."""
+    unknowns = rig_unknowns(
+        found.board, ((found.lower, found.upper), refined), found.T_upper_lower, found.fit.T_cam_board
+    )
+    observed = rig_observations(found.views, (found.board, AS_DRAWN))
+    return find_print_shape(unknowns.camera, unknowns.ends[-1], observed, found.fit.T_cam_board, unknowns.prior)
 
 
 def rig_held_out_px(found: RigCalibration) -> float:
     """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
-    unknowns = _unknowns(found.board, ((found.lower, found.upper), True), found.T_upper_lower, found.fit.T_cam_board)
+    unknowns = rig_unknowns(found.board, ((found.lower, found.upper), True), found.T_upper_lower, found.fit.T_cam_board)
     return cross_validated_px(
         unknowns.camera,
         unknowns.ends[-1],
         found.fit.T_cam_board,
-        _observations(found.views, found.board),
+        rig_observations(found.views, (found.board, found.shape), fixed=True),
         unknowns.prior,
     )
 
@@ -289,8 +226,8 @@ def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:
 
 def _rig_calibration(
     good: Sequence[PairView],
-    board: CalibrationBoard,
-    solved: tuple[BundleResult, _RigParameterisation],
+    printed: Printed,
+    solved: tuple[BundleResult, RigParameterisation],
     rejected: Sequence[RejectedView],
 ) -> RigCalibration:
     fit, unknowns = solved
@@ -309,7 +246,7 @@ def _rig_calibration(
         found.lower,
         found.upper,
         found.T_upper_lower,
-        board,
+        printed[0],
         tuple(good),
         fit,
         parameters,
@@ -317,4 +254,5 @@ def _rig_calibration(
         float(np.sqrt(along @ motion[:3, :3] @ along)),
         covariance,
         tuple(rejected),
+        printed[1].moved(fit.board_steps),
     )

@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.boards.board import CalibrationBoard
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
-from calib.fit.boards.rig_fit import PairView, RigCalibration, Sides, fit_rig, rig_held_out_px
+from calib.fit.boards.rig_fit import RigCalibration, fit_rig, rig_held_out_px
+from calib.fit.boards.rig_problem import PairView, Sides
 from calib.models.ocam import OcamCamera
 
 # The polynomial of a round mirror has even powers; higher ones are not needed for mirrors near the paraboloid.
@@ -49,18 +51,22 @@ class SelectedRig:
 
 
 def select_rig(
-    views: Sequence[PairView], board: CalibrationBoard, cameras: Sides, mirrors: tuple[OcamCamera, OcamCamera] | None
+    views: Sequence[PairView],
+    board: CalibrationBoard,
+    cameras: Sides,
+    mirrors: tuple[OcamCamera, OcamCamera] | None,
+    shape: PrintShape = AS_DRAWN,
 ) -> SelectedRig:
     """Calibrate a rig with central cameras, and with the terms of real mirrors; select by the held-out error.
 
-    mirrors: ocam cameras from which the terms of real mirrors are fitted, None: central cameras only. Raises CalibError
-    as fit_rig does for the central cameras.
+    mirrors: ocam cameras from which the terms of real mirrors are fitted, None: central cameras only. shape: start
+    value of the print's shape, whose free modes are fitted. Raises CalibError as fit_rig does for the central cameras.
     """
-    central = fit_rig(views, board, cameras)
+    central = fit_rig(views, board, cameras, shape=shape)
     if mirrors is None:
         return SelectedRig(central, ())
     try:
-        general = fit_rig(central.views, board, (mirror_start(mirrors[0]), mirror_start(mirrors[1])))
+        general = fit_rig(central.views, board, (mirror_start(mirrors[0]), mirror_start(mirrors[1])), shape=shape)
     except (CalibError, np.linalg.LinAlgError):
         return SelectedRig(central, (_score("central cameras", central, np.nan),))
     if not _may_be_better(central, general):

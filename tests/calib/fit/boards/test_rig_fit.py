@@ -11,7 +11,8 @@ from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.boards.board_pose import ambiguous_orders, board_pose
 from calib.errors import CalibError
-from calib.fit.boards.rig_fit import PairView, RigCalibration, fit_rig
+from calib.fit.boards.rig_fit import RigCalibration, fit_rig
+from calib.fit.boards.rig_problem import PairView
 from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera

@@ -8,7 +8,7 @@ import pytest
 from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.fit.boards.camera_selection import SelectedCalibration, select_calibration
-from calib.fit.boards.rig_fit import PairView
+from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import SelectedRig, select_rig
 from calib.models.ocam import OcamCamera
 from calib.rig import Rig

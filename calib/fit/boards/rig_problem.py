@@ -1,0 +1,113 @@
+"""The unknowns of a rig that saw boards: both cameras, the transform between them, the shape of the print."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib import se3
+from calib.boards.board import CalibrationBoard
+from calib.boards.print_shape import PrintShape
+from calib.fit.boards.bundle import Observations, Prior
+from calib.fit.boards.relative_pose import ViewPair
+from calib.fit.parameterisation import WAVEFRONT_NAMES, CameraParameterisation, parameterise
+from calib.models.camera import Array, OmniCamera
+from calib.models.ocam import has_wavefront, project_near
+
+# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre.
+MIRROR_NAMES, MIRROR_SIGMA_STEPS = ("s1", "s2", *WAVEFRONT_NAMES), 1.0
+# The lower and the upper camera.
+Sides = tuple[OmniCamera, OmniCamera]
+# A board, and the shape of its print whose free modes are fitted.
+Printed = tuple[CalibrationBoard, PrintShape]
+
+
+@dataclass(frozen=True, slots=True)
+class PairView:
+    """The views of a board at one instant by both cameras, or by only one of them."""
+
+    name: str
+    seen: ViewPair  # by the lower and the upper camera
+
+
+@dataclass(frozen=True, slots=True)
+class PairCamera:
+    """Both cameras as one: of every 2N points of a view the lower camera projects the first N, the upper the others."""
+
+    lower: OmniCamera
+    upper: OmniCamera
+    T_upper_lower: Array
+    corners: int
+
+    def project(self, points: Array) -> Array:
+        """Return pixels (M, 2) of points (M, 3) in the lower camera's frame."""
+        both = points.reshape(-1, 2, self.corners, 3)
+        lower = project_near(self.lower, both[:, 0].reshape(-1, 3))
+        upper = project_near(self.upper, se3.apply(self.T_upper_lower, both[:, 1].reshape(-1, 3)))
+        return np.stack([pixels.reshape(-1, self.corners, 2) for pixels in (lower, upper)], axis=1).reshape(-1, 2)
+
+
+@dataclass(frozen=True, slots=True)
+class RigParameterisation:
+    """Parameterisation of a rig: steps of both cameras, if they are refined, and of the transform between them."""
+
+    parameterisations: tuple[CameraParameterisation, CameraParameterisation]
+    refined: bool
+    T_upper_lower: Array
+    units: Array  # (6,) one step of the transform [m, rad]
+    corners: int
+
+    @property
+    def ends(self) -> tuple[int, int, int]:
+        """Return the end indices of the lower camera's, the upper camera's and the transform's steps."""
+        lower, upper = (len(side.names) if self.refined else 0 for side in self.parameterisations)
+        return lower, lower + upper, lower + upper + 6
+
+    @property
+    def prior(self) -> Prior:
+        """Return the prior of the terms of real mirrors, about 0."""
+        center, sigma = np.zeros(self.ends[-1]), np.full(self.ends[-1], np.inf)
+        for side, first in zip(self.parameterisations if self.refined else (), (0, self.ends[0]), strict=False):
+            for k, name in enumerate(side.names):
+                if name in MIRROR_NAMES:
+                    center[first + k], sigma[first + k] = -side.start[k] / side.units[k], MIRROR_SIGMA_STEPS
+        return Prior(center, sigma)
+
+    def camera(self, steps: Array) -> PairCamera:
+        """Return both cameras at the steps."""
+        lower_end, upper_end, _ = self.ends
+        lower, upper = self.parameterisations
+        T_upper_lower = se3.exp(steps[upper_end:] * self.units) @ self.T_upper_lower
+        if not self.refined:
+            return PairCamera(lower.base, upper.base, T_upper_lower, self.corners)
+        return PairCamera(
+            lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]), T_upper_lower, self.corners
+        )
+
+
+def rig_unknowns(
+    board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
+) -> RigParameterisation:
+    """Return the parameterisation about cameras (given: and whether they are refined) and T_upper_lower."""
+    (lower, upper), refined = given
+    reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
+    # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
+    units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)
+    sides = [parameterise(camera, wavefront=has_wavefront(camera)) for camera in (lower, upper)]
+    return RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
+
+
+def rig_observations(good: Sequence[PairView], printed: Printed, *, fixed: bool = False) -> Observations:
+    """Return the corners (K, 2N, 2) of both cameras, the lower one's first; fixed: the print has no unknown modes."""
+    board, shape = printed
+    none = np.full((len(board.points), 2), np.nan)
+    pixels = np.array([np.concatenate([none if seen is None else seen.pixels for seen in view.seen]) for view in good])
+    modes = None if fixed else shape.modes(board.points)
+    return Observations(
+        pixels,
+        np.tile(shape.points(board.points), (2, 1)),
+        cameras=2,
+        modes=None if modes is None else np.tile(modes, (2, 1, 1)),
+    )
