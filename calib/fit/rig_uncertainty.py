@@ -33,6 +33,16 @@ class DriveUncertainty:
     scale: float
     heading_rad_m: float
 
+    @property
+    def length_part(self) -> float:
+        """Return the part of its length by which a drive may be wrong, in 1 of 20 cases more (two sigmas)."""
+        return 2 * self.scale
+
+    @property
+    def heading_deg_m(self) -> float:
+        """Return the heading by which a drive may be wrong after each metre [degree], in 1 of 20 cases more."""
+        return 2 * float(np.rad2deg(self.heading_rad_m))
+
     def __str__(self) -> str:
         return f"scale uncertain by {100 * self.scale:.2g} %, heading by {np.rad2deg(self.heading_rad_m):.2g} degree/m"
 

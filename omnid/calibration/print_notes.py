@@ -1,4 +1,4 @@
-"""What a calibration has found about the print of its board, in words."""
+"""Notes on the print of a board that a calibration has found."""
 
 from __future__ import annotations
 

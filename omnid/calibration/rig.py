@@ -19,7 +19,7 @@ from calib.fit.boards.rig_covariance import rig_covariance
 from calib.fit.boards.rig_fit import RigCalibration, fit_rig, refine_rig_calibration, rig_print_shape
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
-from calib.fit.rig_uncertainty import drive_uncertainty
+from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
@@ -29,8 +29,9 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
+from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
-from omnid.calibration.camera import MAX_LOG_VIEWS, misfit_warning
+from omnid.calibration.camera import MAX_LOG_VIEWS
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
 from omnid.calibration.images import Images
 from omnid.calibration.print_notes import print_shape_notes
@@ -55,23 +56,20 @@ class RigResult:
     calibration: RigCalibration
     images: PairedImages
     notes: tuple[str, ...]  # about the baseline and masks that were not found
+    drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras were given
 
     @property
     def is_misfit(self) -> bool:
-        """True if a camera model leaves more than noise."""
-        return any(self.calibration.structure(side).is_misfit for side in range(len(SIDES)))
+        """True if a camera model leaves more than noise, and drives may be wrong by MISFIT_PART because of it."""
+        costly = self.drives is None or self.drives.length_part >= MISFIT_PART
+        return costly and any(self.calibration.structure(side).is_misfit for side in range(len(SIDES)))
 
     @property
     def warnings(self) -> list[str]:
         """Limits of the result, one line each."""
-        misfit = [
-            line
-            for side, name in enumerate(SIDES)
-            for line in misfit_warning(f"{name} camera", self.calibration.structure(side))
-        ]
         shape = print_shape_notes(self.calibration.shape, self.calibration.board)
         return [
-            *misfit,
+            *accuracy_warnings([self.calibration.structure(side) for side in range(len(SIDES))], self.drives),
             *shape,
             *self.notes,
             *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected),
@@ -82,13 +80,13 @@ class RigResult:
         rotation_deg = np.rad2deg(np.linalg.norm(se3.rotation_log(found.T_upper_lower[:3, :3])))
         sigma_deg = np.rad2deg(np.linalg.norm(found.motion_sigma[3:]))
         single_views = len(found.views) - found.pairs
-        uncertainty = drive_uncertainty(self.rig) if any(found.parameters) else None
         return (
             f"{'MISFIT: ' if self.is_misfit else ''}baseline {found.baseline_m * 1e3:.2f} mm (sigma "
             f"{found.baseline_sigma_m * 1e3:.2f}), upper rotated by {rotation_deg:.3f} deg (sigma {sigma_deg:.3f}),"
             f" mean reprojection error {found.fit.mean_px:.3f} px, {found.pairs} pairs"
             + (f", {single_views} views of one camera alone" if single_views else "")
-            + (f"; drives: {uncertainty}" if uncertainty else "")
+            + (f"; drives: {self.drives}" if self.drives else "")
+            + (f", good for {GOOD_PART:.1%} of length" if self.drives and self.drives.length_part <= GOOD_PART else "")
         )
 
     def save(self, path: Path) -> None:
@@ -151,7 +149,9 @@ def calibrate_rig(
     # 7. Compare the baseline with what it can be, and build the rig with masks and covariance.
     notes = _check_baseline(found, board, expected_baseline_m)
     rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
-    return RigResult(replace(rig, covariance=rig_covariance(found, rig)), found, images, (*notes, *unmasked))
+    rig = replace(rig, covariance=rig_covariance(found, rig))
+    drives = drive_uncertainty(rig) if refined else None
+    return RigResult(rig, found, images, (*notes, *unmasked), drives)
 
 
 def _fit_rig(

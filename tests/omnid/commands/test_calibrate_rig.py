@@ -140,7 +140,8 @@ def test_views_of_one_camera_are_used_if_cameras_are_refined(
     words = [*given(folder), "--refine-cameras", "--report", alone / "report.html"]
     assert run(alone, "-o", alone / "rig.toml", *words) == 0
     output = capsys.readouterr()
-    assert "5 pairs, 2 views of one camera alone; drives: scale uncertain by 0." in output.out and output.err == ""
+    assert "5 pairs, 2 views of one camera alone; drives: scale uncertain by 0." in output.out
+    assert "the images leave much open: drives may be wrong by" in output.err and output.err.count("\n") == 1
     found = read_rig(alone / "rig.toml")
     assert "not seen" in (alone / "report.html").read_text() and turn_off_deg(found) < 0.05
     assert found.covariance is not None and "upper fv" in found.covariance.names
