@@ -33,6 +33,11 @@ OUTLIER_SQUARED = 16.0
 # Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before.
 COARSE_STEPS, STEPS = (3,), (2, 4)
 FEW_RATIO = 0.6  # share of the tracks that are inliers, below which the velocity may have been wrong
+# Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.
+RECOGNISED_ROUNDS = 2
+MIN_AGREEING = 20  # patches that have to agree with it: as many as are wanted of a pose
+# Squared Mahalanobis distance of six components that one refined pose in 1,000 exceeds.
+RECOGNISED_SQUARED = 22.5
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
@@ -160,6 +165,31 @@ class FrameToMap:
             _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
         )
+
+    def refine_recognised(self, frame: StereoFrame, found: PoseEstimate, exposure: Exposure) -> PoseEstimate:
+        """Return a recognised pose, refined by the keyframes' patches where as many of them agree with it.
+
+        Places are recognised by corners, whose pose errs by a centimetre. A refined pose farther from it than its
+        covariance allows is not taken: then the patches were aligned with other texture.
+        """
+        none, refined = np.zeros(0, np.intp), found
+        for _ in range(RECOGNISED_ROUNDS):
+            start = CoarsePose(
+                se3.inverse(refined.T_odom_rect),
+                none,
+                np.zeros(0),
+                np.zeros(0),
+                Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0),
+            )
+            again = self.refine(frame, start, exposure)
+            if again is None or len(again.landmarks) < MIN_AGREEING:
+                return found
+            refined = again
+        error = se3.log(se3.inverse(found.T_odom_rect) @ refined.T_odom_rect)
+        if error @ np.linalg.solve(found.covariance, error) > RECOGNISED_SQUARED:
+            return found
+        inliers = min(found.inliers, len(refined.landmarks))
+        return replace(refined, visible=found.visible, tracked=found.tracked, inliers=inliers)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.

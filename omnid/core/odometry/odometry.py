@@ -111,7 +111,7 @@ class VisualOdometry:
         if estimate is not None and self._has_support(estimate) and not self._is_plausible(estimate, dt_s):
             too_fast_mps = self._moved_m(estimate) / self._since_fix_s(dt_s)
         if searched and after_break and not self._is_plausible(estimate, dt_s):
-            estimate = self._relocaliser.locate(frame)
+            estimate = self.relocalise(frame, self._exposures.predicted(frame, dt_s))
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
         if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
@@ -183,6 +183,11 @@ class VisualOdometry:
             others += [refined] if refined is not None else []
         # 3. The likeliest one, and whether another one is nearly as likely.
         return likeliest(estimate, others, T_predicted, reach_m)
+
+    def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
+        """Return the pose of a frame among the newest keyframes, refined by the patches of the local map in view."""
+        found = self._relocaliser.locate(frame)
+        return None if found is None else self._frame_to_map.refine_recognised(frame, found, exposure)
 
     def complete(self) -> None:
         """Make the last frame a keyframe if the map needs one; the next `process` does so where this is not called.

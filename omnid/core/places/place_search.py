@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -13,23 +12,17 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.places.features import FEATURES
 from omnid.core.places.hypotheses import angle_rad, length_m
+from omnid.core.places.place_comparison import compare, is_elsewhere, supported, unambiguous
 from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
-from omnid.core.places.recognition import Recognition, recognise
+from omnid.core.places.recognition import Recognition
 from omnid.core.places.signature import Signature, signature_of, similarities
-from omnid.core.places.votes import votes
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
 NEAR_M: Final = 1.5  # a place is looked for among keyframes so near to where odometry expects it
-NEAR_INLIERS, NEAR_SECTORS = 20, 4  # least support where odometry agrees
-# Least support where it cannot tell; other worlds gave 10 in 600 queries: docs/notes/places.md.
-FAR_INLIERS, FAR_SECTORS = 24, 5
-PER_PLACE, SAME_PLACE_M = 3, 1.5  # at most so many of the keyframes that are compared lie so near together
 ENOUGH_INLIERS: Final = 50  # of a place that is enough
-RUNNER_UP: Final = 0.6  # share of the inliers with which another place makes a recognition ambiguous
-RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
 
 
 class Effort(NamedTuple):
@@ -73,11 +66,7 @@ class PlaceSearch:
         near = apart_m < NEAR_M + np.array(list(expected.error_m.values()))
         ids = [known[n] for n in np.flatnonzero(near).tolist()]
         enough = ENOUGH_INLIERS if expected.recognised else FEATURES + 1
-        found = [
-            place
-            for place in self._compare(small, features, (places, ids), NEAR_EFFORT, enough)
-            if place.inliers >= NEAR_INLIERS and place.sectors >= NEAR_SECTORS
-        ]
+        found = supported(self._compare(small, features, (places, ids), NEAR_EFFORT, enough), near=True)
         best = self._unambiguous(found, places.poses)
         if best is not None and not _is_expected(best, places.poses, expected):
             self.refused += 1
@@ -96,14 +85,10 @@ class PlaceSearch:
 
         T_map_rect: the pose by other evidence, which settles which of several places that look alike it is.
         """
-        found = [
-            place
-            for place in self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1)
-            if place.inliers >= FAR_INLIERS and place.sectors >= FAR_SECTORS
-        ]
+        found = supported(self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1))
         if T_map_rect is not None:
             found = [
-                place for place in found if not _is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)
+                place for place in found if not is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)
             ]
         return self._unambiguous(found, places.poses)
 
@@ -134,18 +119,11 @@ class PlaceSearch:
         others = np.array([self._signature(places.keyframes[id]) for id in ids])
         similar = similarities(signature_of(small), others)
         ids = [ids[n] for n in np.argsort(-similar, kind="stable")[: effort.voted].tolist()]
-        voted = [votes(features, places.keyframes[id].features, self._model.cylinder.width) for id in ids]
-        ranked = np.argsort([-count for count, _ in voted], kind="stable")
-        found: list[Recognition] = []
-        for n in _spread(ranked, places.positions(ids), effort.compared):
-            place = recognise(features, places.keyframes[ids[n]].features, ids[n], voted[n][1], self._model)
-            self.compared[ids[n]] = 0 if place is None else place.inliers
-            if place is not None:
-                found.append(place)
-                if place.inliers >= enough:
-                    break
-        self._seen = found
-        return found
+        known = {id: places.keyframes[id].features for id in ids}
+        found = compare(features, known, places.poses, effort.compared, enough, self._model)
+        self.compared = {id: 0 if place is None else place.inliers for id, place in found.items()}
+        self._seen = [place for place in found.values() if place is not None]
+        return self._seen
 
     def _signature(self, keyframe: PlaceKeyframe) -> Signature:
         if keyframe.id not in self._signatures:
@@ -158,36 +136,9 @@ class PlaceSearch:
 
     def _unambiguous(self, found: list[Recognition], poses: Mapping[int, Array]) -> Recognition | None:
         """Return the recognition with most inliers, None where another place has nearly as many."""
-        best = max(found, key=lambda place: place.inliers, default=None)
-        if best is None:
-            return None
-        T = poses[best.id] @ best.T_place_rect
-        for place in found:
-            if _is_elsewhere(T, poses[place.id] @ place.T_place_rect) and place.inliers > RUNNER_UP * best.inliers:
-                self.ambiguous += 1
-                return None
+        best = unambiguous(found, poses)
+        self.ambiguous += best is None and bool(found)
         return best
-
-
-def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
-    """Return the first of ranked places (N,) at positions (N, 3), at most so many, and at most PER_PLACE near another.
-
-    So a second place that looks the same is compared as well, although all neighbours of the first look more similar.
-    """
-    chosen: list[int] = []
-    for n in ranked.tolist():
-        beside = np.linalg.norm(at[chosen] - at[n], axis=1) < SAME_PLACE_M
-        if beside.sum() < PER_PLACE:
-            chosen.append(n)
-        if len(chosen) == most:
-            break
-    return chosen
-
-
-def _is_elsewhere(a: Array, b: Array) -> bool:
-    """True if two poses (4, 4) are different places."""
-    between = se3.inverse(a) @ b
-    return length_m(between) > RUNNER_UP_M or angle_rad(between) > RUNNER_UP_RAD
 
 
 def _is_expected(place: Recognition, poses: Mapping[int, Array], expected: Expected) -> bool:

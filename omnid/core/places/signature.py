@@ -30,34 +30,16 @@ def thumbnail(panorama: PaddedPanorama) -> Thumbnail:
     return np.asarray(np.clip(scaled, -127, 127), np.int8)
 
 
-def signature(panorama: PaddedPanorama) -> Signature:
-    """Return the signature (ROWS, COLUMNS / 2 + 1) of a panorama (H, W).
-
-    It is the spectrum over azimuth of the panorama at 16x128 pixels without its slow changes of brightness, scaled to
-    length 1; zeros for a panorama without contrast.
-    """
-    return np.fft.rfft(_contrast(panorama), axis=1).astype(np.complex64)
-
-
 def signature_of(small: Thumbnail) -> Signature:
     """Return the signature of the panorama that has a thumbnail."""
     size = float(np.linalg.norm(small.astype(np.float32)))
     return np.fft.rfft(small / max(size, 1.0), axis=1).astype(np.complex64)
 
 
-def similarity(a: Signature, b: Signature) -> float:
-    """Return the largest circular correlation of two panoramas over all headings, -1 .. 1."""
-    return float(_correlation(a, b).max())
-
-
 def similarities(a: Signature, others: NDArray[np.complex64]) -> NDArray[np.float32]:
     """Return the largest circular correlations (N,) over all headings with others (N, ROWS, COLUMNS / 2 + 1)."""
     correlation = np.fft.irfft(np.einsum("rk,nrk->nk", a, others.conj()), COLUMNS, axis=1)
     return np.asarray(correlation.max(axis=1), np.float32)
-
-
-def _correlation(a: Signature, b: Signature) -> NDArray[np.float64]:
-    return np.fft.irfft((a * b.conj()).sum(axis=0), COLUMNS)
 
 
 def _contrast(panorama: PaddedPanorama) -> NDArray[np.float32]:

@@ -96,6 +96,26 @@ def test_no_pose_without_tracks() -> None:
     assert located(map_of(texture(1), texture(1)), stereo_frame(np.zeros((120, 480), np.uint8))) is None
 
 
+RECOGNISED_OFF = np.array([0.01, -0.008, 0.004, 0, 0, 0.004])  # m, rad
+
+
+@pytest.mark.parametrize(
+    ("shown", "sigma", "refined"), [(texture(1), 0.01, True), (texture(2), 0.01, False), (texture(1), 5e-4, False)]
+)
+def test_the_patches_refine_a_recognised_pose_that_they_agree_with(shown: Image, sigma: float, refined: bool) -> None:
+    """Other texture, or an error that the recognition excludes, leaves the pose as it was recognised."""
+    steps = FrameToMap(map_of(texture(1), shown), MODEL, KltSettings())
+    found = PoseEstimate(se3.exp(RECOGNISED_OFF), sigma**2 * np.eye(6), 80, 80, 60)
+    exposure = Exposure.of(AT_ONCE, UNKNOWN_VELOCITY, MODEL)
+    pose = steps.refine_recognised(stereo_frame(texture(1)), found, exposure)
+    if not refined:
+        assert pose is found
+        return
+    distance, angle = motion_errors(pose.T_odom_rect, np.eye(4))
+    assert distance < 1e-3 and angle < 1e-3 and len(pose.landmarks) > 100
+    assert (pose.visible, pose.tracked, pose.inliers) == (80, 80, 60)
+
+
 @pytest.mark.parametrize("columns", [70, -70])
 def test_the_best_yaw_is_the_hypothesis_that_keeps_the_landmarks(columns: int) -> None:
     local_map = map_of(texture(1), texture(1))

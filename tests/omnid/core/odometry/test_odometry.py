@@ -191,7 +191,7 @@ def test_relocalises_at_a_keyframe_where_tracking_finds_nothing(cameras: Rendere
     (T_world_rig,) = planar_poses(np.array([[0.3, -0.3]]), np.array([0.45]))
     back = run(odometry, [cameras.frame(200 + k, T_world_rig) for k in range(2)], first=False)
     distance, angle = motion_errors(back[0].T_odom_rect, se3.inverse(PATH[0]) @ T_world_rig)
-    assert distance < 0.02 and angle < 0.01
+    assert distance < 2e-3 and angle < 1e-3, "as exact as tracking, by the patches of the local map"
     assert [estimate.state for estimate in back] == [TrackingState.DEGRADED, TrackingState.TRACKING]
     assert back[-1].resets == 0 and np.sqrt(np.diag(back[-1].covariance)).max() < 0.03
 

@@ -1,0 +1,90 @@
+"""Comparison of a frame with keyframes: votes choose those that RANSAC and Gauss-Newton verify; what then counts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.places.hypotheses import angle_rad, length_m
+from omnid.core.places.place_map import PlaceFeatures
+from omnid.core.places.recognition import Recognition, recognise
+from omnid.core.places.votes import votes
+from omnid.core.types.stereo_model import StereoModel
+
+Array = NDArray[np.float64]
+
+
+# Least inliers, and sectors of azimuth that hold them, where odometry agrees; by trial on development seeds.
+NEAR_INLIERS, NEAR_SECTORS = 20, 4
+# The same where it cannot tell; other worlds gave 10 inliers in 600 queries: docs/notes/places.md.
+FAR_INLIERS, FAR_SECTORS = 24, 5
+# At most so many of the keyframes that are compared lie so near together; by trial on development seeds.
+PER_PLACE, SAME_PLACE_M = 3, 1.5
+# Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
+RUNNER_UP: Final = 0.6
+RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
+
+
+def compare(
+    here: PlaceFeatures,
+    known: Mapping[int, PlaceFeatures],
+    poses: Mapping[int, Array],
+    most: int,
+    enough: int,
+    model: StereoModel,
+) -> dict[int, Recognition | None]:
+    """Return what a frame shows of those keyframes (at most `most`) that its features vote for, best one first.
+
+    known: features of each keyframe; poses: (4, 4) of each. It ends at a recognition with enough inliers.
+    """
+    ids = list(known)
+    voted = [votes(here, known[id], model.cylinder.width) for id in ids]
+    ranked = np.argsort([-count for count, _ in voted], kind="stable")
+    found: dict[int, Recognition | None] = {}
+    for n in _spread(ranked, np.array([poses[id][:3, 3] for id in ids]), most):
+        place = found[ids[n]] = recognise(here, known[ids[n]], ids[n], voted[n][1], model)
+        if place is not None and place.inliers >= enough:
+            break
+    return found
+
+
+def supported(found: Iterable[Recognition | None], *, near: bool = False) -> list[Recognition]:
+    """Return the recognitions with enough support; near: odometry agrees with them."""
+    inliers, sectors = (NEAR_INLIERS, NEAR_SECTORS) if near else (FAR_INLIERS, FAR_SECTORS)
+    return [place for place in found if place and place.inliers >= inliers and place.sectors >= sectors]
+
+
+def unambiguous(found: list[Recognition], poses: Mapping[int, Array]) -> Recognition | None:
+    """Return the recognition with most inliers, None where another place has nearly as many, or none was found."""
+    best = max(found, key=lambda place: place.inliers, default=None)
+    if best is None:
+        return None
+    T = poses[best.id] @ best.T_place_rect
+    rivals = (place for place in found if is_elsewhere(T, poses[place.id] @ place.T_place_rect))
+    return None if any(place.inliers > RUNNER_UP * best.inliers for place in rivals) else best
+
+
+def is_elsewhere(a: Array, b: Array) -> bool:
+    """True if two poses (4, 4) are different places."""
+    between = se3.inverse(a) @ b
+    return length_m(between) > RUNNER_UP_M or angle_rad(between) > RUNNER_UP_RAD
+
+
+def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
+    """Return the first of ranked places (N,) at positions (N, 3), at most so many, and at most PER_PLACE near another.
+
+    So a second place that looks the same is compared as well, although all neighbours of the first look more similar.
+    """
+    chosen: list[int] = []
+    for n in ranked.tolist():
+        beside = np.linalg.norm(at[chosen] - at[n], axis=1) < SAME_PLACE_M
+        if beside.sum() < PER_PLACE:
+            chosen.append(n)
+        if len(chosen) == most:
+            break
+    return chosen
