@@ -133,30 +133,43 @@ def wire(
 ) -> WiredStages:
     """Join the stages from the pairs on; return those that are asked at the end."""
     geometry, parts = front_end.geometry, parts or RunParts()
+    # 1. Pairs give poses.
     panoramas = graph.stage("dewarp", front_end.dewarp, pairs, direct=True)
     odometry = graph.stage("odometry", front_end.poses, panoramas)
-    outgoing: dict[str, Stream[Outgoing]] = {
-        "bus": odometry,
-        "bus-drive": _commands(graph, odometry, geometry, config, parts.drive),
-    }
+    commands = _commands(graph, odometry, geometry, config, parts.drive)
+    # 2. Poses give maps and rings, where these are consumed.
     mapping, maps = _mapping(graph, odometry, front_end, config, sinks, parts)
     places, in_map = _places(graph, odometry, front_end, config, sinks, parts)
     grids = _grids(graph, in_map, geometry, config, parts) if sinks.take_all else None
     obstacles, rings = _rings(graph, odometry, front_end, config, sinks, parts)
+    # 3. All of them give the way.
     updates = _navigation(
         graph, geometry, config, parts, places, [odometry, *(stream for stream in (in_map, rings) if stream)]
     )
-    named = {"bus-map": maps, "bus-places": in_map, "bus-grid": grids, "bus-scan": rings, "bus-navigation": updates}
-    outgoing.update({name: stream for name, stream in named.items() if stream})
+    # 4. What is made leaves the run.
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
+    named = {
+        "bus": odometry,
+        "bus-drive": commands,
+        "bus-map": maps,
+        "bus-places": in_map,
+        "bus-grid": grids,
+        "bus-scan": rings,
+        "bus-navigation": updates,
+    }
+    _send(graph, {name: stream for name, stream in named.items() if stream}, sinks)
+    return WiredStages(front_end, mapping, places, obstacles)
+
+
+def _send(graph: Graph, outgoing: dict[str, Stream[Outgoing]], sinks: Sinks) -> None:
+    """Join the recorder and the bus, which take every stream that leaves the run."""
     if sinks.recording:
         recorder, frames, depth = sinks.recording
         graph.sink("record", recorder, *frames, *outgoing.values(), depth=depth)
     if sinks.bus:
         for name, stream in outgoing.items():  # an inbox each: to encode a map takes longer than a pose may wait
             graph.sink(name, sinks.bus, stream, policy=NEWEST)
-    return WiredStages(front_end, mapping, places, obstacles)
 
 
 def _mapping(

@@ -88,11 +88,13 @@ class Arming:
 
         fault: reason that disarms and holds now; empty without one. longest_s: age at which a request is too old.
         """
+        # 1. A fault or a stop that was asked for disarms.
         self._touched |= fault in LATCHING
         if self.armed and fault:
             self.armed, self.reason = False, fault
         if self.stop_asked:
             self.armed, self.reason = False, ASKED
+        # 2. The newest request is answered, and arms where nothing refuses it.
         request, self._request = self._request, None
         if request is not None:
             self.answer = ArmAnswer(request.id, self._refusal(request, fault, now_ns, longest_s))
@@ -100,6 +102,7 @@ class Arming:
                 self._released_ns, self._touched = request.arrival_ns, False
                 self._arm()
                 return request
+        # 3. In the automatic mode the base is armed without a request, until a stop or a latching fault.
         if self._automatic and not fault and not self.stop_asked and not self._touched:
             self._arm()
         return None

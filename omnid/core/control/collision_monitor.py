@@ -124,8 +124,10 @@ class CollisionMonitor:
 
     def step(self, now_ns: int, motion: Twist) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc."""
+        # 1. Judge the motion by the obstacles; a base that was stopped stays so while it could only creep on.
         allowance = self._held(self._judged(now_ns, motion), motion)
         self.share, self.reason = allowance
+        # 2. Scale both speeds alike.
         self._stopped_mps = motion.velocity_mps if allowance.share == 0.0 else 0.0
         if allowance.share >= 1.0:
             return motion

@@ -70,13 +70,16 @@ class HeadingController:
         Where setpoint or heading are not finite, the base stops as fast as the limits allow. Where the time or the
         previous motion are not finite, it stops at once: there is no speed to slow down from.
         """
+        # 1. Bring the inputs into their limits.
         if not all(map(math.isfinite, (dt_s, previous.velocity_mps, previous.yaw_rate_radps))):
             return Twist()
         limits = self.limits
         dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S)
         velocity_mps = _clamp(previous.velocity_mps, limits.velocity_mps)
         yaw_rate_radps = _clamp(previous.yaw_rate_radps, limits.yaw_rate_radps)
+        # 2. The motion that turns to the heading.
         wanted = self._wanted(setpoint, heading_rad, yaw_rate_radps)
+        # 3. Approach it with the accelerations allowed.
         return Twist(
             _towards(velocity_mps, wanted.velocity_mps, limits.acceleration_mps2 * dt_s),
             _towards(yaw_rate_radps, wanted.yaw_rate_radps, limits.yaw_acceleration_radps2 * dt_s),

@@ -36,10 +36,12 @@ class VelocityLimits:
         A last motion that is not finite counts as the stop, one beyond the limits as at the limits. A time that is not
         finite or negative counts as 0, one longer than LONGEST_TICK_S as that: a late tick allows no larger step.
         """
+        # 1. Bring the inputs into their limits.
         wanted, last = (motion if _finite(motion) else STOP for motion in (wanted, last))
         dt_s = min(max(dt_s, 0.0), LONGEST_TICK_S) if math.isfinite(dt_s) else 0.0
         top_mps, top_radps = self.velocity_mps, self.yaw_rate_radps
         velocity_mps, yaw_rate_radps = _clamp(last.velocity_mps, top_mps), _clamp(last.yaw_rate_radps, top_radps)
+        # 2. Approach what is wanted with the accelerations allowed.
         reach_radps = self.yaw_acceleration_radps2 * dt_s
         return Twist(
             self._velocity(velocity_mps, _clamp(wanted.velocity_mps, top_mps), dt_s),

@@ -94,11 +94,14 @@ class Follower:
         self, stamp_ns: int, pose: Array, speed_mps: float, yaw_rate_radps: float, obstacle_m: float = math.inf
     ) -> Following:
         """Return the motion at a pose (3,) with its measured speeds."""
+        # 1. Predict the pose at which the command takes effect.
         at_effect = predicted(pose, speed_mps, yaw_rate_radps, self._settings.pursuit.delay_s)
+        # 2. Follow the legs.
         if self._pursuit is not None:
             following = self._follow(self._pursuit, stamp_ns, at_effect, speed_mps, obstacle_m)
             if following is not None:
                 return following
+        # 3. At the end, turn to the heading of the goal, and drive what is missing.
         return self._align(pose, speed_mps, yaw_rate_radps)
 
     def _follow(

@@ -105,8 +105,10 @@ class MovingTracker:
         self, stamp_ns: int, T_odom_base: Array, ranges_m: RangeScan, sigma_m: RangeScan
     ) -> tuple[MovingObstacle, ...]:
         """Return the moving obstacles after a pair, of which the ring's ranges and their sigmas are given."""
+        # 1. Predict the tracks.
         for track in self._tracks:
             track.predict(stamp_ns)
+        # 2. Give each cluster to the nearest track within the gate, or begin one.
         waiting = list(self._tracks)
         for cluster in self._clusters(stamp_ns, T_odom_base, ranges_m, sigma_m):
             distances = [float(np.linalg.norm(track.place - cluster.middle)) for track in waiting]
@@ -114,6 +116,7 @@ class MovingTracker:
                 waiting.pop(int(np.argmin(distances))).update(cluster)
             elif cluster.appeared and len(self._tracks) < MOST_TRACKS:
                 self._tracks.append(_Track(stamp_ns, cluster))
+        # 3. Forget what was long not seen.
         self._tracks = [track for track in self._tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
         self._rings.append((stamp_ns, T_odom_base, ranges_m))
         return tuple(found for track in self._tracks if (found := track.obstacle()) is not None)

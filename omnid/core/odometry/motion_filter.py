@@ -73,9 +73,12 @@ class MotionFilter:
 
     def update(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> Array:
         """Update with a measured motion and its covariance (6, 6); return the filtered motion T_prev_curr (4, 4)."""
+        # 1. The measured velocity is the motion over its time.
         R = covariance / dt_s**2 + MIN_VELOCITY_VARIANCE * np.eye(6)
         self._filter.update(se3.log(T_prev_curr)[:, None] / dt_s, R=R)
+        # 2. Rounding must not make the covariance unsymmetric.
         self._filter.P = (self._filter.P + self._filter.P.T) / 2
+        # 3. The filtered velocity gives the motion.
         return se3.exp(self.velocity * dt_s)
 
     def slow_down(self, factor: float) -> None:

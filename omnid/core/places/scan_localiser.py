@@ -60,14 +60,17 @@ class ScanLocaliser:
 
         proposed: poses T_map_rect (4, 4), at which the filter begins.
         """
+        # 1. Draw the map when it is first asked for.
         if self._filter is None:
             self._filter = ParticleFilter(scan_grid(self._scans, self._poses, CELL_M))
+        # 2. Move the particles by odometry; a robot that stands shows nothing new.
         if self._last_T is not None:
             moved = se3.inverse(self._last_T) @ T_odom_rect
             if np.linalg.norm(moved[:3, 3]) < UPDATE_M and abs(float(se3.yaw(moved))) < UPDATE_RAD:
                 return self._found
             self._filter.move(moved)
         self._last_T = T_odom_rect
+        # 3. Weight them by a scan; the pose counts once they have converged.
         estimate = self._filter.update(scan(), proposed)
         self.ambiguous += estimate.ambiguous
         self._found = _pose(estimate, T_odom_rect) if estimate.converged else None

@@ -61,7 +61,9 @@ class TagFinder:
 
     def process(self, lower: PaddedPanorama, upper: PaddedPanorama) -> list[TagPose]:
         """Return the poses of the tags that both panoramas show, in the order of their ids."""
+        # 1. Detect the corners of tags in both panoramas.
         in_lower, in_upper = self._corners(lower), self._corners(upper)
+        # 2. Estimate the pose of each tag of known size that both show.
         found = []
         for id in sorted(in_lower.keys() & in_upper.keys() & self._sizes_m.keys()):
             pose = self._pose(id, in_lower[id], in_upper[id])
