@@ -1,9 +1,10 @@
 """Recognition after a loss: `python -m tests.benchmark.losses FAMILY_sSEED ... [--size 384] [--count 40]`.
 
 The odometry follows the first pairs of a rendered drive. Then it is dark, and the robot is found elsewhere: `ahead` on
-its path, `turned` there to any heading, `covered`: the same while half of both panoramas shows nothing, or in `another
-world` of the same family, where no pose is right. Each view is searched until it is recognised, in SEARCHES frames at
-most, with the support that the odometry asks for. Wrong is an error of more than 5 cm or 1 degree.
+its path, `turned` there to any heading, `covered`: the same while half of both panoramas shows nothing, in `another
+world` of the same family, where no pose is right, or `back` where it had been, turned to any heading. Each view is
+searched until it is recognised, in SEARCHES frames at most, with the support that the odometry asks for. Wrong is an
+error of more than 5 cm or 1 degree.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ STEP_M: Final = 0.1  # of the path between two pairs: slower drives leave some o
 SEARCHES: Final = 8  # frames after which a view is given up
 WRONG_M, WRONG_RAD = 0.05, math.radians(1)
 OTHER: Final = 7000  # added to a seed for the other world
-LOSSES: Final = ("ahead", "turned", "covered", "another world")
+LOSSES: Final = ("ahead", "turned", "covered", "another world", "back")
 COLUMNS: Final = (
     Column("drive"),
     Column("size", "px"),
@@ -103,7 +104,8 @@ class Drive:
         """Return what becomes of a view after a loss."""
         turn = rng.uniform(-0.3, 0.3) if loss == "ahead" else rng.uniform(-math.pi, math.pi)
         aside = rng.uniform(-ASIDE_M, ASIDE_M, 2)
-        T_world_rig = self.poses[DRIVEN + rng.integers(AHEAD)] @ se3.exp([*aside, 0, 0, 0, turn])
+        at = rng.integers(DRIVEN) if loss == "back" else DRIVEN + rng.integers(AHEAD)
+        T_world_rig = self.poses[at] @ se3.exp([*aside, 0, 0, 0, turn])
         truth = se3.inverse(self.T_world_odom) @ T_world_rig @ se3.inverse(self.cameras.rig.T_rect_rig)
         cameras = self.elsewhere if loss == "another world" else self.cameras
         limits, longest_s = OdometryLimits(), 0.0

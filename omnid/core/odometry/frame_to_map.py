@@ -35,9 +35,6 @@ COARSE_STEPS, STEPS = (3,), (2, 4)
 FEW_RATIO = 0.6  # share of the tracks that are inliers, below which the velocity may have been wrong
 # Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.
 RECOGNISED_ROUNDS = 2
-MIN_AGREEING = 20  # patches that have to agree with it: as many as are wanted of a pose
-# Squared Mahalanobis distance of six components that one refined pose in 1,000 exceeds.
-RECOGNISED_SQUARED = 22.5
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
@@ -166,30 +163,25 @@ class FrameToMap:
             in_view,
         )
 
-    def refine_recognised(self, frame: StereoFrame, found: PoseEstimate, exposure: Exposure) -> PoseEstimate:
-        """Return a recognised pose, refined by the keyframes' patches where as many of them agree with it.
+    def refine_recognised(
+        self, frame: StereoFrame, recognised: PoseEstimate, exposure: Exposure
+    ) -> PoseEstimate | None:
+        """Return the pose of a frame that was recognised, by the keyframes' patches; None where too few agree.
 
-        Places are recognised by corners, whose pose errs by a centimetre. A refined pose farther from it than its
-        covariance allows is not taken: then the patches were aligned with other texture.
+        Places are recognised by corners, whose pose errs by centimetres. Corners and patches are two independent
+        supports of the pose: the number of inliers is the smaller one of both.
         """
-        none, refined = np.zeros(0, np.intp), found
+        none = np.zeros(0, np.intp)
+        untracked = Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0)
+        refined = recognised
         for _ in range(RECOGNISED_ROUNDS):
-            start = CoarsePose(
-                se3.inverse(refined.T_odom_rect),
-                none,
-                np.zeros(0),
-                np.zeros(0),
-                Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0),
-            )
+            start = CoarsePose(se3.inverse(refined.T_odom_rect), none, np.zeros(0), np.zeros(0), untracked)
             again = self.refine(frame, start, exposure)
-            if again is None or len(again.landmarks) < MIN_AGREEING:
-                return found
+            if again is None:
+                return None
             refined = again
-        error = se3.log(se3.inverse(found.T_odom_rect) @ refined.T_odom_rect)
-        if error @ np.linalg.solve(found.covariance, error) > RECOGNISED_SQUARED:
-            return found
-        inliers = min(found.inliers, len(refined.landmarks))
-        return replace(refined, visible=found.visible, tracked=found.tracked, inliers=inliers)
+        inliers = min(recognised.inliers, len(refined.landmarks))
+        return replace(refined, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.

@@ -53,7 +53,7 @@ class Relocaliser:
         poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
         found = compare(here, self._features, poses, len(keyframes), FEATURES + 1, self._model)
         # 3. Take the best one, unless another place looks alike.
-        best = unambiguous(supported(found.values()), poses)
+        best = unambiguous(supported(found.values(), near=True), poses)
         if best is None:
             return None
         A = se3.adjoint(se3.inverse(best.T_place_rect))
