@@ -101,7 +101,7 @@ RECOGNISED_OFF = np.array([0.01, -0.008, 0.004, 0, 0, 0.004])  # m, rad
 
 @pytest.mark.parametrize(("columns_shown", "inliers"), [(480, 60), (60, 50)])
 def test_a_recognised_pose_is_refined_and_supported_by_the_patches(columns_shown: int, inliers: int) -> None:
-    """Where most of the keyframe shows other texture, few patches support the pose."""
+    """A keyframe most of which shows other texture supports the pose with few patches."""
     shown = np.where(np.arange(480) < columns_shown, texture(1), texture(2))
     pose = refined(shown)
     assert pose is not None and (pose.visible, pose.tracked) == (80, 80) and pose.inliers <= inliers
