@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Final
 
@@ -81,7 +82,7 @@ class Obstacles:
         evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
         pose = transform(planar(T_odom_base))
         ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched)
-        moving = self._tracker.update(odometry.stamp_ns, pose, *self._grid.pair_ring(evidence))
+        moving = self._tracker.update(odometry.stamp_ns, pose, ring.arrivals)
         return ObstacleRing(
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
@@ -121,7 +122,8 @@ def controller_ring(ring: ObstacleRing) -> ControllerRing:
     for obstacle in ring.moving:
         x, y = (np.array([obstacle.x_m, obstacle.y_m]) - T[:2, 3]) @ T[:2, :2]
         vx, vy = np.array([obstacle.vx_mps, obstacle.vy_mps]) @ T[:2, :2]
-        moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m))
+        sigmas = (math.sqrt(np.diag(obstacle.covariance)[part].max()) for part in (slice(2), slice(2, 4)))
+        moving.append(MovingPoint(float(x), float(y), float(vx), float(vy), obstacle.radius_m, *sigmas))
     return ControllerRing(
         ring.stamp_ns,
         tuple(np.maximum(nearest, 0.0).tolist()),

@@ -29,6 +29,8 @@ BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on; because the res
 UNKNOWN_SECTORS: Final = 5
 BESIDE_M: Final = 0.05  # beyond the sides' room: corrections of the heading do not swing a corner so far in time_s
 MOVING_STEP_S: Final = 0.1  # of the prediction of moving obstacles; 0.15 m of a person at 1.5 m/s: fine enough
+MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
+NEW_MPS: Final = 0.4  # sigma of the velocity of who was seen twice; three looks make it smaller
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
 MOST_MOVING: Final = 16  # so that the time of a tick is bounded (docs/results/speed.md has it with so many)
 
@@ -52,6 +54,8 @@ class MovingPoint(NamedTuple):
     vx_mps: float
     vy_mps: float
     radius_m: float
+    sigma_m: float = 0.0  # of the place
+    sigma_mps: float = 0.0  # of the velocity
 
 
 class ControllerRing(NamedTuple):
@@ -231,10 +235,12 @@ class CollisionMonitor:
         return FREE if share >= 1.0 else Allowance(share, reason)
 
     def _before_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
-        """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be."""
+        """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be, and
+        to slow_mps where a new one may be there, within one sigma: two looks tell roughly where somebody goes.
+        """
         settings, stop = self._settings, self._stop_polygon(motion)
-        steps = math.ceil(settings.time_s / MOVING_STEP_S)
-        for step in range(steps):
+        slow = FREE
+        for step in range(round(MOVING_S / MOVING_STEP_S)):
             ahead_s = step * MOVING_STEP_S
             pose = composed(moved, along_arc(motion.velocity_mps, motion.yaw_rate_radps, ahead_s))
             at_s = age_s + ahead_s
@@ -243,9 +249,18 @@ class CollisionMonitor:
                 for obstacle in self._moving
             ]
             for obstacle, (x, y) in zip(self._moving, seen_from(pose, places), strict=True):
-                if stop.gap_m(x, y) <= obstacle.radius_m and (step or self._outline.is_approached(x, y, motion)):
-                    return Allowance(0.0 if ahead_s <= MOVING_STOP_S else ahead_s / settings.time_s, MOVING)
-        return FREE
+                gap_m = stop.gap_m(x, y) - obstacle.radius_m
+                if not step and not self._outline.is_approached(x, y, motion):
+                    continue
+                if gap_m <= 0.0:
+                    share = 0.0 if ahead_s <= MOVING_STOP_S else ahead_s / MOVING_S
+                    return min(slow, Allowance(share, MOVING))
+                spread_m = math.hypot(obstacle.sigma_m, at_s * obstacle.sigma_mps)
+                if slow is FREE and obstacle.sigma_mps > NEW_MPS and gap_m <= spread_m:
+                    slow = self._capped(
+                        motion, max(settings.slow_mps, abs(motion.velocity_mps) * ahead_s / MOVING_S), MOVING
+                    )
+        return slow
 
     def _capped(self, motion: Twist, speed_mps: float, reason: str) -> Allowance:
         """Return the share at which the speed is at most so high; turns on the spot slow down alike."""

@@ -18,6 +18,7 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence
 from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.usual_floor import Arrivals, UsualFloor
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -40,7 +41,6 @@ MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow
 MOST_SURFACE: Final = 1.0
 FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
 TAKEN_ODDS: Final = 0.0  # of a surface
-PAIR_RUN: Final = 4.0  # of a surface in one pair, that may move
 CONTRADICTION: Final = -2.5  # to a surface where the floor is seen and no surface; by trial on development seeds
 APART_M: Final = 0.05  # between places whose errors differ
 APART_S: Final = 0.2  # of pairs from one place that are one more
@@ -72,6 +72,7 @@ class GridRing(NamedTuple):
     ranges_m: Floats  # (SECTORS,) nearest surface; inf: floor up to the longest range; NaN: unknown
     sigma_m: Floats  # (SECTORS,) of the ranges, NaN without one
     free_m: Floats  # (SECTORS,) up to which the way is free
+    arrivals: Arrivals  # of this pair
 
 
 class ObstacleGrid:
@@ -99,6 +100,7 @@ class ObstacleGrid:
         self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
         self._fresh = np.zeros((CELLS, CELLS), np.float32)  # mean evidence of the last FRESH_NS
         self._free_ns = np.full((CELLS, CELLS), NEVER, np.int64)  # when a cell was free last
+        self._usual = UsualFloor(CELLS)
         self._flooded = np.zeros((CELLS, CELLS), np.uint8)  # 1 where something may have come unseen
         self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
         self._start_ns: int | None = None
@@ -120,12 +122,20 @@ class ObstacleGrid:
         # 1. Evidence of each cell.
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
+        weight, at_rest = self._weights(stamp_ns, T_odom_base[:2, 3])
+        arrivals = self._usual.arrivals(
+            self._usual.compare((rows, columns), floor, weight),
+            self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9),
+            self._odds[SURFACE] > TAKEN_ODDS,
+            np.array([*(place - corner), CELL_M, self._max_range_m, self._at_1m]),
+            self._azimuths + float(se3.yaw(T_odom_base)),
+            evidence.nearest_floor_m,
+        )
         in_view = np.isfinite(floor)
         floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
         surface = np.minimum(surface, np.float32(MOST_SURFACE))
         # 2. Log-odds.
         odds = self._odds[:, rows, columns]
-        weight, at_rest = self._weights(stamp_ns, T_odom_base[:2, 3])
         is_surface = surface > 0
         odds[FLOOR] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
         passes = (floor > 0) & ~is_surface
@@ -141,7 +151,7 @@ class ObstacleGrid:
         self._clear_seen_past(place - corner, evidence.nearest_floor_m)
         i, j = int(at[1]), int(at[0])
         self._odds[FLOORS, i - 3 : i + 4, j - 3 : j + 4] = LIMIT
-        return self._ring(T_odom_base, place - corner)
+        return self._ring(T_odom_base, place - corner, arrivals)
 
     @property
     def corner_m(self) -> Array:
@@ -267,44 +277,19 @@ class ObstacleGrid:
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._flooded[cells] = 0
 
-    def _ring(self, T_odom_base: Array, place: Array) -> GridRing:
+    def _ring(self, T_odom_base: Array, place: Array, arrivals: Arrivals) -> GridRing:
         """Return the ring about a place (2,) [cells] of the square."""
         hit, free = np.empty(SECTORS), np.empty(SECTORS)
-        kernels.march(
-            self.state(),
-            np.array(
-                [
-                    *place,
-                    CELL_M / 2,
-                    self._max_range_m,
-                    CELL_M,
-                    self._gap_share,
-                    CELL_M + self._gap_share * self._nearest_m,
-                ]
-            ),
-            self._azimuths + float(se3.yaw(T_odom_base)),
-            hit,
-            free,
-        )
+        gap_m = CELL_M + self._gap_share * self._nearest_m
+        origin = np.array([*place, CELL_M / 2, self._max_range_m, CELL_M, self._gap_share, gap_m])
+        kernels.march(self.state(), origin, self._azimuths + float(se3.yaw(T_odom_base)), hit, free)
         # A direction between cells may belong to either side.
         free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
         is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)
         ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
         sigma = np.where(np.isfinite(ranges), CELL_M / 2, np.nan)
         free = np.where(free < hit, np.maximum(free - END_M, 0.0), hit)
-        return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32))
-
-    def pair_ring(self, evidence: ColumnEvidence) -> tuple[Floats, Floats]:
-        """Return the nearest surface (SECTORS,) of one pair, NaN without one, and its sigma."""
-        surface = evidence.surface > PAIR_RUN
-        bins, width = surface.shape
-        nearest = np.where(surface.any(axis=0), bins - 1 - np.argmax(surface[::-1], axis=0), -1)
-        T = se3.inverse(self._T_rect_base)
-        azimuth = math.pi - (np.arange(width) + 0.5) * (math.tau / width) + math.atan2(T[1, 0], T[0, 0])
-        found = np.full(SECTORS, -1)
-        np.maximum.at(found, np.floor((azimuth + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS, nearest)
-        ranges = np.where(found >= 0, self._at_1m / np.maximum(found, 1), np.nan)
-        return ranges.astype(np.float32), (0.5 * ranges**2 / self._at_1m).astype(np.float32)
+        return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)
 
     def _follow(self, place: Array) -> NDArray[np.int64]:
         """Move the square where the robot comes near its border; return its corner, in cells of odom."""
@@ -320,10 +305,10 @@ class ObstacleGrid:
         x, y = np.clip(shift, -CELLS, CELLS).tolist()
         gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
         self._odds[:] = np.roll(self._odds, (-y, -x), axis=(1, 2))
-        for layer in (self._fresh, self._free_ns, self._flooded):
+        for layer in (self._fresh, self._free_ns, self._flooded, self._usual.mean):
             layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
         self._odds[:, gone] = np.array(PRIOR, np.float32)[:, None]
-        self._fresh[gone], self._flooded[gone] = 0.0, 0
+        self._fresh[gone], self._flooded[gone], self._usual.mean[gone] = 0.0, 0, 0.0
         self._free_ns[gone] = NEVER
         self._corner = self._corner + shift
         return self._corner

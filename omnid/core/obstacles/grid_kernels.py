@@ -108,3 +108,43 @@ def march(state: Bytes, origin: Doubles, azimuths: Doubles, hit: Doubles, free: 
             elif r - free[n] > max(gap_share * r, least_gap):
                 ended = True
             r += step
+
+
+@compiled("(f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("found",))
+def hidden_from(
+    hidden: Floats,
+    was_free: Bytes,
+    taken: Bytes,
+    origin: Doubles,
+    azimuths: Doubles,
+    bounds: Doubles,
+    found: Doubles,
+) -> None:
+    """Write, along directions (N,), the range from which on all floor that was free is hidden, NaN where none is.
+
+    The sum of log-odds from a range to the end of the way is that of all less that of what is nearer: it is largest
+    from where the latter is least. Each disparity counts once, however many cells it has.
+    hidden (H, W): log-odds of cells; was_free, taken (H, W): 1 where so. origin (5,): place in cells, size of a cell
+    [m], longest way [m], disparity at 1 m. bounds (2,): least sum, and gap [m] in what was free that ends a way: the
+    floor behind what stands there may be hidden by it.
+    """
+    height, width = hidden.shape
+    cell, longest, at_1m = origin[2], origin[3], origin[4]
+    step = 0.5 * cell
+    for n in range(len(azimuths)):
+        dx, dy = math.cos(azimuths[n]) / cell, math.sin(azimuths[n]) / cell
+        total, least, begin, last = 0.0, 0.0, math.nan, math.nan
+        r = cell
+        while r < longest:
+            i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
+            if i < 0 or j < 0 or i >= height or j >= width or taken[i, j] > 0 or r - last > bounds[1]:
+                break
+            if was_free[i, j] > 0:
+                total += hidden[i, j] * at_1m * step / (r * r)
+                last = r
+                if total <= least:
+                    least, begin = total, math.nan
+                elif math.isnan(begin):
+                    begin = r
+            r += step
+        found[n] = begin if total - least >= bounds[0] else math.nan

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.grid import GridRing
+from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.core.stereo.tiles import tile_columns
 
 Array = NDArray[np.float64]
@@ -64,4 +65,5 @@ def without(ring: GridRing, unwatched: Flags) -> GridRing:
         np.where(unwatched, nan, ring.ranges_m),
         np.where(unwatched, nan, ring.sigma_m),
         np.where(unwatched, np.float32(0), ring.free_m),
+        Arrivals(*(np.where(unwatched, nan, found) for found in ring.arrivals)),
     )

@@ -241,6 +241,15 @@ def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does
     assert after(FREE_RING, moving=(near,)) == (Twist(), monitor_module.MOVING)
 
 
+def test_a_new_one_slows_the_base_down_where_it_may_go() -> None:
+    """Seen twice, it seems to walk beside the way; three looks make the sigma smaller than 0.4 m/s."""
+    new = MovingPoint(1.0, 1.0, 0.0, -0.1, 0.2, 0.1, 0.6)
+    allowed, reason = after(FREE_RING, moving=(new,))
+    assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.MOVING
+    assert after(FREE_RING, moving=(new._replace(sigma_mps=0.3),)) == (AHEAD, "")
+    assert after(FREE_RING, moving=(new._replace(y_m=3.0),)) == (AHEAD, "")
+
+
 def test_never_gives_more_than_was_asked_nor_another_direction() -> None:
     rng = random.Random(3)
     reasons = set()

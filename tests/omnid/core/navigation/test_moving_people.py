@@ -18,6 +18,7 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes
 
@@ -67,13 +68,16 @@ class BaseAmongPeople(BaseAmongBoxes):
             self.ring_s = self.t_s
             T = se3.transform(se3.rotation_exp([0, 0, self.pose[2]]), [*self.pose[:2], 0.0])
             self.moving = self.tracker.update(
-                now.stamp_ns, T, ranges.astype(np.float32), np.full(360, 0.01, np.float32)
+                now.stamp_ns,
+                T,
+                Arrivals(np.where(person < walls, ranges, math.nan), np.full(360, 0.01)),
             )
             points = tuple(
                 MovingPoint(
                     *relative(self.pose, np.array([m.x_m, m.y_m, 0.0]))[:2].tolist(),
                     *(T[:2, :2].T @ (m.vx_mps, m.vy_mps)).tolist(),
                     m.radius_m,
+                    *(math.sqrt(np.diag(m.covariance)[part].max()) for part in (slice(2), slice(2, 4))),
                 )
                 for m in self.moving
             )
@@ -102,8 +106,9 @@ def test_nothing_changes_where_the_person_has_passed_before_or_comes_after(at_m:
     base = BaseAmongPeople(4, (at_m, 1.9), (0.0, -0.9), begins_s)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m > 0.3
-    assert base.slowest_mps(1.0, 4.0) > 0.35
-    assert {sample.navigation.reason for sample in base.samples} == {""}
+    # Two looks at somebody who steps out slow it down, until the third tells where they go.
+    assert base.slowest_mps(1.0, 4.0) > 0.3
+    assert sum(sample.navigation.reason != "" for sample in base.samples) <= 2
 
 
 @pytest.mark.parametrize(("seed", "aside_m"), [(5, 0.3), (6, -0.2)])
@@ -112,7 +117,8 @@ def test_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m > 0.1
     states = [sample.navigation.state for sample in base.samples]
-    assert NavigationState.AVOIDING in states and NavigationState.BLOCKED not in states
+    # Its track is noisy: two pairs may leave no way around, before the base has even slowed down.
+    assert NavigationState.AVOIDING in states and states.count(NavigationState.BLOCKED) <= 2
 
 
 def test_stands_when_a_person_walks_into_it() -> None:

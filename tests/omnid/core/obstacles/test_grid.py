@@ -191,7 +191,17 @@ def test_square_follows_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
     assert np.abs(grid.corner_m - [50.0 - 6.4, -6.4]).max() < 0.1 and not np.isfinite(ring.ranges_m).any()
 
 
-def test_ring_of_one_pair_has_the_wall(grid: ObstacleGrid, seen: Pairs) -> None:
-    ranges, sigma = grid.pair_ring(seen[0])
-    assert np.isfinite(ranges).mean() > 0.8 and np.nanmedian(ranges) == pytest.approx(WALL_M, abs=0.15)
-    assert np.nanmedian(sigma) == pytest.approx(0.5 * WALL_M**2 / COLUMNS.at_1m, rel=0.2)
+@pytest.mark.parametrize("grey", [120.0, 190.0])
+def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid, seen: Pairs, grey: float) -> None:
+    """Somebody plain, 30 cm wide; the room that stands, and who has stood there from the start, have not come."""
+    person = evidence(stains, striped, pole=Pole(1.3, 0.3, grey))
+    assert np.isnan(after(grid, seen, 20).arrivals.ranges_m).all()
+    came = grid.update(20 * PERIOD_NS, np.eye(4), person[0])
+    assert np.nanmedian(came.arrivals.ranges_m[AHEAD]) == pytest.approx(1.3, abs=0.15)
+    assert (came.arrivals.sigma_m[AHEAD] < 0.1).all()
+    assert np.isfinite(came.arrivals.ranges_m).sum() < 2 * np.degrees(0.3 / 1.3)
+    stays = after(grid, person, 10, first=21)
+    assert np.nanmedian(stays.arrivals.ranges_m[AHEAD]) == pytest.approx(1.3, abs=0.15)
+    assert np.isnan(after(grid, seen, 5, first=31).arrivals.ranges_m).all(), "the floor is as it was"
+    grid.clear()
+    assert np.isnan(after(grid, person, 20).arrivals.ranges_m).all()

@@ -1,4 +1,4 @@
-"""Moving obstacles: a person in a room of known walls, seen from a base that drives."""
+"""Moving obstacles: a person who comes onto free floor, seen from a base that drives."""
 
 from __future__ import annotations
 
@@ -11,35 +11,34 @@ from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.obstacles.moving_tracker import MovingTracker, surfaces
+from omnid.core.obstacles.usual_floor import Arrivals
 
 S = 1_000_000_000
 PERIOD_S = 0.2
-WALLS_M = 3.0  # a square room about the origin
 
 
-def ring(x_m: float, people: list[tuple[float, float]], rng: np.random.Generator) -> np.ndarray:
-    """Return the ring at a place in the room, people being discs of 0.2 m radius."""
+def arrived(x_m: float, people: list[tuple[float, float]], rng: np.random.Generator) -> np.ndarray:
+    """Return the ranges of what has come, from a place on the x axis: people, discs of 0.2 m radius."""
     c, s = np.cos(azimuths()), np.sin(azimuths())
-    with np.errstate(divide="ignore"):
-        ranges = np.minimum((np.sign(c) * WALLS_M - x_m) / c, WALLS_M / np.abs(s))
+    ranges = np.full(SECTORS, np.nan)
     for px, py in people:
         along = (px - x_m) * c + py * s
         across2 = (px - x_m) ** 2 + py**2 - along**2
         hit = (along > 0) & (across2 < 0.04)
-        ranges = np.where(hit, np.minimum(ranges, along - np.sqrt(np.maximum(0.04 - across2, 0))), ranges)
+        ranges = np.where(hit, np.fmin(ranges, along - np.sqrt(np.maximum(0.04 - across2, 0))), ranges)
     return (ranges + 0.01 * ranges**2 * rng.standard_normal(SECTORS)).astype(np.float32)
 
 
 def tracked(
-    path: list[tuple[float, float]] | None, speed_mps: float = 0.0, seed: int = 1, steps: int = 25
+    path: list[tuple[float, float]], speed_mps: float = 0.0, seed: int = 1, period_s: float = PERIOD_S
 ) -> list[tuple[MovingObstacle, ...]]:
     """Return the moving obstacles of a drive; path: the places of a person."""
     rng, tracker, found = np.random.default_rng(seed), MovingTracker(), []
-    for i in range(steps):
-        x_m = speed_mps * PERIOD_S * i
+    for i, place in enumerate(path):
+        x_m = speed_mps * period_s * i
+        ranges = arrived(x_m, [place], rng)
         T = se3.transform(np.eye(3), [x_m, 0, 0])
-        ranges = ring(x_m, [path[i]] if path else [], rng)
-        found.append(tracker.update(round(i * PERIOD_S * S), T, ranges, (0.01 * ranges**2).astype(np.float32)))
+        found.append(tracker.update(round(i * period_s * S), T, Arrivals(ranges, 0.01 * ranges**2)))
     return found
 
 
@@ -61,14 +60,35 @@ def test_a_person_who_walks_is_tracked_with_velocity_and_covariance(speed_mps: f
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_room_that_stands_has_no_moving_obstacles(seed: int) -> None:
-    assert sum(len(moving) for moving in tracked(None, 0.4, seed)) == 0
-    assert sum(len(moving) for moving in tracked([(1.5, 0.8)] * 25, 0.3, seed)) == 0
+def test_what_was_put_down_and_stands_does_not_move(seed: int) -> None:
+    found = tracked([(1.5, 0.8)] * 25, 0.3, seed)
+    assert not any(found[5:])
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("speed_mps", [0.8, 1.2, 1.6])
+def test_two_looks_tell_who_comes_and_three_how_fast(side: int, speed_mps: float) -> None:
+    """Pairs at 10 Hz."""
+    path = [(2.0, side * (1.8 - speed_mps * 0.1 * i)) for i in range(3)]
+    found = tracked(path, 0.5, period_s=0.1)
+    assert not found[0] and found[1] and found[1][0].vy_mps * side < -0.3 * speed_mps
+    assert found[2][0].vy_mps * side == pytest.approx(-speed_mps, rel=0.4)
+
+
+def test_range_of_who_hides_the_nearest_floor_in_view_is_not_taken_for_a_stop() -> None:
+    """The ranges stay at 1 m while the person comes nearer; their sigma says that they are a bound."""
+    tracker, rng = MovingTracker(), np.random.default_rng(1)
+    for i in range(12):
+        ranges = arrived(0.0, [(2.2 - 0.12 * i, 0.0)], rng)
+        is_near = ranges < 1.0
+        ranges = np.where(is_near, 1.0, ranges).astype(np.float32)
+        sigma_m = np.where(is_near, 0.3, 0.01 * ranges**2).astype(np.float32)
+        found = tracker.update(round(i * 0.1 * S), np.eye(4), Arrivals(ranges, sigma_m))
+    assert found[0].vx_mps < -0.9
 
 
 def test_a_person_who_stops_is_no_longer_moving() -> None:
-    path = [(2.0, min(-2.0 + 0.8 * PERIOD_S * i, -0.5)) for i in range(40)]
-    found = tracked(path, steps=40)
+    found = tracked([(2.0, min(-2.0 + 0.8 * PERIOD_S * i, -0.5)) for i in range(40)])
     assert any(found[:12]) and not any(found[-8:])
 
 

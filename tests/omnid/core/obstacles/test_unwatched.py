@@ -9,6 +9,7 @@ from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.grid import GridRing
 from omnid.core.obstacles.unwatched import Unwatched, without
+from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.core.stereo.tiles import TILE_COLUMNS
 
 CYLINDER = Cylinder(width=900, height=250, row0=80.0)
@@ -49,9 +50,10 @@ def test_spans_are_named_counter_clockwise_from_ahead() -> None:
 def test_unwatched_sectors_have_neither_range_nor_free_floor() -> None:
     """No range, no free floor, and the rest as it was."""
     ranges = np.full(SECTORS, 2.0, np.float32)
-    seen = GridRing(ranges, 0.1 * ranges, ranges)
+    seen = GridRing(ranges, 0.1 * ranges, ranges, Arrivals(ranges, 0.1 * ranges))
     where = np.arange(SECTORS) < 90
     found = without(seen, where)
     assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any()
+    assert np.isnan(found.arrivals.ranges_m[:90]).all() and (found.arrivals.ranges_m[90:] == 2.0).all()
     assert (found.ranges_m[90:] == 2.0).all() and (found.free_m[90:] == 2.0).all()
     assert without(seen, np.zeros(SECTORS, bool)) is seen

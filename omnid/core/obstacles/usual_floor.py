@@ -1,0 +1,74 @@
+"""Usual evidence of each cell of the floor, and where floor that was free is suddenly hidden: something has come.
+
+A person hides all floor behind the feet from one image to the next, while the grid's log-odds, which are sums of many
+pairs, follow later. So each cell keeps the mean of its evidence, and a pair is judged against it. README.md has the
+equations.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.obstacles import grid_kernels as kernels
+
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Array = NDArray[np.float64]
+
+MOST_RATIO: Final = np.float32(3.0)  # of a cell and a pair, as the grid counts it
+LEARNED: Final = np.float32(0.5)  # share of a pair that counts in full in the mean: that of some four pairs
+HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden: two disparities in full
+BIN_SIGMA: Final = 0.3  # sigma of the range at which hidden floor begins, in disparities: within one
+NEAR_SIGMA: Final = 0.3  # the same where nearer floor is not in view, as a share of the range: anywhere before it
+GAP_M: Final = 0.1  # of floor that was not free lately, which ends the way along a direction: a base of something
+
+
+class Arrivals(NamedTuple):
+    """What has come onto floor that was free, by one pair."""
+
+    ranges_m: Floats  # (SECTORS,) from which on that floor is hidden, NaN where it is not
+    sigma_m: Floats  # (SECTORS,)
+
+
+class UsualFloor:
+    """Mean evidence of the floor of cells (N, N), 0 where it has not been seen."""
+
+    def __init__(self, cells: int) -> None:
+        self.mean = np.zeros((cells, cells), np.float32)
+
+    def compare(self, window: tuple[slice, slice], floor: Floats, weight: np.float32) -> Floats:
+        """Return the log-odds (N, N) that the floor is hidden, 0 out of a window, and learn where it is not.
+
+        floor: of the window, evidence of a pair, NaN where nothing can be seen.
+        """
+        mean = self.mean[window]
+        # 1. Evidence with the variance 2 about the usual m or about 0, what is hidden: log-odds m/2 (m/2 - floor).
+        in_view = np.isfinite(floor)
+        seen = np.clip(np.where(in_view, floor, 0), -MOST_RATIO, MOST_RATIO)
+        hidden = np.clip(mean / 2 * (mean / 2 - seen), -MOST_RATIO, MOST_RATIO)
+        hidden[~in_view] = 0
+        # 2. What is hidden tells nothing of the floor.
+        mean += LEARNED * weight * in_view / (1 + np.exp(hidden)) * (seen - mean)
+        np.maximum(mean, 0, out=mean)
+        found = np.zeros_like(self.mean)
+        found[window] = hidden
+        return found
+
+    def arrivals(
+        self, hidden: Floats, was_free: Flags, taken: Flags, origin: Array, azimuths: Array, nearest_m: float
+    ) -> Arrivals:
+        """Return what has come, along directions (N,).
+
+        hidden (H, W): log-odds of cells; was_free: lately; taken: by what stands there. origin (5,): place [cells],
+        size of a cell [m], longest range [m], disparity at 1 m; nearest_m: of the floor in view.
+        """
+        found = np.empty(len(azimuths))
+        flags = was_free.view(np.uint8), taken.view(np.uint8)
+        kernels.hidden_from(hidden, *flags, origin, azimuths, np.array([HIDDEN_SUM, GAP_M]), found)
+        # What hides the nearest floor in view may stand anywhere before it.
+        is_near = found < nearest_m + 2 * origin[2]
+        sigma_m = np.where(is_near, NEAR_SIGMA * found, found**2 * (BIN_SIGMA / origin[4]))
+        return Arrivals(found.astype(np.float32), sigma_m.astype(np.float32))
