@@ -3,8 +3,8 @@
 An operator holds the stick ahead in a corridor at 0.5 m/s; the collision monitor alone keeps the simulated robot from
 what it meets. A contact is one of the robot's true outline, over an edge, too; it is the robot's own where the robot
 drove. A stop of the monitor is false where nothing true stands or walks within 1 m of the outline, in the robot's way
-or 0.2 m beside it, and no person walks within 2 m. Printed beside that: the highest speed within 1 m of what stands ahead,
-and how many of the obstacle rings there told the way as unknown.
+or 0.2 m beside it, and no person walks within 2 m. The speed told is the highest within 1 m of what stands ahead; the
+obstacle rings there are counted, and those that told the way as unknown.
 """
 
 from __future__ import annotations
@@ -91,22 +91,16 @@ def world_text(case: str, rng: random.Random) -> str:
         "[space]",
         f"low = [-2.0, {right}]",
         f"high = [{end_m}, {left}]",
-        "[[wall]]",
-        f"points = [[-2.0, {left}], [{end_m}, {left}]]",
-        f'texture = "{walls[0]}"',
-        "posters_per_m = 0.6",
-        "[[wall]]",
-        f"points = [[{end_m}, {right}], [-2.0, {right}]]",
-        f'texture = "{walls[1]}"',
-        "posters_per_m = 0.6",
-        "[[wall]]",
-        f"points = [[{end_m}, {left}], [{end_m}, {right}]]",
-        f'texture = "{end}"',
-        f"posters_per_m = {posters}",
-        "[[wall]]",
-        f"points = [[-2.0, {right}], [-2.0, {left}]]",
-        'texture = "brick"',
     ]
+    corners = [[-2.0, left], [end_m, left], [end_m, right], [-2.0, right]]
+    for first, last, texture, per_m in (
+        (0, 1, walls[0], 0.6),
+        (2, 3, walls[1], 0.6),
+        (1, 2, end, posters),
+        (3, 0, "brick", 0.0),
+    ):
+        points = [corners[first], corners[last]]
+        lines += ["[[wall]]", f"points = {points}", f'texture = "{texture}"', f"posters_per_m = {per_m}"]
     if case.endswith("box"):
         size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), 0.08 if case == "low box" else rng.uniform(0.4, 1.2)]
         lines += [

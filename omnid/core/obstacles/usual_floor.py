@@ -27,7 +27,7 @@ GAP_M: Final = 0.1  # of floor that was not free lately, which ends the way alon
 
 
 class Arrivals(NamedTuple):
-    """What has come onto floor that was free, by one pair."""
+    """Ranges of what has come onto floor that was free, by one pair."""
 
     ranges_m: Floats  # (SECTORS,) from which on that floor is hidden, NaN where it is not
     sigma_m: Floats  # (SECTORS,)
