@@ -22,6 +22,7 @@ COMMANDS = (
     "replay",
     "demo",
     "eval",
+    "accept",
     "calibrate",
     "cameras",
     "arm",

@@ -32,6 +32,12 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
             "eval est.txt truth.txt --align rigid --json",
             "eval est.txt truth.txt --score hilti",
         ),
+        "accept": (
+            "accept",
+            "accept drive.mcap --rig rig.toml --distance-m 12.34 -o accept.html",
+            "accept est.txt --distance-m 12.34 --marks 12.5 60 110",
+            "accept --keys marks.txt",
+        ),
         "calibrate board": (
             "calibrate board --corners 6x7 --square-mm 25 -o board.pdf",
             "calibrate board --board charuco --corners 5x7 --square-mm 30 --marker-mm 22 "

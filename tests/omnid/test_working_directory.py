@@ -32,6 +32,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "replay": (("none.mcap",), "none.mcap"),
     "demo": (("--output", "/dev/null/demo"), "/dev/null/demo"),
     "eval": (("none.txt", "none.txt"), NO_FILE),
+    "accept": (("none.mcap", "--distance-m", "10"), "none.mcap"),
     "calibrate board": (("--corners", "6x7", "--square-mm", "25", "-o", "board.pdf"), "board of 6x7 inner corners"),
     "calibrate live": (("--log", "none.mcap", "--corners", "6x7", "--square-mm", "30"), "none.mcap"),
     "calibrate camera": (("none.png", "--corners", "6x7", "--square-mm", "30", "-o", "c.toml"), "none.png"),
