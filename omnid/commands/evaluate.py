@@ -44,6 +44,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "the truth's poses are missing, with --align rigid unless another one is given; kitti: drift "
         "over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m",
     )
+    parser.add_argument(
+        "--live",
+        type=Path,
+        metavar="FILE",
+        help="the poses as they were known while driving (replay --map-live-tum), whose errors are printed beside",
+    )
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -55,7 +61,9 @@ def run(args: argparse.Namespace) -> int:
     from omnid.recordings.scores import drift_text, hilti_score, kitti_drift
 
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
-    metrics = evaluate(estimate, truth, tolerance_s, args.align or ("rigid" if args.score == "hilti" else "origin"))
+    alignment = args.align or ("rigid" if args.score == "hilti" else "origin")
+    metrics = evaluate(estimate, truth, tolerance_s, alignment)
+    live = evaluate(read_tum(args.live), truth, tolerance_s, alignment) if args.live else None
     if metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
         print(
             f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
@@ -68,9 +76,12 @@ def run(args: argparse.Namespace) -> int:
             "hilti": {"hilti_score": hilti_score(metrics)},
             "kitti": {"drift": drift},
         }
-        print_json(asdict(metrics) | scores.get(args.score, {}))
+        causal = {} if live is None else {"live": asdict(live)}
+        print_json(asdict(metrics) | scores.get(args.score, {}) | causal)
         return 0
     print(metrics)
+    if live is not None:
+        print(f"as known while driving, of {args.live}\n{live}")
     if args.score == "hilti":
         print(f"score (Hilti 2026)    {hilti_score(metrics):.2f} of 100")
     elif args.score == "kitti":

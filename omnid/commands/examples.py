@@ -31,6 +31,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
             "eval est.txt truth.txt",
             "eval est.txt truth.txt --align rigid --json",
             "eval est.txt truth.txt --score hilti",
+            "eval map.txt truth.txt --live live.txt",
         ),
         "accept": (
             "accept",

@@ -50,6 +50,12 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="trajectory in the map, T_map_rig: places that are recognised correct all poses before them",
     )
+    group.add_argument(
+        "--map-live-tum",
+        type=Path,
+        metavar="FILE",
+        help="the same as it was known at each pose, which is what a controller gets: later places correct nothing",
+    )
     group.add_argument("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
     group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
     group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
@@ -93,6 +99,7 @@ def run(args: argparse.Namespace) -> int:
         span_s=_span_of(args),
         tum=args.tum,
         map_tum=args.map_tum,
+        map_live_tum=args.map_live_tum,
         cloud=args.cloud,
         plan=args.plan,
         record=args.record,

@@ -75,6 +75,7 @@ class ReplayOptions:
     span_s: tuple[float, float] = WHOLE  # the part of the log, from and until so many seconds after its first image
     tum: Path | None = None
     map_tum: Path | None = None
+    map_live_tum: Path | None = None  # poses in the map as they were known when they were computed
     cloud: Path | None = None
     plan: Path | None = None
     record: Path | None = None
@@ -99,6 +100,7 @@ class ReplayOptions:
         named = (
             ("--tum", self.tum),
             ("--map-tum", self.map_tum),
+            ("--map-live-tum", self.map_live_tum),
             ("--cloud", self.cloud),
             ("--plan", self.plan),
             ("--record", self.record),
@@ -127,8 +129,9 @@ class _Replay:
 
     def run(self) -> RunResult:
         check_outputs(self._options.files, self._inputs())
-        if self._options.map_tum and not self._config.places.enabled:
-            raise OmnidError("--map-tum: places.enabled = false, so that there is no pose in the map; leave one out")
+        in_map = [name for name, _ in self._options.files if name in ("--map-tum", "--map-live-tum")]
+        if in_map and not self._config.places.enabled:
+            raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
         prepare_kernels(log_line)
         graph = Graph(
             policy=NEWEST if self._options.drops else LOSSLESS,
@@ -230,7 +233,7 @@ class _Replay:
             sinks.maps["collect-map"] = self._map
         if options.tum:
             sinks.poses["trajectory"] = TrajectoryFile(options.tum)
-        if options.map_tum or options.collect:
+        if options.map_tum or options.map_live_tum or options.collect:
             sinks.places["collect-places"] = self._map_poses
         if options.cloud:
             sinks.maps["map"] = MapFile(options.cloud)
@@ -287,6 +290,8 @@ class _Replay:
         newest, in_map = self._map.get(), results.map_poses(self._map_poses)
         if self._options.map_tum:
             write_trajectory(self._options.map_tum, self._map_poses.stamps_ns, in_map)
+        if self._options.map_live_tum:
+            write_trajectory(self._options.map_live_tum, self._map_poses.stamps_ns, self._map_poses.T_map_rig)
         return RunResult(
             self._poses.stamps_ns,
             self._poses.T_odom_rig,

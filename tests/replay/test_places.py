@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -41,14 +42,24 @@ def test_the_trajectory_in_the_map_is_better_and_the_same_threaded_and_inline(
 ) -> None:
     for name, more in (("a", ["--record", tmp_path / "out.mcap"]), ("b", ["--inline"])):
         files = ("--tum", tmp_path / f"{name}.odom", "--map-tum", tmp_path / name, *more)
+        files = (*files, "--map-live-tum", tmp_path / f"{name}.live")
         result = omnid.replay(drive / "log.mcap", *files, "--set", "rig.check=off", rig=drive / "wrong.toml")
         assert result.code == 0 and result.count("loops") >= 3
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    for end in ("", ".live"):
+        assert (tmp_path / f"a{end}").read_bytes() == (tmp_path / f"b{end}").read_bytes()
     odom, in_map, truth = (read_tum(path) for path in (tmp_path / "a.odom", tmp_path / "a", drive / "truth.txt"))
     assert np.array_equal(odom.stamps_ns, in_map.stamps_ns)
     by_odometry, by_map = evaluate(odom, truth), evaluate(in_map, truth)
     assert by_odometry.end_error_m > 0.01 and by_map.end_error_m < 0.6 * by_odometry.end_error_m
     _assert_published(tmp_path / "out.mcap", odom.T)
+    # What the controller had: odometry's poses until the first place was recognised, corrected ones afterwards.
+    live = read_tum(tmp_path / "a.live")
+    np.testing.assert_allclose(live.T[:5], odom.T[:5], atol=1e-6)
+    words = ("eval", tmp_path / "a", drive / "truth.txt", "--live", tmp_path / "a.live")
+    found = json.loads(omnid(*words, "--json").out)
+    assert found["end_error_m"] == pytest.approx(by_map.end_error_m)
+    assert found["ate_rmse_m"] < found["live"]["ate_rmse_m"] and found["live"]["end_error_m"] < by_odometry.end_error_m
+    assert "as known while driving" in omnid(*words).out
 
 
 def _assert_published(log: Path, T_odom_rig: np.ndarray) -> None:
