@@ -215,7 +215,13 @@ class PlacesConfig:
 class MappingConfig:
     """Voxel map of the whole run."""
 
-    rate_hz: float = knob(5.0, "pairs a second that enter the map, each with dense stereo; 0: all", low=0, high=1000)
+    rate_hz: float = knob(
+        5.0,
+        "pairs a second that enter the map, each with dense stereo; 0: all; "
+        "keyframes only while no client receives and no log records the cloud of a live run",
+        low=0,
+        high=1000,
+    )
     voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
     log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
     max_sigma_m: float = knob(0.15, "largest sigma of a point that enters the map, m", low=0.001, high=100)

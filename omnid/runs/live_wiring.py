@@ -88,7 +88,13 @@ class LiveWiring:
         if recorder is not None:
             sinks = replace(sinks, recording=RecordingSink(recorder, tuple(frames), config.record.queue))
         self._warn_of_unstated_height()
-        parts = run_places.known_to(RunParts(load=lambda: ladder.level, map_every_s=config.live.cloud_s))
+        parts = run_places.known_to(
+            RunParts(
+                load=lambda: ladder.level,
+                map_every_s=config.live.cloud_s,
+                map_is_read=lambda: recorder is not None or bus.is_received("cloud"),
+            )
+        )
         if controller:
             sinks.rings["controller-ring"] = RingToController(controller)
             parts = replace(

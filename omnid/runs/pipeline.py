@@ -32,7 +32,7 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.grid import MapGrid
 from omnid.stages.lockstep_drive import LockstepDrive
-from omnid.stages.mapping import Mapping
+from omnid.stages.mapping import Mapping, always
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.obstacles import Obstacles
 from omnid.stages.places import Places
@@ -75,6 +75,7 @@ class RunParts:
     navigation: NavigationParts | None = None
     load: Load = full_load
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
+    map_is_read: Callable[[], bool] = always  # somebody takes the maps now
 
 
 class RequestSource(Protocol):
@@ -178,7 +179,7 @@ def _mapping(
     """Join the map; None where no sink takes it."""
     if not (sinks.maps or sinks.take_all):
         return None, None
-    mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s, parts.load)
+    mapping = Mapping(config.mapping, front_end.dense, parts.map_every_s, parts.load, parts.map_is_read)
     maps = graph.stage("mapping", mapping, odometry)
     for name, sink in sinks.maps.items():
         graph.sink(name, sink, maps)

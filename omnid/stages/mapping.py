@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
@@ -33,14 +34,26 @@ def _is_step(last: Position, new: Position, step_m: float) -> bool:
     return math.dist(last, new) >= step_m
 
 
+def always() -> bool:
+    """Return True: the answer of a run whose maps are files."""
+    return True
+
+
 class Mapping:
     """Fuses points of small variance at tracked poses; returns the map periodically and at the end."""
 
-    def __init__(self, config: MappingConfig, dense: DenseDepths, every_s: float = 0.0, load: Load = full_load) -> None:
+    def __init__(
+        self,
+        config: MappingConfig,
+        dense: DenseDepths,
+        every_s: float = 0.0,
+        load: Load = full_load,
+        is_read: Callable[[], bool] = always,
+    ) -> None:
         """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
-        at the end.
+        at the end. is_read: somebody takes the maps now.
         """
-        self._load = load
+        self._load, self._is_read = load, is_read
         self._config, self._dense = config, dense
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._map = VoxelMap(config.voxel_m, 1 << config.log2_voxels)
@@ -75,8 +88,11 @@ class Mapping:
         """True if a pair is to enter the map: so often, and sooner where the view has changed.
 
         Dense stereo costs as much as the odometry of a pair. A robot at rest sees nothing new. A keyframe, whose dense
-        stereo the odometry needs anyway, is due after half the time: then another pair can do without.
+        stereo the odometry needs anyway, is due after half the time: then another pair can do without. While no client
+        reads the map, keyframes are enough: one that reads it later finds all of it, of fewer views.
         """
+        if not (odometry.is_keyframe or self._is_read()):
+            return False
         load = self._load()
         if load >= LoadLevel.NO_MAP:
             return False

@@ -36,6 +36,10 @@ def gather(
     obstacle, whose directions count together.
     """
     bins, width = floor.shape
+    likelihoods = np.empty((bins, width), np.float32)
+    for k in range(bins):
+        for u in range(width):
+            likelihoods[k, u] = math.exp(surface[k, u])
     by_angle = width / math.tau
     c, s = origin[2], origin[3]
     for i in range(cells.shape[1]):
@@ -62,7 +66,7 @@ def gather(
             for u in range(first, last + 1):
                 at_u = (u + width) % width
                 for k in range(first_surface, last_surface + 1):
-                    likelihood += math.exp(surface[k, at_u])
+                    likelihood += likelihoods[k, at_u]
                 for k in range(far, near + 1):
                     above += level[0, k, at_u]
                     below += level[1, k, at_u]

@@ -133,6 +133,33 @@ def test_keyframes_enter_the_map_after_half_the_time() -> None:
     assert counted.computed == list(range(0, 60, 4))
 
 
+def test_keyframes_alone_enter_a_map_without_readers() -> None:
+    """Later readers find it; from then on pairs enter it at its rate."""
+    counted, seqs = Counted(), [0]
+    mapping = Mapping(MappingConfig(rate_hz=15.0), DenseDepths(counted), 0.5, is_read=lambda: seqs[-1] > 30)
+    maps = 0
+    for seq in range(60):
+        seqs.append(seq)
+        stamp_ns = round(seq * 1e9 / 30)
+        update = OdometryUpdate(
+            seq,
+            stamp_ns,
+            se3.transform(np.eye(3), np.array([stamp_ns * 1e-9, 0, 0])),
+            np.eye(6),
+            np.zeros(6),
+            np.eye(6),
+            TrackingState.TRACKING,
+            0,
+            50,
+            50,
+            StereoDepth(panoramas(seq, stamp_ns)),
+            is_keyframe=seq % 10 == 0,
+        )
+        maps += mapping.process(update) is not None
+    assert counted.computed == [0, 10, 20, 30, *range(32, 60, 2)]
+    assert maps == 3, "a query for the newest one finds it"
+
+
 def test_depth_is_computed_for_each_motion_that_is_asked_for() -> None:
     counted = Counted()
     depths, model = DenseDepths(counted), StereoModel(Cylinder(100, 4, 2.0), 0.2)
