@@ -7,11 +7,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from calib.image_area import ImageArea, TwoViews
 from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Frame, gray
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.images import SUFFIXES, Image, Images, is_log, one_size, read_images
+from omnid.calibration.images import SUFFIXES, Image, Images, image_topic, is_log, one_size, read_images
 from omnid.errors import OmnidError
 
 SIDES = ("lower", "upper")
@@ -27,6 +28,7 @@ class PairedImages:
 
     sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
+    one_image: TwoViews | None = None  # the areas of both views, where one image holds them
 
     @property
     def names(self) -> list[str]:
@@ -46,6 +48,17 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
             "and upper_001.png in a folder, or images with nearly equal stamps in a log"
         )
     return pairs
+
+
+def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None = None) -> PairedImages:
+    """Read images of which each holds both views: of a folder, or of a log's topic."""
+    if is_log(source):
+        topic = image_topic(source, topic)
+    images = read_images([str(source)], topic)
+    height, width = next(iter(images.values())).shape
+    lower, upper = ({name: area.crop(image) for name, image in images.items()} for area in areas)
+    topics = (topic, topic) if topic else ("", "")
+    return PairedImages((lower, upper), topics, TwoViews(areas, (width, height)))
 
 
 def _counted(pairs: PairedImages) -> str:

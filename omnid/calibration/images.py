@@ -105,6 +105,12 @@ def _of_log(path: Path, topic: str | None) -> Images:
         return dict(_frames(log, chosen, stride))
 
 
+def image_topic(path: Path, topic: str | None) -> str:
+    """Return the requested topic of a log, or the only one with images."""
+    with closing(open_image_log(path)) as log:
+        return _topic(path, log, topic)
+
+
 def _topic(path: Path, log: ImageLog, topic: str | None) -> str:
     """Return the requested topic, or the only one with images."""
     images = sorted(name for name, kind in log.topics().items() if kind in IMAGE_TYPES)

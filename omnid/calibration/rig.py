@@ -20,6 +20,7 @@ from calib.fit.boards.rig_fit import RigCalibration, fit_rig, refine_rig_calibra
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
+from calib.image_area import ImageArea
 from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
@@ -32,7 +33,7 @@ from calib.rig_frame import rig_between
 from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera import MAX_LOG_VIEWS
-from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
+from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
 from omnid.calibration.images import Images
 from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
@@ -95,7 +96,9 @@ class RigResult:
 
     def save_report(self, path: Path) -> None:
         """Write an HTML page with residuals, coverage and panoramas."""
-        write_file(path, rig_report_html(self.calibration, self.images, self.rig).encode())
+        one_image = self.images.one_image
+        rig = self.rig if one_image is None else one_image.of_areas(self.rig)
+        write_file(path, rig_report_html(self.calibration, self.images, rig).encode())
 
 
 def calibrate_rig(
@@ -109,6 +112,7 @@ def calibrate_rig(
     view: View = "mirror",
     with_struts: bool = False,
     expected_baseline_m: float | None = None,
+    areas: tuple[ImageArea, ImageArea] | None = None,
     progress: Progress = silent,
 ) -> RigResult:
     """Calibrate two cameras and the transform between them by images of a board.
@@ -116,10 +120,12 @@ def calibrate_rig(
     source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
     upper_*. cameras: known cameras, which stay as they are unless refine_cameras. model, view, progress: as in
     `calibrate_camera`. with_struts: masks with hub and struts, not only the rim. expected_baseline_m: by ruler; a
-    result that differs by a tenth is refused. Raises OmnidError or CalibError where the images do not suffice.
+    result that differs by a tenth is refused. areas: of the lower and the upper view in images that hold both, which
+    are all images of the folder or of the log's topic; the result is the rig of the whole images. Raises OmnidError or
+    CalibError where the images do not suffice.
     """
     # 1. Read the images.
-    images = read_pairs(source, *topics)
+    images = _read(source, topics, areas, cameras)
     _require_sizes(images, cameras)
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
@@ -151,7 +157,26 @@ def calibrate_rig(
     rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig) if refined else None
+    if images.one_image is not None:
+        rig = images.one_image.of_whole_image(rig)
     return RigResult(rig, found, images, (*notes, *unmasked), drives)
+
+
+def _read(
+    source: Path,
+    topics: tuple[str | None, str | None],
+    areas: tuple[ImageArea, ImageArea] | None,
+    cameras: GivenCameras | None,
+) -> PairedImages:
+    """Return the images of both cameras, or both views of the images of one."""
+    if areas is None:
+        return read_pairs(source, *topics)
+    if cameras is not None:
+        raise OmnidError("calibrate rig: expected no camera files beside the areas of both views: they are fitted")
+    named = sorted({topic for topic in topics if topic})
+    if len(named) > 1:
+        raise OmnidError(f"calibrate rig: expected one topic with both views, found {' and '.join(named)}")
+    return read_two_views(source, areas, named[0] if named else None)
 
 
 def _fit_rig(

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from calib.camera_file import read_camera
 from calib.fit.boards.camera_selection import MODEL_CHOICES
+from calib.image_area import ImageArea
 from calib.models.ocam import VIEWS
 from omnid.calibration.rig import GivenCameras, calibrate_rig
 from omnid.commands.board_options import add_board_options, board_of
@@ -40,6 +41,13 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--refine-cameras", action="store_true", help="adjust the given cameras as well")
     parser.add_argument("--lower", metavar="TOPIC", help="a log's topic of the lower camera")
     parser.add_argument("--upper", metavar="TOPIC", help="a log's topic of the upper camera")
+    for side in ("lower", "upper"):
+        parser.add_argument(
+            f"--{side}-area",
+            type=_area,
+            metavar="X,Y,W,H",
+            help=f"where each image holds both views: left, top, width and height of the {side} view [px]",
+        )
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
     parser.add_argument(
         "--view",
@@ -77,6 +85,7 @@ def run(args: argparse.Namespace) -> int:
         view=args.view,
         with_struts=args.mask,
         expected_baseline_m=expected_m,
+        areas=_areas(args),
         progress=progress_of(args),
     )
     found = replace(found, rig=with_height(found.rig, args))
@@ -86,6 +95,21 @@ def run(args: argparse.Namespace) -> int:
     print_result(args.output, found)
     print(f"{args.output}: {height_of(found.rig)}")
     return 0
+
+
+def _area(text: str) -> ImageArea:
+    """Return the area of an option; ValueError for anything else, which argparse reports."""
+    left, top, width, height = map(int, text.split(","))
+    return ImageArea(left, top, width, height)
+
+
+def _areas(args: argparse.Namespace) -> tuple[ImageArea, ImageArea] | None:
+    """Return the areas of both views; raises OmnidError if only one is given."""
+    if args.lower_area is None and args.upper_area is None:
+        return None
+    if args.lower_area is None or args.upper_area is None:
+        raise OmnidError("calibrate rig: expected both --lower-area and --upper-area or neither, found one")
+    return args.lower_area, args.upper_area
 
 
 def _given(args: argparse.Namespace) -> GivenCameras | None:
