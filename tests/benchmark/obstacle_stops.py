@@ -155,6 +155,7 @@ def ahead(moment: Moment, speed_mps: float = SPEED_MPS) -> Iterator[Request]:
 
 def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: float = SPEED_MPS) -> Drive:
     """Drive one seed of a case along x, backwards at a negative speed."""
+    limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
         path.write_text(world_text(case, random.Random(seed)))
@@ -171,7 +172,7 @@ def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: flo
             partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,
-            config=load_config(None, ["places.enabled=false", *overrides]),
+            config=load_config(None, ["places.enabled=false", *limits, *overrides]),
         )
     return judged(done, world, edges, backwards=speed_mps < 0)
 
