@@ -193,6 +193,15 @@ def opens_as_another_user(port: str) -> bool:
     return subprocess.run(["sh", "-c", 'exec 3<> "$0"', port], capture_output=True, check=False, **user).returncode == 0
 
 
+def test_after_a_command_that_was_refused_a_stop_comes_first(simulated: SimulatedMotor) -> None:
+    with contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor:
+        assert not motor.send(VelocityCommand(0, 0.3, 0.0, 0.0)).watchdog_expired and motor.replaced_by_stop == 0
+        with pytest.raises(DriverError):
+            motor.send(VelocityCommand(0, math.nan, 0.0, 0.0))
+        assert motor.send(VelocityCommand(0, 0.3, 0.0, 0.0)).watchdog_expired and motor.replaced_by_stop == 1
+        assert not motor.send(VelocityCommand(0, 0.3, 0.0, 0.0)).watchdog_expired
+
+
 def test_no_other_program_can_open_the_port(simulated: SimulatedMotor) -> None:
     os.chmod(simulated.port, 0o666)
     assert opens_as_another_user(simulated.port)

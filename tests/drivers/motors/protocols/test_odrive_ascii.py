@@ -56,7 +56,7 @@ def test_ignores_replies_that_do_not_match(answers: tuple[str, ...]) -> None:
         result(armed().drive(TURN, 0.0), *replies(*answers))
 
 
-@pytest.mark.parametrize("damaged", [b"0 0", b"0 0*1", b"0 0*", b"0 nan*%d", b"\xff*255", b"*0"])
+@pytest.mark.parametrize("damaged", [b"0 0", b"0 0*1", b"0 0*", with_checksum("0 nan").rstrip(), b"\xff*255", b"*0"])
 def test_counts_damaged_replies(damaged: bytes) -> None:
     protocol = armed()
     with pytest.raises(UnfinishedError):
@@ -84,6 +84,7 @@ def test_never_clears_other_errors() -> None:
     status = result(protocol.drive(TURN, 0.0), *replies("0 0", "0 0", "64", "0", "24"))
     assert status.fault == 64 and not status.watchdog_expired
     assert b"error 0" not in written(protocol.drive(stop_command(0), 0.0))
+    assert result(armed().drive(TURN, 0.0), *replies("0 0", "0 0", "1", "2048", "24")).fault == 1
 
 
 def test_only_a_stop_arms_an_expired_axis() -> None:
@@ -97,6 +98,7 @@ def test_only_a_stop_arms_an_expired_axis() -> None:
         order = [lines.index(b"v %d 0.00000" % axis), lines.index(b"w axis%d.error 0" % axis),
                  lines.index(b"w axis%d.requested_state 8" % axis)]  # fmt: skip
         assert order == sorted(order), "the stop comes before the axis is armed"
+        assert b"w axis%d.controller.config.control_mode 2*" % axis in lines, "velocity control"
     assert not result(protocol.drive(stop_command(0), 0.0), *replies("0 0", "0 0", "0", "0", "24")).watchdog_expired
 
 

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.vesc import MASK, PacketFramer, Vesc, packet
+from drivers.motors.protocols.vesc import MASK, MAX_ERPM, PacketFramer, Vesc, packet
 from tests.drivers.motors.transactions import UnfinishedError, result, written
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, pole_pairs=7, can_id=9)  # 420 erpm at 1 m/s
@@ -36,6 +36,13 @@ def test_bytes_of_a_command() -> None:
     speeds = bytes.fromhex("08 00000069"), bytes.fromhex("08 0000013b")  # 105 and 315
     whole = [asked, b"\x22\x09" + asked, speeds[0], b"\x22\x09" + speeds[1]]
     assert written(Vesc(DRIVE).drive(TURN, 0.0)) == b"".join(map(packet, whole))
+
+
+def test_a_speed_beyond_the_largest_number_is_limited_and_goes_the_same_way() -> None:
+    fast = Vesc(DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, max_wheel_mps=1e9, can_id=9))
+    commands = written(fast.drive(VelocityCommand(0, 1e7, 0.0, 2e7), 0.0))
+    slow, limited = (b"\x08" + erpm.to_bytes(4, "big") for erpm in (MAX_ERPM // 3, MAX_ERPM))
+    assert commands.endswith(packet(slow) + packet(b"\x22\x09" + limited))
 
 
 def test_status_in_the_units_of_the_base_in_any_order_of_replies() -> None:
