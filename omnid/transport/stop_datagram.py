@@ -11,6 +11,7 @@ from __future__ import annotations
 import ipaddress
 import re
 import secrets
+import select
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +27,7 @@ REPEAT_S: Final = 0.05
 MOST_PER_PASS: Final = 16  # of a flood
 _HEAD: Final = b"omnid stop 1 "
 _LONGEST: Final = 512  # bytes
+_WAIT_MS: Final = 100  # so long the end of a daemon waits for its listener
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls|ws)/(.+):(\d{1,5})(?:[?#].*)?")  # those whose UDP port is free
 _NONCE_BYTES: Final = 8
@@ -48,14 +50,17 @@ class StopListener:
         self._robot, self._on_stop, self._is_stopped = config.robot.encode(), on_stop, is_stopped
         needs_proof = bool(config.users_file or config.tls_mutual)
         self._sockets: list[socket.socket] = []
+        self._poll = select.poll()
         for host, port in addresses(config.listen):
             if needs_proof and not _is_loopback(host):
                 host = "127.0.0.1"
             with suppress(OSError):
                 self._sockets.append(_bound(host, port))
+                self._poll.register(self._sockets[-1], select.POLLIN)
 
     def process(self) -> None:
-        """Take the requests that have come, a bounded number; never blocks."""
+        """Take the requests that have come, a bounded number, or wait for one."""
+        self._poll.poll(_WAIT_MS)
         for listener in self._sockets:
             for _ in range(MOST_PER_PASS):
                 try:

@@ -28,7 +28,9 @@ def test_a_sender_has_its_own_budget_and_the_key_has_one() -> None:
     ring.extend("c" * 100)
     for _ in range(20):
         list(found.messages(lambda: 50.0))
-    assert len(ring) == 100 - (TAKEN_PER_DECODED * 5 - 10) and found.crowded > 0, "the rest is left in the ring"
+    assert len(ring) == 99 - (TAKEN_PER_DECODED * 5 - 10) and found.crowded > 0, "the rest is left in the ring"
+    assert found.refused == 9, "the one that waits is not lost"
+    assert list(found.messages(lambda: 50.0 + 0.1)) == ["c"]
 
 
 def test_an_empty_ring_uses_nothing_up() -> None:
