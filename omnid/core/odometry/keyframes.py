@@ -74,7 +74,7 @@ class Keyframes:
         frame = request.frame
         free = clear_around(request.usable, request.pixels, LANDMARK_SPACING_PX)
         points = corners(frame.lower, free, self._wanted() - len(request.pixels))
-        new = located(frame, points, self._model, self._klt, request.exposure)
+        new = located(frame, points, self._model, self._klt, request.exposure, request.views)
         keyframe = Keyframe(frame.seq, frame.lower, request.T_odom_rect, request.covariance)
         ids = self._map.add_keyframe(keyframe, new.views, new.slopes, new.whole_noise, new.pixels)
         self._map.late_depths.added(ids, new)

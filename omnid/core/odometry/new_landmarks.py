@@ -13,6 +13,7 @@ from omnid.core.odometry.patch_alignment import align_rows, view_noise
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.odometry.wrong_periods import has_wrong_period
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -38,11 +39,12 @@ class NewLandmarks:
 
 
 def located(
-    frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure
+    frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure, known: Array
 ) -> NewLandmarks:
     """Return those of the corners (N, 2) of the lower panorama that are found in the upper one as well.
 
-    They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel.
+    They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel. known (M, 3) [px]:
+    views of the map's landmarks.
     """
     # 1. Disparity by dense stereo.
     dense = replace(frame, exposure=exposure).disparity
@@ -55,6 +57,7 @@ def located(
     slopes = fitted_slopes(pair, corners, near, slopes, model)
     rows, variance = align_rows(pair, corners, near, slopes, model)
     found = np.isfinite(rows)
+    found[found] = ~has_wrong_period(pair, corners[found], rows[found], known)
     pixels, rows, slopes = corners[found], rows[found], slopes[found]
     noise = view_noise(np.zeros((2, 2)), variance[found])
 

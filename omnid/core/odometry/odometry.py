@@ -35,7 +35,9 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-UNTRACKED_SPEED_SIGMA = 0.5  # standard deviation of the velocity while poses are refused, m/s and rad/s
+# Standard deviation of the velocity while poses are refused, m/s and rad/s. Where one is refused for its speed alone,
+# that speed, as the vehicle may be so fast: at 10 m/s the position was 11 sigmas off.
+UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Share of the predicted landmarks, inliers, below which they are also searched with a pyramid: without one, in noise,
 # tracks stay near a wrong prediction and confirm it.
@@ -71,6 +73,7 @@ class VisualOdometry:
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status = TrackingStatus()
         self._resets = 0
+        self._untracked_mps = UNTRACKED_SPEED_SIGMA
         self._doubt: Doubt | None = None  # which of several motions was made
         self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
         self._requested: KeyframeRequest | None = None  # by the last frame, see complete
@@ -115,6 +118,7 @@ class VisualOdometry:
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
         if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
+            self._untracked_mps = max(self._untracked_mps, too_fast_mps)
             known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
             refused = self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
             return replace(refused, refused_mps=too_fast_mps)
@@ -159,8 +163,8 @@ class VisualOdometry:
         self, frame: StereoFrame, estimate: PoseEstimate | None, T_predicted: Array, exposure: Exposure, dt_s: float
     ) -> PoseEstimate | None:
         """Return the likeliest motion that a vehicle may have made, with its runner-up: runner_up_motions.py."""
-        if estimate is None:
-            return None
+        if estimate is None or self._status.refused_frames:
+            return estimate  # from an unknown place displacements lead anywhere: relocalisation decides
         # 1. How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors
         #    of steps for independent, which those of runners-up are not; wheels, which measure each step, tell more.
         sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
@@ -342,7 +346,10 @@ class VisualOdometry:
         self._status = next_status(self._status, facts, self._limits)
         after_s = self._status.time_since_fix_s
         if after_s > before_s and not facts.carried:
-            self._covariance = self._covariance + UNTRACKED_SPEED_SIGMA**2 * (after_s**2 - before_s**2) * np.eye(6)
+            sigma = np.repeat([self._untracked_mps, UNTRACKED_SPEED_SIGMA], 3)
+            self._covariance = self._covariance + np.diag(sigma**2) * (after_s**2 - before_s**2)
+        if after_s == 0:
+            self._untracked_mps = UNTRACKED_SPEED_SIGMA
 
     def _update_map(
         self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure

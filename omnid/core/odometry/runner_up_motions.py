@@ -47,6 +47,8 @@ MIN_PATCH_GREY = 1.0  # standard deviation of a patch's grey levels, below which
 # Difference of the costs of two poses, the logarithm of the ratio of their likelihoods, up to which the less likely one
 # is a runner-up: a million to one.
 RUNNER_UP_COST = math.log(1e6)
+# Share of the landmarks in view: without repetition no two poses explain more than half of them each.
+LEAST_SHARE = 0.5
 # Error of a runner-up pose as a share of its displacement: few millimetres of a period of some decimetres.
 RUNNER_UP_ERROR = 0.02
 SAME_M = 0.02  # poses that differ less are one: four sigmas of a pose that few landmarks support
@@ -131,10 +133,16 @@ def doubt_after(before: Doubt | None, T_odom_prev: Array, estimate: PoseEstimate
 def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Array, reach_m: float) -> PoseEstimate:
     """Return the most likely estimate, with the farthest of its runners-up.
 
-    others: from displacements; one that is not within reach_m [m] of the pose T_predicted is no motion of a vehicle. Of
-    estimates of one pose the one with most inliers is taken.
+    others: from displacements; one that is not within reach_m [m] of the pose T_predicted is no motion of a vehicle,
+    and one that explains less than LEAST_SHARE of the landmarks in view no view of the scene. Of estimates of one pose
+    the one with most inliers is taken.
     """
-    within = [each for each in others if np.linalg.norm(each.T_odom_rect[:3, 3] - T_predicted[:3, 3]) < reach_m]
+    within = [
+        each
+        for each in others
+        if np.linalg.norm(each.T_odom_rect[:3, 3] - T_predicted[:3, 3]) < reach_m
+        and len(each.landmarks) >= LEAST_SHARE * each.in_view
+    ]
     best = min([found, *within], key=lambda estimate: estimate.cost)
     steps = [(each, se3.log(se3.inverse(best.T_odom_rect) @ each.T_odom_rect)) for each in (found, *within)]
     same = [each for each, step in steps if np.linalg.norm(step[:3]) <= SAME_M]

@@ -275,3 +275,15 @@ def test_few_inliers_near_a_guess_call_for_a_wider_search(
     """In a dim log 107 of some 290 landmarks in view confirmed a pose that was 33 mm off."""
     estimate = PoseEstimate(np.eye(4), np.eye(6), visible=290, tracked=inliers + 43, inliers=inliers)
     assert visual_odometry(cameras.model, OdometryLimits())._is_good(estimate, is_near) == is_good
+
+
+def test_a_pose_refused_for_its_speed_leaves_a_covariance_that_covers_it(cameras: RenderedCameras) -> None:
+    """The vehicle may be as fast as the pose says that was refused."""
+    odometry = visual_odometry(cameras.model, OdometryLimits(max_speed_mps=2.0))
+    poses = planar_poses(np.array([[0.4 * k, 0.0] for k in range(4)]), np.zeros(4))
+    found = run(odometry, [cameras.frame(k, T) for k, T in enumerate(poses)])
+    assert found[1].refused_mps == pytest.approx(4.0, abs=0.2)
+    for k, estimate in enumerate(found[1:3], 1):
+        off_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - 0.4 * k * np.array([1.0, 0, 0])))
+        assert estimate.state is TrackingState.DEGRADED and off_m > 0.35, k
+        assert off_m < 2 * float(np.sqrt(np.trace(estimate.covariance[:3, :3]) / 3)), k

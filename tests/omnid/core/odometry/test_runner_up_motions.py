@@ -66,7 +66,9 @@ def test_wheels_tell_which_motion_it_was(alike: RenderedCameras) -> None:
 
 def pose(x_m: float, cost: float, inliers: int = 100, runner_up: Array | None = None) -> PoseEstimate:
     T = se3.exp([x_m, 0, 0, 0, 0, 0])
-    return PoseEstimate(T, 1e-6 * np.eye(6), 100, 100, inliers, cost=cost, in_view=100, runner_up=runner_up)
+    return PoseEstimate(
+        T, 1e-6 * np.eye(6), 100, 100, inliers, np.arange(inliers), cost=cost, in_view=100, runner_up=runner_up
+    )
 
 
 def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
@@ -74,7 +76,7 @@ def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
     best = pose(0.0, 0.2)
     found = likeliest(best, [near], np.eye(4), 0.5)
     assert found.runner_up is not None and found.runner_up == pytest.approx([0.3, 0, 0, 0, 0, 0])
-    for other in (unlikely, far):
+    for other in (unlikely, far, pose(0.3, 0.25, inliers=49)):
         assert likeliest(best, [other], np.eye(4), 0.5).runner_up is None
     assert likeliest(best, [same], np.eye(4), 0.5).inliers == 120
     assert likeliest(unlikely, [best], np.eye(4), 0.5).T_odom_rect[0, 3] == 0
