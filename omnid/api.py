@@ -25,7 +25,6 @@ from omnid.config import Config, load_config
 from omnid.config_use import unused_settings
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.logging_setup import log
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -124,7 +123,7 @@ class Odometry:
         Raises OmnidError for a rig or a configuration that cannot be used.
         """
         with _user_errors():
-            prepare_kernels(log)
+            prepare_kernels()
             settings = _config(config, overrides)
             loaded = rig if isinstance(rig, Rig) else read_rig(Path(rig))
             self._cameras: dict[Camera, OmniCamera] = {"lower": loaded.lower.camera, "upper": loaded.upper.camera}

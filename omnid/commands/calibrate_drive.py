@@ -56,13 +56,11 @@ def run(args: argparse.Namespace) -> int:
     """Return 0: the rig was written, or it is as good as the drives can make it, which is said."""
     from omnid.calibration.drive import calibrate_drive
     from omnid.engine.kernel_cache import prepare_kernels
-    from omnid.engine.logging_setup import log
 
     _check(args)
-    prepare_kernels(log)
-    found = calibrate_drive(
-        args.logs, _start(args), (args.lower, args.upper), lambda line: print(line, file=sys.stderr)
-    )
+    start = _start(args)
+    prepare_kernels()
+    found = calibrate_drive(args.logs, start, (args.lower, args.upper), lambda line: print(line, file=sys.stderr))
     print("\n".join(describe(found)))
     if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px and not args.distance_m:
         print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig: nothing was written")
@@ -87,14 +85,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _start(args: argparse.Namespace) -> Rig:
-    """Return the rig to start from."""
+    """Return the rig to start from; refuse logs that cannot be read."""
     from drivers.logs.log_reader import LogReader
     from omnid.runs.log_rig import attached_rig
 
-    if args.rig is not None:
-        return read_rig(args.rig)
-    with closing(LogReader(args.logs[0], args.lower, args.upper)) as reader:
-        return attached_rig(reader, args.logs[0])
+    start = None if args.rig is None else read_rig(args.rig)
+    for log in args.logs:
+        with closing(LogReader(log, args.lower, args.upper)) as reader:
+            start = start or attached_rig(reader, log)
+    assert start is not None, "there is a log"
+    return start
 
 
 def _check(args: argparse.Namespace) -> None:

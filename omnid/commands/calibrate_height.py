@@ -31,11 +31,9 @@ def run(args: argparse.Namespace) -> int:
     """Print the height; return 1, and write nothing, where the ruler contradicts it."""
     from omnid.calibration.height import calibrate_height
     from omnid.engine.kernel_cache import prepare_kernels
-    from omnid.engine.logging_setup import log
 
     if args.output:
         check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
-    prepare_kernels(log)
     topics = args.lower, args.upper
     rig = read_rig(args.rig) if args.rig else None
     if rig is None:
@@ -44,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
             rig = attached_rig(reader, args.log)
         finally:
             reader.close()
+    prepare_kernels()
     found = calibrate_height(args.log, rig, topics)
     print(found)
     print(f"the rig so far: {height_of(rig)}")

@@ -69,11 +69,16 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def run_recover(args: argparse.Namespace) -> int:
-    """Recover a log."""
+    """Recover a log; of one that is whole a copy is kept only where it is asked for."""
     from drivers.logs.mcap_recovery import recover
 
     out = args.output or _default_output(args.log)
-    print("\n".join(map(_shown, _reported(recover(args.log, out), args.log, out))))
+    found = recover(args.log, out)
+    if found.whole and args.output is None:
+        out.unlink()
+        print(_shown(f"{args.log} is whole: there is nothing to recover; -o FILE makes a copy"))
+        return 0
+    print("\n".join(map(_shown, _reported(found, args.log, out))))
     return 0
 
 

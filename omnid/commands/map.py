@@ -151,6 +151,7 @@ def run_show(args: argparse.Namespace) -> int:
     lines = [(line[:13].strip(), line[13:]) for line in _described(args.map, summary(places, rig), rig)]
     html = map_page(args.map.name, lines, places, rig)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
+    print(f"written      {args.output}")
     return 0
 
 
@@ -227,6 +228,7 @@ def run_export(args: argparse.Namespace) -> int:
             write_ply(args.ply, points)
         if args.plan:
             write_plan(args.plan, points, place_views.base_poses(places, rig)[:, :2, 3])
+    print("written     ", ", ".join(str(path) for _, path in [*outputs, *images]))
     return 0
 
 

@@ -134,14 +134,17 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: 
     try:
         result = run_log(log, config, options if output.quiet else replace(options, progress=Progress))
     except RunFailedError as error:
-        _print_result(error.result, options, output)
+        _print_result(error.result, options, output, failed=True)
         raise
     _print_result(result, options, output)
     return 128 + result.signal if result.signal else int(result.counters.no_pose)
 
 
-def _print_result(result: RunResult, options: ReplayOptions, output: Output) -> None:
-    """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout."""
+def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, failed: bool = False) -> None:
+    """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout.
+
+    failed: by an error, which is told after this; of the files only those that are there are named.
+    """
     from omnid.diagnostics.run_summary import folded_entry, run_summary
     from omnid.sinks.files import on_stdout
 
@@ -161,9 +164,12 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output) -> 
         return
     columns = get_terminal_size().columns if stream.isatty() else 0
     print(run_summary(result.counters, result.timings.values(), columns, verbose=output.verbose), file=stream)
-    if options.files:
-        written = ", ".join(str(path) for _, path in options.files)
-        print("\n".join(folded_entry("written", written, columns)), file=stream)
+    files = [path for _, path in options.files] + ([result.map_file] if result.map_file else [])
+    if failed:
+        files = [path for path in files if path.exists()]
+    if files:
+        name, listed = "cut short" if failed else "written", ", ".join(map(str, files))
+        print("\n".join(folded_entry(name, listed, columns)), file=stream)
 
 
 def _span_of(args: argparse.Namespace) -> tuple[float, float]:

@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 from omnid.engine import kernel_store as store
 from omnid.engine.kernel_compiler import Report, compile_missing
+from omnid.engine.logging_setup import log_unlimited
 from omnid.errors import OmnidError
 
 _state = {"ready": False}
 
 
-def prepare_kernels(report: Report) -> None:
+def prepare_kernels(report: Report = log_unlimited) -> None:
     """Compile all functions, or read them from the disk; report what takes long, and what is not kept.
 
     The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run

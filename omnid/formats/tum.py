@@ -72,7 +72,8 @@ def _read_text(path: Path) -> str:
         with path.open("rb") as file:
             raw = file.read(FILE_LIMIT_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise OmnidError(f"{path}: cannot read the trajectory: {error}") from error
+        found = error.strerror if isinstance(error, OSError) else error
+        raise OmnidError(f"{path}: cannot read the trajectory: {found}") from error
     if len(raw) > FILE_LIMIT_BYTES:
         raise OmnidError(f"{path}: expected at most {FILE_LIMIT_BYTES >> 20} MiB: split the file")
     try:

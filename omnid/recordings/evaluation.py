@@ -37,10 +37,10 @@ class Metrics:
         length = (
             f"{self.length_estimate_m:.4f} m, truth {self.length_truth_m:.4f} m ({_percent(self.length_error_ratio)})"
         )
-        position = f"rmse {_mm(self.ate_rmse_m)}, max {_mm(self.ate_max_m)}, end {_mm(self.end_error_m)}"
-        heading = (
-            f"rmse {_deg(self.heading_rmse_rad)}, max {_deg(self.heading_max_rad)}, end {_deg(self.heading_end_rad)}"
-        )
+        errors_mm = (1e3 * v for v in (self.ate_rmse_m, self.ate_max_m, self.end_error_m))
+        position = "rmse {:.2f}, max {:.2f}, end {:.2f} mm".format(*errors_mm)
+        errors_deg = (math.degrees(v) for v in (self.heading_rmse_rad, self.heading_max_rad, self.heading_end_rad))
+        heading = "rmse {:.3f}, max {:.3f}, end {:.3f} deg".format(*errors_deg)
         rows = [
             ("associated poses", f"{self.pairs} ({self.coverage:.1%} of the truth)"),
             ("path length", length),

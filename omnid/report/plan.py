@@ -105,7 +105,7 @@ def _footnote(plan: Plan, drawn: int) -> str:
     low, high = Z_M
     return (
         f"Grey: {drawn} of the map's {len(plan.points)} points, those from {-low:g} m below the rig's height at "
-        f"the start to {high:g} m above it; the darker, the higher their confidence and number in a column."
+        f"the start to {high:g} m above it; they stand out by their confidence and number in a column."
     )
 
 

@@ -66,7 +66,7 @@ class LiveRun:
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
             kernels_read()
-            prepare_kernels(self._report)
+            prepare_kernels()
             self._connected = True
             run_places = RunPlaces(self._config, geometry, session.warn)
             LiveWiring(session, geometry, self._refined, self._report).wire(self._robot, run_places)

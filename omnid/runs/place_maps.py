@@ -65,6 +65,7 @@ class RunPlaces:
         elif begins or tags:
             self.places = new_places(settings)
         self._is_kept = given is not None or begins
+        self.written: Path | None = None  # the file, once the run has written it
         if self.places is not None:
             self._know(tags, self.places)
         self._saved = frozenset[int]()  # keyframes in the file
@@ -147,6 +148,7 @@ class RunPlaces:
             self._warn(f"{name}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
         if self._path is not None and self._writes and new:
             write_places(self._path, self.places, self._rig)
+            self.written = self._path
         elif self._path is not None and self._writes and not self._known:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
         return found

@@ -25,7 +25,6 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.logging_setup import log as log_line
 from omnid.engine.playback_clock import PlaybackClock
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
@@ -132,7 +131,6 @@ class _Replay:
         in_map = [name for name, _ in self._options.files if name in ("--map-tum", "--map-live-tum")]
         if in_map and not self._config.places.enabled:
             raise OmnidError(f"{in_map[0]}: places.enabled = false, so that there is no pose in the map; leave one out")
-        prepare_kernels(log_line)
         graph = Graph(
             policy=NEWEST if self._options.drops else LOSSLESS,
             threaded=not self._options.inline,
@@ -143,6 +141,7 @@ class _Replay:
             reader = self._reader()
             outputs.callback(reader.close)
             geometry = session.geometry(self._rig(reader), reader.frames())
+            prepare_kernels()  # may take a minute: after a log or a rig that is wrong was refused
             health = examined_rig(reader, self._log, geometry, self._config)
             run_places = RunPlaces(
                 self._config, geometry, session.warn, self._options.rig_places, build=self._options.build
@@ -164,7 +163,7 @@ class _Replay:
                     raise
                 raise RunFailedError(str(error), self._result(session, result)) from error
             extended = run_places.finish()  # first: it may warn
-            return replace(self._result(session, result), rig_places=extended)
+            return replace(self._result(session, result), rig_places=extended, map_file=run_places.written)
 
     def _inputs(self) -> list[tuple[str, Path]]:
         """The files that are read, each with its name for errors."""

@@ -52,6 +52,7 @@ class RunResult:
     map_states: tuple[MapState, ...] = ()  # (N,)
     places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
     rig_places: RigPlaces | None = None  # the map of places that the run was given, extended
+    map_file: Path | None = None  # of places, where the run has written one
 
     def __repr__(self) -> str:
         """Return one line: poses, span, length, states, map points and warnings."""

@@ -174,5 +174,7 @@ class Routes:
 
     def _map(self) -> RouteMap:
         if self._places is None or not self._places.name:
-            raise OmnidError("routes need a map that is saved: start with `omnid run --map FILE.omap`")
+            raise OmnidError(
+                "routes need a map that is saved: start the robot (`omnid run`, `omnid simulate`) with --map FILE.omap"
+            )
         return self._places

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,6 +16,8 @@ from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, set_knobs, text_of
 from omnid.transport.topics import PATH, REQUEST_TOPICS, command_topics, request_key
 
+_OS_ERROR: Final = re.compile(r"\(os error (\d+)\)")
+_NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[.*\]\. Timeout!")
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
 _PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
@@ -193,5 +196,8 @@ def _users(config: BusConfig) -> Iterator[tuple[str, Any, str]]:
 
 
 def reason(error: zenoh.ZError) -> str:
-    """Return zenoh's message in one line, without references to its source files."""
-    return " ".join(_SOURCE_LINE.sub("", str(error)).split())
+    """Return a common cause in a few words, else zenoh's message in one line without references to its sources."""
+    text = " ".join(_SOURCE_LINE.sub("", str(error)).split())
+    if by_system := _OS_ERROR.search(text):
+        return os.strerror(int(by_system[1]))
+    return "no answer" if _NO_ANSWER.fullmatch(text) else text

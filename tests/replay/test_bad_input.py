@@ -6,6 +6,9 @@ import os
 import random
 import re
 import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +29,34 @@ def test_refuses_a_file_that_is_no_mcap(omnid: Command, tmp_path: Path, scene: P
 
 def test_refuses_a_missing_log(omnid: Command, tmp_path: Path) -> None:
     assert "absent.mcap" in omnid.refused("replay", tmp_path / "absent.mcap")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("replay", "none.mcap"),
+        ("replay", "{log}", "--rig", "none.toml"),
+        ("calibrate", "height", "none.mcap"),
+        ("calibrate", "drive", "none.mcap", "--rig", "{rig}", "-o", "a.toml"),
+    ],
+)
+def test_a_first_start_refuses_a_wrong_path_before_it_compiles(
+    tmp_path: Path, scene: Path, words: Sequence[str]
+) -> None:
+    """A compilation takes a minute on a busy machine."""
+    filled = [word.format(log=scene / "log.mcap", rig=scene / "rig.toml") for word in words]
+    environment = {**os.environ, "OMNID_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-m", "omnid", *filled], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
+
+
+def test_on_a_full_disk_only_files_that_are_there_are_named(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    plan = tmp_path / "plan.png"
+    code, out, err = omnid.replay(scene / "log.mcap", "--tum", "/dev/full", "--plan", plan, rig=scene / "rig.toml")
+    assert code == 2 and "/dev/full: can no longer be written: No space left on device" in err
+    assert "written" not in out and ("plan.png" in out) == plan.exists() and "cut short /dev/full" in out
 
 
 def test_uses_the_readable_part_of_a_truncated_log(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -146,6 +146,8 @@ def test_refuses_a_log_that_is_being_written(omnid: Command, tmp_path: Path) -> 
 def test_recover_reports_its_result_and_overwrites_nothing(omnid: Command, tmp_path: Path) -> None:
     path = write_log(tmp_path / "log.mcap", pairs(30), [("rig.toml", b"1")])
     assert "was already whole" in omnid("log", "recover", path, "-o", tmp_path / "copy.mcap").out
+    assert "nothing to recover" in omnid("log", "recover", path).out
+    assert not (tmp_path / "log.recovered.mcap").exists()
     os.truncate(path, path.stat().st_size - 1)
     code, out, err = omnid("log", "recover", path)
     assert (code, err) == (0, "") and "60 messages and 1 attachments saved" in out and "no count of its messages" in out

@@ -63,6 +63,7 @@ def test_a_second_run_is_localised_from_its_first_second_and_extends_the_map(
     for path, more in ((omap, ["--map-tum", tmp_path / "m"]), (twin, ["--inline"])):
         result = omnid.replay(scene / "log.mcap", "--map", path, *more, rig=scene / "rig.toml")
         assert result.code == 0 and result.count("loops") >= 2
+        assert result.out.splitlines()[-1].startswith("written") and result.out.rstrip().endswith(str(path))
         assert result.err.count("warning") == 1 and "height of the cameras" in result.err  # not stated
     assert omap.read_bytes() == twin.read_bytes()
     places, _ = read_places(omap)
@@ -86,7 +87,7 @@ def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_aga
     before = omap.read_bytes()
     result = omnid.replay(scene / "log.mcap", "--map", omap, "--localize-only", rig=tmp_path / "better.toml")
     assert result.code == 0 and result.count("loops") >= 2
-    assert "calibrated again" in result.err and omap.read_bytes() == before
+    assert "calibrated again" in result.err and omap.read_bytes() == before and "written" not in result.out
 
 
 def test_what_is_not_recognised_is_left_out_with_a_warning(

@@ -10,6 +10,18 @@ const OBSTACLE_PX = 2.5;
 const AIM_PX = 18; // a finger that is drawn less far gives no heading
 const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
 
+// Columns and rows between which cells are known, null without one: a grid is as wide as the views might reach.
+function knownPart(cells, width) {
+  const part = { left: width, right: -1, low: cells.length, high: -1 };
+  cells.forEach((cell, at) => {
+    if (!cell) return;
+    const [column, row] = [at % width, Math.floor(at / width)];
+    part.left = Math.min(part.left, column); part.right = Math.max(part.right, column);
+    part.low = Math.min(part.low, row); part.high = Math.max(part.high, row);
+  });
+  return part.right < 0 ? null : part;
+}
+
 export class Plan {
   constructor(canvas) {
     this.canvas = canvas;
@@ -72,7 +84,7 @@ export class Plan {
     } else {
       const stream = new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"));
       const cells = new Uint8Array(await new Response(stream).arrayBuffer());
-      this.map = { ...header, cells, image: null };
+      this.map = { ...header, cells, image: null, known: knownPart(cells, width) };
       this.recolour();
     }
     this.draw();
@@ -194,11 +206,11 @@ export class Plan {
     for (const point of this.points) add(point[0], point[1]);
     for (const point of this.obstacles) add(point[0], point[1]);
     if (this.pose !== null) add(this.pose.x_m, this.pose.y_m);
-    if (this.map !== null) {
+    if (this.map !== null && this.map.known !== null) {
       const [x, y, yaw] = this.mapOrigin();
-      const { x_m: left, y_m: low, cell_m: cell } = this.map;
-      for (const u of [left, left + this.map.width * cell]) {
-        for (const v of [low, low + this.map.height * cell]) {
+      const { x_m: left, y_m: low, cell_m: cell, known } = this.map;
+      for (const u of [left + known.left * cell, left + (known.right + 1) * cell]) {
+        for (const v of [low + known.low * cell, low + (known.high + 1) * cell]) {
           add(x + u * Math.cos(yaw) - v * Math.sin(yaw), y + u * Math.sin(yaw) + v * Math.cos(yaw));
         }
       }

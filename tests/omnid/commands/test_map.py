@@ -48,7 +48,10 @@ def test_info_as_json_and_of_a_file_that_is_no_map(omap: Path, capsys: pytest.Ca
 def test_show_writes_a_page_with_keyframes_loops_and_both_paths(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It is one file, and nothing in it comes from elsewhere."""
     page = omap.parent / "a.html"
-    assert main(["map", "show", str(omap), "-o", str(page)]) == 0 and not capsys.readouterr().err
+    assert main(["map", "show", str(omap), "-o", str(page)]) == 0
+    printed = capsys.readouterr()
+    assert not printed.err and printed.out.split() == ["written", str(page)]
+    assert "white is" not in page.read_text("utf-8"), "wrong on a dark screen"
     html = page.read_text()
     assert html.count("class='keyframe'") == 12 and html.count("<title>0 to 11: 77 features</title>") == 1
     assert html.count("<path class='after'") == html.count("<path class='before'") == 3  # two sessions, and the keys
@@ -83,7 +86,7 @@ def test_align_moves_a_map_into_the_axes_of_a_plan(omap: Path, capsys: pytest.Ca
         assert message in error and error.count("\n") == 1
 
 
-def test_export_writes_what_is_asked_for(omap: Path) -> None:
+def test_export_writes_what_is_asked_for_and_names_it(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = omap.parent
     assert (
         main(
@@ -103,6 +106,8 @@ def test_export_writes_what_is_asked_for(omap: Path) -> None:
         )
         == 0
     )
+    printed = capsys.readouterr().out
+    assert printed.startswith("written") and all(f"{out}/a.{end}" in printed for end in ("ply", "png", "yaml", "pgm"))
     assert len(read_ply(out / "a.ply").xyz) > 50
     assert cv2.imread(str(out / "a.png")) is not None
     assert "resolution: 0.1\n" in (out / "a.yaml").read_text() and (out / "a.pgm").read_bytes().startswith(b"P5\n")

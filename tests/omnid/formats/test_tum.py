@@ -114,6 +114,11 @@ def test_names_the_wrong_line(tmp_path: Path, line: str, found: str) -> None:
     assert "line 3: expected" in message and found in message
 
 
+def test_a_file_that_does_not_exist_is_refused_without_numbers_of_the_system(tmp_path: Path) -> None:
+    with pytest.raises(OmnidError, match=r"none.txt: cannot read the trajectory: No such file or directory$"):
+        read_tum(tmp_path / "none.txt")
+
+
 def test_refuses_binary_files(tmp_path: Path) -> None:
     assert "line 2: expected" in refusal(tmp_path, GOOD.encode() + b"1 \xff\n")
     assert "found byte 0x89" in refusal(tmp_path, b"\x89MCAP0\r\n\x01\x0c")

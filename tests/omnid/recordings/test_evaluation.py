@@ -71,6 +71,7 @@ def test_known_errors() -> None:
     assert metrics.heading_max_rad == pytest.approx(0.02)
     assert metrics.heading_rmse_rad == pytest.approx(0.02 * math.sqrt(10 / 11))
     assert metrics.rpe_rotation_rmse_rad == pytest.approx(0.02 / math.sqrt(10))
+    assert max(map(len, str(metrics).splitlines())) <= 60, "as wide as a small terminal"
 
 
 def test_step_error_is_per_step() -> None:

@@ -108,6 +108,7 @@ def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.Capture
     log, out = save(tmp_path / "log.mcap", entries), tmp_path / "out.html"
     assert main(["report", str(log), "-o", str(out)]) == 0
     assert "100 poses of /omnid/odom" in capsys.readouterr().out
+    assert "darker" not in out.read_text("utf-8"), "wrong on a dark screen"
     page = Page(out.read_text("utf-8"))
     assert_harmless(page)
     for words in (

@@ -265,7 +265,7 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     assert update.answer is not None and "taught in another map (site.omap)" in update.answer.refusal
     other.places.name = ""
     update = other.send(RouteRequest(RouteAction.TEACH, "x"))
-    assert update.answer is not None and "omnid run --map" in update.answer.refusal
+    assert update.answer is not None and "--map FILE.omap" in update.answer.refusal
 
 
 def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path: Path) -> None:

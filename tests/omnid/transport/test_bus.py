@@ -225,6 +225,15 @@ def test_a_second_instance_is_refused_with_the_knob_to_change() -> None:
     assert "\n" not in text and ".rs:" not in text
 
 
+def test_a_port_that_is_taken_or_silent_is_refused_in_two_words() -> None:
+    endpoint = free_endpoint()
+    taken = pytest.raises(OmnidError, match=r"\(Address already in use\)$")
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))), taken:
+        Bus(BusConfig(robot="other", listen=(endpoint,)))
+    with pytest.raises(Unreachable, match=r"change bus.connect \((no answer|Connection refused)\)$"):
+        Robot(connect=(endpoint,))
+
+
 @pytest.mark.parametrize("robot", ["", "/omnid", "omnid/", "a//b", "*", "a/**", "a$b", "a#b", "a?b", "@a", "a b"])
 def test_robot_name_must_be_plain(robot: str) -> None:
     with pytest.raises(OmnidError, match=r"bus\.robot"):

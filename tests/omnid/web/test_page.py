@@ -22,6 +22,7 @@ import pytest
 
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.map_codec import grid_cdr
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import scan_cdr
@@ -178,6 +179,30 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, c
             assert "omnid" in new.value.title() and new.value.locator("svg").count() > 0
             screenshot(new.value, "report")
             screenshot(page, "ended")
+
+
+def test_the_plan_is_fitted_to_what_is_known_of_a_wide_map(browser: Any) -> None:
+    endpoint, cells = free_endpoint(), np.full((800, 800), -1, np.int8)
+    cells[390:450, 390:450] = 100
+    share_of_walls = """() => {
+        const plan = document.querySelector("canvas");
+        const hex = getComputedStyle(document.documentElement).getPropertyValue("--wall").trim();
+        const wall = [1, 3, 5].map((at) => parseInt(hex.slice(at, at + 2), 16));
+        const { data } = plan.getContext("2d").getImageData(0, 0, plan.width, plan.height);
+        let found = 0;
+        for (let at = 0; at < data.length; at += 4) found += wall.every((part, n) => data[at + n] === part);
+        return found / (plan.width * plan.height);
+    }"""
+    with contextlib.ExitStack() as ends:
+        bus = ends.enter_context(contextlib.closing(Bus(BusConfig(listen=(endpoint,)))))
+        server = ends.enter_context(served("--connect", endpoint))
+        page = ends.enter_context(opened(browser, server, "desk", "light"))
+        end_s = time.monotonic() + PATIENCE_S
+        while not page.evaluate(share_of_walls) > 0.15:
+            assert time.monotonic() < end_s
+            bus.publish("odom", odometry(8), PoseAttachment(8, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
+            bus.publish("map", grid_cdr(10**18, "map", cells, 0.05, (-20.0, -20.0)))
+            page.wait_for_timeout(200)
 
 
 def test_obstacles_and_the_coverage_of_a_calibration(browser: Any) -> None:
