@@ -15,7 +15,7 @@ import ctypes
 import inspect
 import operator
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final, Generic, ParamSpec, TypeVar
@@ -47,8 +47,8 @@ class Argument:
 class Kernel(Generic[P, R]):
     """A function that is compiled before it is called first; callable with what its signature allows."""
 
-    def __init__(self, function: Callable[P, R], signature: str, writes: tuple[str, ...]) -> None:
-        self.function, self.arguments = function, tuple(_arguments(function, signature, writes))
+    def __init__(self, function: Callable[P, R], arguments: Sequence[Argument]) -> None:
+        self.function, self.arguments = function, arguments
         self._compiled: Any = None
         self._engine: Any = None  # has the code's memory
         self.__doc__, self.__name__ = function.__doc__, function.__name__
@@ -176,7 +176,7 @@ def compiled(signature: str, writes: tuple[str, ...] = ()) -> Callable[[Callable
     """
 
     def decorate(function: Callable[P, R]) -> Kernel[P, R]:
-        kernel = Kernel(function, signature, writes)
+        kernel = Kernel(function, tuple(_arguments(function, signature, writes)))
         _declared.append(kernel)
         return kernel
 

@@ -139,7 +139,9 @@ class CommandReceiver:
 
     def receive(self, request: Request) -> Answer | None:
         """Handle one message, never raises; return the refusal, None where there is none or the target decides."""
-        arrival_ns = time.monotonic_ns()  # before anything else: a stop that arrives meanwhile voids the command
+        # Before anything else: a stop that arrives meanwhile voids the command. Both clocks are read at once, for the
+        # time at which a request was sent is computed by their difference.
+        arrival_ns, unix_ns = time.monotonic_ns(), time.time_ns()
         if request.topic == STOP:
             self._stop_ns = arrival_ns
             self.stops += 1
@@ -149,7 +151,7 @@ class CommandReceiver:
             if request.topic in _CONTACTS:
                 self._touch(request)
             elif request.topic == ARM:
-                self._arm(request, arrival_ns)
+                self._arm(request, arrival_ns, unix_ns)
             else:
                 self._drive(request, arrival_ns)
         except (RefusedCommand, RefusedStamp) as refusal:
@@ -176,13 +178,13 @@ class CommandReceiver:
         finally:
             self._target.touch(_CONTACTS[request.topic], holds=holds)
 
-    def _arm(self, request: Request, arrival_ns: int) -> None:
+    def _arm(self, request: Request, arrival_ns: int, unix_ns: int) -> None:
         _check_length(request.payload)
         stamp_ns = stamp_from_cdr(request.payload)
-        age_ns = self._stamps.check_arm(stamp_ns)
+        self._stamps.check_arm(stamp_ns)
         if not self._is_unique():
             raise RefusedCommand(SAME_NAME)
-        if self._stamps.synchronised and arrival_ns - age_ns <= self._stop_ns:
+        if self._stamps.synchronised and arrival_ns - (unix_ns - stamp_ns) <= self._stop_ns:
             raise RefusedCommand(OLDER_THAN_STOP)
         self._stamps.accept_arm(stamp_ns)
         self.arms += 1

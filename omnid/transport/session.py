@@ -14,7 +14,7 @@ import zenoh
 from omnid.errors import OmnidError
 from omnid.transport.access import access_control
 from omnid.transport.bus_config import BusConfig, set_knobs, text_of
-from omnid.transport.topics import PATH, REQUEST_TOPICS, command_topics, request_key
+from omnid.transport.topics import PATH, PUBLISHED, REQUEST_TOPICS, SERVED, command_topics, request_key
 
 _OS_ERROR: Final = re.compile(r"\(os error (\d+)\)")
 _NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[.*\]\. Timeout!")
@@ -175,8 +175,13 @@ def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
 
 
 def _query_rates(config: BusConfig) -> list[dict[str, Any]]:
-    """Return the rules that bound how often a link may ask."""
-    keys = [f"{config.robot}/*", *(f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS))]
+    """Return the rules that bound how often a link may ask.
+
+    Each key has one: a rule refuses what comes sooner than the time between two messages, of any of the keys it covers.
+    """
+    kept = [name.removeprefix("/") for name, topic in PUBLISHED.items() if topic.latched]
+    asked = [*kept, *SERVED, *map(request_key, sorted(REQUEST_TOPICS))]
+    keys = [f"{config.robot}/{name}" for name in asked]
     return [
         {
             "id": "queries",

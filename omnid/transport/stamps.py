@@ -50,30 +50,29 @@ class StampRule:
         if not stamp_ns:
             raise RefusedStamp(UNSTAMPED)
         if self.synchronised:
-            self._checked_age_ns(stamp_ns)
+            self._check_age(stamp_ns)
             return
         if stamp_ns <= self._newest_ns.get(topic, 0):
             raise RefusedStamp(NOT_RISING)
         self._newest_ns[topic] = stamp_ns
 
-    def check_arm(self, stamp_ns: int) -> int:
-        """Return the age of a request to arm [ns], 0 where the clocks differ. Raise RefusedStamp as `check`."""
+    def check_arm(self, stamp_ns: int) -> None:
+        """Raise RefusedStamp for a request to arm whose stamp is missing, not fresh or used before."""
         if not stamp_ns:
             raise RefusedStamp(UNSTAMPED)
-        age_ns = self._checked_age_ns(stamp_ns) if self.synchronised else 0
-        if not self.synchronised and stamp_ns in self._arm_stamps_ns:
+        if self.synchronised:
+            self._check_age(stamp_ns)
+        elif stamp_ns in self._arm_stamps_ns:
             raise RefusedStamp(USED_BEFORE)
-        return age_ns
 
     def accept_arm(self, stamp_ns: int) -> None:
         """Remember a request to arm that was accepted; stamps may begin again after it."""
         self._arm_stamps_ns.append(stamp_ns)
         self._newest_ns.clear()
 
-    def _checked_age_ns(self, stamp_ns: int) -> int:
+    def _check_age(self, stamp_ns: int) -> None:
         age_ns = time.time_ns() - stamp_ns
         if age_ns > self._stale_ns:
             raise RefusedStamp(TOO_OLD)
         if age_ns < -self._stale_ns:
             raise RefusedStamp(EARLY)
-        return age_ns

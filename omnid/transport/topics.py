@@ -42,6 +42,7 @@ PUBLISHED: Final = {
     "imu": Topic(motion_codec.IMU_SCHEMA),
     CLOCK: Topic(codec.CLOCK_SCHEMA, realtime=True),
 }
+SERVED: Final = ("config", "rig")  # texts that answer queries
 STOP: Final = "cmd/stop"
 ARM: Final = "cmd/arm"
 BUMPER: Final = "cmd/bumper"

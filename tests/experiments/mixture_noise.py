@@ -55,9 +55,9 @@ def gauss_newton_with(weigh: Weigh) -> Kernel[..., None]:
     before = pose_kernels.robust_weight, pose_kernels.accumulate
     of_cauchy = pose_kernels.gauss_newton
     pose_kernels.robust_weight, pose_kernels.accumulate = inner(weigh), inner(before[1].function)
-    compiled = Kernel(of_cauchy.function, of_cauchy.signature, of_cauchy.writes)
+    compiled = Kernel(of_cauchy.function, of_cauchy.arguments)
     try:
-        compiled.compile()
+        compiled.load(compiled.code())
     finally:
         pose_kernels.robust_weight, pose_kernels.accumulate = before
     return compiled

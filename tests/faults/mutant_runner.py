@@ -157,7 +157,8 @@ def _changed(before: CodeType, after: CodeType) -> dict[CodeType, CodeType] | No
 def replace_functions(changed: dict[CodeType, CodeType]) -> None:
     """Give all functions with one of these codes the changed one."""
     for thing in gc.get_objects():
-        if isinstance(thing, FunctionType) and thing.__code__ in changed:
+        # Not isinstance, which asks the object itself for its class: a weak proxy raises where its object is gone.
+        if type(thing) is FunctionType and thing.__code__ in changed:
             thing.__code__ = changed[thing.__code__]
 
 

@@ -6,6 +6,7 @@ import contextlib
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import pytest
 import zenoh
@@ -17,7 +18,7 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.open_requests import OpenRequests
 from omnid.transport.requests import MOST_OPEN, Request, answer_of
 from omnid.transport.session import open_session
-from omnid.transport.topics import REQUEST_TOPICS, command_topics
+from omnid.transport.topics import REQUEST_TOPICS, SERVED, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 
 
@@ -102,6 +103,22 @@ def test_large_requests_are_dropped_before_they_wait() -> None:
         with pytest.raises(OmnidError, match="has not answered"):
             program.driver().ask("cmd/path", lambda _: bytes(20_000), timeout_s=0.2)
         assert [request.topic for request in received] == ["cmd/path"]
+
+
+def test_queries_for_several_keys_at_once_are_all_answered() -> None:
+    endpoint, keys = free_endpoint(), [f"omnid/{name}" for name in ("map", "tf_static", "status", *SERVED)]
+    answered: list[str] = []
+    with (
+        open_session(BusConfig(listen=(endpoint,))) as daemon,
+        Robot(connect=(endpoint,)) as program,
+        ExitStack() as stack,
+    ):
+        for key in keys:
+            stack.enter_context(daemon.declare_queryable(key, lambda query: query.reply(query.key_expr, b"")))
+        wait_until(lambda: any(reply.ok for reply in program._session.get(keys[-1], timeout=5.0)))
+        for key in keys:
+            program._session.get(key, lambda reply: answered.append(str(reply.ok.key_expr)), timeout=5.0)
+        wait_until(lambda: sorted(answered) == sorted(keys))
 
 
 def test_queries_of_a_link_are_bounded_before_they_reach_a_ring() -> None:
