@@ -1,7 +1,8 @@
-"""Time from the start of a program to its first result, on an idle machine: `python -m tests.benchmark.start`.
+"""Time from the start of a program to its first result: `python -m tests.benchmark.start`.
 
 `omnid demo`: to the first line with pairs, on a terminal. `omnid run` on the sample log: to the first pose that a
-client receives. The others: the whole command.
+client receives. The others: the whole command, with its processor time and its memory, which a busy machine changes
+less. `omnid replay` reads 5 pairs of the sample.
 """
 
 from __future__ import annotations
@@ -23,7 +24,13 @@ from tests.benchmark.results import Column, ResultTable
 from tests.omnid.transport.bus_fixtures import free_endpoint
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
-COMMANDS = (("--version",), ("replay", "--help"), ("--help",))
+REPLAY = ("replay", str(SAMPLE), "--seconds", "0.45", "--quiet")
+COMMANDS = {
+    "`omnid --version`": ("--version",),
+    "`omnid replay --help`": ("replay", "--help"),
+    "`omnid --help`": ("--help",),
+    "`omnid replay`, 5 pairs": REPLAY,
+}
 
 
 def demo_s(folder: Path) -> float:
@@ -59,11 +66,14 @@ def first_pose_s() -> float:
     return taken_s
 
 
-def command_s(words: tuple[str, ...]) -> float:
-    """Return the time of a command."""
+def command(words: tuple[str, ...]) -> tuple[float, float, float]:
+    """Return time [s], processor time [s] and largest memory [MB] of a command."""
     start_s = time.monotonic()
-    subprocess.run([sys.executable, "-m", "omnid", *words], stdout=subprocess.DEVNULL, check=True)
-    return time.monotonic() - start_s
+    process = subprocess.Popen([sys.executable, "-m", "omnid", *words], stdout=subprocess.DEVNULL)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    assert process.returncode == 0, words
+    return time.monotonic() - start_s, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
 
 
 def main() -> None:
@@ -74,12 +84,19 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         rows = {"`omnid demo`: first line": [demo_s(Path(folder) / str(run)) for run in range(count)]}
     rows["`omnid run`: first pose"] = [first_pose_s() for _ in range(count)]
-    for words in COMMANDS:
-        rows[f"`omnid {' '.join(words)}`"] = [command_s(words) for _ in range(count)]
-    columns = (Column("what"), *(Column(name, "s", 2) for name in (f"median of {count}", "smallest", "largest")))
+    columns = (
+        Column("what"),
+        *(Column(name, "s", 2) for name in (f"median of {count}", "smallest", "largest", "processor time")),
+        Column("memory", "MB", 0),
+    )
     table = ResultTable("start", "speed", "Start of a program", columns)
     for name, times_s in rows.items():
-        table.add(name, statistics.median(times_s), min(times_s), max(times_s))
+        table.add(name, statistics.median(times_s), min(times_s), max(times_s), None, None)
+    for name, words in COMMANDS.items():
+        command(words)  # the first run compiles what is missing
+        times_s, used_s, memory_mb = zip(*(command(words) for _ in range(count)), strict=True)
+        middle = statistics.median
+        table.add(name, middle(times_s), min(times_s), max(times_s), middle(used_s), middle(memory_mb))
 
 
 if __name__ == "__main__":
