@@ -82,6 +82,7 @@ def _drive(args: argparse.Namespace) -> int:
     import numpy as np
 
     from omnid.config import load_config
+    from omnid.engine.kernel_cache import prepare_kernels
     from omnid.errors import OmnidError
     from omnid.navigation_state import NavigationState
     from omnid.simulation.demonstration import TeachAndRepeat, both_paths, cross_track_m, draw, drift_m, seen_obstacles
@@ -96,18 +97,19 @@ def _drive(args: argparse.Namespace) -> int:
     config = load_config(args.config, [*args.overrides, f"places.map={place_map}", f"navigation.routes={routes}"])
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
     world, robot = load_world("room", args.seed), make_robot()
+    prepare_kernels()  # which says so where it takes long
+    if not args.quiet:
+        print("a simulated robot is taught an oval and repeats it, in its own\ntime: a minute or two", flush=True)
     script = TeachAndRepeat(lambda line: None if args.quiet else print(line, flush=True))
     run = simulate(world, robot, script, seconds=DRIVE_S, seed=args.seed, config=config)
     first, second = both_paths(run, script.repeated_s)
     if not cv2.imwrite(str(image), draw(world, seen_obstacles(run), first, second)):
         raise OmnidError(f"{image}: cannot be written; name another folder by --output")
     end = script.end or f"not reached within {DRIVE_S:g} s"
-    print(f"end: {end}; contacts with obstacles: {len(run.contacts)}; pose {100 * drift_m(run):.1f} cm off at the end")
+    print(f"end       {end}, contacts with obstacles: {len(run.contacts)}")
+    print(f"pose      {100 * drift_m(run):.1f} cm off at the end")
     if len(second):
         off_cm = 100 * cross_track_m(first, second)
-        print(
-            f"the repeated path is {np.percentile(off_cm, 95):.1f} cm off the taught one (95 % of it), at most "
-            f"{off_cm.max():.1f} cm, by the truth"
-        )
-    print(f"picture: {image}; map: {place_map}")
+        print(f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), at most {off_cm.max():.1f} cm")
+    print(f"written   {image}, {place_map}")
     return 0 if script.end == NavigationState.REACHED else 1

@@ -64,7 +64,7 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
     try:
         found = read_rig(path)
     except CalibError as error:
-        yield Finding("error", "rig", str(error), "create one with `omnid calibrate`")
+        yield Finding("error", "rig", str(error))
         return
     cameras = {"lower": found.lower, "upper": found.upper}
     for name, mounted in cameras.items():

@@ -158,6 +158,20 @@ def test_a_lost_motor_ends_the_run(tmp_path: Path, scene: Path) -> None:
     assert len(rows(tum)) >= 3
 
 
+def test_the_first_start_of_a_drive_says_what_it_waits_for(tmp_path: Path) -> None:
+    """The compilation before it takes a minute on a busy computer; it ends with the program that began it."""
+    environment = {**os.environ, "OMNID_CACHE_DIR": str(tmp_path / "cache")}
+    command = [sys.executable, "-m", "omnid", "demo", "--drive", "--output", str(tmp_path / "out")]
+    with subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True
+    ) as process:
+        assert process.stderr is not None
+        first = process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=PATIENCE_S)
+    assert "compiling" in first and out == ""
+
+
 def test_demo_waits_for_a_busy_computer_and_loses_nothing(tmp_path: Path) -> None:
     """It has one core, which has something else to do meanwhile."""
     one_core = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0)))]
