@@ -23,6 +23,7 @@ from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
+from omnid.core.odometry.recognised_pose import likeliest_recognised
 from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, displacements, doubt_after, likeliest
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
@@ -189,9 +190,8 @@ class VisualOdometry:
         return likeliest(estimate, others, T_predicted, reach_m)
 
     def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
-        """Return the pose of a frame among the newest keyframes, refined by the patches of the local map in view."""
-        found = self._relocaliser.locate(frame)
-        return None if found is None else self._frame_to_map.refine_recognised(frame, found, exposure)
+        """Return the pose of a frame among the newest keyframes; None where none is recognised, or several are."""
+        return likeliest_recognised(frame, self._relocaliser.locate(frame), exposure, self._frame_to_map)
 
     def complete(self) -> None:
         """Make the last frame a keyframe if the map needs one; the next `process` does so where this is not called.
