@@ -43,7 +43,8 @@ CONSTANTS: Final = {
         "good_inliers",
         "good_inlier_ratio",
     ),
-    "odometry/odometry": ("NEAR_RATIO", "GOOD_TRACKED_RATIO", "TEXTURED_CORNERS", "TRACKED_SHARE"),
+    "odometry/odometry": ("TEXTURED_CORNERS",),
+    "odometry/pose_search": ("NEAR_RATIO", "GOOD_TRACKED_RATIO", "TRACKED_SHARE"),
     "odometry/pose_estimation": ("RANSAC_THRESHOLD_PX",),
     "odometry/frame_to_map": (
         "OUTLIER_SQUARED",

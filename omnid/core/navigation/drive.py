@@ -9,14 +9,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.control.heading_controller import Setpoint
+from calib.se2_arrays import composed, relative
+from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.follower import Follower
 from omnid.core.navigation.giving_way import GivingWay
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
+from omnid.core.navigation.situation import Situation
 from omnid.navigation_state import NavigationState
 
 Array = NDArray[np.float64]
+
+PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # by trial on development seeds
 
 
 @dataclass(slots=True)
@@ -39,6 +43,29 @@ class Drive:
     giving_way: GivingWay | None = None  # while it does
     gave_way: int = 0  # times, at the block before which it was
     gave_way_m: float = math.inf  # way left there
+
+    def path_ahead(self, now: Situation, way_m: float) -> Array:
+        """Return the path (N, 2) ahead, in odom."""
+        T_odom_frame = relative(now.T_frame_odom(self.frame), np.zeros(3))
+        ahead = self.follower.path_ahead(way_m)
+        path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
+        return np.asarray(path[:, :2])
+
+    def in_odom(self, setpoint: Setpoint, now: Situation) -> Setpoint:
+        """Return a setpoint whose heading is in odom."""
+        if setpoint.heading_rad is None:
+            return setpoint
+        turned_rad = float(now.T_frame_odom(self.frame)[2])
+        return Setpoint(setpoint.velocity_mps, wrap_angle(setpoint.heading_rad - turned_rad))
+
+    def stands_since_s(self, pose: Array, left_m: float, dt_s: float) -> float:
+        """Return for how long the base has neither come nearer to the end nor turned, dt_s after the last call."""
+        turned_rad = abs(wrap_angle(float(pose[2]) - self.heading_rad))
+        if left_m < self.nearest_m - PROGRESS_M or turned_rad > PROGRESS_RAD:
+            self.nearest_m, self.heading_rad, self.stuck_s = left_m, float(pose[2]), 0.0
+        else:
+            self.stuck_s += dt_s
+        return self.stuck_s
 
 
 class Navigation(NamedTuple):

@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.se2_arrays import composed, relative
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
-from omnid.core.control.heading_controller import Setpoint, wrap_angle
+from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, IDLE
 from omnid.core.navigation.drive import Drive, Navigation
 from omnid.core.navigation.follower import STAND, Follower, Following
@@ -30,7 +29,6 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 STOPS: Final = 5  # poses after an end at which a stop is sent: one might be lost
-PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # by trial on development seeds
 BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left; by trial on development seeds
 PLANNED_M: Final = 4.0  # of the path that the local planner is given; enough: its grid ends at 3.2 m
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
@@ -132,9 +130,9 @@ class Navigator:
             return self._finished(drive, following.missed_m)
         if self._is_beside(following):
             return self._taken_away(following)
-        setpoint = self._in_odom(following.setpoint, drive, now)
+        setpoint = drive.in_odom(following.setpoint, now)
         # 5. Obstacles.
-        plan = self._around_obstacles(drive.follower, self._path_ahead(drive, now, PLANNED_M), now, setpoint)
+        plan = self._around_obstacles(drive.follower, drive.path_ahead(now, PLANNED_M), now, setpoint)
         if plan.avoiding:
             drive.follower.skip_corner(pose)
         if plan.setpoint is None:
@@ -142,7 +140,7 @@ class Navigator:
         if now.wheels.held_by:  # the setpoint is still sent: the monitor lets go by itself
             return self._blocked(drive, now.wheels.held_by, now, following, dt_s)._replace(setpoint=plan.setpoint)
         # 6. What holds the wheels, and progress.
-        if self._is_stuck(drive, now, following.left_m, dt_s):
+        if self._is_stuck(drive, now, following, dt_s):
             if plan.avoiding and not drive.gave_way and self._begins_to_give_way(drive, now, following.left_m):
                 return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
             return self._no_progress(now, AROUND if plan.avoiding else "")
@@ -246,7 +244,7 @@ class Navigator:
         if giving.phase is Phase.BACK:
             is_closed = now.obstacles is None or closed(giving.look_back(), obstacles, self._half_width_m).any()
             if following is not None and not is_closed and not now.wheels.held_by:
-                if self._is_stuck(drive, now, following.left_m, dt_s):
+                if self._is_stuck(drive, now, following, dt_s):
                     return self._no_progress(now, GIVES_WAY)
                 self.state, self.reason = NavigationState.AVOIDING, GIVES_WAY
                 return Navigation(following.setpoint, self.state, self.reason, drive.gave_way_m)
@@ -254,7 +252,7 @@ class Navigator:
             drive.nearest_m = math.inf
         # 2. Rest until the way is free, or it is time to look for another one.
         if giving.phase is Phase.REST:
-            way = np.vstack([giving.way_to_block(now.pose), self._path_ahead(drive, now, PAST_M)])
+            way = np.vstack([giving.way_to_block(now.pose), drive.path_ahead(now, PAST_M)])
             room_m = self._half_width_m + self._settings.clearance_m
             if giving.move_on(now.pose, dt_s, is_free(way, obstacles, room_m)):
                 return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
@@ -267,7 +265,7 @@ class Navigator:
                 giving.rest()
                 drive.nearest_m = math.inf
                 return self._wait(drive, NavigationState.BLOCKED, plan.reason or now.wheels.held_by, dt_s)
-            if self._is_stuck(drive, now, following.left_m, dt_s):
+            if self._is_stuck(drive, now, following, dt_s):
                 return self._no_progress(now, AROUND if plan.avoiding else "")
             self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
             self.reason = plan.reason
@@ -275,13 +273,6 @@ class Navigator:
         drive.giving_way, drive.nearest_m = None, math.inf
         drive.waits.clear()
         return Navigation(STAND, self.state, self.reason, drive.gave_way_m)
-
-    def _path_ahead(self, drive: Drive, now: Situation, way_m: float) -> Array:
-        """Return the path (N, 2) of the drive ahead, in odom."""
-        T_odom_frame = relative(now.T_frame_odom(drive.frame), np.zeros(3))
-        ahead = drive.follower.path_ahead(way_m)
-        path = composed(np.repeat(T_odom_frame[None], len(ahead), 0), np.column_stack([ahead, np.zeros(len(ahead))]))
-        return np.asarray(path[:, :2])
 
     def _around_obstacles(self, follower: Follower, path: Array, now: Situation, setpoint: Setpoint) -> Detour:
         """Return the motion, by way of a detour where the path (N, 2) in odom is blocked."""
@@ -297,20 +288,9 @@ class Navigator:
             speed_mps=now.speed_mps,
         )
 
-    def _in_odom(self, setpoint: Setpoint, drive: Drive, now: Situation) -> Setpoint:
-        if setpoint.heading_rad is None:
-            return setpoint
-        turned_rad = float(now.T_frame_odom(drive.frame)[2])
-        return Setpoint(setpoint.velocity_mps, wrap_angle(setpoint.heading_rad - turned_rad))
-
-    def _is_stuck(self, drive: Drive, now: Situation, left_m: float, dt_s: float) -> bool:
+    def _is_stuck(self, drive: Drive, now: Situation, following: Following, dt_s: float) -> bool:
         """True if the base has come neither nearer to the end nor turned for too long."""
-        turned_rad = abs(wrap_angle(float(now.pose[2]) - drive.heading_rad))
-        if left_m < drive.nearest_m - PROGRESS_M or turned_rad > PROGRESS_RAD:
-            drive.nearest_m, drive.heading_rad, drive.stuck_s = left_m, float(now.pose[2]), 0.0
-        else:
-            drive.stuck_s += dt_s
-        return drive.stuck_s > self._settings.stuck_s
+        return drive.stands_since_s(now.pose, following.left_m, dt_s) > self._settings.stuck_s
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
         """Begin the next path, or end."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.late_depths import LateDepths
 from omnid.core.odometry.patch_alignment import AlignedPatches, align
@@ -134,3 +135,12 @@ class LocalMap:
         """Return the slopes (M, 2) of the disparity of landmarks (M,) [px/px] in a panorama with that pose."""
         table, T_curr_ref = self.store.table, self.store.from_anchors(se3.inverse(T_odom_rect), landmarks)
         return moved_slopes((table.anchor_points[landmarks], table.slopes[landmarks]), T_curr_ref, self._model)
+
+    def covariance_of(self, estimate: PoseEstimate) -> Array:
+        """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to a pose."""
+        total = np.zeros((6, 6))
+        for seq, share in self.store.anchor_shares(estimate.landmarks).items():
+            keyframe = self.store.keyframes[seq]
+            A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ keyframe.T_odom_rect)
+            total = total + share * A @ keyframe.covariance @ A.T
+        return total

@@ -6,7 +6,7 @@ VisualOdometry.process is the algorithm, one frame at a time. Equations and sect
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, with_more_inliers
+from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
@@ -23,13 +23,13 @@ from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
+from omnid.core.odometry.pose_search import LastFrame, PoseSearch
 from omnid.core.odometry.recognised_pose import likeliest_recognised
-from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, displacements, doubt_after, likeliest
+from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, doubt_after
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
-from omnid.core.odometry.yaw_search import correlation_peaks, steps
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -40,14 +40,7 @@ Flags = NDArray[np.bool_]
 # that speed, as the vehicle may be so fast: at 10 m/s the position was 11 sigmas off.
 UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
-# Share of the predicted landmarks, inliers, below which they are also searched with a pyramid: without one, in noise,
-# tracks stay near a wrong prediction and confirm it.
-NEAR_RATIO = 0.5
-GOOD_TRACKED_RATIO = 0.5  # share of the predicted landmarks, tracked, below which other yaw angles are tried
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
-# Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
-# start of the refinement, which aligns the patches of all landmarks.
-TRACKED_SHARE = 0.6
 COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 
 
@@ -87,6 +80,7 @@ class VisualOdometry:
             keyframes=self._keyframes,
             frame_to_map=self._frame_to_map,
         )
+        self._search = PoseSearch(self._map, model, limits, frame_to_map=self._frame_to_map, exposures=self._exposures)
 
     def process(self, frame: StereoFrame, dt_s: float) -> OdometryEstimate:
         """Return the pose at a frame, dt_s [s] after the previous one (0 for the first).
@@ -104,10 +98,11 @@ class VisualOdometry:
         # 1. Predict: v <- v + dt a, T <- T exp(v dt) (section IV.D, eq. 10), with wheels and gyro where there are some.
         T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)
 
-        # 2. to 4. Once a frame was refused, those without corners (darkness, a blank wall) are left out to save time.
+        # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
+        #    (darkness, a blank wall) are left out to save time.
         after_refusal = self._status.refused_frames > 0
         searched = not after_refusal or self._is_textured(frame, usable)
-        estimate = self._estimate(frame, usable, T_predicted, dt_s) if searched else None
+        estimate = self._find(frame, usable, T_predicted, dt_s) if searched else None
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
@@ -126,7 +121,7 @@ class VisualOdometry:
         self._resets += gap.is_turned  # odom has another heading than it was published with
 
         estimate = self._exposures.start_again(
-            frame, usable, estimate, dt_s, request=self._request, tracked=self._tracked()
+            frame, usable, estimate, dt_s, request=self._request, tracked=self._search.tracked
         )
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
@@ -141,53 +136,22 @@ class VisualOdometry:
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
         return replace(result, is_keyframe=True)
 
-    def _estimate(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
-        """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
-        estimate: PoseEstimate | None = None
-        exposure = self._exposures.predicted(frame, dt_s)
-        for T_guess, is_near in self._guesses(frame, usable, T_predicted):
-            # 2. Track the landmarks of the last panorama by KLT, forward and backward (section IV.A).
-            tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=is_near)
-
-            # 3. Estimate: find them in the upper panorama as well, then RANSAC on three points (IV.B) and Gauss-Newton
-            #    on the bearings in both panoramas (IV.C, in place of eq. 9).
-            coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
-
-            # 4. Refine: align the keyframes' patches, warped to the estimated viewpoint; Gauss-Newton again.
-            refined = self._exposures.refine(frame, coarse, exposure, self._T_odom_rect, dt_s) if coarse else None
-            estimate = with_more_inliers(estimate, refined)
-            if self._is_good(estimate, is_near):
-                break
-        return self._with_runner_up(frame, estimate, T_predicted, exposure, dt_s)
-
-    def _with_runner_up(
-        self, frame: StereoFrame, estimate: PoseEstimate | None, T_predicted: Array, exposure: Exposure, dt_s: float
-    ) -> PoseEstimate | None:
-        """Return the likeliest motion that a vehicle may have made, with its runner-up: runner_up_motions.py."""
+    def _find(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
+        """Return the likeliest pose of a frame in the map, with its runner-up; None: no landmarks were found."""
+        assert self._previous is not None
+        last = LastFrame(self._T_odom_rect, self._previous)
+        estimate = self._search.find(frame, usable, last, T_predicted, dt_s)
         if estimate is None or self._status.refused_frames:
             return estimate  # from an unknown place displacements lead anywhere: relocalisation decides
-        # 1. How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors
-        #    of steps for independent, which those of runners-up are not; wheels, which measure each step, tell more.
+        # How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors of
+        # steps for independent, which those of runners-up are not; wheels, which measure each step, tell more.
         sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
         is_measured = frame.sensed is not None and frame.sensed.is_complete
         doubt = None if is_measured or not self._in_doubt else self._doubt
         of_runner_up_mps = doubt.runner_up_distance_mps if doubt else 0.0
         most_mps = min(REACH_SIGMAS * sigma_mps + of_runner_up_mps, self._limits.max_speed_mps)
         reach_m = most_mps * self._since_fix_s(dt_s)
-        off_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
-        # 2. Displacements there from which the images look alike, and the poses to which they lead.
-        peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
-        is_good, others = self._is_good(estimate, is_near=False), []
-        for x, y in peaks:
-            if is_good and x == y == 0:
-                continue
-            T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
-            tracks = self._map.track(frame.lower, T_guess, self._tracked(), turn=frame.seq, near=True)
-            coarse = self._frame_to_map.estimate(frame, tracks, T_guess, exposure)
-            refined = self._exposures.refine(frame, coarse, exposure, self._T_odom_rect, dt_s) if coarse else None
-            others += [refined] if refined is not None else []
-        # 3. The likeliest one, and whether another one is nearly as likely.
-        return likeliest(estimate, others, T_predicted, reach_m)
+        return self._search.with_runner_up(frame, estimate, last, T_predicted, dt_s, reach_m=reach_m)
 
     def relocalise(self, frame: StereoFrame, exposure: Exposure) -> PoseEstimate | None:
         """Return the pose of a frame among the newest keyframes; None where none is recognised, or several are."""
@@ -202,32 +166,6 @@ class VisualOdometry:
         if requested is not None:
             self._keyframes.add(requested)
             self._added = requested.frame.seq
-
-    def _guesses(self, frame: StereoFrame, usable: Flags, T_predicted: Array) -> Iterator[tuple[Array, bool]]:
-        """Yield guesses of the pose, and whether they count as near: the prediction, which nearly always is near.
-
-        Then, each if what was before was not good: the prediction, searched with a pyramid; the best yaw hypothesis
-        there (IV.F). The hypotheses are the peaks of the circular correlation with the last panorama, then the paper's
-        steps.
-        """
-        yield T_predicted, True
-        yield T_predicted, False
-        assert self._previous is not None
-        peaks = correlation_peaks(self._previous.panorama, frame.lower.panorama, usable, turn_px=frame.lower.period_px)
-        T_unturned = self._T_odom_rect.copy()
-        T_unturned[:3, 3] = T_predicted[:3, 3]
-        yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
-
-    def _is_good(self, estimate: PoseEstimate | None, is_near: bool) -> bool:
-        """True if no other guess is needed; is_near: it was found near a guess, without a pyramid."""
-        limits = self._limits
-        return (
-            estimate is not None
-            and estimate.inliers >= NEAR_RATIO * is_near * estimate.visible
-            and estimate.tracked >= GOOD_TRACKED_RATIO * estimate.visible
-            and estimate.inlier_ratio >= limits.good_inlier_ratio
-            and estimate.inliers >= limits.good_inliers
-        )
 
     def _is_plausible(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
@@ -267,7 +205,7 @@ class VisualOdometry:
             self._motion.reset()
         self._map.late_depths.settle(at_previous)
         self._motion.found()
-        self._covariance = estimate.covariance + (self._map_covariance(estimate) if len(estimate.landmarks) else 0.0)
+        self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
         self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=self._in_doubt))
@@ -369,19 +307,6 @@ class VisualOdometry:
     def _request(self, frame: StereoFrame, usable: Flags, exposure: Exposure) -> KeyframeRequest:
         """Return the request of a keyframe at the current pose, all of whose landmarks are new."""
         return KeyframeRequest(frame, usable, self._T_odom_rect, self._covariance, exposure)
-
-    def _tracked(self) -> int:
-        """Return the number of landmarks that are tracked at most."""
-        return max(2 * self._limits.good_inliers, round(TRACKED_SHARE * self._limits.features))
-
-    def _map_covariance(self, estimate: PoseEstimate) -> Array:
-        """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to the pose."""
-        keyframes = self._map.store.keyframes
-        total = np.zeros((6, 6))
-        for seq, share in self._map.store.anchor_shares(estimate.landmarks).items():
-            A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ keyframes[seq].T_odom_rect)
-            total = total + share * A @ keyframes[seq].covariance @ A.T
-        return total
 
     def _result(
         self, tracked: int, inliers: int, features: Features | None = None, exposure: Exposure | None = None

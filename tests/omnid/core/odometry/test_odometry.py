@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
+from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
@@ -266,15 +266,6 @@ def test_the_same_frames_give_the_same_bytes(cameras: RenderedCameras, frames: l
     first, second = (run(visual_odometry(cameras.model, OdometryLimits()), frames)[-1] for _ in range(2))
     assert first.T_odom_rect.tobytes() == second.T_odom_rect.tobytes()
     assert first.covariance.tobytes() == second.covariance.tobytes()
-
-
-@pytest.mark.parametrize(("inliers", "is_near", "is_good"), [(160, True, True), (107, True, False), (107, False, True)])
-def test_few_inliers_near_a_guess_call_for_a_wider_search(
-    cameras: RenderedCameras, inliers: int, is_near: bool, is_good: bool
-) -> None:
-    """In a dim log 107 of some 290 landmarks in view confirmed a pose that was 33 mm off."""
-    estimate = PoseEstimate(np.eye(4), np.eye(6), visible=290, tracked=inliers + 43, inliers=inliers)
-    assert visual_odometry(cameras.model, OdometryLimits())._is_good(estimate, is_near) == is_good
 
 
 def test_a_pose_refused_for_its_speed_leaves_a_covariance_that_covers_it(cameras: RenderedCameras) -> None:
