@@ -29,7 +29,8 @@ TIERS: Mapping[str, str] = {
     "omnid.plain_text omnid.utc",
     "numerics": "omnid.core",
     "threads, queues, the controller process": "omnid.engine omnid.controller",
-    "messages, formats, bus": "omnid.messages omnid.config omnid.config_use omnid.formats omnid.transport",
+    "messages, formats, bus": "omnid.messages omnid.camera_config omnid.config omnid.config_use omnid.formats "
+    "omnid.transport",
     "parts of a run": "omnid.stages omnid.recordings omnid.service",
     "what watches and writes a run": "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration "
     "omnid.refinement omnid.batch",

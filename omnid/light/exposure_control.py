@@ -9,7 +9,7 @@ from typing import Final
 from drivers.cameras.camera_exposure import CameraExposure, ExposureRanges, ExposureRequest, ExposureSetting
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
-from omnid.config import CamerasConfig
+from omnid.camera_config import CamerasConfig
 from omnid.light.exposure_law import STEP_S, ExposureLaw, ExposureState
 from omnid.light.grey_levels import GreyLevels, UsefulArea
 from omnid.messages import FramePair

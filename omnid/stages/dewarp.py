@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
-from omnid.config import PanoramaConfig, TimingConfig
+from omnid.camera_config import TimingConfig
+from omnid.config import PanoramaConfig
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
 from omnid.core.stereo.tiles import Side, TileMonitor, tile_columns
 from omnid.core.types.panorama import PaddedPanorama

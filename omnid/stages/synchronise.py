@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from drivers.motion import MotionSample
-from omnid.config import PairConfig
+from omnid.camera_config import PairConfig
 from omnid.messages import FramePair
 from omnid.stages.decoder import Decoder, Image
 from omnid.stages.motion_inbox import MotionInbox

@@ -14,7 +14,7 @@ from calib.rig import Rig
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame
 from drivers.motor import MotorStatus, VelocityCommand
-from omnid.config import PairConfig
+from omnid.camera_config import PairConfig
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerStatistics
 from omnid.core.control.arming import ArmRequest

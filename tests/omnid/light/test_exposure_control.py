@@ -10,7 +10,7 @@ from calib.rig import Rig
 from drivers.cameras.camera_exposure import CameraExposure, ExposureRanges, ExposureSetting, ValueRange
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
-from omnid.config import CamerasConfig
+from omnid.camera_config import CamerasConfig
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
 from omnid.messages import FramePair

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calib.rig import ShutterTimes
-from omnid.config import PanoramaConfig, TimingConfig
+from omnid.camera_config import TimingConfig
+from omnid.config import PanoramaConfig
 from omnid.messages import FramePair
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.dewarp import Dewarp

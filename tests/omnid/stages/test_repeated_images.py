@@ -10,7 +10,7 @@ import pytest
 
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
-from omnid.config import PairConfig
+from omnid.camera_config import PairConfig
 from omnid.stages.repeated_images import FROZEN_IMAGES, KEPT, RepeatedImages
 from omnid.stages.synchronise import Synchronise
 from tests.simulation import build

@@ -15,7 +15,8 @@ from calib.panorama import remap_tables
 from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame
 from drivers.logs.log_reader import LogReader
-from omnid.config import Config, MappingConfig, PairConfig
+from omnid.camera_config import PairConfig
+from omnid.config import Config, MappingConfig
 from omnid.core.frames import in_outer_axes, of_base
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph, Stream

@@ -13,7 +13,7 @@ import pytest
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from drivers.motion import GyroSample, WheelSample
-from omnid.config import PairConfig
+from omnid.camera_config import PairConfig
 from omnid.messages import FramePair
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.synchronise import MAX_WAITING, Synchronise

@@ -12,7 +12,8 @@ import pytest
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
-from omnid.config import Config, PairConfig, PanoramaConfig
+from omnid.camera_config import PairConfig
+from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_matches import POINTS
 from omnid.core.rig.driving_views import MIN_PLACES, VIEWS
 from omnid.core.rig.rig_health import RigContradictedError, RigHealth
