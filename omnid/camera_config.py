@@ -52,11 +52,11 @@ class CamerasConfig:
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 
     def require_two_devices(self) -> None:
-        """Raise DriverError where both cameras are one device, which cannot be opened twice."""
+        """Raise DriverError where both cameras are one device, whose images hold both views."""
         if self.lower == self.upper:
             raise DriverError(
                 f"cameras.lower and cameras.upper are both {self.lower!r}, expected two devices: images "
-                "that hold both views are read from logs only"
+                "that hold both views are taken by `omnid run`, which records them with record.enabled"
             )
 
 

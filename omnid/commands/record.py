@@ -45,9 +45,9 @@ def run(args: argparse.Namespace) -> int:
         "cameras.upper": args.upper,
     }
     config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
+    config.cameras.require_two_devices()
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, Camera] = ("lower", "upper")
-    config.cameras.require_two_devices()
     with ExitStack() as closing:
         sources: dict[Camera, V4l2Camera] = {}
         for name in cameras:

@@ -55,7 +55,10 @@ def cameras(
     nodes = {_resolved(settings.device, root) for settings in wanted.values()}
     if len(nodes) < len(wanted):
         yield Finding(
-            "error", "cameras", "both names lead to one device", "configure one device for each, see `omnid cameras`"
+            "warning",
+            "cameras",
+            "both names lead to one device",
+            "right if its images hold both views; else configure one device for each, see `omnid cameras`",
         )
     yield from buses(streams)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,16 @@ import pytest
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
-from calib.rig_file import write_rig
+from calib.rig_file import read_rig, write_rig
+from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
+from drivers.cameras.shared_camera import SharedCamera
+from drivers.frame import Camera
+from drivers.logs.log_reader import LogReader
+from omnid.config import load_config
+from omnid.report.report_data import collect_report_data
+from omnid.runs.live import LiveRun
+from omnid.runs.live_cameras import LiveCamera
+from omnid.runs.live_robot import ConnectedRobot
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from tests.drivers.logs.mcap_logs import COMPRESSED, Entry, compressed, write_log
@@ -59,16 +69,48 @@ def test_one_topic_gives_both_cameras(recording: Path, tmp_path: Path, omnid: Co
     assert abs(errors["length_error_ratio"]) < 0.002 and errors["ate_rmse_m"] < 0.003, errors
 
 
-def test_one_device_is_not_two_cameras(recording: Path, omnid: Command) -> None:
-    """Live, it would be waited for twice; one line says that logs can."""
-    device = ("--lower", "/dev/video9", "--upper", "/dev/video9")
-    assert "expected two devices" in omnid.refused("run", *device, "--rig", recording / "rig.toml")
+def test_one_device_of_both_views_needs_masks_and_is_opened_once(
+    recording: Path, tmp_path: Path, omnid: Command
+) -> None:
+    device = tmp_path / "video9"
+    words = ("run", "--lower", device, "--upper", device, "--rig")
+    assert "[lower.mask] and [upper.mask] must tell" in omnid.refused(*words, without_upper_mask(recording, tmp_path))
+    assert f"camera {device}" in omnid.refused(*words, recording / "rig.toml"), "it comes as far as the device"
+    assert "expected two devices" in omnid.refused("record", tmp_path / "rec", "--lower", device, "--upper", device)
+
+
+def without_upper_mask(recording: Path, folder: Path) -> Path:
+    text = (recording / "rig.toml").read_text()
+    (folder / "rig.toml").write_text(text[: text.index("[upper.mask]")])
+    return folder / "rig.toml"
 
 
 def test_masks_must_tell_which_part_is_whose(recording: Path, tmp_path: Path, omnid: Command) -> None:
-    rig = tmp_path / "rig.toml"
-    text = (recording / "rig.toml").read_text()
-    rig.write_text(text[: text.index("[upper.mask]")])
+    rig = without_upper_mask(recording, tmp_path)
     log = recording / "log.mcap"
     assert "[upper.mask] must tell which part" in omnid.refused("replay", log, "--rig", rig, "--quiet")
     assert "no lower camera" in omnid.refused("replay", log, "--rig", recording / "apart.toml", "--quiet")
+
+
+def test_a_live_run_takes_both_views_from_one_stream(recording: Path, tmp_path: Path) -> None:
+    """Run the daemon on a log in place of the device: each view has a thread, both have the same stamps."""
+    images = LogImages.load(recording / "log.mcap", TOPIC, TOPIC)
+    opened = list[SharedCamera]()
+
+    def open_view(camera: Camera) -> LiveCamera:
+        if camera == "lower":
+            opened.append(SharedCamera(LogCamera(images, "lower", LogClock(), pace=0.25, once=True)))
+        return opened[-1].lower if camera == "lower" else opened[-1].upper
+
+    config = load_config(None, [f"record.folder={tmp_path}", "record.enabled=true", "bus.listen=[]"])
+    run = LiveRun(config, ConnectedRobot(open_view), lambda *_: None, read_rig(recording / "rig.toml"))
+    assert run.run() == 0 and len(opened) == 1
+    (log,) = tmp_path.glob("*.mcap")
+    stamps: dict[str, set[int]] = {"lower": set(), "upper": set()}
+    with closing(LogReader(log)) as reader:
+        for frame in reader.frames():
+            stamps[frame.camera].add(frame.stamp_ns)
+    assert len(stamps["lower"]) == PAIRS and stamps["upper"] <= stamps["lower"]
+    poses = collect_report_data(log, keep_poses=True).poses
+    moved_m = np.linalg.norm(poses.trajectory.T[-1, :3, 3] - poses.trajectory.T[0, :3, 3])
+    assert poses.poses >= 2 and 0.04 < moved_m < 0.05 * PAIRS
