@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from drivers.cameras.v4l2_settings import EXPOSURE_MODES, PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
-from drivers.errors import DriverError
 from omnid.settings import knob
 
 
@@ -51,13 +50,10 @@ class CamerasConfig:
         shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 
-    def require_two_devices(self) -> None:
-        """Raise DriverError where both cameras are one device, whose images hold both views."""
-        if self.lower == self.upper:
-            raise DriverError(
-                f"cameras.lower and cameras.upper are both {self.lower!r}, expected two devices: images "
-                "that hold both views are taken by `omnid run`, which records them with record.enabled"
-            )
+    @property
+    def is_one_device(self) -> bool:
+        """True where one device is both cameras: its images hold both views."""
+        return self.lower == self.upper
 
 
 @dataclass(frozen=True, slots=True)

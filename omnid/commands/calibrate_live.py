@@ -116,8 +116,13 @@ def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Ima
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.calibration.camera_pairs import newest_pairs
     from omnid.engine.logging_setup import log
+    from omnid.errors import OmnidError
 
-    config.cameras.require_two_devices()
+    if config.cameras.is_one_device:
+        raise OmnidError(
+            f"cameras.lower and cameras.upper are both {config.cameras.lower!r}, expected two devices: record images "
+            "that hold both views by `omnid record`, and take `omnid calibrate rig --lower-area --upper-area`"
+        )
     sources = []
     for camera in ("lower", "upper"):
         sources.append(V4l2Camera(config.cameras.settings(camera), camera, on_event=log))

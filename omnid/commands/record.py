@@ -45,9 +45,11 @@ def run(args: argparse.Namespace) -> int:
         "cameras.upper": args.upper,
     }
     config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
-    config.cameras.require_two_devices()
     rig = _rig(config, wanted=args.rig is not None)
-    cameras: tuple[Camera, Camera] = ("lower", "upper")
+    cameras: tuple[Camera, ...] = ("lower", "upper")
+    if config.cameras.is_one_device:
+        cameras = ("lower",)
+        _log(logging.INFO, f"{config.cameras.lower} is both cameras: its images, with both views, are the lower one's")
     with ExitStack() as closing:
         sources: dict[Camera, V4l2Camera] = {}
         for name in cameras:

@@ -99,7 +99,7 @@ def _devices(config: Config) -> OpenCamera:
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.engine.logging_setup import log
 
-    if config.cameras.lower != config.cameras.upper:
+    if not config.cameras.is_one_device:
         return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
     # One device: its images hold both views, and the rig's masks tell which part is whose.
     read_rig(Path(config.cameras.rig)).of_one_image(config.cameras.lower)

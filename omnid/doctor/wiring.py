@@ -64,7 +64,8 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
     try:
         found = read_rig(path)
     except CalibError as error:
-        yield Finding("error", "rig", str(error))
+        advice = "" if "omnid calibrate" in str(error) else "create one with `omnid calibrate`"
+        yield Finding("error", "rig", str(error), advice)
         return
     cameras = {"lower": found.lower, "upper": found.upper}
     for name, mounted in cameras.items():

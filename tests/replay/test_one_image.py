@@ -76,7 +76,10 @@ def test_one_device_of_both_views_needs_masks_and_is_opened_once(
     words = ("run", "--lower", device, "--upper", device, "--rig")
     assert "[lower.mask] and [upper.mask] must tell" in omnid.refused(*words, without_upper_mask(recording, tmp_path))
     assert f"camera {device}" in omnid.refused(*words, recording / "rig.toml"), "it comes as far as the device"
-    assert "expected two devices" in omnid.refused("record", tmp_path / "rec", "--lower", device, "--upper", device)
+    code, _, err = omnid("record", tmp_path / "rec", *words[1:5])
+    assert code == 2 and f"{device} is both cameras" in err and f"camera {device}" in err.splitlines()[-1]
+    board = ("--corners", "6x7", "--square-mm", 30)
+    assert "expected two devices" in omnid.refused("calibrate", "live", tmp_path / "live", *board, *words[1:5])
 
 
 def without_upper_mask(recording: Path, folder: Path) -> Path:
