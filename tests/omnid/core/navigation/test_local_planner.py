@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.navigation.local_planner import room_ahead
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
@@ -154,3 +155,11 @@ def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     base.navigator.start("path", NavigationFrame.ODOM, [path], base.seen())
     assert base.run(90).state is NavigationState.REACHED
     assert clearance_m(base) > 0.02
+
+
+@pytest.mark.parametrize(("speed_mps", "distance_m"), [(0.3, 1.0), (-0.3, 2.0), (0.0, 1.0)])
+def test_the_room_ahead_ends_at_the_nearest_obstacle_that_is_not_behind(speed_mps: float, distance_m: float) -> None:
+    pose = np.array([2.0, -3.0, math.pi / 2])
+    obstacles = np.array([[2.0, -2.0], [2.0, -5.0], [2.5, 0.0]])
+    assert room_ahead(pose, speed_mps, obstacles) == pytest.approx(distance_m)
+    assert room_ahead(pose, speed_mps, np.zeros((0, 2))) == math.inf
