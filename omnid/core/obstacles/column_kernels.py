@@ -227,7 +227,8 @@ def floor_evidence(
                     likelihoods(sums[d], floor, scale, value)
                 add(value, prior[abs(d - k)], others[k])
                 weights += prior[abs(d - k)]
-        others[k] /= weights
+        for u in range(width):
+            others[k, u] /= weights
 
 
 @compiled(
