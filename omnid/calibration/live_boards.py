@@ -67,9 +67,11 @@ class LiveBoards:
 
         need_still: they count only where the board stood at the same place in the pair before.
         """
+        # 1. Search the board.
         self._update_rims(images)
         lower, upper = self._pool.map(self._search, images)
         before, self._before, self.views = self._before, (lower, upper), (lower, upper)
+        # 2. Leave out what says nothing new.
         if lower is None and upper is None:
             return PairOutcome.NO_BOARD
         if lower is None or upper is None:
@@ -80,6 +82,7 @@ class LiveBoards:
             return PairOutcome.SEEN_BEFORE
         if self.pairs >= MOST_PAIRS:
             return PairOutcome.FULL
+        # 3. Keep the pair, and count what it covers.
         self._kept.append((lower, upper))
         for coverage, view in zip(self._covered(), (lower, upper), strict=True):
             coverage.add(view)

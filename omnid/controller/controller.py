@@ -100,20 +100,24 @@ class Controller:
 
     def tick(self) -> TickReport:
         """Step the law and send its motion."""
+        # 1. Step the law.
         now_ns = self._clock_ns()
         dt_s, late_s = self._keep_rhythm(now_ns)
         output = self._law.step(
             now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed, motor_stopped=self._motor_stopped
         )
+        # 2. Keep its state for the status, and report what has changed.
         self._report_arming()
         self._report_slowing()
         self._report_obstacles()
         self._count_stop(output.reason)
+        # 3. Send its motion, and tell the law what became of it.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
         self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
         if status is not None:
             self._take_status(status, now_ns)
+        # 4. Times and the wheels' own motion.
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
         wheels = None if status is None else WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps)

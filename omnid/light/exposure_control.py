@@ -52,6 +52,7 @@ class ExposureControl:
 
     def process(self, pair: FramePair) -> None:
         """Measure a pair if it is due, and make a request where the law takes a step."""
+        # 1. Measure the pair where it is due.
         if self._newest_ns and pair.stamp_ns > self._newest_ns:
             self._period_ns = min(self._period_ns, float(pair.stamp_ns - self._newest_ns))
         self._newest_ns = pair.stamp_ns
@@ -60,11 +61,13 @@ class ExposureControl:
         self._next_ns = pair.stamp_ns + STEP_S / S_PER_NS
         levels = self._area.levels(pair)
         self._levels = levels
+        # 2. Leave it to the cameras where it cannot be regulated.
         if self._left_to_cameras or not math.isfinite(self._period_ns):
             return
         if any(exposure.problem for exposure in self._exposures):
             self._give_back(pair.stamp_ns)
             return
+        # 3. Start, or take the law's step.
         if self._law is None:
             self._law = self._started()
             self._request(self._law.setting, pair.stamp_ns)

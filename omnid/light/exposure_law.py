@@ -70,19 +70,23 @@ class ExposureLaw:
         """Return the setting from now on; None where it stays. The levels are those of images at the stamp."""
         if self.state == "no answer" or stamp_ns < self._next_ns:
             return None
+        # 1. The factor on the light that is wanted, with a dead band.
         factor = wanted_factor(lower, upper)
         direction = (factor >= LEAST_UP) - (factor <= LEAST_DOWN)
         self.state = "regulated"
         if not direction:
             self._before, self._deaf = None, 0
             return None
+        # 2. The setting that gives it; at the end of the range it stays.
         wanted = self._raised(factor) if direction > 0 else self._lowered(factor)
         if wanted == self.setting:
             self.state = "too dark" if direction > 0 else "too bright"
             return None
+        # 3. A camera whose images do not follow is given up.
         if self._is_deaf(wanted, math.sqrt(lower.mean * upper.mean)):
             self.state = "no answer"
             return None
+        # 4. Take the step, and wait until the images show it.
         self._note(direction)
         self._next_ns = stamp_ns + self._wait_s / S_PER_NS
         self.setting, self.steps = wanted, self.steps + 1

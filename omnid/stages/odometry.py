@@ -66,11 +66,13 @@ class OdometryStage:
 
     def process(self, pair: Panoramas) -> OdometryUpdate:
         """Return the pose at a pair."""
+        # 1. What wheels and gyro have measured since the pair before.
         last_ns, self._last_ns = self._last_ns, pair.stamp_ns
         dt_s = 0.0 if last_ns is None else (pair.stamp_ns - last_ns) * 1e-9
         self.sensors.add(pair.motion)
         self._agreement.add(pair.motion, float(self.sensors.values[BIAS][2]))
         sensed = None if last_ns is None else self.sensors.between(last_ns, pair.stamp_ns)
+        # 2. The pose of the rectified frame.
         usable = np.zeros_like(pair.visible) if pair.light.shows_nothing else pair.usable
         frame = StereoFrame(
             pair.seq,
@@ -83,10 +85,12 @@ class OdometryStage:
             lost=pair.tiles.lost_pixels(pair.visible.shape),
         )
         estimate = self._method.process(frame, dt_s)
+        # 3. Compare its step with wheels and gyro: their scales, biases and delay.
         if estimate.step is not None and last_ns is not None:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
             seen = self._to_base @ se3.log(estimate.step[0])
             self._agreement.add_step(last_ns, pair.stamp_ns, float(seen[0]), float(seen[5]))
+        # 4. The message, in the frame of the rig.
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         return OdometryUpdate(
             pair.seq,

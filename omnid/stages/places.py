@@ -81,12 +81,15 @@ class Places:
 
     def process(self, odometry: OdometryUpdate) -> PlaceUpdate:
         """Return the pose in the map at a pair."""
+        # 1. The pose in the map.
         pose = self._localiser.process(self._frame(odometry), idle=self._load() >= LoadLevel.NO_MAP)
         self.state = pose.state
+        # 2. Copies for other threads, which never read the map itself.
         if self._copy_wanted:
             self._copy_wanted, self._copy = False, self._localiser.places.part(self._localiser.places.keyframes)
         if odometry.stamp_ns >= self._counted_ns + COUNTED_NS:
             self._counted_ns, self.counts = odometry.stamp_ns, self._localiser.counts
+        # 3. The message, in the frame of the rig.
         T_map_odom = self._T_rig_rect @ pose.T_map_odom @ self._T_rect_rig
         T_map_rig = T_map_odom @ odometry.T_odom_rig
         covariance = self._to_rig @ pose.covariance @ self._to_rig.T
