@@ -129,7 +129,8 @@ def _drift(finding: RigFinding) -> list[str]:
         f"{value:+.2f} ({sigma:.2f}) along {axis}" for value, sigma, axis in zip(shift, shift_sigma, "xy", strict=True)
     )
     return [
-        f"upper camera: rotated by {finding.turn_deg:.3f} deg: {rotation}; z is along the baseline",
+        f"upper camera: rotated by {finding.turn_deg:.3f} deg, sigma {np.rad2deg(drift.angle_sigma):.3f}: "
+        f"{rotation}; z is along the baseline",
         f"upper viewpoint: shifted by {translation} deg, as seen from the lower one",
         f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
     ]

@@ -70,7 +70,8 @@ class RigFinding:
         x, y, z = np.rad2deg(self.drift.turn)
         return (
             f"{self.state}: columns off by {self.offset_px:+.2f} px (spread {self.spread_px:.2f}), upper "
-            f"camera turned by {self.turn_deg:.3f} deg ({x:+.3f} {y:+.3f} {z:+.3f}) by {self.matches} points"
+            f"camera turned by {self.turn_deg:.3f} deg, sigma {np.rad2deg(self.drift.angle_sigma):.3f} "
+            f"({x:+.3f} {y:+.3f} {z:+.3f}), by {self.matches} points"
         )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.fit.rig_drift import apply_drift, estimate_rig_drift
+from calib.fit.rig_drift import CORRELATED_POINTS, apply_drift, estimate_rig_drift
 from calib.masks.rim_check import rim_shift
 from calib.models.camera import Array, Mask
 from calib.rig import Rig
@@ -62,7 +62,10 @@ def test_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, around: 
         drift = estimate_rig_drift(lower, upper)
         assert drift is not None
         misses.append((np.rad2deg(drift.turn) - (0.3, -0.2, 0.4)) / np.rad2deg(drift.turn_sigma))
-    assert 0.7 < np.sqrt(np.mean(np.square(misses))) < 1.5
+        axis = drift.turn / np.linalg.norm(drift.turn)
+        assert min(drift.turn_sigma) < drift.angle_sigma < np.linalg.norm(drift.turn_sigma)
+        assert drift.angle_sigma**2 == pytest.approx(axis @ drift.covariance[:3, :3] @ axis)
+    assert 0.7 < np.sqrt(CORRELATED_POINTS * np.mean(np.square(misses))) < 1.5, "the noise here is independent"
 
 
 def test_returns_none_for_too_few_points(rig: Rig, around: Array) -> None:
