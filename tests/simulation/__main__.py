@@ -2,6 +2,7 @@
 
 Cameras that are not synchronised: `--speed 1.4 --skew-ms 15`, or `--skew-ms 5 25` (first and last pair); a rolling
 shutter of 20 ms on 768 rows: `--line-time-us 26`. Real mirrors: `--mirrors`, with nominal.toml instead of rig.toml.
+Real lenses, lamps and electronics: `--real`, or some of `tests/simulation/disturbances.py` by `--disturb flicker dust`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import time
 from pathlib import Path
 
 from omnid.simulation.rendering.sensor import DIM
+from tests.simulation.disturbances import DISTURBANCES
 from tests.simulation.logs import write_log
 from tests.simulation.readout import Readout
 from tests.simulation.recipes import RECIPES, build
@@ -65,6 +67,11 @@ def main() -> None:
         "that of the first row",
     )
     parser.add_argument("--dim", action="store_true", help="dim images with much noise, whose brightness changes")
+    disturb = parser.add_mutually_exclusive_group()
+    disturb.add_argument(
+        "--disturb", nargs="+", choices=DISTURBANCES, default=(), metavar="NAME", help=", ".join(DISTURBANCES)
+    )
+    disturb.add_argument("--real", action="store_const", const=DISTURBANCES, dest="disturb", help="all of --disturb")
     arguments = parser.parse_args()
     run = build(arguments.name, arguments.seed, arguments.size, arguments.pairs)
     rig = with_real_mirrors(run.rig, arguments.seed, arguments.mirrors) if arguments.mirrors else run.rig
@@ -86,6 +93,7 @@ def main() -> None:
         seed=arguments.seed,
         supersample=arguments.supersample,
         readout=readout,
+        disturbances=arguments.disturb,
         progress=progress,
     )
     sys.stderr.write("\n")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from calib.rig_file import write_rig
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
+from tests.simulation.disturbances import Disturbance, DisturbedCamera
 from tests.simulation.mirrors import MirrorCamera
 from tests.simulation.readout import Readout, body_twists
 from tests.simulation.rigs import nominal_rig
@@ -47,19 +48,36 @@ def write_log(
     seed: int = 0,
     supersample: int = 2,
     readout: Readout | None = None,
+    disturbances: Collection[Disturbance] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Render both cameras' images at poses T_world_rig (N, 4, 4), and write the log and its ground truth to folder."""
     readout = readout or Readout()
     cameras, delay_s = (rig.lower, rig.upper), readout.delay_s(len(poses))
     twists = body_twists(poses, 1e-9 * readout.period_ns)
+    disturbed = _disturbed(rig, disturbances, seed)
 
     def ideal_image(pair: int, camera: int) -> Floats:
-        T_world_rig = poses[pair] @ se3.exp(twists[pair] * delay_s[pair]) if camera else poses[pair]
         row_twist = twists[pair] * 1e-6 * readout.line_time_us[camera]
-        return render_grey(scene, cameras[camera], T_world_rig, supersample, row_twist)
+        delays_s = [delay_s[pair] * camera + at_s for at_s in disturbed[camera].times_s()]
+        parts = [
+            render_grey(scene, cameras[camera], poses[pair] @ se3.exp(twists[pair] * late_s), supersample, row_twist)
+            for late_s in delays_s
+        ]
+        time_s = 1e-9 * readout.period_ns * pair + delay_s[pair] * camera
+        return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), pair, time_s)
 
-    pack_log(folder, rig, poses, ideal_image, sensor=sensor, seed=seed, readout=readout, progress=progress)
+    pack_log(
+        folder,
+        rig,
+        poses,
+        ideal_image,
+        sensor=sensor,
+        seed=seed,
+        readout=readout,
+        disturbances=disturbances,
+        progress=progress,
+    )
 
 
 def pack_log(
@@ -71,13 +89,15 @@ def pack_log(
     sensor: Sensor | None = None,
     seed: int = 0,
     readout: Readout | None = None,
+    disturbances: Collection[Disturbance] = (),
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
     """Write the log of a run at poses T_world_rig (N, 4, 4), and its ground truth, from ideal images.
 
     rig.toml has masks of the rims only; if struts or a hub hide pixels, rig_masked.toml has masks of those too. A rig
     of ray-traced mirrors has no model: nominal.toml is what its builder knows. Without a readout both images of a pair
-    show the instant of the lower camera's stamp, and stamps differ by up to SKEW_NS. Same arguments, same bytes.
+    show the instant of the lower camera's stamp, and stamps differ by up to SKEW_NS. disturbances: those of
+    electronics and encoding; those of the light are in the ideal images. Same arguments, same bytes.
     """
     folder.mkdir(parents=True, exist_ok=True)
     readout = readout or Readout()
@@ -90,17 +110,29 @@ def pack_log(
     sensor = sensor or Sensor()
     exposures = [MountedSensor.of(sensor, m.visible, m.camera.size) for m in (rig.lower, rig.upper)]
     _write_rigs(folder, rig, exposures)
+    disturbed = _disturbed(rig, disturbances, seed)
+
+    def jpeg(pair: int, camera: int) -> bytes:
+        exposed = exposures[camera].expose(ideal_image(pair, camera), rng)
+        image = disturbed[camera].digitised(exposed, pair)
+        return disturbed[camera].encoded(image, pair) or exposures[camera].jpeg(image)
 
     def images() -> Images:
         for i in range(len(poses)):
-            both = [e.jpeg(e.expose(ideal_image(i, k), rng)) for k, e in enumerate(exposures)]
-            yield i, both[0], both[1]
+            yield i, jpeg(i, 0), jpeg(i, 1)
             if progress:
                 progress(i + 1, len(poses))
 
     # log.mcap appears only when it is complete.
     _write_mcap(folder / "log.mcap.part", rig, (stamps, stamps + skews), images())
     (folder / "log.mcap.part").replace(folder / "log.mcap")
+
+
+def _disturbed(rig: Rig, names: Collection[Disturbance], seed: int) -> list[DisturbedCamera]:
+    return [
+        DisturbedCamera.of(names, number, mounted.visible, mounted.camera.size, seed)
+        for number, mounted in enumerate((rig.lower, rig.upper))
+    ]
 
 
 def _write_rigs(folder: Path, rig: Rig, exposures: list[MountedSensor]) -> None:

@@ -1,0 +1,165 @@
+"""What real lenses, mirrors, lamps and cameras do to images, each by a name: `--disturb NAME ...`, or all by `--real`.
+
+They act on ideal images, 0 to 255, before the sensor's own blur and noise (`DisturbedCamera.shown`), or on its digits
+(`digitised`, `encoded`). What is fixed to a camera, as dust, is drawn once from the seed; what changes, from pair to
+pair. Lengths are parts of the image's width, so that images of all sizes are disturbed alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Final, Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.models.camera import Mask
+from omnid.simulation.rendering.sensor import Floats
+
+Disturbance = Literal[
+    "motion blur", "defocus", "chromatic", "flare", "dust", "drop", "flicker", "gain", "pattern", "lines", "jpeg"
+]
+DISTURBANCES: Final[tuple[Disturbance, ...]] = get_args(Disturbance)
+
+EXPOSURE_S: Final = 0.015  # of motion blur, and of lamps' flicker
+SUB_EXPOSURES: Final = 5  # rendered for motion blur
+DEFOCUS: Final = 0.003  # sigma of the blur at the rim; it grows with the square of the radius
+CHROMATIC: Final = 0.0015  # by which red is magnified and blue is reduced
+CHANNELS: Final = (0.299, 0.587, 0.114)  # of red, green and blue in grey
+FLARE, FLARE_SIGMA = 0.08, 0.12  # share of the light that is spread, and how far
+REFLECTION, REFLECTION_RADIUS = 0.25, 0.09  # of the camera in its mirror: how light, and how large
+DUST, DUST_RADIUS = 40, (0.002, 0.008)  # specks, each of which dims by up to half
+DROP_RADIUS, DROP_SIGMA = 0.05, 0.01  # of a drop of water, and of the blur in it
+LAMP_HZ, FLICKER = 100.0, 0.25  # lamps on mains of 50 Hz, and how deep their light swings
+LINE_S: Final = 26e-6  # from row to row: flicker shows as bands
+GAIN_EVERY, GAIN_STEP = 9, 0.25  # pairs from step to step of automatic exposure, and the largest step
+PATTERN_GREY, COLUMN_GREY, HOT = 1.5, 1.0, 2e-4  # sigma of pixels and columns, share of hot pixels
+LINES: Final = 3  # rows of each image that repeat the row above
+QUALITY: Final = (60, 91)  # of JPEG, another for each image
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DisturbedCamera:
+    """The disturbances of one camera."""
+
+    names: frozenset[Disturbance]
+    number: int  # 0: lower, 1: upper
+    seed: int
+    radius: Floats  # (H, W) distance from the middle of the mask, 1 at the rim
+    dust: Floats  # (H, W) factor on the light
+    drop: tuple[int, int]  # (u, v)
+    pattern: Floats  # (H, W) grey
+
+    @staticmethod
+    def of(
+        names: Collection[Disturbance], number: int, mask: Mask, size: tuple[int, int], seed: int
+    ) -> DisturbedCamera:
+        """Return the disturbances of a camera with that mask and image size (width, height)."""
+        rng = np.random.default_rng([seed, number, 31])
+        width, height = size
+        u, v = np.meshgrid(np.arange(width) - mask.center[0], np.arange(height) - mask.center[1])
+        rim_px = min(mask.outer_px, width / 2)
+        dust = np.ones((height, width))
+        for _ in range(DUST):
+            at, radius_px = rng.uniform(-rim_px, rim_px, 2), width * rng.uniform(*DUST_RADIUS)
+            dust *= 1 - rng.uniform(0.1, 0.5) * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * radius_px**2))
+        angle = rng.uniform(0, 2 * np.pi)
+        drop = np.array(mask.center) + 0.6 * rim_px * np.array([np.cos(angle), np.sin(angle)])
+        pattern = PATTERN_GREY * rng.standard_normal((height, width)) + COLUMN_GREY * rng.standard_normal(width)
+        pattern[rng.uniform(size=pattern.shape) < HOT] += 120
+        return DisturbedCamera(
+            frozenset(names),
+            number,
+            seed,
+            (np.hypot(u, v) / rim_px).astype(np.float32),
+            dust.astype(np.float32),
+            (int(drop[0]), int(drop[1])),
+            pattern.astype(np.float32),
+        )
+
+    def times_s(self) -> list[float]:
+        """Return the times at which an image is rendered, about the middle of its exposure."""
+        if "motion blur" not in self.names:
+            return [0.0]
+        return (EXPOSURE_S * ((np.arange(SUB_EXPOSURES) + 0.5) / SUB_EXPOSURES - 0.5)).tolist()
+
+    def shown(self, ideal: Floats, pair: int, time_s: float) -> Floats:
+        """Return the light (H, W) on the sensor; time_s: of the exposure."""
+        grey = ideal
+        if "chromatic" in self.names:
+            grey = self._chromatic(grey)
+        if "defocus" in self.names:
+            grey = self._defocused(grey)
+        if "dust" in self.names and self.number == 1:
+            grey = grey * self.dust
+        if "drop" in self.names and self.number == 0:
+            grey = self._behind_drop(grey)
+        if "flare" in self.names:
+            grey = self._flared(grey)
+        rows = np.arange(grey.shape[0], dtype=np.float32)[:, None]
+        if "flicker" in self.names:
+            # The light of a lamp, 1 + a cos(2 pi f t), over the exposure: sinc(f T) is left of its swing.
+            swing = FLICKER * np.sinc(LAMP_HZ * EXPOSURE_S)
+            grey = grey * (1 + swing * np.cos(2 * np.pi * LAMP_HZ * (time_s + LINE_S * rows)))
+        if "gain" in self.names:
+            step = np.random.default_rng([self.seed, pair // GAIN_EVERY, 37]).uniform(-GAIN_STEP, GAIN_STEP)
+            grey = grey * np.float32(1 + step)
+        return np.asarray(grey, np.float32)
+
+    def digitised(self, image: NDArray[np.uint8], pair: int) -> NDArray[np.uint8]:
+        """Return the image (H, W) as the sensor's electronics deliver it."""
+        if "pattern" in self.names:
+            image = np.clip(np.rint(image + self.pattern), 0, 255).astype(np.uint8)
+        if "lines" in self.names:
+            rows = self._rng(pair).integers(1, image.shape[0], LINES)
+            image = image.copy()
+            image[rows] = image[rows - 1]
+        return image
+
+    def encoded(self, image: NDArray[np.uint8], pair: int) -> bytes | None:
+        """Return the image as a colour JPEG with 4:2:0; None where it is not disturbed."""
+        if "jpeg" not in self.names:
+            return None
+        quality = int(self._rng(pair).integers(*QUALITY))
+        sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+        colours = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+        return cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling])[1].tobytes()
+
+    def _rng(self, pair: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, self.number, pair, 41])
+
+    def _chromatic(self, grey: Floats) -> Floats:
+        """Return the sum of three colours, of which a lens magnifies each a little differently."""
+        height, width = grey.shape
+        whole = np.zeros_like(grey)
+        for share, scale in zip(CHANNELS, (1 + CHROMATIC, 1.0, 1 - CHROMATIC), strict=True):
+            M = np.array([[scale, 0, (1 - scale) * width / 2], [0, scale, (1 - scale) * height / 2]])
+            whole += share * cv2.warpAffine(grey, M, (width, height), borderMode=cv2.BORDER_REPLICATE)
+        return whole
+
+    def _defocused(self, grey: Floats) -> Floats:
+        """Return the image blurred by a sigma that grows with the square of the radius, between three blurs."""
+        sigma = DEFOCUS * grey.shape[1] * np.minimum(self.radius, 1.2) ** 2
+        levels = np.linspace(0, float(sigma.max()), 4)
+        blurred = [grey, *(cv2.GaussianBlur(grey, (0, 0), level) for level in levels[1:])]
+        at = sigma / levels[1]
+        return np.asarray(sum(image * np.maximum(0, 1 - np.abs(at - k)) for k, image in enumerate(blurred)), np.float32)
+
+    def _behind_drop(self, grey: Floats) -> Floats:
+        """Return the image with a drop, in which the surroundings are small, upside down and blurred."""
+        height, width = grey.shape
+        radius_px = DROP_RADIUS * width
+        x, y = np.meshgrid(np.arange(width) - self.drop[0], np.arange(height) - self.drop[1])
+        u, v = ((centre - 3 * offset).astype(np.float32) for centre, offset in zip(self.drop, (x, y), strict=True))
+        inside = cv2.remap(grey, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+        inside = cv2.GaussianBlur(inside, (0, 0), DROP_SIGMA * width)
+        share = np.clip(radius_px - np.hypot(x, y), 0, 1)
+        return np.asarray(grey + share * (inside - grey), np.float32)
+
+    def _flared(self, grey: Floats) -> Floats:
+        """Return the image with scattered light, and the light ring of a lens in the middle of its mirror."""
+        spread = cv2.GaussianBlur(grey, (0, 0), FLARE_SIGMA * grey.shape[1])
+        ring = np.abs(self.radius * 0.5 - REFLECTION_RADIUS) < REFLECTION_RADIUS / 4
+        return np.asarray((1 - FLARE) * grey + FLARE * spread + REFLECTION * 255 * ring, np.float32)

@@ -1,0 +1,80 @@
+"""Disturbances: each changes what it is named for, and nothing else; the same arguments give the same images."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.models.camera import Mask
+from omnid.simulation.rendering.sensor import Floats
+from tests.simulation.disturbances import DISTURBANCES, LINES, Disturbance, DisturbedCamera
+
+SIDE = 160
+MASK = Mask((79.5, 79.5), 0.0, 75.0)
+IDEAL: Floats = np.random.default_rng(1).uniform(40, 180, (SIDE, SIDE)).astype(np.float32)
+LIGHT: tuple[Disturbance, ...] = ("defocus", "chromatic", "flare", "flicker", "gain")
+
+
+def camera(*names: Disturbance, number: int = 0) -> DisturbedCamera:
+    return DisturbedCamera.of(names, number, MASK, (SIDE, SIDE), 5)
+
+
+def digits(one: DisturbedCamera, pair: int = 3) -> NDArray[np.uint8]:
+    return one.digitised(np.rint(IDEAL).astype(np.uint8), pair)
+
+
+def test_without_a_name_nothing_changes() -> None:
+    none = camera()
+    assert none.times_s() == [0.0] and none.encoded(digits(none), 0) is None
+    assert np.array_equal(none.shown(IDEAL, 0, 0.3), IDEAL) and np.array_equal(digits(none), np.rint(IDEAL))
+
+
+@pytest.mark.parametrize("name", LIGHT)
+def test_light_changes_in_both_cameras_and_is_that_of_the_seed(name: Disturbance) -> None:
+    for number in (0, 1):
+        seen = camera(name, number=number).shown(IDEAL, 3, 0.3)
+        assert np.abs(seen - IDEAL).max() > 1
+        assert np.array_equal(seen, camera(name, number=number).shown(IDEAL, 3, 0.3))
+
+
+def test_dirt_is_on_one_mirror_and_stays() -> None:
+    for name, dirty in (("dust", 1), ("drop", 0)):
+        changed = [camera(name, number=number).shown(IDEAL, 3, 0.3) != IDEAL for number in (0, 1)]
+        assert changed[dirty].any() and not changed[1 - dirty].any()
+        assert np.array_equal(changed[dirty], camera(name, number=dirty).shown(IDEAL, 40, 4.0) != IDEAL)
+
+
+def test_defocus_grows_to_the_rim() -> None:
+    lost = np.abs(camera("defocus").shown(IDEAL, 0, 0.0) - IDEAL)
+    assert lost[70:90, 70:90].mean() < 0.3 * lost[70:90, 5:15].mean()
+
+
+def test_gain_steps_are_those_of_both_cameras_and_last() -> None:
+    ratios = [camera("gain", number=k).shown(IDEAL, pair, 0.0) / IDEAL for pair in (0, 8, 9) for k in (0, 1)]
+    steps = [float(ratio.mean()) for ratio in ratios]
+    assert steps[0] == steps[1] == steps[2] == steps[3] != steps[4] == steps[5]
+
+
+def test_electronics_repeat_rows_and_add_a_pattern() -> None:
+    image = digits(camera("lines"))
+    changed = np.flatnonzero((image != np.rint(IDEAL)).any(axis=1))
+    assert 0 < len(changed) <= LINES and np.array_equal(image[changed], image[changed - 1])
+    assert not np.array_equal(digits(camera("lines"), 4), image), "other rows in the next pair"
+    assert np.array_equal(digits(camera("pattern"), 3), digits(camera("pattern"), 4))
+
+
+def test_jpeg_is_in_colour_with_another_quality_for_each_image() -> None:
+    sizes = set()
+    for pair in range(4):
+        data = camera("jpeg").encoded(digits(camera()), pair)
+        assert data is not None
+        sizes.add(len(data))
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (SIDE, SIDE, 3)
+    assert len(sizes) > 1
+
+
+def test_motion_blur_renders_times_about_the_stamp() -> None:
+    times = camera(*DISTURBANCES).times_s()
+    assert len(times) > 2 and sum(times) == pytest.approx(0, abs=1e-12)
