@@ -22,13 +22,13 @@ from calib.fit.boards.camera_selection import (
 from calib.fit.residual_structure import ResidualStructure
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
-from calib.models.ocam import View
 from calib.rig_file import write_file
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, is_log, read_images
 from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
+from omnid.calibration.view_guess import ViewChoice, view_of_images
 
 # A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
 MAX_LOG_VIEWS = 40
@@ -95,16 +95,16 @@ def calibrate_camera(
     *,
     topic: str | None = None,
     model: ModelChoice = "auto",
-    view: View = "mirror",
+    view: ViewChoice = "auto",
     with_mask: bool = False,
     progress: Progress = silent,
 ) -> CameraResult:
     """Calibrate a camera by images of a board that it saw at several places.
 
     sources: files, folders and patterns of images, or one log, with the topic of the camera in it. model: "auto" fits
-    every model and selects by cross-validation. view: the world is seen in a mirror or directly; images of a flat board
-    do not distinguish the two. with_mask: also search rim, hub and struts. progress receives one line for each image
-    and each model. Raises OmnidError or CalibError where the images do not suffice.
+    every model and selects by cross-validation. view: the world is seen in a mirror or directly; "auto": as the images
+    show, see `view_guess`. with_mask: also search rim, hub and struts. progress receives one line for each image and
+    each model. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images.
     images = read_images(sources, topic)
@@ -112,14 +112,15 @@ def calibrate_camera(
     # 2. Find the board in each. Of a log the views that differ most are used.
     views = find_boards(images, board, thorough=not many, progress=progress)
     views = select_diverse_views(views, MAX_LOG_VIEWS) if many else views
+    seen = view_of_images(view, [(images.values(), views)], board, progress)
     # 3. Fit the models, and select the one with the least error at views that it was not fitted to.
     height, width = images[views[0].name].shape
-    selected = select_calibration(views, board, (width, height), model, view)
+    selected = select_calibration(views, board, (width, height), model, seen)
     report_scores(selected, "camera", progress)
     # 4. Refine the corners with the camera, and fit it again.
-    selected = refine_selection(selected, images, view)
+    selected = refine_selection(selected, images, seen)
     # 5. If the print differs from its drawing, select and fit again with its shape.
-    bent = with_print_shape(selected, view)
+    bent = with_print_shape(selected, seen)
     if bent is not selected:
         report_scores(bent, "camera, with the shape of the print", progress)
     # 6. Find what never shows the world.

@@ -25,7 +25,7 @@ from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.names import sees_directly
-from calib.models.ocam import OcamCamera, View
+from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
@@ -39,6 +39,7 @@ from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
 from omnid.calibration.rig_report import rig_report_html
+from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
 
 # The board scales the rig: a baseline outside this range, from smaller than any mirror to larger than any vehicle,
@@ -109,7 +110,7 @@ def calibrate_rig(
     cameras: GivenCameras | None = None,
     refine_cameras: bool = False,
     model: ModelChoice = "auto",
-    view: View = "mirror",
+    view: ViewChoice = "auto",
     with_struts: bool = False,
     expected_baseline_m: float | None = None,
     areas: tuple[ImageArea, ImageArea] | None = None,
@@ -130,11 +131,15 @@ def calibrate_rig(
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
-    single = (
-        FittedCameras.known(cameras, views)
-        if cameras
-        else fit_cameras(views, images, board, (model, view, AS_DRAWN), progress)
-    )
+    if cameras is None:
+        sides = [
+            (side.values(), [seen for seen in own if seen is not None])
+            for side, own in zip(images.sides, zip(*(pair.seen for pair in views), strict=True), strict=True)
+        ]
+        choice = model, view_of_images(view, sides, board, progress)
+        single = fit_cameras(views, images, board, (*choice, AS_DRAWN), progress)
+    else:
+        single = FittedCameras.known(cameras, views)
     # 4. Fit the transform between the cameras, and the cameras with it.
     refined = cameras is None or refine_cameras
     found = _fit_rig(single.views, single, board, refined, AS_DRAWN, progress)
@@ -146,7 +151,7 @@ def calibrate_rig(
     if not shape.is_as_drawn:
         progress("the board is not as drawn: once more with its shape")
         if cameras is None:
-            single = fit_cameras(list(found.views), images, board, (model, view, shape), progress)
+            single = fit_cameras(list(found.views), images, board, (*choice, shape), progress)
             rejected = (*rejected, *single.rejected)
         found = _fit_rig(single.views if cameras is None else found.views, single, board, refined, shape, progress)
         rejected = (*rejected, *found.rejected)

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib.fit.boards.camera_selection import MODEL_CHOICES
-from calib.models.ocam import VIEWS
 from omnid.calibration.camera import CameraResult, calibrate_camera
 from omnid.calibration.progress import Progress, silent
+from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.board_options import add_board_options, board_of
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
@@ -31,13 +31,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     add_board_options(parser)
     parser.add_argument("--topic", help="the camera's topic in a log")
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
-    parser.add_argument(
-        "--view",
-        choices=VIEWS,
-        default="mirror",
-        help="the world is seen in a mirror (default) or "
-        "directly through a lens: images of a flat board do not distinguish the two",
-    )
+    parser.add_argument("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP)
     parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and coverage")
     parser.add_argument(
         "--mask",

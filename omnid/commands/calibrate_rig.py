@@ -9,8 +9,8 @@ from pathlib import Path
 from calib.camera_file import read_camera
 from calib.fit.boards.camera_selection import MODEL_CHOICES
 from calib.image_area import ImageArea
-from calib.models.ocam import VIEWS
 from omnid.calibration.rig import GivenCameras, calibrate_rig
+from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.board_options import add_board_options, board_of
 from omnid.commands.calibrate_camera import MODEL_HELP, print_result, progress_of
 from omnid.commands.height_option import add_height, height_of, with_height
@@ -49,13 +49,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
             help=f"where each image holds both views: left, top, width and height of the {side} view [px]",
         )
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
-    parser.add_argument(
-        "--view",
-        choices=VIEWS,
-        default="mirror",
-        help="the world is seen in mirrors (default) or "
-        "directly through lenses: images of a flat board do not distinguish the two",
-    )
+    parser.add_argument("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP)
     parser.add_argument(
         "--mask",
         action="store_true",

@@ -36,8 +36,8 @@ def test_the_result_prints_itself_in_one_line(found: CameraResult) -> None:
     assert "\n" not in line and not found.is_misfit and found.mask is None
 
 
-def test_progress_has_a_line_for_each_image_and_model(found: CameraResult) -> None:
-    assert [line.split()[0] for line in lines] == [f"[{k}/5]" for k in range(1, 6)] + ["camera:"]
+def test_progress_has_a_line_for_each_image_the_view_and_each_model(found: CameraResult) -> None:
+    assert [line.split()[0] for line in lines] == [f"[{k}/5]" for k in range(1, 6)] + ["view:", "camera:"]
 
 
 def test_what_is_saved_is_the_camera(found: CameraResult, tmp_path: Path) -> None:
