@@ -1,4 +1,4 @@
-"""Does a camera see the world in a mirror or directly through a lens? The view, from images of a board.
+"""View of a camera: does it see the world in a mirror or directly through a lens? From images of a board.
 
 A flat checkerboard looks the same either way: its poses are then the mirror images of each other. What tells:
 

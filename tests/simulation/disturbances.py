@@ -1,4 +1,4 @@
-"""What real lenses, mirrors, lamps and cameras do to images, each by a name: `--disturb NAME ...`, or all by `--real`.
+"""Effects of real lenses, mirrors, lamps and cameras on images, each by a name: `--disturb NAME`, or all by `--real`.
 
 They act on ideal images, 0 to 255, before the sensor's own blur and noise (`DisturbedCamera.shown`), or on its digits
 (`digitised`, `encoded`). What is fixed to a camera, as dust, is drawn once from the seed; what changes, from pair to
