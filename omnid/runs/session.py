@@ -15,7 +15,9 @@ from drivers.frame import Camera, Frame
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
+from omnid.core.control.collision_settings import STOP
 from omnid.core.control.control_law import ControllerSettings
+from omnid.core.obstacles.column import FLOOR_FOCAL_PX
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.bounded_call import returns_within
 from omnid.engine.graph import Graph
@@ -54,6 +56,7 @@ class Session:
         self.offset_ns, self.clock_ns = offset_ns, clock_ns
         self.statistics = RunStatistics()
         self.signal = 0  # number of the signal that ended the run
+        self._focal_px = FLOOR_FOCAL_PX  # of the panoramas
 
     def geometry(self, rig: Rig, frames: Iterable[Frame]) -> Geometry:
         """Return the geometry of the rig; its missing masks are found in the frames, which are read only for that."""
@@ -64,7 +67,9 @@ class Session:
                     f"no mirror rim was found in the first images of the {name} camera: the whole image is used; "
                     f"the mask can be given in the rig's file under [{name}.mask]"
                 )
-        return geometry(rig, self.config.panorama)
+        found = geometry(rig, self.config.panorama)
+        self._focal_px = found.cylinder.focal_px
+        return found
 
     def open_bus(self, rig: Rig, *, gives_time: bool) -> Bus:
         """Open the bus; it answers queries for the configuration and the rig. gives_time: as Bus has it."""
@@ -93,14 +98,29 @@ class Session:
         return link
 
     def with_obstacles_known(self, settings: ControllerSettings) -> ControllerSettings:
-        """Return the settings, without the collision monitor where no obstacles are looked for, which is told."""
-        if not settings.collision.check or self.config.obstacles.enabled:
+        """Return the settings, without the collision monitor where no obstacles are looked for, which is told.
+
+        Images that are too small to see the floor are told, too: the base would stop without a reason in view.
+        """
+        collision = settings.collision
+        if collision.check and self.config.obstacles.enabled and collision.unknown == STOP:
+            self._warn_of_small_images()
+        if not collision.check or self.config.obstacles.enabled:
             return settings
         self.warn(
             "obstacles.enabled = false: the collision monitor is off, nothing keeps the base from driving "
             "against obstacles"
         )
         return settings.without_obstacles
+
+    def _warn_of_small_images(self) -> None:
+        if self._focal_px < FLOOR_FOCAL_PX:
+            self.warn(
+                f"the images are small: {self._focal_px:.0f} rows of the panorama a radian, where it takes "
+                f"{FLOOR_FOCAL_PX:.0f} to tell the floor from an edge of 5 cm (512 px by a mirror), so the base "
+                "will often stop because the way ahead is unknown; use larger images, "
+                'or controller.collision.unknown = "slow"'
+            )
 
     def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
         """Return an encoder that gives at most so many points of the map."""

@@ -28,13 +28,13 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.people import Walkers
-from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
+from tests.benchmark.uneven_floors import with_edge, with_ramp
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,7 @@ CASES: Final = {
     "edge 15 cm": 10.0,
     "edge 30 cm": 10.0,
     "edge 50 cm": 10.0,
+    "ramp": 10.0,
 } | dict.fromkeys(KINDS, 12.0)
 
 
@@ -171,6 +172,8 @@ def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: flo
         edges = np.zeros((0, 2, 2))
         if case.startswith("edge"):
             world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
+        if case == "ramp":
+            world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
         if case in KINDS:
             world = with_floating(world, case, random.Random(seed))
         world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
@@ -183,30 +186,6 @@ def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: flo
             config=load_config(None, ["places.enabled=false", *limits, *overrides]),
         )
     return judged(done, world, edges, backwards=speed_mps < 0)
-
-
-def with_edge(world: World, at_m: float, drop_m: float) -> tuple[World, Array]:
-    """Return the world with its floor lower from a place on along x, and the edge (1, 2, 2)."""
-    standing = []
-    for part in world.standing:
-        if part.name != "floor":
-            standing.append(part)
-            continue
-        share = (at_m - part.origin[0]) / part.edge_u[0]
-        column = round(share * part.texture.shape[1])
-        along, across, end = part.edge_u * share, part.edge_v, part.edge_u * (1 - share)
-        corner, down = part.origin + along - (0, 0, drop_m), np.array([0.0, 0.0, -drop_m])
-        standing += [
-            replace(part, edge_u=along, texture=part.texture[:, :column].copy()),
-            replace(part, origin=corner, edge_u=end, texture=part.texture[:, column:].copy()),
-        ]
-        # What closes the walls below the old floor.
-        standing += [
-            Rectangle(first - down, way, down, part.texture[:64].copy(), "wall")
-            for first, way in ((corner, end), (corner + across, end), (corner + end, across))
-        ]
-        edge = np.array([[(corner)[:2], (corner + across)[:2]]])
-    return replace(world, standing=tuple(standing)), edge
 
 
 def judged(done: SimulatedRun, world: World, edges: Array, *, backwards: bool = False) -> Drive:

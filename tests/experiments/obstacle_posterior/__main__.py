@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import Config
-from omnid.core.compiled import declared
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles.column import FOCAL_PX, NEAREST_M, Columns, floor_plane
 from omnid.core.obstacles.grid import CELL_M, CELLS, GridRing, ObstacleGrid
 from omnid.core.obstacles.settings import RingSettings
+from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import FramePair, Panoramas
 from omnid.simulation.lockstep import with_masks
 from omnid.simulation.rendering.sensor import MountedSensor
@@ -179,8 +179,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=40, help="of 5 cm")
     parser.add_argument("--reliability", action="store_true", help="print the table of evidence too")
     arguments = parser.parse_args()
-    for kernel in declared():
-        kernel.compile()
+    prepare_kernels()
     robot = make_robot(arguments.size)
     robot = replace(robot, rig=with_masks(robot.rig))
     print(
