@@ -110,6 +110,6 @@ def _drive(args: argparse.Namespace) -> int:
     print(f"pose      {100 * drift_m(run):.1f} cm off at the end")
     if len(second):
         off_cm = 100 * cross_track_m(first, second)
-        print(f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), at most {off_cm.max():.1f} cm")
+        print(f"repeated  {np.percentile(off_cm, 95):.1f} cm off the taught path (95 %), {off_cm.max():.1f} at most")
     print(f"written   {image}, {place_map}")
     return 0 if script.end == NavigationState.REACHED else 1

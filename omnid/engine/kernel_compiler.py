@@ -39,7 +39,7 @@ def compile_missing(folders: Mapping[str, Path], report: Report) -> None:
     with _lock_file() as lock:
         # 1. One program at a time. It goes on without the lock where the holder makes no progress.
         if not _is_locked(lock):
-            report(logging.INFO, "another program compiles the functions for this processor: waiting for it")
+            report(logging.INFO, "another program compiles the functions: waiting for it")
             if not _wait(lambda: _is_locked(lock), folders, report):
                 report(logging.WARNING, f"it has compiled nothing for {PATIENCE_S:.0f} s: going on without it")
         # 2. What the holder has not made.
@@ -47,7 +47,7 @@ def compile_missing(folders: Mapping[str, Path], report: Report) -> None:
         if not missing:
             return
         started_s, count = time.monotonic(), _functions(missing)
-        report(logging.INFO, f"compiling {count} functions for this processor, once; takes 10 s or more")
+        report(logging.INFO, f"compiling {count} functions, once; takes 10 s or more")
         _run_helpers(missing, lock, report)
         if all(store.is_intact(folder) for folder in missing.values()):
             report(logging.INFO, f"compiled in {time.monotonic() - started_s:.0f} s; kept in {store.cache_folder()}")
