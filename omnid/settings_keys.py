@@ -12,6 +12,8 @@ from omnid.errors import OmnidError
 
 Path: TypeAlias = tuple[str, ...]
 MAX_UNIT_LETTERS: Final = 3  # of the unit at the end of a key, such as mps: it says nothing about what is meant
+# Names of other programs (diff_drive_controller of ROS: wheel_separation) that are spelled like other keys.
+ELSEWHERE: Final = {"wheel_base": "track_m", "wheelbase": "track_m", "wheel_separation": "track_m"}
 _SHOWN: Final = 60  # characters of a value in a message
 
 
@@ -55,11 +57,12 @@ class Keys:
         """Return the error for a key that never existed; it proposes similar ones of the section, else of the file."""
         neighbours = [other[: len(path)] for other in self.known if other[: len(path) - 1] == path[:-1]]
         family = [other for other in self.known if other[0] == path[0]]
+        meant = (*path[:-1], _own_name(path[-1]))
         near = (
-            _alike(path, neighbours)
-            or _alike(path, family)
-            or _sharing_a_word(path, family)
-            or _alike(path, self.known)
+            _alike(meant, neighbours)
+            or _alike(meant, family)
+            or _sharing_a_word(meant, family)
+            or _alike(meant, self.known)
         )
         if near:
             return OmnidError(
@@ -68,6 +71,13 @@ class Keys:
             )
         names = ", ".join(map(dotted, dict.fromkeys(neighbours)))
         return OmnidError(f"unknown key {dotted(path)}: known are {names}")
+
+
+def _own_name(name: str) -> str:
+    """Return a name with the words of other programs replaced by those of omnid."""
+    for other, own in ELSEWHERE.items():
+        name = name.replace(other, own)
+    return name
 
 
 def _alike(path: Path, candidates: Sequence[Path]) -> list[Path]:

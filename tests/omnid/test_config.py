@@ -47,6 +47,8 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
     ("key", "proposed"),
     [
         ("controller.max_velocity", "did you mean controller.limits.velocity_mps or "),
+        ("motor.wheel_base_mm", "did you mean motor.drive.track_m?"),
+        ("wheel_separation", "did you mean motor.drive.track_m?"),
         ("mapping.voxel_mm", "did you mean mapping.voxel_m?"),
     ],
 )
