@@ -171,6 +171,9 @@ class ObstacleGrid:
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
         cells = about[patch, cv2.CC_STAT_AREA]
         free |= (cells <= SPECK_CELLS) | ((cells <= LEVEL_SPECK_CELLS) & (level > FREE_ODDS))
+        # Steps are seen by several directions together, of which those at a corner show half floor.
+        beside = cv2.dilate(((level < 0) & ~free).astype(np.uint8), GAP) > 0
+        free = taken | (free & ~beside)
         return np.where(taken, np.uint8(2), free.astype(np.uint8))
 
     def _level_odds(self) -> Floats:

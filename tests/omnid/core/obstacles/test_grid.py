@@ -8,6 +8,7 @@ import pytest
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.grid import (
+    ABOVE,
     CELL_M,
     FLOOD_MPS,
     FLOOR,
@@ -15,6 +16,7 @@ from omnid.core.obstacles.grid import (
     FRESH_NS,
     NEVER,
     PRIOR,
+    SURFACE,
     GridRing,
     ObstacleGrid,
 )
@@ -103,6 +105,15 @@ def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: fl
 def test_floor_at_another_height_is_unknown(grid: ObstacleGrid, drop_m: float) -> None:
     ring = after(grid, evidence(stains, striped, drop_m), 40)
     assert ring.free_m.max() < 1.3 and not np.isposinf(ring.ranges_m).any()
+
+
+def test_floor_beside_a_step_is_not_free(grid: ObstacleGrid) -> None:
+    """Directions are compared together, so those at a corner show half the floor beside it."""
+    grid._odds[:SURFACE] = 4.0
+    grid._odds[ABOVE, 98:103, 98:103] = -3.0
+    free = grid.state() == 1
+    assert not free[97:104, 99:102].any() and not free[99:102, 97:104].any()
+    assert free[96, 100] and free[100, 104]
 
 
 def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: Pairs) -> None:
