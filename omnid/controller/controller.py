@@ -15,12 +15,13 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing, remedy
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
-from omnid.core.control.control_law import S_PER_NS, ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Motion
 from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport
 from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.core.control.velocity_limits import STOP
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
 
 UNTIL_ARMED = "they stay stopped until cmd/arm (`omnid arm`)"

@@ -18,7 +18,8 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
-from omnid.core.control.control_law import S_PER_NS, ControllerPose
+from omnid.core.control.control_law import ControllerPose
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
 from omnid.engine.python_program import python, python_environment
 from omnid.engine.telemetry import StageStats

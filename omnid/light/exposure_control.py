@@ -10,6 +10,7 @@ from drivers.cameras.camera_exposure import CameraExposure, ExposureRanges, Expo
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.light.exposure_law import STEP_S, ExposureLaw, ExposureState
 from omnid.light.grey_levels import GreyLevels, UsefulArea
 from omnid.messages import FramePair
@@ -32,7 +33,6 @@ _WORDS: Final[Mapping[str, str]] = {
     "no answer": "the images stay as bright with another exposure: left to the cameras",
 }
 UNIT_MS: Final = 1e-3  # of 1 us
-S_PER_NS: Final = 1e-9
 
 
 class ExposureControl:

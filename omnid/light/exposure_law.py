@@ -11,6 +11,7 @@ import math
 from typing import Final, Literal
 
 from drivers.cameras.camera_exposure import ExposureRanges, ExposureSetting, ValueRange
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.light.grey_levels import GreyLevels
 
 # Grey levels: the mean that is aimed at, the least one that bright spots may push it to, the highest of bright spots,
@@ -27,7 +28,6 @@ STEP_S, LONGEST_STEP_S = 0.5, 32.0
 # A camera that does not answer: so many steps of the exposure time in a row, by at least the factor, that do not
 # change the mean as much as ANSWER while it is neither black nor white.
 DEAF_STEPS, DEAF_FACTOR, ANSWER, SEEN_GREY = 4, 1.2, 1.02, (10.0, 245.0)
-S_PER_NS: Final = 1e-9
 
 ExposureState = Literal["regulated", "too dark", "too bright", "no answer"]
 

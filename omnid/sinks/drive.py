@@ -13,8 +13,8 @@ from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from omnid.controller.link import ControllerLink, DriveLink
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
-from omnid.core.control.control_law import S_PER_NS
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import Sink, nothing
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose

@@ -17,7 +17,6 @@ from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import (
-    S_PER_NS,
     ControlLaw,
     ControllerPose,
     ControllerSettings,
@@ -25,6 +24,7 @@ from omnid.core.control.control_law import (
 )
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.frames import of_base
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.messages import OdometryUpdate
 from omnid.tracking_state import TrackingState
 

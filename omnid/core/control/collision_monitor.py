@@ -16,8 +16,8 @@ from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
 from omnid.core.control.collision_geometry import Outline, contact_s
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
+from omnid.core.nanoseconds import S_PER_NS
 
-S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
 TURN_MPS: Final = 0.01  # slower motions turn on the spot; in 0.1 s no more than 1 mm
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds

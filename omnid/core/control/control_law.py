@@ -29,9 +29,9 @@ from omnid.core.control.plausibility import Plausibility
 from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
 from omnid.core.control.trust import TrustSettings
 from omnid.core.control.velocity_limits import STOP, VelocityLimits
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.settings import knob
 
-S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 TO_STAND: Final = Setpoint(0.0)
 JUMP_RAD: Final = 0.3  # of the heading, beyond what the base can turn: odometry was corrected, or is wrong
 

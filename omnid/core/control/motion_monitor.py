@@ -21,9 +21,9 @@ from typing import Final, NamedTuple
 
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.control.velocity_limits import STOP
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.settings import knob
 
-S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 MOST_ACCOUNTS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
 SIGMAS: Final = 3.0  # so that 0.3 % of honest differences exceed it
 # Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.

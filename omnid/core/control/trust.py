@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.settings import knob
 
-S_PER_NS: Final = 1e-9  # seconds in a nanosecond, exact
 # A voltage that is low for a shorter time is that of a motor that starts; by trial on development seeds.
 BATTERY_S: Final = 2.0
 OFF: Final = 0.0  # exact: the value of a setting that switches its rule off

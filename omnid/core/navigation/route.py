@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
 from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
+from omnid.core.places.keyframe_id import NO_KEYFRAME
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]
@@ -25,7 +26,6 @@ MOST_POINTS: Final = 15_000  # so that a route is bounded: 1.5 km
 SHORTEST_ROUTE_M: Final = 0.5
 LEAST_MPS: Final = 0.1  # where it was driven more slowly, it is repeated at that speed
 STANDING_MPS: Final = 0.02
-NO_KEYFRAME: Final = -1  # because ids are never negative
 SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be in the map
 CLOSED_M: Final = 1.0  # from the end to the start of a route that is driven in rounds
 ENTRY_M: Final = 1.5  # from the robot to the route

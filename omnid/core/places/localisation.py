@@ -19,9 +19,10 @@ from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
 from omnid.core.places.features import describe
 from omnid.core.places.hypotheses import Hypotheses, Hypothesis, length_m
+from omnid.core.places.keyframe_id import NO_KEYFRAME
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.map_parts import MapParts
-from omnid.core.places.map_pose import NO_KEYFRAME, MapPose, OdometryFrame
+from omnid.core.places.map_pose import MapPose, OdometryFrame
 from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_search import Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition

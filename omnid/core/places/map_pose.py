@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,6 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
-NO_KEYFRAME: Final = -1  # in place of an id; ids are never negative
 
 
 @dataclass(frozen=True, slots=True, eq=False)

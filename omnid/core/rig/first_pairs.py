@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from calib.panorama import Cylinder
+from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_finding import BROKEN_DEG, DRIFTED_DEG, MIN_MATCHES, RigFinding, judge
 from omnid.core.rig.column_matches import Matches, PanoramaPair, is_motion_unknown, match, together
@@ -37,7 +38,6 @@ PATIENT_PAIRS: Final = 5
 SCATTERED_PX: Final = 0.6
 # Matches with the cameras exchanged, per match: right rigs have up to 0.41, exchanged ones 2.0 or more.
 EXCHANGED_RATIO: Final = 1.2
-S_PER_NS: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
