@@ -7,7 +7,7 @@ from typing import Any, Final
 from ruamel.yaml import YAML
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
 
-MAX_BYTES: Final = 1 << 15
+MAX_BYTES: Final = 1 << 15  # enough for MAX_NODES of 16 characters
 # Values and lists; a camera has about 60.
 MAX_NODES: Final = 2000
 MAX_DEPTH: Final = 16

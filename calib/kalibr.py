@@ -28,7 +28,7 @@ from calib.validation import ValidatedTable, decode, read_bytes
 # Tolerance between T_cam_imu and T_cn_cnm1: more than rounding, less than any real difference of two rigs.
 MAX_DISAGREEMENT_M = 1e-3
 MAX_DISAGREEMENT_RAD = np.deg2rad(0.1)
-# Least difference in height by which the lower camera is identified.
+# Least difference in height by which the lower camera is identified: less may be rounding, as above.
 MIN_HEIGHT_M = 1e-3
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 

@@ -15,7 +15,7 @@ from calib.rig import Rig
 from calib.rig_frame import rig_between
 from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, read_bytes, shown
 
-# A file of the toolbox has about 2 kB.
+# More than any file needs: one of the toolbox has about 2 kB.
 MAX_BYTES = 1 << 16
 # The degree of the inverse polynomial is raised until it reaches this error: the toolbox's own goal and bound.
 INVERSE_GOAL_PX = 0.01

@@ -24,14 +24,15 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 # sector, at which a slope is visible.
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # A sector begins and ends at one of so many steps of a full turn, each of a whole number of columns. Steps of 3.75
-# degrees are five directions of the obstacles, and a sector is at most two of them wider than what is seen.
+# degrees are five directions of the obstacles, so that both share their borders, and a sector is at most two of them
+# wider than what is seen.
 SECTOR_STEPS = 96
 SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
 # Least azimuth that no camera pair shares beside which a panorama is a sector: a strut or a mast hides less.
 MIN_UNSEEN_RAD = math.radians(45)
 # Least elevations that both cameras see: 15 degrees have 60 rows at scale 1, four windows of the tracker.
 MIN_SHARED_DEG = 15.0
-# Least length of the horizon, a full turn, of a camera that sees it.
+# Least length of the horizon, a full turn, of a camera that sees it. By judgement; not measured.
 MIN_HORIZON_PX = 64
 # Steps along the horizon are about as long as each other; a longer one leads from one end of the image to the other.
 MAX_STEP_RATIO = 20

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from calib.boards.board import Board, BoardView
 from calib.boards.board_order import array_to_grid, largest_rectangle, orient_corners, select_board_window
 from calib.boards.board_shape import (
+    FEW_CORNERS,
     grid_irregularity,
     has_checker_pattern,
     is_bounded_board,
     is_complete_board,
     prediction_spread,
 )
-from calib.boards.corner_candidates import Grey, describe_corners, find_corners, smoothed
+from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, find_corners, smoothed
 from calib.boards.corner_grid import (
     MIN_RING_PX,
     RING_PART,
@@ -36,32 +37,29 @@ from calib.boards.corner_grid import (
 from calib.boards.corner_refinement import refine_corners
 from calib.boards.derived_images import DerivedImage, Image, derived_images
 from calib.boards.opencv_boards import are_same, confirmed, grids_nearby, opencv_grids, shared_part
+from calib.image_area import MIN_SIDE_PX
 from calib.models.camera import Array
 
-# Smaller images are not searched.
-MIN_SIDE_PX = 32
-# Standard deviation of the Gaussian blur before grey levels are sampled.
-BLUR_PX = 0.7
 # Number of grids per image that are grown and checked: those closest to the board's corner count.
 TRIED_GRIDS = 5
-# Largest distance of a corner from the position its neighbours predict, in parts of a square.
+# Largest distance of a corner from where its neighbours predict it, in parts of a square. By judgement; not measured.
 MAX_IRREGULARITY = 0.2
 # A corner that is farther off than its board's others is one that a shadow or a cover moves: in parts of the median,
 # where the prediction's own spread is taken out, and least distance in parts of a square.
 MAX_OUTLIER, MIN_OUTLIER = 4.0, 0.015
-# Least share of accepted corners in a detected board.
+# Least share of accepted corners in a detected board. By judgement; not measured.
 MIN_GOOD = 0.75
 # Number of boards without an outline that OpenCV is asked to confirm in one image.
 MAX_UNCONFIRMED = 2
 # Least share of the board's corners in a grid around which OpenCV searches once more.
 PARTIAL = 0.6
-# Least share of accepted corners, and least corners, of a board without an outline that one detector alone finds.
-MIN_LONE_PART, MIN_LONE_CORNERS = 0.9, 20
+# Least share of corners accepted of a board without outline that one detector alone finds. By judgement; not measured.
+MIN_LONE_PART = 0.9
 # Larger grids are not grown: in parts of the board's corners, and at least.
 FLOOR_PART, MIN_FLOOR_CORNERS = 3, 200
-# What shares more than so much of its corners with a floor is a part of it.
+# What shares more than so much of its corners with a floor is a part of it. By judgement; not measured.
 MAX_SHARED = 0.5
-# A smaller grid is not reported as a board of another size.
+# A smaller grid is not reported as a board of another size, because bricks and letters form a few squares by chance.
 MIN_HINT_CORNERS = 12
 MIN_HINT_SIDE = 3
 
@@ -154,7 +152,7 @@ def _opencv_view(image: Image, blurred: Grey, shown: tuple[Board, Grid, list[Gri
         found = _detection(image, blurred, (grid, floors), board)
         agree = any(are_same(grid, other) for other in detected[number + 1 :])
         if found is not None and (
-            agree or (found.is_bounded and found.part >= MIN_LONE_PART and found.corners.size // 2 >= MIN_LONE_CORNERS)
+            agree or (found.is_bounded and found.part >= MIN_LONE_PART and found.corners.size // 2 >= FEW_CORNERS)
         ):
             return found.view(name)
     return None

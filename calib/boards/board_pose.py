@@ -9,7 +9,7 @@ from calib import se3
 from calib.boards.board import Board, CalibrationBoard
 from calib.models.camera import Array, OmniCamera
 
-MIN_CORNERS = 6
+MIN_CORNERS = 6  # a homography needs four; with two more, one that is off shows
 # Corners whose rays are off by this ratio of the median error, and by this angle, are left out; number of solutions.
 OUTLIER_RATIO, MIN_OUTLIER_RAD, ROUNDS = 5.0, np.deg2rad(0.3), 4
 

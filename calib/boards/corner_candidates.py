@@ -12,24 +12,27 @@ from scipy.spatial import cKDTree
 from calib.models.camera import Array
 
 Grey = NDArray[np.float32]
-# Samples on the ring about a corner.
+# Samples on the ring about a corner: about one a pixel on the largest one, which is 29 px around.
 RING = 32
-# Least contrast of a ring [grey levels].
+# Standard deviation of the Gaussian blur before grey levels of a ring are sampled. By judgement; not measured.
+BLUR_PX = 0.7
+# Least contrast of a ring [grey levels]. By judgement; not measured.
 MIN_CONTRAST = 6.0
 # Opposite sides of a corner are alike: largest ratio of the ring's odd part to its even part (standard deviations).
 MAX_ODD = 0.6
-# Least angle between the two edges of a corner.
+# Least angle between the two edges of a corner. By judgement; not measured.
 MIN_CROSSING_RAD = np.deg2rad(18)
-# Least second derivative at a saddle point [grey levels / px^2].
+# Least second derivative at a saddle point [grey levels / px^2]. By judgement; not measured.
 MIN_SADDLE = 0.6
-# Quality falls from 1 to this over the accepted range of the odd part.
+# Quality falls from 1 to this over the accepted range of the odd part; it stays above 0, because 0 is no corner.
 MIN_RING_QUALITY = 0.1
-# Contrast [grey levels] above which candidates are ranked by quality alone.
+# Contrast [grey levels] above which candidates are ranked by quality alone. By judgement; not measured.
 FULL_CONTRAST = 40
-# Smallest side [px] of a shrunk image that is searched.
+# Smallest side [px] of a shrunk image that is searched. By judgement; not measured.
 MIN_LEVEL_SIDE_PX = 100
-MAX_PER_LEVEL = 4000
-# Candidates closer than SAME_PX, or than this part of their ring's radius, are the same corner.
+MAX_PER_LEVEL = 4000  # so that the largest board fits: 61 x 61 corners
+# Candidates closer than SAME_PX, or than this part of their ring's radius, are the same corner, because neighbours are
+# 3 px apart at least (MIN_SPACING_PX), and farther than the radius of their rings.
 SAME_PX = 2.0
 SAME_RING_PART = 0.35
 # cv2.remap expects images, not lists: samples are folded into rows of this length.
@@ -45,6 +48,7 @@ class ScaleLevel:
     ring_px: float
 
 
+# Rings of 2.6, 4.6, 8.4 and 16.8 px of the image, each at most twice the last, so that squares of all sizes fit one.
 LEVELS = (ScaleLevel(1.0, 0.8, 2.6), ScaleLevel(1.0, 1.4, 4.6), ScaleLevel(0.5, 1.2, 4.2), ScaleLevel(0.25, 1.2, 4.2))
 
 

@@ -17,20 +17,22 @@ from calib.models.camera import Array
 Cell = tuple[int, int]
 # Pixel (2,) of the corner at (column, row). The turn from the column axis to the row axis is clockwise in the image.
 Grid = dict[Cell, Array]
+# To the neighbours along columns and rows: exact.
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Bounds of the growth: no board has more corners, and every round adds a row at least.
 MAX_CELLS = 61 * 61
 MAX_ROUNDS = 64
 # Least corners of a grid: one square.
 MIN_GRID_CORNERS = 4
-# Radius, in parts of the corner spacing, in which a predicted corner is searched, and radius of its ring.
+# Radius, in parts of the corner spacing, in which a predicted corner is searched, and radius of its ring: less than a
+# half, otherwise they would reach the next corner's. A smaller ring than MIN_RING_PX has too few pixels, twelve.
 SEARCH_PART, MIN_SEARCH_PX = 0.3, 1.5
 RING_PART = 0.28
 MIN_RING_PX = 2.0
 # Smaller squares are not resolved.
 MIN_SPACING_PX = 3
 MIN_QUALITY = 0.15
-# Least contrast of a predicted corner, in parts of the grid's median contrast.
+# Least contrast of a predicted corner, in parts of the grid's median contrast. By judgement; not measured.
 MIN_CONTRAST_PART = 0.25
 # Corners of which that median is taken: measuring all of them takes long on a wall full of corners.
 CONTRAST_CELLS = 64

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from calib.boards.corner_candidates import CornerCandidates, Grey, sample
 from calib.models.camera import Array
 
-# Number of nearest candidates among which an arm's neighbour is chosen.
+# Number of nearest candidates among which an arm's neighbour is chosen: those of a board within three squares.
 NEAREST = 28
 # Largest angle between an arm and the line to its neighbour: edges in a mirror image are curved.
 MAX_TURN_RAD = np.deg2rad(22)

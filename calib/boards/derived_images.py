@@ -17,8 +17,10 @@ Image = NDArray[np.uint8]
 MAX_ENLARGED_PIXELS = 1_600_000
 # Largest width of one turn of a log-polar strip, and its width in turns: boards across its ends are seen whole.
 MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
-# Inner and outer radius of a log-polar strip, in parts of the image's smaller and larger side.
-STRIP_INNER_PART, STRIP_OUTER_PART = 1 / 16, 1 / 2
+# Inner radius of a log-polar strip, in parts of the image's smaller side. By judgement; not measured.
+STRIP_INNER_PART = 1 / 16
+# Outer radius, in parts of the larger side: up to the border.
+STRIP_OUTER_PART = 1 / 2
 # CLAHE (contrast limited adaptive histogram equalisation): clip limit and number of tiles per axis.
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
 

@@ -24,7 +24,7 @@ DICTIONARIES = {
 }
 # Least part of a square that a marker fills, and largest: a light margin must remain.
 MIN_MARKER_PART, MAX_MARKER_PART = 0.3, 0.95
-# Largest and least space between two tags, in parts of a tag.
+# Least and largest space between two tags, in parts of a tag. By judgement; not measured.
 MIN_SPACING, MAX_SPACING = 0.05, 1.0
 # Kalibr's tags: family, width of the border [bits], bits along a side within the border.
 TAG_FAMILY, TAG_BORDER_BITS, TAG_BITS = "APRILTAG_36h11", 2, 6

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.boards.board import BoardView
 from calib.boards.board_shape import quadratic_terms
-from calib.boards.corner_candidates import Grey, describe_corners, smoothed
+from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, smoothed
 from calib.boards.corner_grid import WINDOW_PART, refine_subpixel
 from calib.boards.corner_refinement import refine_in_mapping
 from calib.boards.derived_images import Image
@@ -20,8 +20,6 @@ from calib.boards.marker_board import MarkerBoard
 from calib.boards.marker_reading import read_markers
 from calib.models.camera import Array
 
-# Standard deviation of the Gaussian blur before grey levels are sampled.
-BLUR_PX = 0.7
 # Points of which a mapping is fitted: the nearest ones, its reach [squares], width of their Gaussian weight [squares];
 # least numbers of a mapping of third, second and first order, and least ratio of its singular values.
 NEAREST, REACH, WEIGHT_WIDTH = 24, 3.0, 1.5
@@ -29,11 +27,11 @@ MIN_CUBIC, MIN_QUADRATIC, MIN_AFFINE = 16, 10, 4
 MIN_CONDITION = 0.02
 # A predicted corner lies at most this far from a known one [squares]; it may move by a part of its square and pixels.
 MAX_AHEAD, MAX_MOVE, MAX_MOVE_PX = 1.1, 0.12, 1.5
-# Radius of the ring about a corner, in parts of the window, and least radius [px].
+# Radius of the ring about a corner, in parts of the window, and least radius [px]. By judgement; not measured.
 RING_PART, MIN_RING_PX = 1.2, 1.8
-# Half side of the window of the first refinement [px].
+# Half side of the window of the first refinement [px]; a smaller one has fewer than nine pixels, too few.
 MIN_WINDOW_PX = 1.5
-ROUNDS = 12
+ROUNDS = 12  # enough: the boards of test_marker_finder.py take 2 to 4
 # Least quality of a corner's ring: the edge of what hides the board crosses others.
 MIN_QUALITY = 0.4
 # Largest distance of a corner from the mapping of the others: in squares, and in pixels added to it.

@@ -12,7 +12,8 @@ from calib.models.camera import Array
 
 # Corners (4, 2) [px] of markers by id, in the order of cv2.aruco.
 Markers = dict[int, Array]
-# Least perimeter of a marker in parts of the image's larger side, and pixels per bit when it is read.
+# Least perimeter of a marker in parts of the image's larger side, and pixels per bit when it is read: half and 1.5 of
+# OpenCV's defaults, because markers are small in a mirror image.
 MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 # Markers whose middles are at most this many sides (of the larger one) apart must predict each other's position, within
 # this part of a side.

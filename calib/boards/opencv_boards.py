@@ -18,9 +18,11 @@ PLAIN = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 SECTOR = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
 # The image is doubled: only for the part in which a board is likely, because it takes long.
 DOUBLED = SECTOR | cv2.CALIB_CB_ACCURACY
-# Distance at which two detectors' corners are the same, in parts of a square and at least.
+# Distance at which two detectors' corners are the same, in parts of a square and at least: less than half of the
+# smallest squares, otherwise a corner would be near two.
 SAME_PART, SAME_PX = 0.25, 1.0
 # Margin around known corners in parts of their extent, around an incomplete grid, and least margin.
+# By judgement; not measured.
 MARGIN_PART, WIDE_MARGIN_PART, MIN_MARGIN_PX = 0.3, 1.5, 20
 
 

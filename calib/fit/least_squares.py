@@ -20,8 +20,6 @@ import scipy
 
 from calib.models.camera import Array
 
-# Ratio of the standard deviation to the median absolute deviation of a normal distribution.
-SIGMA_PER_MAD = 1.4826
 # The damping at the start takes a nearly undamped step. It changes by a power of ten after each step (Marquardt 1963).
 # Below the least value a step is in effect undamped, above the largest one it is lost in rounding.
 START_DAMPING, DAMPING_FACTOR = 1e-4, 10.0
@@ -31,11 +29,6 @@ MIN_DAMPING, MAX_DAMPING = 1e-9, 1e8
 BLOCK_REGULARISATION = 1e-9
 
 State = TypeVar("State")
-
-
-def robust_sigma(residual: Array, least: float) -> float:
-    """Return the standard deviation of residuals by the median of their sizes (NaN: none), not less than `least`."""
-    return max(least, SIGMA_PER_MAD * float(np.nanmedian(np.abs(residual))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from calib.models.unified import UnifiedCamera
 OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 OCAM_TANGENTIAL_NAMES, OCAM_ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
-# One step of a wavefront's coefficient [m], about half a pixel of a board at half a metre.
+# One step of a wavefront's coefficient [m]: about half a pixel of a board at half a metre, as of the other parameters.
 WAVEFRONT_UNIT_M = 1e-3
 
 

@@ -11,12 +11,13 @@ from calib.models.camera import Array
 
 # Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
 RINGS, SECTORS = 6, 12
-# Least number of corners in a bin that is used.
+# Least number of corners in a bin that is used: the mean of fewer errs by more than half the noise.
 MIN_CORNERS = 4
 # A misfit is reported if the systematic part exceeds this part of the noise, and this error: smaller ones do not change
 # the motion estimate by a measurable amount.
 MAX_SYSTEMATIC_PART, MAX_SYSTEMATIC_PX = 0.5, 0.03
-# Residuals longer than this many times their median length are outliers.
+# Residuals longer than this many times their median length are outliers: 3 of 100 million of a
+# normal distribution.
 OUTLIER_RATIO = 5.0
 MIN_BOARD_M = 1e-6  # guards against division by zero where all corners are one
 

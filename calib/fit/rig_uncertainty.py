@@ -20,7 +20,8 @@ from calib.rig_covariance import TRANSFORM_NAMES
 POINT_STEP_M, SIGMA_STEP = 1e-5, 0.1
 # The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
 WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
-# Length of the predicted drive, and its directions.
+# Length of the predicted drive, short against WALLS_M, and its directions: the walls are the same all around, so that
+# few are enough.
 DRIVE_M, DIRECTIONS = 0.1, 4
 # Least number of points that both cameras must see.
 MIN_POINTS = 30

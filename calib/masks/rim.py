@@ -8,11 +8,12 @@ from numpy.typing import NDArray
 
 from calib.models.camera import Array, Mask
 
-AZIMUTHS = 720
-MIN_SIDE_PX = 64
+AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would tell the same
+MIN_SIDE_PX = 64  # By judgement; not measured.
 # The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least.
 CORNER_PART, MIN_CORNER_PX = 1 / 32, 4
 # Least difference of grey levels between the middle and the corners, and across the edge at one azimuth.
+# By judgement; not measured.
 MIN_CONTRAST = 25.0
 MIN_STEP = 12.0
 # Threshold between the dark (0) and the light level (1), nearer the dark one: the world at the rim is often dark too.
@@ -25,9 +26,10 @@ MIN_SUPPORT = 0.6
 # Least part of the circle that lies in the image: less does not determine the centre.
 MIN_ARC = 0.4
 RANSAC_ROUNDS = 200
-# Least squares repetitions on the inliers after RANSAC.
+# Least squares repetitions on the inliers after RANSAC. By judgement; not measured.
 REFINEMENTS = 3
-# Largest distance of the circle's centre from the guess, in parts of the radius.
+# Largest distance of the circle's centre from the guess, in parts of the radius: more than the tenth by which a
+# guess may be off.
 MAX_CENTER_SHIFT = 0.25
 # Margin inside the rim and outside the hub: blur and the last reflections at the edge.
 SAFETY_PX = 1.5

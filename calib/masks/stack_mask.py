@@ -13,13 +13,13 @@ from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 
 Image = NDArray[np.uint8]
-MIN_FRAMES = 5
-MAX_FRAMES = 64
+MIN_FRAMES = 5  # By judgement; not measured.
+MAX_FRAMES = 64  # so that the memory is bounded: 128 MB of images of 2 megapixels
 # A strut is darker than this part of the median light level in all frames, and changes less than this part of the
-# median change.
+# median change. By judgement; not measured.
 DARK_PART = 0.35
 STILL_PART = 0.35
-# Percentiles that stand for the light and the dark level of a pixel over time.
+# Percentiles that stand for the light and the dark level of a pixel over time: single glints must not count.
 LIGHT_PERCENTILE, DARK_PERCENTILE = 95, 5
 # Morphology: opening removes specks, closing fills gaps; components smaller than this part of the ring are dropped; the
 # rest is dilated by the blur at its edges.

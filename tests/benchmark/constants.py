@@ -3,8 +3,8 @@
 A constant is a module-level name in capitals whose value contains a number, or a knob of a settings class. Its comment
 is behind it, or above it, where it holds for all lines up to the next comment or empty line. A comment that only says
 what the constant is describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives
-its reason. Words decide that: a person judges whether the reason is a good one. `--write` makes docs/constants.md,
-`--missing` lists what lacks a reason.
+its reason. Words decide that: a person judges whether the reason is a good one. One that says "by judgement" gives none
+and says so: it is counted apart. `--write` makes docs/constants.md, `--missing` lists what says neither.
 """
 
 from __future__ import annotations
@@ -57,6 +57,8 @@ REASON: Final = re.compile(
     r"|\([^()]* (19|20)\d\d\)|[:;] |, so (?!many|much)",
     re.IGNORECASE,
 )
+# What says plainly that there is no reason but somebody's judgement, whatever else the comment says.
+JUDGEMENT: Final = re.compile(r"\bby judgement\b", re.IGNORECASE)
 SOURCE: Final = re.compile(
     r"\([A-Z][\w .&-]* (?:et al\.,? )?(?:19|20)\d\d[^)]*\)|Dang et al[^:;]*|(?:section|eq\.) [IVX()\d.A-Z]+"
     r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+"
@@ -83,7 +85,12 @@ class Constant:
     @property
     def has_reason(self) -> bool:
         """True if the comment says why the value is this one."""
-        return REASON.search(self.comment) is not None
+        return REASON.search(self.comment) is not None and not self.is_by_judgement
+
+    @property
+    def is_by_judgement(self) -> bool:
+        """True if the comment says that the value was judged and not measured."""
+        return JUDGEMENT.search(self.comment) is not None
 
     @property
     def source(self) -> str:
@@ -125,12 +132,13 @@ class Comments:
         }
 
     def at(self, first: int, last: int) -> str:
-        """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason.
+        """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason
+        or says that there is none.
 
         A comment above holds up to the next one, or to the next empty line.
         """
         behind = self._joined(line for line in range(first, last + 1) if line in self._of)
-        return behind if REASON.search(behind) else f"{self._above(first)} {behind}".strip()
+        return behind if REASON.search(behind) or JUDGEMENT.search(behind) else f"{self._above(first)} {behind}".strip()
 
     def _above(self, line: int) -> str:
         """Return the comment above a line that holds for it, empty where there is none."""
@@ -216,16 +224,18 @@ def page(found: list[Constant]) -> str:
     """Return the document: a summary for each room, then a table for each file."""
     rooms = Counter(Path(one.path).parent.as_posix() for one in found)
     lacking = Counter(Path(one.path).parent.as_posix() for one in missing(found))
+    judged = Counter(Path(one.path).parent.as_posix() for one in by_judgement(found))
     lines = [
         "# Constants of omnid/core and calib",
         "",
         "Made by `python -m tests.benchmark.constants --write`. A constant without a comment, or whose comment "
-        "says what it is and not why it has this value, counts as one without a reason.",
+        "says what it is and not why it has this value, counts as one without a reason. One that was set by judgement, "
+        "and neither derived nor measured, says so in its comment.",
         "",
-        "| room | constants and settings | constants without a reason |",
-        "|---|---|---|",
-        *(f"| `{room}` | {count} | {lacking[room]} |" for room, count in sorted(rooms.items())),
-        f"| all | {len(found)} | {sum(lacking.values())} |",
+        "| room | constants and settings | constants by judgement | constants without a reason |",
+        "|---|---|---|---|",
+        *(f"| `{room}` | {count} | {judged[room]} | {lacking[room]} |" for room, count in sorted(rooms.items())),
+        f"| all | {len(found)} | {sum(judged.values())} | {sum(lacking.values())} |",
     ]
     for path in sorted({one.path for one in found}):
         lines += [
@@ -249,8 +259,13 @@ def _cell(text: str) -> str:
 
 
 def missing(found: list[Constant]) -> list[Constant]:
-    """Return the constants without a reason; settings have descriptions instead."""
-    return [one for one in found if not one.is_knob and not one.has_reason]
+    """Return the constants without a reason that do not say so; settings have descriptions instead."""
+    return [one for one in found if not one.is_knob and not one.has_reason and not one.is_by_judgement]
+
+
+def by_judgement(found: list[Constant]) -> list[Constant]:
+    """Return the constants whose comment says that they were judged and not measured."""
+    return [one for one in found if not one.is_knob and one.is_by_judgement]
 
 
 def main() -> None:
@@ -265,10 +280,10 @@ def main() -> None:
     if args.missing:
         for one in missing(found):
             print(f"{one.path}:{one.line}: {one.name} = {one.value}  # {one.comment or 'no comment'}")
-    undescribed = sum(not one.comment for one in found)
+    undescribed, judged = sum(not one.comment for one in found), len(by_judgement(found))
     print(
         f"{len(found)} constants and settings, {sum(one.is_knob for one in found)} of them settings; "
-        f"{undescribed} without a comment, {len(missing(found))} without a reason"
+        f"{undescribed} without a comment, {judged} by judgement, {len(missing(found))} without a reason"
     )
 
 

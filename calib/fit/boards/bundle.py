@@ -14,7 +14,8 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.fit.boards.smooth_misfit import covariance_with_misfit, smooth_fields
-from calib.fit.least_squares import ArrowSystem, Ending, minimise, robust_sigma
+from calib.fit.least_squares import ArrowSystem, Ending, minimise
+from calib.fit.robust_scale import robust_sigma
 from calib.models.camera import Array
 
 # A damped step hardly moves along a flat direction, such as xi against the focal length: so the search ends only with a

@@ -23,12 +23,13 @@ from calib.models.ocam import OcamCamera, View
 # In ascending order of the number of parameters. A more general model is one more entry here and in fit_model.
 Model = Literal["omni", "ocam", "ocam_tangential"]
 MODELS: tuple[Model, ...] = ("omni", "ocam", "ocam_tangential")
-# A further term is used if it reduces the error by this part. A smaller gain may come from a mirror that is not quite
-# central, and then bends rays by tenths of a degree.
+# A further term is used if it reduces the error by this part, because a smaller gain may come from a mirror that
+# is not quite central, and then bends rays by tenths of a degree.
 MIN_IMPROVEMENT = 0.1
 # Degrees tried above DEGREE: higher ones would bend the profile between the radii of the corners.
 HIGHER_DEGREES = (5, 6)
 # A tangential camera of degree 5 is used if its held-out error is lower by this part than that of degree 4.
+# By judgement; not measured.
 MIN_HELD_OUT_IMPROVEMENT = 0.01
 
 

@@ -22,8 +22,9 @@ MAX_POSE_ERROR_RAD = np.deg2rad(1.0)
 # Distance of two transforms: angle [rad] plus shift relative to the baseline. A pair is an inlier below INLIER_RATIO
 # times the median distance, within these limits.
 MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
-# The order of corners is ambiguous if a transform farther away than DISTINCT_DISTANCE costs less than this ratio.
-DISTINCT_DISTANCE, MIN_COST_RATIO = 0.3, 3.0
+# The order of corners is ambiguous if a transform farther away than any inlier costs less than this ratio.
+# By judgement; not measured.
+MIN_COST_RATIO = 3.0
 # Weight of the capped mean in a transform's cost, which breaks ties of the median; the cap.
 MEAN_WEIGHT, MEAN_CAP = 0.1, 1.0
 MIN_LENGTH_M = 1e-9
@@ -108,7 +109,7 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
     nearest = apart.min(axis=2)
     cost = np.median(nearest, axis=1) + MEAN_WEIGHT * np.minimum(nearest, MEAN_CAP).mean(axis=1)
     best = int(cost.argmin())
-    others = cost[apart[best].ravel() > DISTINCT_DISTANCE]
+    others = cost[apart[best].ravel() > MAX_INLIER_DISTANCE]
     if candidates.shape[1] > 1 and others.size and others.min() < max(MIN_COST_RATIO * cost[best], MIN_INLIER_DISTANCE):
         raise CalibError(
             "calibrate rig: a board with two even or two odd sides looks the same upside down, and its "

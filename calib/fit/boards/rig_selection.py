@@ -20,11 +20,11 @@ from calib.models.ocam import OcamCamera
 
 # The polynomial of a round mirror has even powers; higher ones are not needed for mirrors near the paraboloid.
 POWERS = (0, 2, 4)
-# Number of radii at which polynomials are compared.
+# Number of radii at which polynomials are compared: enough for three coefficients.
 RADII = 60
 # Start values of terms that are fitted: a wavefront [m], tangential terms [1/px].
 START_M, START_TANGENTIAL = 1e-9, (1e-12, 1e-12)
-# The more general rig is selected if its held-out error is lower by this part.
+# The more general rig is selected if its held-out error is lower by this part. By judgement; not measured.
 MIN_IMPROVEMENT = 0.01
 
 

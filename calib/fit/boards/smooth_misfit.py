@@ -21,7 +21,7 @@ from calib.models.camera import Array
 NODES, WIDTH = 5, 1.0
 # Nodes farther from the centre, in parts of the largest radius, tell nothing.
 MAX_RADIUS = 1.3
-# Values of tau / sigma over which the posterior is summed.
+# Values of tau / sigma over which the posterior is summed: steps of 4 % are fine enough for any ratio.
 RATIOS = np.concatenate([[0.0], np.geomspace(1e-3, 30.0, 240)])
 # Least part of the largest eigenvalue of what the fields explain beyond the parameters: less is rounding.
 LEAST_PART = 1e-3

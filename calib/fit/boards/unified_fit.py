@@ -17,9 +17,9 @@ DISTORTION_TERMS = (0, 2, 4)
 NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 # Start values of xi: pinhole (0), hyperbolic mirrors, parabolic mirrors (1), fisheye lenses.
 START_XI = np.linspace(0.0, 3.0, 31)
-# Least cos(angle) + xi at which the projection is well defined.
+# Least cos(angle) + xi at which the projection is well defined: less would be 100 focal lengths from the centre.
 MIN_DENOMINATOR = 1e-2
-# Number of radii at which profiles are compared.
+# Number of radii at which profiles are compared: enough for two parameters.
 RADII = 60
 
 

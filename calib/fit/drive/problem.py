@@ -11,7 +11,8 @@ from calib import se3
 from calib.errors import CalibError
 from calib.fit.drive.observations import DriveObservations, DriveState, Indices, project
 from calib.fit.drive.rig_parameters import RigParameters
-from calib.fit.least_squares import ArrowSystem, robust_sigma
+from calib.fit.least_squares import ArrowSystem
+from calib.fit.robust_scale import robust_sigma
 from calib.models.camera import Array
 
 # Step of numeric derivatives, in steps of a parameter (about a pixel each) or in parts of a point's distance: a model

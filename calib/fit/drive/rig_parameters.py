@@ -15,7 +15,7 @@ from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 
 ANGLE_UNIT_RAD = 1.0 / 250.0  # one step of the transform between the cameras: about a pixel
-TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]  # the baseline's length stays
+TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]  # the baseline's length stays, because a drive cannot tell it
 # Times of exposure, and one step of each: some tenths of a pixel at walking speed.
 UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
 TIME_UNITS = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}

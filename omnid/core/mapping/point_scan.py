@@ -20,7 +20,7 @@ Counts = NDArray[np.intp]
 
 HEIGHT_SIGMAS: Final = 2.0  # of the height, above the floor, so that 2 % of the floor's points are obstacles
 INVERSE_STEP: Final = 0.02  # 1/m: width of a bin; two of them are about four sigma of a usual rig
-NEAREST_M: Final = 0.2  # of the bins
+NEAREST_M: Final = 0.2  # of the bins, from the middle of the base. By judgement; not measured.
 
 
 class ScanLimits(NamedTuple):

@@ -20,23 +20,25 @@ from omnid.core.obstacles.usual_floor import Arrivals
 
 Array = NDArray[np.float64]
 
-MOST_TRACKS: Final = 16
-SAME_SURFACE_M: Final = 0.15  # step in range between neighbouring sectors of one cluster, beside the noise
-NOISE_SIGMAS: Final = 4.0
-SECTOR_GAP: Final = 2  # sectors without range within a cluster
-WIDEST_M: Final = 1.2  # of a cluster that may be a person or a cart
-LEAST_SECTORS: Final = 3
-FARTHEST_M: Final = 4.0  # beyond it, stereo's noise looks like motion
-GATE_M: Final = 0.7  # between a cluster and a track's prediction
-ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person
+MOST_TRACKS: Final = 16  # so that the memory is bounded
+SAME_SURFACE_M: Final = (
+    0.15  # step in range between sectors of one cluster, beside the noise. By judgement; not measured.
+)
+NOISE_SIGMAS: Final = 4.0  # of a range; so that 0.5 % of the steps within a surface are larger: 2.8 of a difference
+SECTOR_GAP: Final = 2  # sectors without range within a cluster. By judgement; not measured.
+WIDEST_M: Final = 1.2  # of a cluster that may be a person or a cart. By judgement; not measured.
+LEAST_SECTORS: Final = 3  # because a person is five sectors wide at FARTHEST_M
+FARTHEST_M: Final = 4.0  # because stereo's noise looks like motion beyond it
+GATE_M: Final = 0.7  # between a cluster and a track's prediction. By judgement; not measured.
+ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person. By judgement; not measured.
 SIGMA_M: Final = 0.06  # of a cluster's middle, beside what follows: its visible side changes
 PERSON_M: Final = 0.4  # width of a person: the rest of a narrower cluster may be on either side
-START_MPS: Final = 1.0  # sigma of the velocity of a new track
-LEAST_MPS: Final = 0.2  # of a moving obstacle
-SPEED_SIGMAS: Final = 1.5  # by which its speed is more than noise
+START_MPS: Final = 1.0  # sigma of the velocity of a new track. By judgement; not measured.
+LEAST_MPS: Final = 0.2  # of a moving obstacle. By judgement; not measured.
+SPEED_SIGMAS: Final = 1.5  # by which its speed is more than noise. By judgement; not measured.
 NEW_LOOKS: Final = 3  # whatever its speed: what was not there before has moved
-CONFIRMED: Final = 2  # pairs that have seen it
-FORGOTTEN_S: Final = 0.9  # without a cluster
+CONFIRMED: Final = 2  # pairs that have seen it: a single one may be noise
+FORGOTTEN_S: Final = 0.9  # without a cluster. By judgement; not measured.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,7 @@ from omnid.core.odometry.sensed_motion import SensedMotion
 
 Array = NDArray[np.float64]
 
-SLOWING_S = 0.3  # time constant with which the predicted velocity decays while poses are refused
+SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused. By judgement; not measured.
 SUDDEN_RAD = 0.14  # rotation by which two steps of a robot do not differ: 8 degrees
 
 

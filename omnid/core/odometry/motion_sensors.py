@@ -32,11 +32,12 @@ LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])  # after many 
 DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02  # of the wheels' distance and turn: roughness, slack
 WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # of the wheels: steps of the encoders
 SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4  # across, by distance and by turn of wheels that cannot move sideways
-GYRO_RADPS_SQRT_S = 1e-3  # of the gyro, for one second
-TILT_RAD = 1e-3  # about x and y without a gyro
-CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # of the cameras' motion in a step, beside their covariance
-STILL_M, STILL_RAD = 1e-4, 5e-5  # of a base that stands
-STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03  # m/s and rad/s below which they read nothing, beside a bias
+GYRO_RADPS_SQRT_S = 1e-3  # of the gyro, for one second. By judgement; not measured.
+TILT_RAD = 1e-3  # about x and y without a gyro. By judgement; not measured.
+CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # of the cameras' step, beside its covariance. By judgement; not measured.
+STILL_M, STILL_RAD = 1e-4, 5e-5  # of a base that stands. By judgement; not measured.
+# m/s and rad/s below which they read nothing, beside a bias. By judgement; not measured.
+STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
 STILL_BEFORE_S = 0.2  # for which they must have stood before the step, so that none swings on
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
 # mean of the squared differences by their expected values. Ratios beyond the limit do not count: slip is no noise.

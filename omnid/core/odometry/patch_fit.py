@@ -27,7 +27,7 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 WINDOW_PX = patch_kernels.WINDOW_PX
-TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the gradient's border
+TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the border that the gradient's 3x3 operator needs
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,10 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-RANSAC_THRESHOLD_PX = 2.0  # largest error of a view in the consensus set
-GAUSS_NEWTON_STEPS = 6  # at most
+# Largest error of a view in the consensus set. Measured: with 1.34 and 3 px the odometry's error is 0.96 and 1.01 times
+# as large (docs/results/accuracy.md).
+RANSAC_THRESHOLD_PX = 2.0
+GAUSS_NEWTON_STEPS = 6  # enough: 305 of 306 fits of test_pose_estimation.py converge in 5
 CONVERGED = 1e-5  # m and rad: a smaller step is the last one
 # Noise of no views: the compiled function would not take None.
 NO_NOISE = np.zeros((0, 3, 3))

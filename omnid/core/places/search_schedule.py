@@ -16,7 +16,7 @@ from omnid.core.places.place_map import PlaceKeyframe
 Array = NDArray[np.float64]
 
 # Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for this multiple of the
-# distance between its keyframes before it asks for dense depth itself.
+# distance between its keyframes before it asks for dense depth itself. By judgement; not measured.
 WAIT_FACTOR: Final = 2.0
 # A recognition is checked in a frame that has moved by this amount; by trial on development seeds.
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.fit.rig_drift import RigDrift, estimate_rig_drift
+from calib.fit.robust_scale import SIGMA_PER_MAD
 from calib.panorama import Cylinder
 from omnid.core.rig.column_matches import Matches
 from omnid.core.rig.rig_state import RigState
@@ -30,13 +31,11 @@ SIGMAS: Final = 4.0
 MIN_MATCHED_PART: Final = 0.08
 MIN_CONTRAST_POINTS: Final = 400
 SECTORS: Final = 12  # of azimuth, 30 deg each: about the width of a wall in a room
-# Matches for the median of a sector, which is then known to about a quarter of the spread.
+# Matches for the median of a sector, so that it is known to 1.25 / sqrt(20), about a quarter of the spread.
 MIN_IN_SECTOR: Final = 20
 # Median residual of the sectors. A camera whose intrinsics have changed bends the columns all around; the matches of
 # one wall alone may be misled.
 DRIFTED_PX: Final = 0.3
-# Ratio of the standard deviation to the median absolute deviation of a normal distribution.
-MAD_TO_SIGMA: Final = 1.4826
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,7 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     # 1. Offsets of the columns, as they are.
     aside = cylinder.wrap(found.upper[:, 0] - found.lower[:, 0])
     offset = float(np.median(aside)) if len(aside) else float("nan")
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(aside - offset))) if len(aside) else float("nan")
+    spread = SIGMA_PER_MAD * float(np.median(np.abs(aside - offset))) if len(aside) else float("nan")
     enough = len(aside) >= MIN_MATCHES
     # 2. The rotation and shift of the upper camera that explain them.
     drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None

@@ -41,7 +41,7 @@ MIN_CORRELATION: Final = 0.8
 MAX_STEP_PX: Final = 2 * COARSE
 # Points at infinity have no disparity; noise makes it negative for some of them, as exchanged cameras do for all.
 MIN_DISPARITY_PX: Final = 0.5
-# Two levels reach as far as MAX_STEP_PX with a window of this size.
+# Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than MAX_STEP_PX.
 KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
 # Standard deviation of a coarse patch with contrast, grey levels: noise alone, averaged over COARSE^2 pixels, has less.
 CONTRAST_GREY: Final = 6.0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from calib.rig import Rig
-from omnid.core.odometry.corners import clear_around, corners, nearby_disparity
+from omnid.core.odometry.corners import APART_PX, clear_around, corners, nearby_disparity
 from omnid.core.odometry.patch_alignment import align
 from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
@@ -35,8 +35,6 @@ MAX_KEYFRAMES: Final = 25
 # Two keyframes and the landmark's own three coordinates leave almost nothing that the rig could contradict, so that
 # there must be a third.
 MIN_KEYFRAMES: Final = 3
-# Least distance of a new landmark from another, as that of corners (`corners.py`).
-APART_PX: Final = 9
 # Rows along the upper and the lower border in which a patch would reach beyond the panorama.
 EDGE_ROWS: Final = 4
 # Largest step of a patch: twice that of patches whose depth is known well, since the rig is not yet.

@@ -37,7 +37,7 @@ TILE_ROWS: Final = 4  # 63 rows at scale 1
 JUDGED_SHARE: Final = 0.5  # of a tile that shows the world; one of which less does is not judged
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts; one may be a glitch of a driver
 LEAST_ALIVE: Final = 0.1  # of the judged tiles that must change before others are dead: else the whole image stands
-# Mean change between two images with independent noise of sigma is 2 sigma / sqrt(pi).
+# Mean change between two images with independent normal noise of sigma: 2 sigma / sqrt(pi), exact to 0.03 %.
 NOISE_CHANGE: Final = 1.128
 # Of it. The noise is that of the smoothest blocks, and pixels of a panorama are interpolated from compressed images:
 # in the sample log live tiles change by a fifth of it at least.

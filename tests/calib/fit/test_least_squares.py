@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from calib.fit.least_squares import ArrowSystem, Ending, minimise, robust_sigma
+from calib.fit.least_squares import ArrowSystem, Ending, minimise
 from calib.models.camera import Array
 
 COMMON, BLOCKS, SIZE = 4, 6, 3
@@ -94,10 +94,3 @@ def test_ends_after_its_steps_and_stays_at_a_minimum() -> None:
     assert problem.cost(start, 1.0) > problem.cost(once, 1.0) > problem.cost(twice, 1.0) > 0
     assert minimise(problem, start, Ending(steps=60, gain=1.0)) == pytest.approx(once)  # any gain is too small
     np.testing.assert_array_equal(minimise(problem, truth, ENDING), truth)
-
-
-def test_the_robust_sigma_is_that_of_most_residuals() -> None:
-    residual = np.random.default_rng(3).normal(0.0, 0.2, 20_000)
-    residual[:1000], residual[1000:2000] = 50.0, np.nan
-    assert robust_sigma(residual, 0.01) == pytest.approx(0.2, rel=0.1)
-    assert robust_sigma(np.zeros(5), 0.01) == 0.01
