@@ -117,7 +117,7 @@ def test_a_result_and_a_pose_print_as_one_line(result: omnid.RunResult, scene: P
     assert re.fullmatch(
         r"<pose 0: tracking, x \+0\.000 y \+0\.000 z \+0\.000 m, heading [+-]0\.00 deg, sigma .* mm>", str(pose)
     )
-    assert np.array_equal(pose.position, pose.T_odom_rig[:3, 3])
+    assert np.array_equal(pose.position, pose.T_odom_rig[:3, 3]) and pose.T is pose.T_odom_rig
 
 
 def test_a_result_is_compared_with_the_truth(result: omnid.RunResult, tmp_path: Path) -> None:
