@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from drivers.errors import FrameDecodeError
 
 Camera = Literal["lower", "upper"]
+CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 
 MAX_PIXELS = 64 * 2**20
 # Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.

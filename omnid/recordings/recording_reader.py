@@ -32,15 +32,14 @@ from omnid.transport.codec import (
 from omnid.transport.decode import Cloud, Diagnostics, PoseInMap, decode_cloud, decode_diagnostics, decode_map_pose
 from omnid.transport.records import OdometryRecord, TwistRecord
 from omnid.transport.scan_codec import SCAN_SCHEMA, Scan, decode_scan
+from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 
 ODOMETRY: Final = "odom"
 STATUS: Final = "status"
 CLOUD: Final = "cloud"
-SCAN: Final = "scan"
 DRIVE: Final = "drive"
-MAP_POSE: Final = "map_pose"
 TWIST_COMMAND: Final = "cmd/twist"
-IMAGES: Final = ("panorama", "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
+IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
 Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage

@@ -19,7 +19,7 @@ from drivers.logs.mcap_info import LogInfo, read_log_info
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from omnid.errors import OmnidError
 from omnid.recordings.odometry_topic import choose_odometry_topic
-from omnid.recordings.recording_reader import CLOUD, DRIVE, MAP_POSE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
+from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
 from omnid.report.downsampling import Downsampled
 from omnid.report.events import Events
 from omnid.report.map_poses import MapPoseHistory
@@ -27,6 +27,7 @@ from omnid.report.poses import PoseHistory
 from omnid.report.status_history import StatusHistory
 from omnid.transport.decode import Cloud, Diagnostics, PoseInMap
 from omnid.transport.records import OdometryRecord, TwistRecord
+from omnid.transport.topics import MAP_POSE
 
 MAX_EARLY: Final = 64  # status messages before the first pose
 MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging

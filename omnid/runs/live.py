@@ -13,6 +13,7 @@ import cv2
 
 from calib.rig import Rig
 from calib.rig_file import read_rig
+from drivers.frame import CAMERAS
 from omnid.config import Config
 from omnid.engine.bounded_call import started
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
@@ -24,7 +25,7 @@ from omnid.runs.live_robot import LiveRobot
 from omnid.runs.live_status import add_terminal_ticker
 from omnid.runs.live_wiring import LiveWiring, Report
 from omnid.runs.place_maps import RunPlaces
-from omnid.runs.session import CAMERAS, Session
+from omnid.runs.session import Session
 from omnid.runs.systemd import print_stacks_when_killed
 from omnid.stages.geometry import Geometry
 from omnid.transport.codec import compile_serialisers

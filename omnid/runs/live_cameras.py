@@ -8,9 +8,8 @@ from itertools import islice
 from typing import Final, Protocol, TypeAlias
 
 from drivers.cameras.camera_state import CameraState
-from drivers.frame import Camera, Frame, FrameSource
+from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from omnid.engine.flow import nothing
-from omnid.runs.session import CAMERAS
 
 MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
 

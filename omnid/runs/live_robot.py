@@ -8,13 +8,13 @@ from contextlib import ExitStack, closing
 from typing import Final, Protocol
 
 from drivers.cameras.camera_state import CameraState
-from drivers.frame import Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import MotionSample
 from omnid.controller.link import DriveLink
 from omnid.engine.graph import Graph, Stream
 from omnid.runs.live_cameras import LiveCamera, OpenCamera, first_frames
 from omnid.runs.sensor_sources import MotionSource
-from omnid.runs.session import CAMERAS, Session
+from omnid.runs.session import Session
 from omnid.transport.records import DiagnosticStatus
 
 

@@ -11,7 +11,7 @@ from typing import Final
 from calib.models.names import sees_directly
 from calib.rig import Rig
 from calib.rig_file import rig_toml
-from drivers.frame import Camera, Frame
+from drivers.frame import Frame
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
@@ -29,7 +29,6 @@ from omnid.sinks.encoder import Encoder, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
-CAMERAS: Final[tuple[Camera, ...]] = ("lower", "upper")
 BUS_END_S: Final = 3.0
 # They drop deadlines, not messages.
 TICKERS: Final = frozenset({"load", "motor", "progress", "router", "routes", "save", "status", "terminal", "watchdog"})

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig import Rig
-from drivers.frame import Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame
 from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
@@ -16,7 +14,6 @@ from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
-CAMERAS: Final[tuple[Camera, Camera]] = ("lower", "upper")
 
 
 class SimulatedCameras:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.rig import Rig
-from drivers.frame import Frame
+from drivers.frame import CAMERAS, Frame
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.statistics import ControllerState
@@ -35,7 +35,7 @@ from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, Place
 from omnid.runs.pipeline import NavigationParts, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
-from omnid.simulation.cameras import CAMERAS, SimulatedCameras
+from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.lockstep_parts import LockstepRequests, Take
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle

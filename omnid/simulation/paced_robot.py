@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.camera_state import CameraState
-from drivers.frame import Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample
 from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
@@ -28,7 +28,7 @@ from omnid.controller.statistics import TickReport
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
-from omnid.simulation.cameras import CAMERAS, SimulatedCameras
+from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.lockstep import STOPPING_NS, with_masks
 from omnid.simulation.paced_link import Delivery, PacedLink
 from omnid.simulation.realtime import MOST_POSES, SAMPLES

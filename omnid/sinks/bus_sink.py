@@ -17,7 +17,7 @@ from omnid.transport.codec import clock_cdr
 from omnid.transport.features_attachment import features_to_bytes
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
-from omnid.transport.topics import CLOCK
+from omnid.transport.topics import CLOCK, PANORAMA
 
 
 class BusSink:
@@ -61,7 +61,7 @@ class PanoramaSink:
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Publish the panorama of a pose, with its features as the attachment, when it is due."""
-        if odometry.stamp_ns < self._next_ns or not self._bus.is_received("panorama"):
+        if odometry.stamp_ns < self._next_ns or not self._bus.is_received(PANORAMA):
             return
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
@@ -69,4 +69,4 @@ class PanoramaSink:
         features = odometry.features
         pixels = {"inliers": features.inliers, "rejected": features.rejected, "new": features.new}
         _, payload = image_cdr(frame, odometry.stamp_ns + self._offset_ns)
-        self._bus.publish("panorama", payload, features_to_bytes(pixels))
+        self._bus.publish(PANORAMA, payload, features_to_bytes(pixels))

@@ -23,6 +23,7 @@ from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.records import DiagnosticStatus, FrameTransform
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
 from omnid.transport.status_names import ODOMETRY, PLACES, Key
+from omnid.transport.topics import MAP_POSE, SCAN
 
 Outgoing: TypeAlias = (
     OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing | NavigationUpdate
@@ -80,7 +81,7 @@ class Encoder:
                     message.sigma_m,
                     (0.0, self._map_encoding.max_range_m),
                 )
-                yield OutgoingMessage("scan", SCAN_SCHEMA, payload)
+                yield OutgoingMessage(SCAN, SCAN_SCHEMA, payload)
                 payload = moving_cdr(message.stamp_ns + self.offset_ns, "odom", message.moving)
                 yield OutgoingMessage("moving", codec.POINT_CLOUD_SCHEMA, payload)
             case MapUpdate():
@@ -121,7 +122,7 @@ class Encoder:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self.T_base_rig)
         T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
         pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
-        yield OutgoingMessage("map_pose", codec.MAP_POSE_SCHEMA, pose)
+        yield OutgoingMessage(MAP_POSE, codec.MAP_POSE_SCHEMA, pose)
         edge = FrameTransform("map", "odom", T_map_odom)
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
 

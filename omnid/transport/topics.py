@@ -8,6 +8,9 @@ from typing import Final, NamedTuple
 from omnid.transport import codec, motion_codec, navigation_codec
 from omnid.transport.scan_codec import SCAN_SCHEMA
 
+MAP_POSE: Final = "map_pose"
+SCAN: Final = "scan"
+PANORAMA: Final = "panorama"
 CLOCK: Final = "/clock"  # of runs whose time is not the computer's only
 IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
@@ -25,17 +28,17 @@ class Topic(NamedTuple):
 PUBLISHED: Final = {
     "odom": Topic(codec.ODOMETRY_SCHEMA, realtime=True, latched=True),
     "pose": Topic(codec.POSE_SCHEMA, realtime=True, latched=True),
-    "map_pose": Topic(codec.MAP_POSE_SCHEMA, latched=True),
+    MAP_POSE: Topic(codec.MAP_POSE_SCHEMA, latched=True),
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
     "/tf_static": Topic(codec.TRANSFORM_SCHEMA, latched=True, transient_local=True),
     "path": Topic(navigation_codec.PATH_SCHEMA, latched=True),
     "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
     "map": Topic(codec.GRID_SCHEMA, latched=True, transient_local=True),
-    "scan": Topic(SCAN_SCHEMA),
+    SCAN: Topic(SCAN_SCHEMA),
     "moving": Topic(codec.POINT_CLOUD_SCHEMA),
     "drive": Topic(codec.TWIST_SCHEMA),
-    "panorama": Topic(IMAGE_SCHEMA),
+    PANORAMA: Topic(IMAGE_SCHEMA),
     "navigation": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "plan": Topic(navigation_codec.PATH_SCHEMA, latched=True),
     "wheel_odom": Topic(motion_codec.WHEEL_SCHEMA),

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import RosImage
-from omnid.recordings.recording_reader import CLOUD, ODOMETRY, SCAN, STATUS, RecordingReader
+from omnid.recordings.recording_reader import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.transport.decode import Cloud, Diagnostics, Pose
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import OdometryRecord
 from omnid.transport.scan_codec import Scan
+from omnid.transport.topics import SCAN
 from omnid.viewer import status_plots
 from omnid.viewer.image_encoding import compressed
 from omnid.viewer.rerun_scene import RerunScene

@@ -21,6 +21,7 @@ from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_navigation
 from omnid.transport.scan_codec import decode_scan
+from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.browsers import Browsers
 from omnid.web.channels import Encoded, LivePath, Newest, with_header
 from omnid.web.snapshot import (
@@ -38,10 +39,7 @@ PERIOD_S: Final = 0.03  # least time between two messages of the state
 QUIET_S: Final = 0.5  # without a message of the robot, after which the state is sent all the same
 RETRY_S: Final = 0.5
 REQUEST_S: Final = 0.2  # between two looks for channels that browsers ask for
-PANORAMA: Final = "panorama"
-SCAN: Final = "scan"
 NAVIGATION: Final = "navigation"
-MAP_POSE: Final = "map_pose"
 PANORAMA_S: Final = 0.4  # least time between two panoramas: what a robot publishes more often is left out
 MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
 _LARGEST: Final = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from tests.benchmark.constants import PAGE, by_judgement, constants, constants_of, missing, page
 
 # Lower them with each reason that is written.
-MOST_WITHOUT_A_REASON = 7
+MOST_WITHOUT_A_REASON = 4
 MOST_BY_JUDGEMENT = 72
 
 SOURCE = '''"""Text."""

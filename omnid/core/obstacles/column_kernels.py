@@ -17,11 +17,11 @@ Words = NDArray[np.uint16]
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.int32]
 
-LARGEST = np.uint16(65535)
+LARGEST = np.uint16(65535)  # of 16 bits: exact
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
-# A sum of likelihoods that is not less than this share of one disparity's keeps ratios finite.
+# Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
 LEAST_LIKELIHOOD = np.float32(1e-3)
-# exp(x) is taken as (1 + x / 32)^32, within 10 % from -2 to 2, and 0 below -32.
+# exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
 FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO, FLOOR_NEAR = 0, 1, 2, 3, 4, 5, 6
 STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR = 0, 1, 2, 3, 4
