@@ -223,16 +223,22 @@ class ObstacleGrid:
         self._fresh[window] += np.float32(1 - kept) * amount
 
     def _assume_free(self, at: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
-        """Take the floor nearer than what is seen for free, in the directions that the panorama shows."""
+        """Take the floor nearer than what is seen for free, in the directions that the panorama shows.
+
+        It ends at a surface where the nearest floor in view is not seen.
+        """
         y, x = np.ogrid[:CELLS, :CELLS]
-        radius = (evidence.nearest_floor_m + 2 * CELL_M) / CELL_M
-        near = (x - at[0]) ** 2 + (y - at[1]) ** 2 < radius**2
-        shown = np.asarray(np.isfinite(evidence.floor).any(axis=0))
-        if shown.any() and not shown.all():
-            yaw = float(se3.yaw(self._T_rect_base)) - float(se3.yaw(T_odom_base))
-            turned = (math.pi - np.arctan2(y - at[1], x - at[0]) - yaw) / math.tau
-            near &= shown[np.floor(turned % 1.0 * len(shown)).astype(np.intp)]
-        self._odds[FLOORS, near] = FREE_ODDS + 1.0
+        in_view = np.isfinite(evidence.floor)
+        shown = np.asarray(in_view.any(axis=0)) | ~in_view.any()
+        reach = np.where(shown, (evidence.nearest_floor_m + 2 * CELL_M) / CELL_M, 0.0)
+        nearest = np.flatnonzero(in_view.any(axis=1))[-1:]
+        stands = (evidence.floor[nearest] < -MOST_RATIO).any(axis=0) & (evidence.surface.max(axis=0) > 0)
+        range_m = self._at_1m / np.maximum(evidence.surface.argmax(axis=0), 1)
+        reach[stands] = np.minimum(reach, range_m / CELL_M - 1.0)[stands]
+        yaw = float(se3.yaw(self._T_rect_base)) - float(se3.yaw(T_odom_base))
+        turned = (math.pi - np.arctan2(y - at[1], x - at[0]) - yaw) / math.tau
+        reach_there = reach[np.floor(turned * len(reach)).astype(np.intp) % len(reach)]
+        self._odds[FLOORS, (x - at[0]) ** 2 + (y - at[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
 
     def _flood(self, stamp_ns: int, in_view: Flags, rows: slice, columns: slice) -> None:
         """Forget the floor that something may have come to that was not seen, from cells that are not watched."""

@@ -107,6 +107,20 @@ def test_floor_at_another_height_is_unknown(grid: ObstacleGrid, drop_m: float) -
     assert ring.free_m.max() < 1.3 and not np.isposinf(ring.ranges_m).any()
 
 
+def test_no_floor_behind_a_near_wall_is_taken_to_be_free_at_the_start(grid: ObstacleGrid) -> None:
+    """The nearest floor in view would be behind it."""
+    near_m = 0.65
+    ring = after(grid, evidence(stains, striped, wall_m=near_m), 1)
+    assert np.quantile(ring.free_m, 0.9) < near_m + 0.05
+
+
+def test_start_at_a_heading_that_is_zero_but_for_rounding(grid: ObstacleGrid, seen: Pairs) -> None:
+    """A turn modulo 1 is 1, not 0, just below 0."""
+    pose = np.eye(4)
+    pose[1, 0] = -1e-17
+    assert grid.update(0, pose, seen[0]).free_m.min() > 0
+
+
 def test_floor_beside_a_step_is_not_free(grid: ObstacleGrid) -> None:
     """Directions are compared together, so those at a corner show half the floor beside it."""
     grid._odds[:SURFACE] = 4.0
