@@ -193,7 +193,7 @@ def main() -> None:
     columns = (
         Column("sectors of"),
         Column("number"),
-        *(Column(one, "%", 1) for one in CLASSES),
+        *(Column(one, "%", 2 if one == "missed" else 1) for one in CLASSES),
         Column("false alarms of ranges", "%", 2),
         Column("error, median", "cm", 1),
         Column("error, p95", "cm", 1),
