@@ -2,8 +2,9 @@
 
 Makes a minimal Debian of that processor in FOLDER, installs omnid and its dependencies there from wheels, compiles its
 functions, replays the sample, and compares the poses with those of this machine. Exit code 1 where one differs by more
-than TOLERANCE. Needs debootstrap and qemu-user-static, whose entry in /proc/sys/fs/binfmt_misc runs programs of aarch64
-as others. Nothing of it is a measurement of time.
+than TOLERANCE: decoded and warped images differ in their last digit, by which another landmark is chosen some time, and
+from then on the two are two estimates of one path. Needs debootstrap and qemu-user-static, whose entry in
+/proc/sys/fs/binfmt_misc runs programs of aarch64 as others. Nothing of it is a measurement of time.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ PYTHON: Final = "3.11"
 PLATFORMS: Final = (*(f"manylinux_2_{minor}_aarch64" for minor in (28, 27, 26, 24, 17)), "manylinux2014_aarch64")
 BINFMT: Final = Path("/proc/sys/fs/binfmt_misc/qemu-aarch64")
 SAMPLE: Final = f"/omnid/lib/python{PYTHON}/site-packages/omnid/sample/log.mcap"
-TOLERANCE: Final = 1e-6  # m, and of the numbers of a quaternion
+# m, and of the numbers of a rotation matrix. Both estimates err by a millimetre; the first pairs differ by 1e-6.
+TOLERANCE: Final = 5e-3
 
 
 def run(*words: str | Path, environment: dict[str, str] | None = None) -> None:
