@@ -1,14 +1,15 @@
 """Effects of real lenses, mirrors, lamps and cameras on images, each by a name: `--disturb NAME`, or all by `--real`.
 
-They act on ideal images, 0 to 255, before the sensor's own blur and noise (`DisturbedCamera.shown`), or on its digits
-(`digitised`, `encoded`). What is fixed to a camera, as dust, is drawn once from the seed; what changes, from pair to
-pair. Lengths are parts of the image's width, so that images of all sizes are disturbed alike.
+They act on the scene (`light_of`), on ideal images, 0 to 255, before the sensor's own blur and noise
+(`DisturbedCamera.shown`), or on its digits (`digitised`, `encoded`). What is fixed to a camera, as dust, is drawn once
+from the seed; what changes, from pair to pair. Lengths are parts of the image's width, so that images of all sizes are
+disturbed alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
 from typing import Final, Literal, get_args
 
 import cv2
@@ -17,14 +18,30 @@ from numpy.typing import NDArray
 
 from calib.models.camera import Mask
 from omnid.simulation.rendering.sensor import Floats
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
 
 Disturbance = Literal[
-    "motion blur", "defocus", "chromatic", "flare", "dust", "drop", "flicker", "gain", "pattern", "lines", "jpeg"
+    "gloss",
+    "windows",
+    "motion blur",
+    "defocus",
+    "chromatic",
+    "flare",
+    "dust",
+    "drop",
+    "flicker",
+    "gain",
+    "pattern",
+    "lines",
+    "jpeg",
 ]
 DISTURBANCES: Final[tuple[Disturbance, ...]] = get_args(Disturbance)
 
+GLOSS: Final = 0.25  # share of the light that a floor reflects like a mirror
+WINDOW_GREY: Final = 200.0  # by which a window is lighter than white paper: it saturates
+WINDOWS: Final = 3  # every third poster is a window
 EXPOSURE_S: Final = 0.015  # of motion blur, and of lamps' flicker
-SUB_EXPOSURES: Final = 5  # rendered for motion blur
+SUB_EXPOSURES: Final = 3  # rendered for motion blur
 DEFOCUS: Final = 0.003  # sigma of the blur at the rim; it grows with the square of the radius
 CHROMATIC: Final = 0.0015  # by which red is magnified and blue is reduced
 CHANNELS: Final = (0.299, 0.587, 0.114)  # of red, green and blue in grey
@@ -38,6 +55,41 @@ GAIN_EVERY, GAIN_STEP = 9, 0.25  # pairs from step to step of automatic exposure
 PATTERN_GREY, COLUMN_GREY, HOT = 1.5, 1.0, 2e-4  # sigma of pixels and columns, share of hot pixels
 LINES: Final = 3  # rows of each image that repeat the row above
 QUALITY: Final = (60, 91)  # of JPEG, another for each image
+
+
+Rendered = Callable[[Scene], Floats]  # returns the image (H, W) of a scene
+
+
+def light_of(scene: Scene, rendered: Rendered, names: Collection[Disturbance]) -> Floats:
+    """Return the ideal image (H, W) of a scene whose floor is glossy, and of whose posters some are windows."""
+    windows = _windows(scene) if "windows" in names else frozenset[str]()
+    image = _with_windows(scene, rendered, windows)
+    if "gloss" not in names:
+        return image
+    # A mirror in the plane z = 0 shows the world below it, where the floor is seen.
+    below = Scene(tuple(_mirrored(face) for face in scene.rectangles if face.name != "floor"))
+    seen = rendered(_painted(scene, frozenset({"floor"}))) / (255 * scene.named("floor").brightness)
+    return np.asarray(image + GLOSS * seen * (_with_windows(below, rendered, windows) - image), np.float32)
+
+
+def _with_windows(scene: Scene, rendered: Rendered, windows: frozenset[str]) -> Floats:
+    image = rendered(scene)
+    return image + np.float32(WINDOW_GREY / 255) * rendered(_painted(scene, windows)) if windows else image
+
+
+def _windows(scene: Scene) -> frozenset[str]:
+    return frozenset([face.name for face in scene.rectangles if face.name.startswith("poster")][::WINDOWS])
+
+
+def _painted(scene: Scene, white: frozenset[str]) -> Scene:
+    """Return a scene in which the surfaces of these names are white, and all others black."""
+    shades = {name: np.full((8, 8), 255 * name, np.uint8) for name in (False, True)}
+    return Scene(tuple(replace(face, texture=shades[face.name in white]) for face in scene.rectangles))
+
+
+def _mirrored(face: Rectangle) -> Rectangle:
+    origin, edge_u, edge_v = (one * (1.0, 1.0, -1.0) for one in (face.origin, face.edge_u, face.edge_v))
+    return replace(face, origin=origin, edge_u=edge_u, edge_v=edge_v)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

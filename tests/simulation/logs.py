@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from calib.rig_file import write_rig
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from tests.simulation.disturbances import Disturbance, DisturbedCamera
+from tests.simulation.disturbances import Disturbance, DisturbedCamera, light_of
 from tests.simulation.mirrors import MirrorCamera
 from tests.simulation.readout import Readout, body_twists
 from tests.simulation.rigs import nominal_rig
@@ -60,10 +61,17 @@ def write_log(
     def ideal_image(pair: int, camera: int) -> Floats:
         row_twist = twists[pair] * 1e-6 * readout.line_time_us[camera]
         delays_s = [delay_s[pair] * camera + at_s for at_s in disturbed[camera].times_s()]
-        parts = [
-            render_grey(scene, cameras[camera], poses[pair] @ se3.exp(twists[pair] * late_s), supersample, row_twist)
-            for late_s in delays_s
-        ]
+        parts = []
+        for late_s in delays_s:
+            T_world_rig = poses[pair] @ se3.exp(twists[pair] * late_s)
+            rendered = partial(
+                render_grey,
+                mounted=cameras[camera],
+                T_world_rig=T_world_rig,
+                supersample=supersample,
+                row_twist=row_twist,
+            )
+            parts.append(light_of(scene, rendered, disturbances))
         time_s = 1e-9 * readout.period_ns * pair + delay_s[pair] * camera
         return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), pair, time_s)
 

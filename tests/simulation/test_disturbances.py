@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from calib.models.camera import Mask
+from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats
-from tests.simulation.disturbances import DISTURBANCES, LINES, Disturbance, DisturbedCamera
+from omnid.simulation.rendering.surfaces import Scene
+from tests.simulation import build
+from tests.simulation.disturbances import DISTURBANCES, GLOSS, LINES, Disturbance, DisturbedCamera, light_of
 
 SIDE = 160
 MASK = Mask((79.5, 79.5), 0.0, 75.0)
@@ -78,3 +83,18 @@ def test_jpeg_is_in_colour_with_another_quality_for_each_image() -> None:
 def test_motion_blur_renders_times_about_the_stamp() -> None:
     times = camera(*DISTURBANCES).times_s()
     assert len(times) > 2 and sum(times) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_glossy_floor_shows_the_room_upside_down_and_windows_saturate() -> None:
+    run = build("rooms", 3, SIDE, 4)
+
+    def rendered(scene: Scene) -> Floats:
+        return render_grey(scene, run.rig.lower, run.poses[0])
+
+    clean, glossy, lit = (light_of(run.scene, rendered, names) for names in ((), ("gloss",), ("windows",)))
+    white = Scene((replace(run.scene.named("floor"), texture=np.full((8, 8), 255, np.uint8)),))
+    on_floor = rendered(white) > 0
+    changed = np.abs(glossy - clean) > 1e-3
+    assert changed[on_floor].mean() > 0.3 and not changed[~on_floor].any()
+    assert np.abs(glossy - clean).max() <= 255 * GLOSS
+    assert clean.max() < 255 < lit.max() and (lit >= clean).all() and 0 < (lit > clean).mean() < 0.1
