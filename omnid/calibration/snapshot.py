@@ -87,7 +87,7 @@ def warnings(views: Mapping[str, CameraView]) -> Iterator[str]:
         if view.rim is None:
             yield (
                 f"{name}: the mirror's rim was not found: light all around, and the whole circle in the image; "
-                "without a rim the mask must be given in the rig"
+                "without a rim the mask must be given in the rig; a lens without a mirror has none, and needs no mask"
             )
         elif _reach_px(view) < NEAR_BORDER_PX:
             yield f"{name}: the rim leaves the image: move the camera towards the middle of the mirror, or farther away"
