@@ -116,7 +116,7 @@ class Session:
         if self._focal_px < FLOOR_FOCAL_PX:
             self.warn(
                 f"the images are small: {self._focal_px:.0f} rows of the panorama a radian, where it takes "
-                f"{FLOOR_FOCAL_PX:.0f} to tell the floor from an edge of 5 cm (512 px by a mirror), so the base "
+                f"{FLOOR_FOCAL_PX:.0f} to tell the floor from an edge of 5 cm (384 px by a mirror), so the base "
                 "will often stop because the way ahead is unknown; use larger images, "
                 'or controller.collision.unknown = "slow"'
             )

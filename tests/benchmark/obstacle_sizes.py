@@ -20,7 +20,7 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.world_file import load_world
 from tests.benchmark.results import Column, ResultTable
 
-SECONDS: Final = 20.0
+SECONDS: Final = 40.0
 GOALS: Final = (GoalRequest(NavigationFrame.ODOM, 0.8, 0.0), GoalRequest(NavigationFrame.ODOM, 0.0, 0.0, 0.0))
 AT_REST: Final = slice(5, 10)  # rings before the robot drives
 DRIVES_S: Final = 1.2

@@ -25,13 +25,13 @@ def warnings_of(size_px: int, *overrides: str) -> list[str]:
 
 def test_small_images_are_named_with_what_to_do() -> None:
     (line,) = warnings_of(320)
-    assert "87 rows" in line and "512 px" in line and "controller.collision.unknown" in line
+    assert "87 rows" in line and "384 px" in line and "controller.collision.unknown" in line
 
 
 @pytest.mark.parametrize(
     ("size_px", "override"),
     [
-        (512, "controller.collision.unknown=stop"),
+        (384, "controller.collision.unknown=stop"),
         (320, "controller.collision.unknown=slow"),
         (320, "controller.collision.check=false"),
     ],
