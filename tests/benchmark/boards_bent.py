@@ -82,7 +82,7 @@ def main(arguments: Sequence[str]) -> int:
         for name, shape in SHAPES.items():
             with tempfile.TemporaryDirectory() as folder:
                 render_pairs(truth, shape, Path(folder), seed, args.pairs)
-                found = calibrate_rig(Path(folder), BOARD).calibration
+                found = calibrate_rig(Path(folder), BOARD, view="mirror").calibration
             flat = as_drawn(found)
             with_shape, without = figures(found, truth), figures(flat, truth)
             table.add(

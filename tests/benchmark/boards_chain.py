@@ -87,6 +87,8 @@ def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> str:
                 f"{BOARD.columns}x{BOARD.rows}",
                 "--square-mm",
                 f"{1e3 * BOARD.square_m:g}",
+                "--view",
+                "mirror",  # these have no hub
                 "-o",
                 str(output),
                 *options,

@@ -70,7 +70,8 @@ def main() -> None:
         folder = Path(name)
         truth = render(folder, pairs)
         before_s, start_s = used_s(), time.monotonic()
-        words = [folder, "--corners", "7x6", "--square-mm", 30, "--quiet", "-o", folder / "rig.toml"]
+        words = [folder, "--corners", "7x6", "--square-mm", 30, "--view", "mirror", "--quiet"]
+        words += ["-o", folder / "rig.toml"]
         subprocess.run(
             [sys.executable, "-m", "omnid", "calibrate", "rig", *map(str, words)], check=True, stdout=subprocess.DEVNULL
         )
