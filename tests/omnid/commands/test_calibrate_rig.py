@@ -109,7 +109,8 @@ def test_recovers_cameras_and_rig_from_images(many: Path, tmp_path: Path, capsys
         assert mounted.camera.focal == pytest.approx(truth.focal, rel=5e-4)
         assert mounted.mask is not None and mounted.mask.outer_px == pytest.approx(310, abs=3)
     page = report.read_text()
-    assert page.count("data:image/jpeg;base64,") == 1 + 2 * 16 and "Baseline 180" in page and "r_x" in page
+    # The panoramas, the corners of each camera, and the residuals of each pair.
+    assert page.count("data:image/jpeg;base64,") == 1 + 2 + 2 * 16 and "Baseline 180" in page and "r_x" in page
 
 
 @pytest.mark.slow
