@@ -9,8 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib import se3
 from calib.rig_file import read_rig, write_rig
+from omnid import replay
 from omnid.formats.tum import read_tum
+from tests.benchmark.honesty import too_fast
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image_message, write_log
 from tests.replay.command import Command
@@ -47,6 +50,16 @@ def test_a_drive_faster_than_the_limit_is_named(omnid: Command, tmp_path: Path, 
         assert float(states[1]) <= 100 / 16 + 0.1
     else:
         assert "m/s" not in done.err, done
+
+
+def test_after_poses_that_were_refused_a_few_landmarks_are_no_pose(tmp_path: Path) -> None:
+    """In a mirror's corridor at 10 m/s 38 of 419 landmarks agreed on a pose 11 m off, with a sigma of millimetres."""
+    run = too_fast(3)
+    write_drive(tmp_path, run.rig, run.poses, run.scene, seed=3)
+    found, T = replay(tmp_path / "log.mcap", tmp_path / "rig.toml"), read_tum(tmp_path / "truth.txt").T
+    wrong = (se3.inverse(T[0]) @ T)[1:, :3, 3] - found.T_odom_rig[1:, :3, 3]
+    sigma_m = np.sqrt(np.trace(found.covariances[1:, :3, :3], axis1=1, axis2=2))
+    assert (np.linalg.norm(wrong, axis=1) < 30 * sigma_m).all()
 
 
 def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene: Path) -> None:
