@@ -111,7 +111,6 @@ REMARKS: Final = (
     "wall: a sector of 30 degrees that one plane fills. too fast: 10 m/s before a limit of 5 m/s, so all but the first "
     "pose must not be tracking. dim: grey level 30, noise 5. bumpy: 0.3 degrees of tilt from pair to pair, rolling "
     "shutters. people: five of them walk back and forth, 0.5 to 1 m from the way.",
-    "Shortfall of too fast: no pose but the first is tracking, yet the covariance of some is far too small.",
 )
 
 
