@@ -109,7 +109,7 @@ class VisualOdometry:
         too_fast_mps = 0.0
         if estimate is not None and self._has_support(estimate) and not self._is_plausible(estimate, dt_s):
             too_fast_mps = self._moved_m(estimate) / self._since_fix_s(dt_s)
-        # Where nobody knows how far the vehicle has come, a few landmarks agree on a wrong pose, too.
+        # Where it is not known how far the vehicle has come, a few landmarks agree on a wrong pose, too.
         is_doubtful = estimate is None or estimate.inliers < self._limits.good_inliers
         if searched and after_break and (is_doubtful or not self._is_plausible(estimate, dt_s)):
             estimate = self.relocalise(frame, self._exposures.predicted(frame, dt_s))
