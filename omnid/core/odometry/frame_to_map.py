@@ -33,6 +33,8 @@ OUTLIER_SQUARED = 16.0
 # Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before.
 COARSE_STEPS, STEPS = (3,), (2, 4)
 FEW_RATIO = 0.6  # share of the tracks that are inliers, below which the velocity may have been wrong
+# Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.
+RECOGNISED_ROUNDS = 2
 YAW_SAMPLE = 150  # landmarks tracked for each yaw hypothesis
 LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search
@@ -160,6 +162,26 @@ class FrameToMap:
             _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
         )
+
+    def refine_recognised(
+        self, frame: StereoFrame, recognised: PoseEstimate, exposure: Exposure
+    ) -> PoseEstimate | None:
+        """Return the pose of a frame that was recognised, by the keyframes' patches; None where too few agree.
+
+        Places are recognised by corners, whose pose errs by centimetres. Corners and patches are two independent
+        supports of the pose: the number of inliers is the smaller one of both.
+        """
+        none = np.zeros(0, np.intp)
+        untracked = Tracks(none, np.zeros((0, 2)), np.zeros((0, 3)), 0)
+        refined = recognised
+        for _ in range(RECOGNISED_ROUNDS):
+            start = CoarsePose(se3.inverse(refined.T_odom_rect), none, np.zeros(0), np.zeros(0), untracked)
+            again = self.refine(frame, start, exposure)
+            if again is None:
+                return None
+            refined = again
+        inliers = min(recognised.inliers, len(refined.landmarks))
+        return replace(refined, visible=recognised.visible, tracked=recognised.tracked, inliers=inliers)
 
     def best_yaw(self, frame: StereoFrame, T_odom_rect: Array, yaws_rad: Iterable[float], likely: int = 0) -> Array:
         """Return the pose, turned by that hypothesis of the yaw which keeps most landmarks through the KLT check.

@@ -10,7 +10,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 
 
 class KeyframeLocaliser(Protocol):
-    """A bounded store of keyframes that gives poses of a frame among them; see core/places."""
+    """A bounded store of keyframes that gives the pose of a frame among them; see core/places."""
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keep a keyframe and its frame."""
@@ -18,5 +18,5 @@ class KeyframeLocaliser(Protocol):
     def clear(self) -> None:
         """Drop all keyframes."""
 
-    def locate(self, frame: StereoFrame) -> list[PoseEstimate]:
-        """Return the poses of a frame relative to the keyframes that it fits."""
+    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
+        """Return the pose of a frame among the keyframes; None if it fits none."""

@@ -13,9 +13,8 @@ from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, describe
-from omnid.core.places.place_comparison import compare, supported
+from omnid.core.places.place_comparison import compare, supported, unambiguous
 from omnid.core.places.place_map import PlaceFeatures
-from omnid.core.places.recognition import Recognition
 from omnid.core.types.stereo_model import StereoModel
 
 MAX_KEYFRAMES: Final = 8  # kept in memory; by trial on development seeds
@@ -23,7 +22,7 @@ KEYFRAMES_APART_M: Final = 0.3  # a keyframe nearer to the last one replaces it;
 
 
 class Relocaliser:
-    """Keep at most max_keyframes keyframes, and find poses of a frame relative to them."""
+    """Keep at most max_keyframes keyframes, and find the pose of a frame relative to them."""
 
     def __init__(
         self, model: StereoModel, max_keyframes: int = MAX_KEYFRAMES, apart_m: float = KEYFRAMES_APART_M
@@ -44,8 +43,8 @@ class Relocaliser:
         self._kept.clear()
         self._features.clear()
 
-    def locate(self, frame: StereoFrame) -> list[PoseEstimate]:
-        """Return the poses by the keyframes that are recognised, with the complete covariance."""
+    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
+        """Return the pose with the most inliers, with the complete covariance; None where no keyframe is recognised."""
         # 1. Describe the frame, and the keyframes that no search has described before.
         here = describe(frame)
         self._features = {kept.seq: self._features.get(kept.seq) or describe(kept) for kept, _ in self._kept}
@@ -53,16 +52,14 @@ class Relocaliser:
         keyframes = {keyframe.seq: keyframe for _, keyframe in self._kept}
         poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
         found = compare(here, self._features, poses, len(keyframes), FEATURES + 1, self._model)
-        # 3. Those with enough support are poses of the frame.
-        return [_pose(place, keyframes[place.id]) for place in supported(found.values(), near=True)]
-
-
-def _pose(place: Recognition, keyframe: Keyframe) -> PoseEstimate:
-    """Return the pose in odom by a keyframe that was recognised."""
-    A = se3.adjoint(se3.inverse(place.T_place_rect))
-    covariance = place.covariance + A @ keyframe.covariance @ A.T
-    matches = max(place.matches, place.inliers)
-    return PoseEstimate(keyframe.T_odom_rect @ place.T_place_rect, covariance, matches, matches, place.inliers)
+        # 3. Take the best one, unless another place looks alike.
+        best = unambiguous(supported(found.values(), near=True), poses)
+        if best is None:
+            return None
+        A = se3.adjoint(se3.inverse(best.T_place_rect))
+        covariance = best.covariance + A @ keyframes[best.id].covariance @ A.T
+        matches = max(best.matches, best.inliers)
+        return PoseEstimate(poses[best.id] @ best.T_place_rect, covariance, matches, matches, best.inliers)
 
 
 def _distance_m(a: Keyframe, b: Keyframe) -> float:

@@ -96,6 +96,31 @@ def test_no_pose_without_tracks() -> None:
     assert located(map_of(texture(1), texture(1)), stereo_frame(np.zeros((120, 480), np.uint8))) is None
 
 
+RECOGNISED_OFF = np.array([0.01, -0.008, 0.004, 0, 0, 0.004])  # m, rad
+
+
+@pytest.mark.parametrize(("columns_shown", "inliers"), [(480, 60), (60, 50)])
+def test_a_recognised_pose_is_refined_and_supported_by_the_patches(columns_shown: int, inliers: int) -> None:
+    """A keyframe most of which shows other texture supports the pose with few patches."""
+    shown = np.where(np.arange(480) < columns_shown, texture(1), texture(2))
+    pose = refined(shown)
+    assert pose is not None and (pose.visible, pose.tracked) == (80, 80) and pose.inliers <= inliers
+    if columns_shown == 480:
+        distance, angle = motion_errors(pose.T_odom_rect, np.eye(4))
+        assert distance < 1e-3 and angle < 1e-3 and pose.inliers == inliers and len(pose.landmarks) > 100
+
+
+def test_a_recognised_pose_that_no_patch_supports_is_none() -> None:
+    assert refined(np.zeros((120, 480), np.uint8)) is None
+
+
+def refined(shown: Image) -> PoseEstimate | None:
+    """The pose from one that is a centimetre off; the keyframe shows an image."""
+    found = PoseEstimate(se3.exp(RECOGNISED_OFF), 1e-4 * np.eye(6), 80, 80, 60)
+    steps = FrameToMap(map_of(texture(1), shown), MODEL, KltSettings())
+    return steps.refine_recognised(stereo_frame(texture(1)), found, Exposure.of(AT_ONCE, UNKNOWN_VELOCITY, MODEL))
+
+
 @pytest.mark.parametrize("columns", [70, -70])
 def test_the_best_yaw_is_the_hypothesis_that_keeps_the_landmarks(columns: int) -> None:
     local_map = map_of(texture(1), texture(1))

@@ -43,8 +43,8 @@ def test_the_pose_beside_a_keyframe_is_found(
 ) -> None:
     relocaliser = Relocaliser(cameras.model)
     _add(relocaliser, keyframe, T_ODOM_KEYFRAME)
-    (estimate,) = relocaliser.locate(nearby)
-    assert estimate.inliers >= 20 and estimate.inliers <= estimate.tracked
+    estimate = relocaliser.locate(nearby)
+    assert estimate is not None and estimate.inliers >= 12 and estimate.inliers <= estimate.tracked
     truth = T_ODOM_KEYFRAME @ se3.inverse(POSES[0]) @ POSES[1]
     distance, angle = motion_errors(estimate.T_odom_rect, truth)
     assert distance < 0.02 and angle < 0.01
@@ -55,12 +55,12 @@ def test_the_pose_beside_a_keyframe_is_found(
 def test_another_place_and_darkness_are_not_recognised(cameras: RenderedCameras, keyframe: StereoFrame) -> None:
     elsewhere = replace(cameras, scene=corridor(7)).frame(3, POSES[0])
     relocaliser = Relocaliser(cameras.model)
-    assert relocaliser.locate(keyframe) == []
+    assert relocaliser.locate(keyframe) is None
     _add(relocaliser, keyframe, T_ODOM_KEYFRAME)
-    assert relocaliser.locate(elsewhere) == []
-    assert relocaliser.locate(cameras.darkness(4)) == []
+    assert relocaliser.locate(elsewhere) is None
+    assert relocaliser.locate(cameras.darkness(4)) is None
     relocaliser.clear()
-    assert relocaliser.locate(keyframe) == []
+    assert relocaliser.locate(keyframe) is None
 
 
 def test_the_newest_keyframes_are_kept_up_to_the_bound(
@@ -72,9 +72,9 @@ def test_the_newest_keyframes_are_kept_up_to_the_bound(
     for k in range(2):
         _add(relocaliser, cameras.darkness(10 + k), se3.exp([10.0 + k, 0, 0, 0, 0, 0]))
         _add(relocaliser, cameras.darkness(20 + k), se3.exp([10.1 + k, 0, 0, 0, 0, 0]))
-    assert len(relocaliser.locate(nearby)) == 1
+    assert relocaliser.locate(nearby) is not None
     _add(relocaliser, cameras.darkness(30), se3.exp([20.0, 0, 0, 0, 0, 0]))
-    assert relocaliser.locate(nearby) == []
+    assert relocaliser.locate(nearby) is None
 
 
 def test_a_keyframe_is_described_once_and_only_for_a_search(
@@ -97,12 +97,11 @@ def test_a_keyframe_is_described_once_and_only_for_a_search(
     assert described == [nearby.seq, 11, 12, nearby.seq]
 
 
-def test_each_keyframe_that_is_recognised_gives_a_pose(
+def test_of_two_places_that_look_the_same_none_is_chosen(
     cameras: RenderedCameras, keyframe: StereoFrame, nearby: StereoFrame
 ) -> None:
-    """Two that look the same give two: the patches of the local map tell which it is."""
-    relocaliser, aside = Relocaliser(cameras.model), se3.exp([10.0, 0, 0, 0, 0, 0])
+    relocaliser = Relocaliser(cameras.model)
     _add(relocaliser, keyframe, T_ODOM_KEYFRAME)
-    _add(relocaliser, replace(keyframe, seq=2), aside @ T_ODOM_KEYFRAME)
-    poses = sorted((estimate.T_odom_rect for estimate in relocaliser.locate(nearby)), key=lambda T: float(T[0, 3]))
-    assert len(poses) == 2 and motion_errors(aside @ poses[0], poses[1])[0] < 0.02
+    assert relocaliser.locate(nearby) is not None
+    _add(relocaliser, replace(keyframe, seq=2), se3.exp([10.0, 0, 0, 0, 0, 0]))
+    assert relocaliser.locate(nearby) is None
