@@ -18,17 +18,17 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.usual_floor import Arrivals, UsualFloor
+from omnid.core.obstacles.usual_floor import MOST_RATIO, Arrivals, UsualFloor
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
-CELL_M: Final = 0.05
-CELLS: Final = 256  # on each side of the square
-MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved
-VIEW_CELLS: Final = 90  # on either side of the robot, that a pair changes
+CELL_M: Final = 0.05  # By judgement; not measured.
+CELLS: Final = 256  # on each side of the square: the largest range on both sides, and the way until it is moved
+MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
+VIEW_CELLS: Final = 90  # on either side of the robot, that a pair changes: it must be less than the margin
 NEVER: Final = np.iinfo(np.int64).min
 
 # Layers: floor against what stands up, against planes just above it, and just below it; surface.
@@ -36,7 +36,6 @@ FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
 FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pairs
-MOST_RATIO: Final = 3.0  # of a cell and a pair: the errors of pairs that follow each other are alike
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = 1.0
 FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free

@@ -18,7 +18,9 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Array = NDArray[np.float64]
 
-MOST_RATIO: Final = np.float32(3.0)  # of a cell and a pair, as in the grid, since errors of pairs are alike
+MOST_RATIO: Final = np.float32(
+    3.0
+)  # of a cell and a pair: the errors of pairs that follow each other are alike, so that a few count
 LEARNED: Final = np.float32(0.5)  # share of a pair that counts in full in the mean: that of some four pairs
 HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden: two disparities in full
 BIN_SIGMA: Final = 0.3  # sigma of the range at which hidden floor begins, in disparities: within one
