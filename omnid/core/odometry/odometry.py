@@ -40,10 +40,10 @@ Flags = NDArray[np.bool_]
 UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
+COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 # Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
 # limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
 AGAIN_SHARE = 1 / 3
-COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
 
 
 class VisualOdometry:
