@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,8 +16,17 @@ from omnid.engine.kernel_store import cache_folder
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 
+# Each of the some hundred programs that tests start would compile all its modules again: 0.5 s each.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 PAIRS = 24
 COURSE_PAIRS = 22  # before the turn
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """Return one worker more than there are processors: many tests wait for programs that they have started."""
+    return (os.cpu_count() or 1) + 1
 
 
 @pytest.fixture(scope="session", autouse=True)
