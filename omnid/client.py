@@ -72,12 +72,14 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
     NavigationReport: ("navigation", decode_navigation),
     Scan: ("scan", decode_scan),
 }
+# A query without an answer ends after this time, which a slow network must not exceed.
 _QUERY_TIMEOUT_S: Final = 1.0
+# The channel of a subscription has no wait with a timeout, so Subscription.wait polls: this is the delay that it adds.
 _POLL_S: Final = 0.002
 
 
 class Subscription(Generic[T]):
-    """The newest message of one kind; broken: messages that could not be decoded."""
+    """The newest message of one kind; older ones are dropped. broken: number of messages that could not be decoded."""
 
     def __init__(
         self,
@@ -94,7 +96,8 @@ class Subscription(Generic[T]):
     def newest(self) -> T | None:
         """Return the newest message since the last call, or None; does not block."""
         sample = self._subscriber.try_recv()
-        latched, self._latched = self._latched, None  # a sample that arrived is newer
+        # The message that the robot had kept counts only until another has arrived.
+        latched, self._latched = self._latched, None
         return self._message(sample or latched)
 
     def wait(self, timeout_s: float) -> T | None:
@@ -168,7 +171,7 @@ class Robot:
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
-        """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map or NavigationReport."""
+        """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map, NavigationReport or Scan."""
         return self._subscription(kind)
 
     def _subscription(self, kind: type[T], on_close: Callable[[], None] | None = None) -> Subscription[T]:
@@ -200,7 +203,7 @@ class Robot:
     def kept_messages(self, callback: Callable[[str, bytes, bytes], None], topics: Iterable[str]) -> None:
         """Call callback(topic, payload, attachment) for the newest message of each topic that the robot keeps.
 
-        For those who come late to a topic that is rarely sent, such as `map` and `tf_static`; see `on_message`.
+        It serves a client that starts after a message of a rare topic, such as `map` or `tf_static`; see `on_message`.
         """
         for topic in topics:
             if (sample := _queried(self._session, f"{self.name}/{topic}")) is not None:

@@ -18,15 +18,16 @@ def dump(settings: object) -> str:
 
 
 def dump_minimal(settings: object, shown: Collection[str]) -> str:
-    """Return TOML with the knobs that differ from their defaults, and those of `shown`, else commented out.
+    """Return TOML with the knobs that differ from their defaults; all others keep those of the installed version.
 
-    shown: dotted paths of knobs. A file of this kind leaves all other defaults to the installed version.
+    shown: dotted paths of knobs that are listed in any case, commented out where they have their default.
     """
     wanted = {*changed(settings), *shown}
     return "\n".join(_minimal(settings, type(settings)(), (), wanted)).strip("\n") + "\n"
 
 
 def _dumped(settings: Any, default: Any, path: _Path) -> Iterator[str]:
+    """Yield the lines of a section and of those within it; knobs come first, because TOML wants them before tables."""
     if path:
         yield from ("", f"[{'.'.join(path)}]")
     for entry, kind in fields_of(type(settings)):
@@ -41,6 +42,7 @@ def _dumped(settings: Any, default: Any, path: _Path) -> Iterator[str]:
 
 
 def _minimal(settings: Any, default: Any, path: _Path, wanted: Collection[str]) -> Iterator[str]:
+    """Yield the lines of the wanted knobs of a section and of those within it."""
     lines = []
     for entry, kind in fields_of(type(settings)):
         if not is_dataclass(kind) and ".".join((*path, entry.name)) in wanted:
@@ -56,6 +58,7 @@ def _minimal(settings: Any, default: Any, path: _Path, wanted: Collection[str]) 
 
 
 def _toml(value: object) -> str:
+    """Return a bool, number, text or tuple as a TOML value."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, tuple):

@@ -1,4 +1,4 @@
-"""The cost of a rig's errors for a drive, in words: per cent of its length and degrees of its heading."""
+"""Warnings about a calibrated rig: how wrong its errors make a drive, in per cent of length and degrees of heading."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from calib.fit.rig_uncertainty import DriveUncertainty
 from omnid.calibration.camera import misfit_warning
 from omnid.calibration.image_pairs import SIDES
 
-# Part of the length by which a drive may be wrong: from MISFIT_PART on a camera model that leaves more than noise is
-# called a misfit, up to GOOD_PART a rig is called good. Wheels are wrong by about a per cent.
+# Relative error of a drive's length. Up to GOOD_PART there is no warning. From MISFIT_PART on the warning advises
+# against the rig: that is a third of the error of wheels, about a per cent, which the cameras are to improve on.
 MISFIT_PART, GOOD_PART = 0.003, 0.001
 
 
 def accuracy_warnings(structures: Sequence[ResidualStructure], drives: DriveUncertainty | None) -> list[str]:
-    """Return a line for each camera whose model leaves more than noise at a cost, or one if noise alone costs as much.
+    """Return the warnings, none for a rig that is accurate enough.
 
-    structures: of the residuals of the lower and the upper camera. drives None: the cost is not known.
+    A camera whose residuals are more than noise has a line; where both have noise only, one line asks for more pairs if
+    the drives are inaccurate nevertheless. structures: those of the residuals of the lower and the upper camera.
+    drives: the error of drives that follows from the rig's covariance; None: it is not known.
     """
     misfits = [(name, structure) for name, structure in zip(SIDES, structures, strict=True) if structure.is_misfit]
     if drives is None:

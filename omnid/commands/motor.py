@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def ask(question: str) -> str:
-    """Print a question and return the answer; OmnidError at the end of the input."""
+    """Print a question and return the answer. Raise OmnidError at the end of the input."""
     from omnid.errors import OmnidError
 
     sys.stdout.write(question)
@@ -87,7 +87,7 @@ def ask(question: str) -> str:
 
 
 def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
-    """Return key and value in TOML of the wiring, and of the scale where it is another one."""
+    """Return keys and TOML values: always those of the wiring, those of the scale only where the test changed them."""
     wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
     scale = {
         name: repr(getattr(drive, name))
@@ -98,7 +98,10 @@ def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
 
 
 def _text_of(path: Path | None) -> str:
-    """Return the text of the file to write; empty where there is none. OmnidError for one that is no configuration."""
+    """Return the present text of the file to write, empty where there is none.
+
+    Raise OmnidError before the wheels turn if it is not a configuration or cannot be written.
+    """
     from omnid.config import load_config
     from omnid.sinks.files import check_outputs
 
@@ -112,7 +115,7 @@ def _text_of(path: Path | None) -> str:
 
 
 def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) -> None:
-    """Set the values in the file, after a check that they are read back and nothing else is changed."""
+    """Set the values in the file, after a check that a reader gets these values and all others as before."""
     import tempfile
     from dataclasses import replace
 

@@ -73,7 +73,11 @@ def _add(
     on_robot: bool = True,
     named: bool = True,
 ) -> argparse.ArgumentParser:
-    """Add an action; on_robot: it works on files of this machine, and needs no connection."""
+    """Add an action.
+
+    on_robot: the command runs on the robot's computer and works on its files, so it has no option for a connection.
+    named: it takes the name of a route.
+    """
     parser = actions.add_parser(name, help=help, description=help[0].upper() + help[1:] + ".")
     if named:
         parser.add_argument("name", metavar="NAME", help="letters, digits, '-' and '_'")
@@ -116,7 +120,7 @@ def run_repeat(args: argparse.Namespace) -> int:
 
 
 def run_text(args: argparse.Namespace) -> int:
-    """Finish a recording, or stop."""
+    """Send `finish` or `stop` and print the robot's answer."""
     from omnid.monitor.navigation import connected, granted
 
     with connected(config_of(args).bus) as robot:
@@ -146,7 +150,7 @@ def run_list(args: argparse.Namespace) -> int:
 
 
 def run_show(args: argparse.Namespace) -> int:
-    """Print a route."""
+    """Print a route; with --tum, write its poses to a file as well."""
     import numpy as np
 
     from calib.se2_arrays import transform
@@ -156,6 +160,7 @@ def run_show(args: argparse.Namespace) -> int:
     route = folder.read(args.name)
     if args.tum:
         check_outputs([("--tum", args.tum)], [("the route that is read", folder.path(args.name))])
+        # A route has speeds and no times. Where the robot nearly stood, 0.1 m/s keeps the times finite.
         steps_m = np.hypot(*np.diff(route.poses[:, :2], axis=0).T)
         times_s = np.concatenate([[0.0], np.cumsum(steps_m / np.maximum(np.abs(route.speeds[1:]), 0.1))])
         write_trajectory(
@@ -195,6 +200,7 @@ def _folder(args: argparse.Namespace) -> RouteFolder:
 
 
 def _summary(route: Route) -> dict[str, object]:
+    """Return the values that `list --json` and `show` print of a route."""
     return {
         "name": route.name,
         "map": route.map_name,

@@ -1,4 +1,8 @@
-"""Messages between the daemon and the controller process; each tick is a TickReport (controller.statistics)."""
+"""Messages between the daemon and the controller process.
+
+The daemon sends a ControllerStart, then ControllerUpdates. The process sends LogRecords, a StartFailed if it cannot
+start, and a TickReport (omnid.controller.statistics) for each tick.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,9 @@ from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.engine.realtime import RealtimeSettings
 
-LONGEST_RAMP_S: Final = 3.0  # at the end: wheels that have not come to a stop within it are stopped at once
+# The wheels are ramped down when the daemon ends. Wheels that still turn after this time are stopped at once, so that
+# the process ends.
+LONGEST_RAMP_S: Final = 3.0
 
 
 class ControllerStart(NamedTuple):
@@ -24,24 +30,24 @@ class ControllerStart(NamedTuple):
 
 
 class ControllerUpdate(NamedTuple):
-    """One message of the daemon: a pose, a ring, a setpoint or a request to arm, if any; always the last stop and the
-    contacts.
+    """One message of the daemon: at most one update, and always the newest stop and contacts.
 
-    So a stop arrives with the next message that does, even if its own was lost.
+    Because each message repeats the stop, it arrives even if its own message was lost. stop_ns: arrival of the newest
+    stop, 0 before the first one. contacts: reports of bumpers and cliff sensors on the bus.
     """
 
-    stop_ns: int  # 0: none
+    stop_ns: int
     update: ControllerPose | ControllerRing | TimedSetpoint | ArmRequest | None
-    contacts: ContactState = NO_CONTACT  # of bumpers and cliff sensors on the bus
+    contacts: ContactState = NO_CONTACT
 
 
 class StartFailed(NamedTuple):
-    """The process cannot open the motor controller."""
+    """The process ends because it cannot open the motor controller."""
 
     reason: str
 
 
 class LogRecord(NamedTuple):
-    """A line for the log of the daemon; the first one, which may be empty, reports that the process is ready."""
+    """A line for the log of the daemon. The first one, whose text may be empty, means that the process is ready."""
 
     text: str

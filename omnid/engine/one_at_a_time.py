@@ -1,4 +1,4 @@
-"""A lock for work that several threads may ask for, of which one is to do it while the others wait."""
+"""A lock for code outside of omnid.engine, where no module imports `threading`."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from types import TracebackType
 
 
 class OneAtATime:
-    """A context that one thread at a time is in."""
+    """A context manager that one thread at a time enters; others wait. It is not reentrant."""
 
     __slots__ = ("_lock",)
 

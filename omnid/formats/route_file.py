@@ -19,8 +19,11 @@ from omnid.formats.whole_file import write_whole
 FORMAT: Final = "omnid route"
 VERSION: Final = 1
 SUFFIX: Final = ".route.json"
+# Limits of what is read, so that any file is refused in bounded time and memory. The longest route that can be taught
+# has MOST_POINTS points and one keyframe at most for each of them, which is less than 4 MB.
 MAX_BYTES: Final = 8 << 20
 MOST_KEYFRAMES: Final = 20_000
+# Speeds and turns that no robot on wheels has are those of a damaged file.
 FASTEST_MPS: Final = 20.0
 COLUMNS: Final = (
     "x_m",
@@ -76,6 +79,7 @@ def parse_route(content: bytes, name: str) -> Route:
 
 
 def _route(found: dict[str, Any]) -> Route:
+    """Return the route of a file's content. Raise OmnidError with what is wrong."""
     _require(found.keys() == _KEYS and found["columns"] == list(COLUMNS), "its keys are not those of a route")
     title, map_name = found["name"], found["map"]
     _require(isinstance(title, str) and isinstance(map_name, str) and len(map_name) <= 4096, "its names are no texts")
@@ -108,6 +112,7 @@ def _route(found: dict[str, Any]) -> Route:
 
 
 def _rows(value: Any, width: int, most: int) -> list[list[Any]]:
+    """Return a value if it is a list of at most `most` rows of `width` numbers. Raise OmnidError for any other."""
     _require(isinstance(value, list) and len(value) <= most, f"expected a list of at most {most} rows")
     for row in value:
         _require(
@@ -135,7 +140,7 @@ class RouteFolder:
         self.folder = folder
 
     def path(self, name: str) -> Path:
-        """Return the file of a route. Raise OmnidError for what is no name."""
+        """Return the path of a route's file. Raise OmnidError where `name` is not a valid name."""
         return self.folder / f"{route_name(name)}{SUFFIX}"
 
     def names(self) -> list[str]:
@@ -165,7 +170,7 @@ class RouteFolder:
         return route
 
     def write(self, route: Route) -> None:
-        """Write a route, in the place of one of the same name. Raise OmnidError where that is impossible."""
+        """Write a route; one of the same name is replaced. Raise OmnidError where it cannot be written."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -26,7 +26,7 @@ from omnid.recordings.series_differences import (
 )
 from omnid.recordings.settings_differences import table_differences
 
-MAX_KEYS: Final = 40  # lines about settings
+MAX_KEYS: Final = 40  # settings that differ and are listed; the number of the others is printed
 ATTACHMENTS: Final = (("settings", "omnid.toml"), ("rig", "rig.toml"))
 NS_PER_S: Final = 1_000_000_000
 
@@ -89,6 +89,7 @@ class RunComparison:
 
     @property
     def _share(self) -> float:
+        """Number of common poses by that of the longer run."""
         longest = max(int(run.poses.stamps_ns.size) for run in (self._a, self._b))
         return int(self._common.stamps_ns.size) / longest
 
@@ -181,7 +182,10 @@ class RunComparison:
 
 
 def _table_rows(name: str, a: bytes | None, b: bytes | None) -> Rows:
-    """Yield the keys of an attached file that differ; they explain differences of the runs and do not count as such."""
+    """Yield the keys of an attached file that differ.
+
+    They may explain why the runs differ, and do not count as a difference of the runs.
+    """
     if a is None or b is None:
         missing = " and ".join(run for run, text in (("A", a), ("B", b)) if text is None)
         yield name, f"not attached to {missing}"

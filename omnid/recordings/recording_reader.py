@@ -1,6 +1,7 @@
 """The reader of recorded runs: messages of one robot, decoded one by one in the order of the file.
 
-Any MCAP log with nav_msgs/msg/Odometry can be read; the robot's other topics are those beside it that omnid publishes.
+Any MCAP log with a topic of nav_msgs/msg/Odometry can be read. The robot's other topics have the same name up to the
+last slash, and the last part under which omnid publishes them.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ CLOUD: Final = "cloud"
 DRIVE: Final = "drive"
 TWIST_COMMAND: Final = "cmd/twist"
 IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # in the order of preference
+# A larger message is counted and not decoded, so that a damaged file cannot exhaust the memory.
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
 Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
@@ -47,9 +49,9 @@ Decoder: TypeAlias = Callable[[memoryview], Content]
 
 
 class RecordedMessage(NamedTuple):
-    """A decoded message."""
+    """A decoded message; name: last part of its topic, one of the constants above or of omnid.transport.topics."""
 
-    name: str  # of the topic, below the robot's: one of the names above
+    name: str
     log_time_ns: int
     content: Content
 
@@ -75,7 +77,7 @@ class RecordingReader:
         return self.topic.rpartition("/")[0].strip("/") or self.topic
 
     def topic_name(self, name: str) -> str:
-        """Return the full name of one of the robot's topics."""
+        """Return the full name of a topic from its last part."""
         return self.topic if name == ODOMETRY else f"{self.topic.rpartition('/')[0]}/{name}"
 
     def image_name(self) -> str:
@@ -98,6 +100,7 @@ class RecordingReader:
             self.damaged = section.broken + (not section.ended)
 
     def _decoded(self, topic: str, message: LogMessage, decoder: Decoder) -> Content | None:
+        """Return the content of a message; None, and count it, where it cannot be decoded."""
         try:
             if message.record.size > MAX_MESSAGE_BYTES:
                 raise OmnidError(f"a message of {message.record.size} bytes: expected at most {MAX_MESSAGE_BYTES}")

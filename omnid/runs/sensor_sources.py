@@ -23,7 +23,7 @@ from omnid.transport.topics import IMU, JOINT_STATES, WHEEL_ODOM
 
 
 def motion_topics(config: Config) -> MotionTopics:
-    """Return the topics of a log to read. Raise OmnidError for half of a pair of joints."""
+    """Return the topics of a log to read. Raise OmnidError where only one of the two wheel joints is named."""
     settings = config.motion
     return MotionTopics(
         "" if settings.wheels == "off" else settings.wheel_topic or None,
@@ -56,9 +56,10 @@ class MotionSource(Protocol):
 
 
 class SensorSources:
-    """One source for the wheels, one for the gyro: the nearest device that the settings name.
+    """One source for the wheels and one for the gyro.
 
-    Where the images are those of a log, or of a simulation, both come with them: no others fit.
+    Wheels: the motor controller, else a topic of the bus. Gyro: the serial IMU, else a topic of the bus. Where the
+    images come from a log or a simulation, so do both, because samples of another motion would not fit these images.
     """
 
     def __init__(
@@ -71,7 +72,10 @@ class SensorSources:
         *,
         with_images: bool = False,
     ) -> None:
-        """Open the IMU; DriverError where its port cannot be opened. with_images: they come with the images."""
+        """Open the IMU. Raise DriverError where its port cannot be opened.
+
+        with_images: the samples come with the images, so nothing is opened.
+        """
         self._inbox = inbox
         self.gyro: WitMotionGyro | None = None
         joints = joint_wheels(config)
@@ -88,7 +92,7 @@ class SensorSources:
         report: Callable[[int, str], None],
         joints: JointWheels | None,
     ) -> set[str]:
-        """Open the devices; return the topics of the bus that are taken."""
+        """Open the devices; return the topics of the bus from which samples are taken."""
         topics = set()
         if settings.wheels == "auto":
             if controller is not None:

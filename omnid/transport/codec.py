@@ -34,6 +34,7 @@ HEADER_SCHEMA = "std_msgs/msg/Header"
 CLOCK_SCHEMA = "rosgraph_msgs/msg/Clock"
 BOOL_SCHEMA = "std_msgs/msg/Bool"
 _PLAIN_TWIST_BYTES = 4 + 6 * 8  # encapsulation header, two vectors
+# Types whose serialisers are compiled at the start of a run, see compile_serialisers.
 SCHEMAS = (
     ODOMETRY_SCHEMA,
     POSE_SCHEMA,
@@ -48,6 +49,8 @@ SCHEMAS = (
     CLOCK_SCHEMA,
 )
 
+# A quaternion whose norm differs from 1 by more than this is refused: more than rounding to float32 or to six decimals
+# makes, and less than a quaternion of zeros or one that was scaled.
 QUATERNION_TOLERANCE = 1e-3
 NS_PER_S = 1_000_000_000
 MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int32
@@ -111,6 +114,7 @@ def pose_message(T: Array) -> ros.geometry_msgs__msg__Pose:
 
 
 def _covariance(matrix: ArrayLike) -> Array:
+    """Return a covariance (6, 6) as the array (36,) of a message. Raise OmnidError for another shape."""
     flat = np.ascontiguousarray(matrix, np.float64).reshape(-1)
     if flat.shape != (36,):
         raise OmnidError(f"covariance of shape {np.shape(matrix)}: expected (6, 6), in the order x y z rx ry rz")
@@ -282,6 +286,7 @@ def odometry_from_cdr(payload: bytes) -> OdometryRecord:
 
 
 def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
+    """Return the stamp of an Odometry. Raise OmnidError for one that is invalid."""
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
         raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)

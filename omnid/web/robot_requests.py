@@ -1,4 +1,4 @@
-"""Requests from the page: the same, with the same answers, as those of `omnid arm`, `goto`, `route` and `map save`."""
+"""Requests of the page to the robot: those of `omnid arm`, `goto`, `route` and `map save`, with the same answers."""
 
 from __future__ import annotations
 
@@ -16,19 +16,25 @@ from omnid.errors import OmnidError
 from omnid.web.feed import RobotFeed
 from omnid.web.snapshot import is_recent
 
-LONGEST_BODY: Final = 256  # bytes
+# The longest request, a route with a name of 64 letters and its options, has less than half of these bytes.
+LONGEST_BODY: Final = 256
+# A connection whose body has not arrived after this time is ended, so that slow ones do not collect.
 BODY_S: Final = 5.0
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
 _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
 
 
 class RobotRequests:
-    """Passes requests on to the robot, one of each kind at a time: each has a thread until it is answered."""
+    """Passes requests on to the robot.
+
+    A request occupies a thread until it is answered, so only one of each kind is under way. arms: number of requests to
+    arm so far.
+    """
 
     def __init__(self, feed: RobotFeed) -> None:
         self._feed = feed
-        self._busy: set[str] = set()
-        self.arms = 0  # that were asked for
+        self._busy: set[str] = set()  # kinds of the requests that wait for an answer
+        self.arms = 0
 
     async def arm(self) -> Answer:
         """Ask the robot to arm."""
@@ -36,7 +42,7 @@ class RobotRequests:
         return await self._asked("arm", Driver.arm)
 
     async def route(self, request: Request) -> Answer:
-        """Pass on what a text of cmd/route says: "teach NAME", "finish", "repeat NAME", "stop"."""
+        """Pass on a request in the words of cmd/route, such as "teach NAME", "finish", "repeat NAME" or "stop"."""
         return await self._asked_in_words("route", request, route_request, Driver.route)
 
     async def navigation(self, request: Request) -> Answer:
@@ -66,7 +72,7 @@ class RobotRequests:
         return await self._asked(kind, lambda driver: ask(driver, text))
 
     async def _asked(self, kind: str, ask: Callable[[Driver], Answer]) -> Answer:
-        """Ask the robot in a thread, unless another request of this kind waits for its answer."""
+        """Ask the robot in a thread; refuse where another request of this kind still waits for its answer."""
         robot = self._feed.robot
         if robot is None:
             return Answer(False, f"There is no connection: {self._feed.link}")
@@ -83,9 +89,10 @@ class RobotRequests:
 
 
 def goal_of(text: str) -> tuple[float, float, float | None]:
-    """Return x, y [m] and the heading [rad], None where it is left open. Raise OmnidError for no goal, or a late one.
+    """Return x, y [m] and the heading [rad] of a goal in odom; a heading of None leaves it open.
 
-    text: "X Y STAMP" or "X Y YAW STAMP", m, m, deg, and the server's time in the state that the page showed last.
+    text: "X Y STAMP" or "X Y YAW STAMP" in m, m, deg; the stamp is the server's time in the state that the page showed
+    last. Raise OmnidError for any other text, and for a stamp that is too old.
     """
     found = _GOAL.fullmatch(text)
     if found is None:
@@ -96,7 +103,7 @@ def goal_of(text: str) -> tuple[float, float, float | None]:
 
 
 async def text_of(request: Request) -> str:
-    """Return the body of a request. Raise OmnidError for one that is too long or does not come."""
+    """Return the body of a request. Raise OmnidError if it is too long or does not arrive within BODY_S."""
     body = bytearray()
     try:
         async with asyncio.timeout(BODY_S):

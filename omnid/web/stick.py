@@ -1,8 +1,9 @@
-"""The stick of the page: a motion for as long as a browser goes on asking for it, and no longer.
+"""The stick of the page: the robot moves only while a browser repeats its requests.
 
-A request counts only if its sender has seen a state of the robot a moment ago: it carries the server's time from the
-newest state that was shown. So a request that waited in a network moves nothing, whatever the browser's clock says. A
-browser that goes sends nothing more, and the robot stops by its own deadline (controller.deadlines.command_s).
+A request is accepted only if its sender has seen a recent state of the robot. It carries the server's time in the
+newest state that the page has shown, so a request that waited in a network moves nothing, and the browser's clock does
+not matter. A browser that is closed sends nothing more, and the robot stops by its own deadline
+(controller.deadlines.command_s).
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from omnid.web.robot_requests import text_of
 from omnid.web.snapshot import is_recent
 from omnid.web.wheel_commands import WheelCommands, within
 
-HELD_S: Final = 1.0  # for which a page that drives keeps others out after its last request
+# Other pages are refused for this time after the last request of the page that drives: several of its requests may be
+# lost before another page takes over.
+HELD_S: Final = 1.0
 _REQUEST: Final = re.compile(r"(-?[01](?:\.\d{1,4})?) (-?[01](?:\.\d{1,4})?) (\d{1,15}) ([0-9a-z]{1,16})")
 
 
@@ -36,7 +39,7 @@ class StickRequest(NamedTuple):
     forward: float  # -1 to 1
     turn: float  # -1 to 1, counter-clockwise
     stamp_ms: int  # the server's time in the newest state that the page has shown
-    page: str  # tells the open pages apart
+    page: str  # identifies an open page
 
     @property
     def moves(self) -> bool:
@@ -56,7 +59,7 @@ def stick_request(text: str) -> StickRequest:
 
 
 class StickCommands:
-    """Makes commands of requests; one page drives at a time, and one command is under way."""
+    """Sends a command for each request. One page drives at a time, and no command is sent before the last one ended."""
 
     def __init__(self, feed: RobotFeed, wheels: WheelCommands) -> None:
         self._feed, self._wheels = feed, wheels
@@ -81,7 +84,8 @@ class StickCommands:
         self._sending = True
         try:
             limits = await self._limits_of_robot()
-            if request.moves and not is_recent(request.stamp_ms):  # the limits took their time
+            # The first request reads the robot's limits, which may take so long that the request is no longer recent.
+            if request.moves and not is_recent(request.stamp_ms):
                 return Answer(False, "the stick is ready now")
             twist = (
                 FIRST_SHARE * request.forward * limits.velocity_mps,
@@ -98,6 +102,7 @@ class StickCommands:
         )
 
     def _refusal(self, request: StickRequest) -> str:
+        """Return why a request is refused, empty where it is not."""
         if self._wheels.is_stopping:
             return "a stop is not confirmed yet: drive after it"
         if self._page != request.page and time.monotonic() < self._held_until_s:
@@ -109,6 +114,7 @@ class StickCommands:
         return ""
 
     async def _limits_of_robot(self) -> VelocityLimits:
+        """Return the robot's limits, read at the first call; the defaults while there is no connection."""
         robot = self._feed.robot
         if self._limits is None and robot is not None:
             self._limits = await asyncio.to_thread(limits_of, robot)

@@ -1,4 +1,7 @@
-"""Estimate of the shape of a printed board beside the cameras and poses that were fitted to it as drawn."""
+"""Estimate of how a printed board differs from its drawing: bends and stretch, adjusted with camera and poses.
+
+It begins with the camera and the poses of a fit that took the board as drawn.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,10 @@ MIN_CHI2_BENDS, MIN_CHI2_STRETCH = 21.1, 15.1
 def find_print_shape(
     camera_of: CameraFactory, count: int, fitted: Observations, T_cam_board: Array, prior: Prior | None = None
 ) -> PrintShape:
-    """Return the significant part of the print's shape, of a fit (K, 4, 4) to a board as drawn.
+    """Return the significant part of the print's shape; AS_DRAWN where the adjustment fails.
 
     camera_of: the camera at steps (count,) from the fitted one. fitted: observations with the drawing's points.
+    T_cam_board: fitted poses (K, 4, 4) of the board as drawn.
     """
     free = replace(fitted, modes=all_modes(fitted.points))
     try:

@@ -15,7 +15,8 @@ from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 
 ANGLE_UNIT_RAD = 1.0 / 250.0  # one step of the transform between the cameras: about a pixel
-TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]  # the baseline's length stays, because a drive cannot tell it
+# The length of the baseline is no parameter: images of a drive do not determine the scale.
+TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]
 # Times of exposure, and one step of each: some tenths of a pixel at walking speed.
 UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
 TIME_UNITS = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
@@ -24,16 +25,17 @@ WAVE_NAMES = tuple(f"{side} {name}" for side in ("lower", "upper") for name in W
 
 
 def _with_wavefront(camera: OmniCamera, wavefront: Array) -> OmniCamera:
-    """Return the camera with a wavefront (5,) [m], if its model has one; others stay central, as seen at DISTANCE_M."""
+    """Return the camera with a wavefront (5,) [m]; a camera whose model has none is returned as it is."""
     return replace(camera, wavefront=tuple(wavefront.tolist())) if isinstance(camera, OcamCamera) else camera
 
 
 @dataclass(frozen=True, slots=True)
 class RigParameters:
-    """A rig as a function of steps: both cameras, then rotation (3) and direction of the baseline (2), then others.
+    """A rig as a function of steps (P,), the unknowns of the adjustment.
 
-    The others are no parameters of the rig: wavefronts of both cameras, if their rays do not meet in one point, and
-    times of exposure. The rig frame stays with the lower camera: moving that as well would only move all poses.
+    Their order: parameters of the lower camera, of the upper camera, rotation (3) and direction of the baseline (2),
+    wavefronts of both cameras (for mirrors whose rays do not meet in one point), times of exposure. The rig frame is
+    fixed to the lower camera, because moving both would only move all poses.
     """
 
     rig: Rig
@@ -46,9 +48,10 @@ class RigParameters:
     def about(
         rig: Rig, distortion: Collection[str] = (), times: tuple[str, ...] = (), *, waves: bool = False
     ) -> RigParameters:
-        """Return the parameters of the cameras' own models about a rig; distortion: terms of omni cameras, if 0.
+        """Return the parameters of a rig's camera models, with the rig's own values at steps of 0.
 
-        waves: with wavefronts of both cameras, about those of the file.
+        distortion: names of the terms of omni cameras that are parameters even where the rig has 0 for them. times: of
+        TIME_UNITS. waves: True if the wavefronts of both cameras are parameters.
         """
         lower, upper = (parameterise(mounted.camera, distortion) for mounted in (rig.lower, rig.upper))
         return RigParameters(rig, lower, upper, times, WAVE_NAMES if waves else ())
@@ -71,7 +74,7 @@ class RigParameters:
 
     @property
     def values(self) -> Array:
-        """Values (P,) at no step, in the parameters' own units; the transform's are zero, in radians."""
+        """Values (P,) at steps of 0, in the parameters' own units; those of the transform are 0 rad."""
         times = self.rig.times
         of_rig = {UPPER_DELAY: times.upper_delay_s / S_PER_MS, LINE_TIME: times.line_time_s / S_PER_US}
         return np.concatenate(
@@ -103,7 +106,7 @@ class RigParameters:
         return np.asarray(~of_lower if camera else of_lower | (np.array(self.names) == LINE_TIME))
 
     def at(self, steps: Array) -> Rig:
-        """Return the rig after steps (P,); CalibError where there is no such camera."""
+        """Return the rig after steps (P,). Raise CalibError where they lead to parameters that no camera has."""
         first, second = len(self.lower.names), len(self.lower.names) + len(self.upper.names)
         turn = steps[second : second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
         rig = self.rig.with_upper_moved(turn[:3], turn[3:])
@@ -117,7 +120,7 @@ class RigParameters:
         return replace(rig, lower=lower, upper=upper, covariance=None, times=self.times_at(steps))
 
     def transform_steps(self, rig: Rig) -> Array:
-        """Return steps (P,) to the transform between another rig's cameras; cameras and times stay."""
+        """Return the steps (P,) that give this rig the transform between the cameras of another; all others are 0."""
         R_rect_rig = self.rig.T_rect_rig[:3, :3]
         R_rig_upper, own = rig.upper.T_cam_rig[:3, :3].T, self.rig.upper.T_cam_rig[:3, :3]
         turn = se3.rotation_log(R_rect_rig @ R_rig_upper @ own @ R_rect_rig.T)

@@ -1,4 +1,4 @@
-"""Simulated controllers by the names of their protocols."""
+"""Registry of the simulated controllers, by the names that `motor.protocol` has for the protocols."""
 
 from __future__ import annotations
 

@@ -9,14 +9,15 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import TextFramer
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
+# AUTO_STOP_INTERVAL and PID_INTERVAL of the firmware, written here again: a wrong value in the protocol must show.
 _AUTO_STOP_MS, _LOOP_S = 2000, 0.033
-_MAX_LINE = 40  # bytes
-_MAX_TICKS = 32767  # int of the board: 16 bits
-_FIRST_COUNT = 2**31 - 100
+_MAX_LINE = 40  # bytes; the longest command, "m -32767 -32767", is shorter
+_MAX_TICKS = 32767  # an int of the board has 16 bits
+_FIRST_COUNT = 2**31 - 100  # a hundred ticks before the 32 bits overflow, so that short drives cross it
 
 
 class SimulatedArduino:
-    """One board; its counts start near the end of their 32 bits, so that they overflow."""
+    """A simulated board. Its counts of ticks start at _FIRST_COUNT, so that they overflow soon."""
 
     def __init__(self, drive: DifferentialDrive | None = None) -> None:
         self.base = SimulatedBase(drive)

@@ -12,7 +12,7 @@ MANUAL: Final = "manual"
 AUTOMATIC: Final = "automatic"
 STARTED: Final = "not armed since the start"
 
-# Reasons to refuse a request to arm, beside those of the faults (omnid.core.control.safety_rules).
+# Reasons to refuse a request to arm. A fault that holds is another one (omnid.core.control.safety_rules).
 OLDER_THAN_STOP: Final = "older than the last stop"
 TOO_LATE: Final = "it was not handled in time"
 
@@ -28,17 +28,23 @@ def arming_knob() -> str:
 
 
 class ArmRequest(NamedTuple):
-    """A request to arm."""
+    """A request to arm.
 
-    arrival_ns: int  # by the clock that steps the law
-    id: int = 0  # rises with each request; the answer carries it
+    arrival_ns: by the clock that steps the control law. id: rises with each request, and the answer carries it.
+    """
+
+    arrival_ns: int
+    id: int = 0
 
 
 class ArmAnswer(NamedTuple):
-    """The answer to the newest request to arm."""
+    """The answer to the newest request to arm.
 
-    id: int  # of the request; 0: there was none
-    refusal: str  # the reason; empty where the request was accepted
+    id: that of the request, 0 before the first one. refusal: why it was refused, empty if it was accepted.
+    """
+
+    id: int
+    refusal: str
 
 
 NO_ANSWER: Final = ArmAnswer(0, "")
@@ -47,27 +53,29 @@ NO_ANSWER: Final = ArmAnswer(0, "")
 class Arming:
     """State machine of the permission to drive.
 
-    Disarmed at the start. Each fault disarms for as long as it holds; after it, mode "manual" waits for a request,
-    "automatic" arms by itself. A stop that was asked for latches in both modes: only a request that arrived after it
-    releases it, so that a request that was sent before the stop, and comes through later, does not. A bumper and a
-    cliff sensor latch as well, and no request is accepted while they hold.
-    A stale command is no fault: the operator has let go of the stick, and may go on.
+    - At the start the base is disarmed.
+    - A fault disarms it while the fault holds. After the fault, mode "manual" waits for a request, and "automatic" arms
+      without one.
+    - A requested stop latches in both modes. Only a request that arrived after the stop releases it, so that one that
+      was sent before the stop and delayed on its way does not.
+    - A bumper and a cliff sensor latch as well, and every request is refused while they report a contact.
+    - A stale command is no fault: the operator has released the stick, and may drive again at any time.
     """
 
     def __init__(self, mode: str) -> None:
         """Begin disarmed; mode: MANUAL or AUTOMATIC."""
         self._automatic = mode == AUTOMATIC
         self._stop_ns = 0  # arrival of the newest stop
-        self._released_ns = 0  # arrival of the request that released the last one
+        self._released_ns = 0  # arrival of the request that released the last stop
         self._request: ArmRequest | None = None
-        self._touched = False  # a contact has latched
+        self._touched = False  # True while a contact is latched
         self.armed = False
-        self.reason = STARTED  # why it is disarmed: the first cause, or a stop; empty while armed
+        self.reason = STARTED  # why the base is disarmed: a requested stop, else the first fault; empty while armed
         self.answer = NO_ANSWER
 
     @property
     def stop_asked(self) -> bool:
-        """True if a stop was asked for and not released."""
+        """True if a stop was requested and is not yet released."""
         return self._stop_ns > self._released_ns
 
     @property
@@ -76,7 +84,7 @@ class Arming:
         return not self.armed and (self.stop_asked or self._touched or not self._automatic)
 
     def stop(self, asked_ns: int) -> None:
-        """Take the time of the newest stop; an earlier one changes nothing, so it may be repeated."""
+        """Take the arrival of a stop; a repeated or earlier one changes nothing."""
         self._stop_ns = max(self._stop_ns, asked_ns)
 
     def request(self, request: ArmRequest) -> None:
@@ -84,11 +92,11 @@ class Arming:
         self._request = request
 
     def step(self, fault: str, now_ns: int, longest_s: float) -> ArmRequest | None:
-        """Disarm where a stop or a fault asks for it; return the request that was accepted in this step.
+        """Disarm at a stop or a fault, answer the newest request, and return the request if it was accepted.
 
-        fault: reason that disarms and holds now; empty without one. longest_s: age at which a request is too old.
+        fault: the fault that holds now, empty without one. longest_s: an older request is refused.
         """
-        # 1. A fault or a stop that was asked for disarms.
+        # 1. A fault or a requested stop disarms.
         self._touched |= fault in LATCHING
         if self.armed and fault:
             self.armed, self.reason = False, fault
@@ -102,7 +110,7 @@ class Arming:
                 self._released_ns, self._touched = request.arrival_ns, False
                 self._arm()
                 return request
-        # 3. In the automatic mode the base is armed without a request, until a stop or a latching fault.
+        # 3. In the automatic mode the base is armed without a request, except after a stop or a latched contact.
         if self._automatic and not fault and not self.stop_asked and not self._touched:
             self._arm()
         return None
@@ -111,6 +119,7 @@ class Arming:
         self.armed, self.reason = True, ""
 
     def _refusal(self, request: ArmRequest, fault: str, now_ns: int, longest_s: float) -> str:
+        """Return why a request is refused, empty where it is accepted."""
         if fault:
             return fault
         if request.arrival_ns <= self._stop_ns:

@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SECTORS: Final = 360  # one a degree: 5 cm at 3 m, the size of a cell, is fine enough
-MAX_RANGE_M: Final = 12.0  # of keyframes; by trial on development seeds
-# Longest gap that is filled between two sectors of one surface; 0.2 m at 3 m: too narrow for a person.
+# Sectors of one degree are as wide as a cell of the map, 5 cm, at 3 m; finer ones would not show more.
+SECTORS: Final = 360
+# Points of a keyframe that are farther away do not enter its scan; by trial on development seeds.
+MAX_RANGE_M: Final = 12.0
+# Longest gap that is filled between two sectors of one surface. It is 0.2 m wide at 3 m: too narrow for a person.
 FILLED_SECTORS: Final = 4
-SURFACE_RATIO: Final = 1.15  # of the ranges on both sides of such a gap, at most; by trial on development seeds
+# The ranges on both sides of a gap belong to one surface if their ratio is at most this; by trial on development seeds.
+SURFACE_RATIO: Final = 1.15
 
-RangeScan = NDArray[np.float32]  # (SECTORS,) m, from azimuth -pi on; NaN: nothing was seen there
+# Ranges (SECTORS,) [m] of the sectors in the order of azimuth, from -pi on. NaN: no obstacle was seen.
+RangeScan = NDArray[np.float32]
 
 
 def azimuths() -> Array:
@@ -25,9 +29,9 @@ def azimuths() -> Array:
 
 
 def fill_gaps(scan: RangeScan) -> RangeScan:
-    """Return the scan with short gaps filled, if the ranges on both sides are those of one surface.
+    """Return the scan (SECTORS,) with short gaps filled, where the ranges on both sides are those of one surface.
 
-    Stereo sees edges: a wall between two of them is no gap.
+    Sparse stereo measures edges only, so a plain wall between two edges appears as a gap and is none.
     """
     known = np.flatnonzero(np.isfinite(scan))
     if len(known) < 2:

@@ -1,6 +1,6 @@
 """Occupancy grid of range scans at poses: obstacles, and the space between the robot and them (ray casting).
 
-The scans are those of keyframes, so the grid is drawn again where keyframes move: a loop that closes moves the map.
+The scans are those of keyframes. A loop that closes moves the keyframes, and the grid is then drawn again.
 Log odds with limits: Elfes 1989, "Using occupancy grids for mobile robot perception and navigation"; the limits, by
 which later views clear what has gone: Hornung et al. 2013, "OctoMap", section 3.4.
 """
@@ -21,23 +21,31 @@ from omnid.core.mapping.range_scan import SURFACE_RATIO, RangeScan, azimuths
 Array = NDArray[np.float64]
 Cells = NDArray[np.int8]
 
-MAX_CELLS: Final = 8_000_000  # of the grid, 2 bytes each; 140 m by 140 m at 0.05 m, so that it has 16 MB
-# Tenths of log odds that a scan adds to a cell with an obstacle; a ratio of 2.5 to 1; by trial on development seeds.
+# Two bytes for each cell are 16 MB, so that the grid fits a small computer; 140 m by 140 m at cells of 0.05 m.
+MAX_CELLS: Final = 8_000_000
+# Log odds are stored in tenths, so that a cell is one byte. A scan adds HIT to a cell with an obstacle (odds of 2.5 to
+# 1) and subtracts MISS from a cell in front of it (1.5 to 1); by trial on development seeds.
 HIT: Final = 9
-MISS: Final = 4  # and takes from one that it sees through; 1.5 to 1; by trial on development seeds
-LIMITS: Final = (-20, 35)  # tenths of log odds: nine free views clear a wall that was seen often
-OCCUPIED_FROM: Final = 14  # tenths of log odds: two hits more than misses
-FREE_UNTIL: Final = -8  # tenths of log odds: two misses, as false matches let single views see through a wall
-SHORTER: Final = 0.02  # 1/m: the free space of a range r ends r^2 times it before the obstacle, as the noise of stereo
-EDGE_SECTORS: Final = 2  # to each side, in which the nearest range ends the free space: so far off may an edge be
-SHIFT: Final = 4  # fractional bits of the corners that are drawn; a sixteenth of a cell is enough
+MISS: Final = 4
+# Tenths of log odds at which a cell stays, so that nine free views clear a wall that was seen often.
+LIMITS: Final = (-20, 35)
+# A cell is occupied from two hits on, because a single one may be a false match ...
+OCCUPIED_FROM: Final = 14
+# ... and free from two misses on, because a false match may let a single view pass through a wall.
+FREE_UNTIL: Final = -8
+# Factor [1/m] of the squared range: the free space ends by this much before the obstacle, as the noise of stereo grows.
+SHORTER: Final = 0.02
+# Sectors to each side whose nearest range ends the free space, because an edge may be measured so far off.
+EDGE_SECTORS: Final = 2
+# Fractional bits of the polygons' corners: a sixteenth of a cell is enough.
+SHIFT: Final = 4
 
 
 class ScanGrid:
     """Log odds of cells, drawn scan by scan; the oldest first, because later ones count more."""
 
     def __init__(self, low: Array, high: Array, cell_m: float, max_cells: int = MAX_CELLS) -> None:
-        """low, high: corners (2,) [m] of the area; cells double in size until there are at most so many."""
+        """low, high: corners (2,) [m] of the area. The size of a cell is doubled until max_cells suffice."""
         while math.prod(np.floor(high / cell_m) - np.floor(low / cell_m) + 1) > max_cells:
             cell_m *= 2
         self._cell_m = cell_m
@@ -47,7 +55,8 @@ class ScanGrid:
         self._seen = np.zeros((height, width), bool)
 
     def add(self, scan: RangeScan, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Add a scan at a pose of its frame."""
+        """Add a scan (SECTORS,) whose frame has this pose in the map."""
+        # 1. The ends of the ranges, and the part of the grid in which they lie.
         known = np.isfinite(scan)
         angle = azimuths() + yaw_rad
         direction = np.column_stack([np.cos(angle), np.sin(angle)]) / self._cell_m
@@ -59,20 +68,25 @@ class ScanGrid:
         left, top, right, bottom = window
         odds, seen = self._odds[top:bottom, left:right], self._seen[top:bottom, left:right]
         free, hit = np.zeros(odds.shape, np.uint8), np.zeros(odds.shape, np.uint8)
-        # A cell's middle is an integer for OpenCV. Sectors without range are a corner at the robot: not seen.
+        # 2. The free space: a polygon through the shortened ranges. A sector without a range has its corner at the
+        # robot, so that nothing becomes free there. OpenCV has integers at the middles of cells, hence the 0.5.
         ranges = np.where(known, scan, np.inf)
         neighbours = [np.roll(ranges, shift) for shift in range(-EDGE_SECTORS, EDGE_SECTORS + 1)]
         nearest = np.where(known, np.min(neighbours, axis=0), 0.0)
         seen_through = np.maximum(nearest - self._cell_m - SHORTER * nearest**2, 0.0)
         corners = np.rint((centre + seen_through[:, None] * direction - [left, top] - 0.5) * 2**SHIFT).astype(np.int32)
         cv2.fillPoly(free, [corners], 1, shift=SHIFT)
+        # 3. The obstacles, and the sum of both; a cell with an obstacle is not free.
         _draw_hits(hit, scan, ends - [left, top])
         change = np.where(hit > 0, HIT, -MISS * free.astype(np.int8)).astype(np.int8)
         np.clip(odds + change, *LIMITS, out=odds)
         seen |= (hit | free) > 0
 
     def grid(self) -> Grid:
-        """Return occupied, free and unknown cells; none is free beside an occupied one, known to a cell."""
+        """Return the occupied, free and unknown cells.
+
+        A cell next to an occupied one is never free, because an obstacle is known to a cell only.
+        """
         cells = np.full(self._odds.shape, UNKNOWN, np.int8)
         is_occupied = self._seen & (self._odds >= OCCUPIED_FROM)
         near = cv2.dilate(is_occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -90,7 +104,7 @@ class ScanGrid:
 
 
 def scan_grid(scans: Sequence[RangeScan], poses: Array, cell_m: float) -> Grid:
-    """Return the grid of scans whose frames have the poses (K, 4, 4) in the map, the oldest first."""
+    """Return the grid of K scans, the oldest first; poses (K, 4, 4): those of their frames in the map."""
     reach, xy = np.array([reach_m(scan) + cell_m for scan in scans])[:, None], poses[:, :2, 3]
     low, high = (xy - reach, xy + reach) if len(scans) else (np.zeros((1, 2)), np.zeros((1, 2)))
     drawn = ScanGrid(low.min(axis=0), high.max(axis=0), cell_m)

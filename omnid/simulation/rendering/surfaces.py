@@ -13,8 +13,9 @@ from calib.models.camera import Array
 Texture = NDArray[np.uint8]
 # Distance of a poster from its wall: well above the depth error of float32.
 POSTER_GAP_M = 0.002
-# Direction of the light in the world; faces differ in grey by it.
+# Unit vector towards the light in the world. Its components differ, so that adjacent faces differ in grey.
 LIGHT = np.array([0.35, 0.55, 0.76])
+# Factors of the light from all sides and of that from LIGHT; the sum is 1, so no surface is brighter than its texture.
 AMBIENT, DIFFUSE = 0.72, 0.28
 
 
@@ -59,7 +60,7 @@ class Rectangle:
 
     @cached_property
     def brightness(self) -> float:
-        """Return the factor of the texture's grey by the angle to the light; the same on both sides."""
+        """Return the factor of the texture's grey by the angle to the light, equal on both sides."""
         return float(AMBIENT + DIFFUSE * abs(self.normal @ LIGHT))
 
     def poster(self, texture: Texture, area_m: tuple[float, float, float, float], name: str = "") -> Rectangle:
@@ -77,5 +78,5 @@ class Scene:
     rectangles: tuple[Rectangle, ...]
 
     def named(self, name: str) -> Rectangle:
-        """Return the rectangle of that name."""
+        """Return the first rectangle with this name."""
         return next(r for r in self.rectangles if r.name == name)
