@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
+from drivers.jpeg import JpegHeader, read_header, restart_fault
 
 Camera = Literal["lower", "upper"]
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
@@ -18,7 +19,6 @@ CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 MAX_PIXELS = 64 * 2**20
 # Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.
 MAX_SAMPLES = 64 * 2**20
-_MAX_JPEG_SEGMENTS = 1000
 _TAIL_BLOCK_BYTES = 4096  # the padding is searched backwards in blocks of this size
 _TAIL_BYTES = 16  # before the padding; longer than any end marker
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
@@ -28,13 +28,6 @@ _PNG_FIRST_CHUNK = 8
 _PNG_CHUNK_BYTES = 12  # length, name and CRC
 _MAX_PNG_CHUNKS = 1000
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
-_JPEG_FIRST_FRAME, _JPEG_LAST_FRAME = 0xC0, 0xCF  # markers SOF0 to SOF15 (ITU T.81, table B.1)
-_JPEG_NO_FRAME = (0xC4, 0xC8, 0xCC)  # among them: DHT, JPG, DAC
-_JPEG_FILL = 0xFF
-_JPEG_NO_LENGTH = (0x00, 0x01, *range(0xD0, 0xDA))  # stuffed byte, TEM, RST0 to RST7, SOI, EOI: not in a header
-_JPEG_LENGTH_BYTES = 2  # the length counts itself
-_JPEG_SCAN = 0xDA  # SOS: the header ends here
-_JPEG_FRAME_BYTES = 10  # marker, length, precision, height, width, number of components
 _CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
 _LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
 _MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
@@ -76,7 +69,7 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
 
     Colours are converted with OpenCV's weights; of mono16 the upper byte is kept, of yuyv, uyvy and nv12 the luma.
     An EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises FrameDecodeError for
-    an image that is truncated, malformed or of an unknown encoding.
+    an image that is truncated, malformed or of an unknown encoding, or of whose restart markers some were lost.
     """
     try:
         image = _decompress(frame) if frame.encoding in _START_MARKER else _unpack(frame)
@@ -99,10 +92,13 @@ def _decompress(frame: Frame) -> NDArray[np.uint8]:
     # libjpeg fills the missing part of a truncated image with grey and reports success, so the end is checked first
     if not _unpadded_tail(data).endswith(_END_MARKER[frame.encoding]):
         raise _decode_error(frame, f"its end is missing after {data.size} bytes")
-    width, height, channels = _png_size(data) if frame.encoding == "png" else _jpeg_size(data)
+    header = read_header(data) if frame.encoding == "jpeg" else JpegHeader(*_png_size(data))
+    width, height, channels = header.width, header.height, header.channels
     _require_size(frame, width, height)
     if width * height * channels > MAX_SAMPLES:
         raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
+    if fault := restart_fault(data, header):
+        raise _decode_error(frame, fault)
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.ndim != 2 or image.dtype != np.uint8:
         raise _decode_error(frame, "its content is corrupt")
@@ -141,29 +137,6 @@ def _is_animated(data: NDArray[np.uint8]) -> bool:
             return name != b"IDAT"
         offset += int.from_bytes(length, "big") + _PNG_CHUNK_BYTES
     return True
-
-
-def _jpeg_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:
-    """Return width, height and channels from the start-of-frame segment (ITU T.81, B.1.1 and B.2.2).
-
-    Zeros where the header has none or several, or a marker that libjpeg skips and that has no length: a walk that takes
-    the bytes after it for a length would find another size than libjpeg does.
-    """
-    offset = 2  # after the start of image
-    found: list[tuple[int, int, int]] = []
-    for _ in range(_MAX_JPEG_SEGMENTS):
-        segment = data[offset : offset + _JPEG_FRAME_BYTES].tobytes()
-        if len(segment) < _JPEG_FRAME_BYTES or segment[0] != _JPEG_FILL:
-            break
-        marker, length = segment[1], int.from_bytes(segment[2:4], "big")
-        if marker == _JPEG_SCAN:
-            return found[0] if len(found) == 1 else (0, 0, 0)
-        if marker in _JPEG_NO_LENGTH or (marker != _JPEG_FILL and length < _JPEG_LENGTH_BYTES):
-            break
-        if _JPEG_FIRST_FRAME <= marker <= _JPEG_LAST_FRAME and marker not in _JPEG_NO_FRAME:
-            found.append((int.from_bytes(segment[7:9], "big"), int.from_bytes(segment[5:7], "big"), segment[9]))
-        offset += 1 if marker == _JPEG_FILL else 2 + length
-    return 0, 0, 0
 
 
 def _require_size(frame: Frame, width: int, height: int) -> None:

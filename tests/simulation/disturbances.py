@@ -1,15 +1,16 @@
 """Effects of real lenses, mirrors, lamps and cameras on images, each by a name: `--disturb NAME`, or all by `--real`.
 
-They act on the scene (`light_of`), on ideal images, 0 to 255, before the sensor's own blur and noise
-(`DisturbedCamera.shown`), or on its digits (`digitised`, `encoded`). What is fixed to a camera, as dust, is drawn once
-from the seed; what changes, from pair to pair. Lengths are parts of the image's width, so that images of all sizes are
-disturbed alike.
+They act on the scene (`light_of` of scene_light.py), on ideal images, 0 to 255, before the sensor's own blur and noise
+(`DisturbedCamera.shown`), on its digits (`digitised`), or on the bytes of its JPEG (`encoded`). What is fixed to a
+camera, as dust, is drawn once from the seed; what changes, from pair to pair. Lengths are parts of the image's width,
+so that images of all sizes are disturbed alike.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
 from typing import Final, Literal, get_args
 
 import cv2
@@ -18,11 +19,12 @@ from numpy.typing import NDArray
 
 from calib.models.camera import Mask
 from omnid.simulation.rendering.sensor import Floats
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
 
 Disturbance = Literal[
     "gloss",
+    "glass",
     "windows",
+    "shadows",
     "motion blur",
     "defocus",
     "chromatic",
@@ -34,12 +36,10 @@ Disturbance = Literal[
     "pattern",
     "lines",
     "jpeg",
+    "restarts",
 ]
 DISTURBANCES: Final[tuple[Disturbance, ...]] = get_args(Disturbance)
 
-GLOSS: Final = 0.25  # share of the light that a floor reflects like a mirror
-WINDOW_GREY: Final = 200.0  # by which a window is lighter than white paper: it saturates
-WINDOWS: Final = 3  # every third poster is a window
 EXPOSURE_S: Final = 0.015  # of motion blur, and of lamps' flicker
 SUB_EXPOSURES: Final = 3  # rendered for motion blur
 DEFOCUS: Final = 0.003  # sigma of the blur at the rim; it grows with the square of the radius
@@ -54,42 +54,10 @@ LINE_S: Final = 26e-6  # from row to row: flicker shows as bands
 GAIN_EVERY, GAIN_STEP = 9, 0.25  # pairs from step to step of automatic exposure, and the largest step
 PATTERN_GREY, COLUMN_GREY, HOT = 1.5, 1.0, 2e-4  # sigma of pixels and columns, share of hot pixels
 LINES: Final = 3  # rows of each image that repeat the row above
+MCU_PX: Final = 16  # width of a coded block of 4:2:2
 QUALITY: Final = (60, 91)  # of JPEG, another for each image
-
-
-Rendered = Callable[[Scene], Floats]  # returns the image (H, W) of a scene
-
-
-def light_of(scene: Scene, rendered: Rendered, names: Collection[Disturbance]) -> Floats:
-    """Return the ideal image (H, W) of a scene whose floor is glossy, and of whose posters some are windows."""
-    windows = _windows(scene) if "windows" in names else frozenset[str]()
-    image = _with_windows(scene, rendered, windows)
-    if "gloss" not in names:
-        return image
-    # A mirror in the plane z = 0 shows the world below it, where the floor is seen.
-    below = Scene(tuple(_mirrored(face) for face in scene.rectangles if face.name != "floor"))
-    seen = rendered(_painted(scene, frozenset({"floor"}))) / (255 * scene.named("floor").brightness)
-    return np.asarray(image + GLOSS * seen * (_with_windows(below, rendered, windows) - image), np.float32)
-
-
-def _with_windows(scene: Scene, rendered: Rendered, windows: frozenset[str]) -> Floats:
-    image = rendered(scene)
-    return image + np.float32(WINDOW_GREY / 255) * rendered(_painted(scene, windows)) if windows else image
-
-
-def _windows(scene: Scene) -> frozenset[str]:
-    return frozenset([face.name for face in scene.rectangles if face.name.startswith("poster")][::WINDOWS])
-
-
-def _painted(scene: Scene, white: frozenset[str]) -> Scene:
-    """Return a scene in which the surfaces of these names are white, and all others black."""
-    shades = {name: np.full((8, 8), 255 * name, np.uint8) for name in (False, True)}
-    return Scene(tuple(replace(face, texture=shades[face.name in white]) for face in scene.rectangles))
-
-
-def _mirrored(face: Rectangle) -> Rectangle:
-    origin, edge_u, edge_v = (one * (1.0, 1.0, -1.0) for one in (face.origin, face.edge_u, face.edge_v))
-    return replace(face, origin=origin, edge_u=edge_u, edge_v=edge_v)
+BROKEN: Final = 0.1  # share of the images whose JPEG is damaged
+LOST_ROWS: Final = (1, 5)  # rows of blocks whose bytes are lost in it, with their restart markers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,13 +139,29 @@ class DisturbedCamera:
         return image
 
     def encoded(self, image: NDArray[np.uint8], pair: int) -> bytes | None:
-        """Return the image as a colour JPEG with 4:2:0; None where it is not disturbed."""
+        """Return the image as a colour JPEG of the camera's own encoder; None where it is not disturbed.
+
+        jpeg: 4:2:0 in both cameras; restarts: 4:2:2 with a restart marker after each row of blocks, some of them lost;
+        both: jpeg in the lower camera, restarts in the upper one.
+        """
+        if "restarts" in self.names and (self.number == 1 or "jpeg" not in self.names):
+            return self._interrupted(image, pair)
         if "jpeg" not in self.names:
             return None
-        quality = int(self._rng(pair).integers(*QUALITY))
-        sampling = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
-        colours = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-        return cv2.imencode(".jpg", colours, [cv2.IMWRITE_JPEG_QUALITY, quality, *sampling])[1].tobytes()
+        return _colour_jpeg(image, int(self._rng(pair).integers(*QUALITY)), cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420)
+
+    def _interrupted(self, image: NDArray[np.uint8], pair: int) -> bytes:
+        """Return a JPEG, of which bytes between two restart markers were lost in some images, as on a bad cable."""
+        rng = self._rng(pair)
+        quality, is_broken, lost = int(rng.integers(*QUALITY)), rng.uniform() < BROKEN, int(rng.integers(*LOST_ROWS))
+        interval = (cv2.IMWRITE_JPEG_RST_INTERVAL, -(-image.shape[1] // MCU_PX))  # one row of blocks
+        data = _colour_jpeg(image, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422, *interval)
+        if not is_broken:
+            return data
+        # In the data of a scan 0xFF is followed by 0 or by a marker (ITU T.81, B.1.1.5).
+        markers = [found.start() for found in re.finditer(rb"\xff[\xd0-\xd7]", data)]
+        first = int(rng.integers(len(markers) - lost))
+        return data[: markers[first]] + data[markers[first + lost] :]
 
     def _rng(self, pair: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, self.number, pair, 41])
@@ -215,3 +199,8 @@ class DisturbedCamera:
         spread = cv2.GaussianBlur(grey, (0, 0), FLARE_SIGMA * grey.shape[1])
         ring = np.abs(self.radius * 0.5 - REFLECTION_RADIUS) < REFLECTION_RADIUS / 4
         return np.asarray((1 - FLARE) * grey + FLARE * spread + REFLECTION * 255 * ring, np.float32)
+
+
+def _colour_jpeg(image: NDArray[np.uint8], quality: int, sampling: int, *more: int) -> bytes:
+    words = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling, *more]
+    return cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), words)[1].tobytes()

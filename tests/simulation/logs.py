@@ -20,10 +20,11 @@ from calib.rig_file import write_rig
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from tests.simulation.disturbances import Disturbance, DisturbedCamera, light_of
+from tests.simulation.disturbances import Disturbance, DisturbedCamera
 from tests.simulation.mirrors import MirrorCamera
 from tests.simulation.readout import Readout, body_twists
 from tests.simulation.rigs import nominal_rig
+from tests.simulation.scene_light import light_of
 
 START_NS = 1_700_000_000_000_000_000
 # Delay from an image's stamp to its arrival at the recorder.
@@ -71,7 +72,7 @@ def write_log(
                 supersample=supersample,
                 row_twist=row_twist,
             )
-            parts.append(light_of(scene, rendered, disturbances))
+            parts.append(light_of(scene, rendered, disturbances, T_world_rig[:2, 3]))
         time_s = 1e-9 * readout.period_ns * pair + delay_s[pair] * camera
         return disturbed[camera].shown(np.mean(parts, axis=0, dtype=np.float32), pair, time_s)
 

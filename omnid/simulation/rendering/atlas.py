@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -18,9 +18,9 @@ SMALLEST_PX = 8
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """All levels of R textures."""
+    """All levels of textures, and where those of R of them are."""
 
-    textures: tuple[Texture, ...]  # kept, so that their ids stay unique
+    textures: tuple[Texture, ...]  # all; kept, so that their ids stay unique
     texels: NDArray[np.uint8]  # (K,) of all levels, row by row
     pyramids: NDArray[np.int64]  # (R, 2) first level of each texture, number of its levels
     levels: NDArray[np.int64]  # (L, 3) first texel, height, width
@@ -52,14 +52,16 @@ def make_atlas(textures: Sequence[Texture]) -> Atlas:
     return Atlas(tuple(textures), texels, np.array([first[id(texture)] for texture in textures], np.int64), levels)
 
 
-_atlases: dict[tuple[int, ...], Atlas] = {}
+_atlases: list[Atlas] = []  # the one used last at the end
 
 
 def cached_atlas(textures: Sequence[Texture]) -> Atlas:
-    """Return the atlas of textures, computed once."""
-    key = tuple(map(id, textures))
-    if key not in _atlases:
-        if len(_atlases) >= MAX_ATLASES:
-            del _atlases[next(iter(_atlases))]
-        _atlases[key] = make_atlas(textures)
-    return _atlases[key]
+    """Return the atlas of textures; the texels of one that has them all are shared, whatever their order."""
+    for number, atlas in enumerate(_atlases):
+        rows = {id(texture): row for row, texture in enumerate(atlas.textures)}
+        if all(id(texture) in rows for texture in textures):
+            _atlases.append(_atlases.pop(number))
+            return replace(atlas, pyramids=atlas.pyramids[[rows[id(texture)] for texture in textures]])
+    del _atlases[: len(_atlases) - MAX_ATLASES + 1]
+    _atlases.append(make_atlas(textures))
+    return _atlases[-1]
