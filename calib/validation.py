@@ -16,7 +16,7 @@ from calib.models.camera import Array
 
 # Larger than any calibration with two embedded masks.
 MAX_FILE_BYTES = 16_000_000
-SHOWN_CHARACTERS = 80  # of a value, so that a message stays one line
+SHOWN_CHARACTERS = 80  # Most characters of a value, so that a message stays one line.
 MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
 # Larger numbers would overflow in products.

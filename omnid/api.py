@@ -37,7 +37,7 @@ from omnid.stages.skew import Skew
 
 FilePath: TypeAlias = str | PathLike[str]
 GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)
-MAX_SKEW_S = 1.0  # between the stamps of a pair: more is a mistake of clocks or units
+MAX_SKEW_S = 1.0  # Stamps of a pair that differ by more are a mistake of clocks or units.
 InputImage: TypeAlias = NDArray[Any] | None  # what cv2.imread gives; a GreyImage is expected and checked
 
 

@@ -10,10 +10,10 @@ class NavigationState(StrEnum):
 
     IDLE = "idle"  # there is nothing to do since the start
     DRIVING = "driving"
-    AVOIDING = "avoiding"  # beside the path, around an obstacle
-    BLOCKED = "blocked"  # it waits for the way to become free
-    PAUSED = "paused"  # by a command, or by a fault that a person must look at; `resume` goes on
-    NOT_LOCALISED = "not localised"  # it waits for the pose in the map
+    AVOIDING = "avoiding"  # off the path, around an obstacle
+    BLOCKED = "blocked"  # waits for the way to become free
+    PAUSED = "paused"  # paused by a command, or by a fault that a person must see to; `resume` continues
+    NOT_LOCALISED = "not localised"  # waits for the pose in the map
     REACHED = "reached"
     CANCELLED = "cancelled"
     FAILED = "failed"

@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 from omnid.errors import OmnidError
 
 Path: TypeAlias = tuple[str, ...]
-MAX_UNIT_LETTERS: Final = 3  # of the unit at the end of a key, such as mps: it says nothing about what is meant
+MAX_UNIT_LETTERS: Final = 3  # Length of a unit at the end of a key, such as mps: it does not show which key is meant.
 # Names of other programs (diff_drive_controller of ROS: wheel_separation) that are spelled like other keys.
 ELSEWHERE: Final = {"wheel_base": "track_m", "wheelbase": "track_m", "wheel_separation": "track_m"}
 _SHOWN: Final = 60  # characters of a value in a message

@@ -30,7 +30,7 @@ MIN_RING_QUALITY = 0.1
 FULL_CONTRAST = 40
 # Smallest side [px] of a shrunk image that is searched. By judgement; not measured.
 MIN_LEVEL_SIDE_PX = 100
-MAX_PER_LEVEL = 4000  # so that the largest board fits: 61 x 61 corners
+MAX_PER_LEVEL = 4000  # Most candidates of a level, so that the largest board fits: 61 x 61 corners.
 # Candidates closer than SAME_PX, or than this part of their ring's radius, are the same corner, because neighbours are
 # 3 px apart at least (MIN_SPACING_PX), and farther than the radius of their rings.
 SAME_PX = 2.0

@@ -13,8 +13,8 @@ from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 
 Image = NDArray[np.uint8]
-MIN_FRAMES = 5  # By judgement; not measured.
-MAX_FRAMES = 64  # so that the memory is bounded: 128 MB of images of 2 megapixels
+MIN_FRAMES = 5  # Fewer images show no mask. By judgement; not measured.
+MAX_FRAMES = 64  # Most images, so that the memory is bounded: 128 MB of images of 2 megapixels.
 # A strut is darker than this part of the median light level in all frames, and changes less than this part of the
 # median change. By judgement; not measured.
 DARK_PART = 0.35

@@ -16,7 +16,7 @@ from calib.errors import CalibError
 from calib.models.camera import Array
 
 NEWTON_STEPS = 20  # enough: lenses with coefficients up to 0.3 take 10 at most
-TOLERANCE_RAD = 1e-10  # of the image radius by the focal length: no pixel is so exact
+TOLERANCE_RAD = 1e-10  # Error of an image radius by the focal length at which the search ends: no pixel is so exact.
 # Angles at which the image radius of an equidistant lens is tested for growing: a quarter of a degree, because its
 # polynomial of few terms does not fall and rise again within.
 ANGLES = 720

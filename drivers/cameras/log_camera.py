@@ -18,9 +18,9 @@ from drivers.logs.topic_choice import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 
 MAX_LOG_BYTES: Final = 1 << 30
-MAX_SAMPLES: Final = 4_000_000  # of wheels and IMU: hours
+MAX_SAMPLES: Final = 4_000_000  # Samples of wheels and IMU that are kept: hours.
 MIN_PACE, MAX_PACE = 0.001, 1000.0
-POLL_PERIOD_S: Final = 0.02  # between two checks for close()
+POLL_PERIOD_S: Final = 0.02  # A wait is interrupted with this period to see whether close() was called.
 MAX_DELAY_NS: Final = 100_000_000  # a frame later than that is dropped, as by a camera whose buffers are full
 TimedFrames: TypeAlias = tuple[tuple[int, Frame], ...]  # time since the log's first frame [ns], frame
 

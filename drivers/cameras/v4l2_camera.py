@@ -25,7 +25,7 @@ from drivers.frame import Camera, Frame
 
 _FIRST_RETRY_S: Final = 0.1
 _SETTLED_FRAMES: Final = 30  # after fewer frames the wait before the next try doubles, else it starts again
-_PAUSE_S: Final = 0.005  # where poll() reports a device as ready and no buffer is filled
+_PAUSE_S: Final = 0.005  # Pause where poll() reports a device as ready and no buffer is filled.
 
 
 class V4l2Camera:

@@ -25,8 +25,9 @@ PACKET: Final = struct.Struct("<BB4hB")
 RADPS_PER_UNIT: Final = math.radians(2000.0) / 32768
 DEFAULT_BAUD: Final = 9600
 READ_S: Final = 0.1  # longest wait for bytes, so that `close` takes effect soon
-SILENT_S: Final = 2.0  # without a packet, after which the port is opened again
-FIRST_WAIT_S, LONGEST_WAIT_S = 0.2, 5.0  # between two tries to open the port; doubles with each try
+SILENT_S: Final = 2.0  # The port is opened again after this time without a packet.
+# Waits between two attempts to open the port: doubled from the first to the longest.
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.2, 5.0
 _REASONS: Final = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
     errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",

@@ -27,16 +27,16 @@ from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
 STAMP_FILES: Final = ("timestamps.txt", "times.txt")
-ATTACHMENT: Final = "rig.toml"  # beside the folders of the cameras
+ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
 MAX_IMAGES: Final = 1_000_000
-_MAX_DEPTH: Final = 4  # of a folder of images below the given one
+_MAX_DEPTH: Final = 4  # Folders of images are searched down to this depth below the given one.
 _MAX_FOLDERS: Final = 64
 _MAX_VISITED: Final = 10_000
 _MAX_STAMP_BYTES: Final = 64 * 2**20
 _MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 # The year 2116: two stamps differ by what fits 64 bits, and trajectories (omnid/formats/tum.py) have the same limit.
 _MAX_STAMP_NS: Final = 2**62
-_LONGEST_GAP_NS: Final = 3600 * 10**9  # between two images of a log
+_LONGEST_GAP_NS: Final = 3600 * 10**9  # Stamps of two successive images that differ by more are not those of one log.
 _NS_DIGITS: Final = 16
 _SECONDS: Final = re.compile(r"\d{1,12}(?:\.(\d{1,12}))?")
 

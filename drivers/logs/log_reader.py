@@ -28,7 +28,7 @@ _WARNINGS = {
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
-MAX_WAITING_SAMPLES = 65_536  # of wheels and IMU: some minutes
+MAX_WAITING_SAMPLES = 65_536  # Samples of wheels and IMU that wait for the next images: some minutes.
 _COUNTERS = ("lower", "upper", *_WARNINGS)
 
 

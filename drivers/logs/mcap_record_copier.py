@@ -26,7 +26,7 @@ from drivers.logs.mcap_records import (
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _MAX_DEFINITIONS: Final = 4096
-_MAX_DEFINITION_BYTES: Final = 64 * 2**20  # of all together
+_MAX_DEFINITION_BYTES: Final = 64 * 2**20  # Limit of all definitions together, so that the memory is bounded.
 
 
 class RecordCopier:

@@ -30,8 +30,8 @@ _TRANSIENT_LOCAL = "".join(
         "  avoid_ros_namespace_conventions: false\n",
     )
 )
-_FLUSH_NS = 5 * 10**8  # of stamps, after which a chunk is ended
-_END_NS = 2**63  # of valid stamps
+_FLUSH_NS = 5 * 10**8  # A chunk ends after this time, by the stamps.
+_END_NS = 2**63  # Valid stamps are smaller.
 
 
 class LogWriter:

@@ -27,7 +27,7 @@ from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7  # field op of a record's header
-_SCAN_BYTES: Final = 64 * 2**20  # of a bag without index, in which its topics are looked for
+_SCAN_BYTES: Final = 64 * 2**20  # Topics of a bag without index are searched in its first bytes, up to this number.
 _MAX_HEADER_BYTES: Final = 2**16
 _MAX_DEFINITION_BYTES: Final = 2**20
 _MAX_TOPICS: Final = 4096

@@ -16,7 +16,7 @@ from drivers.logs.log_folder import LogFolder, RotationSettings, complete_path, 
 from drivers.logs.mcap_writer import LogWriter
 
 _FIRST_RETRY_S: Final = 1.0
-_END_NS: Final = 2**63  # of valid stamps
+_END_NS: Final = 2**63  # Valid stamps are smaller.
 
 
 @dataclass(slots=True)

@@ -40,7 +40,7 @@ _TABLES: Final = (
 _COLUMNS: Final = "SELECT name FROM pragma_table_info('messages') LIMIT 4"
 _EXPECTED: Final = ["id", "topic_id", "timestamp", "data"]
 _LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
-_ROW_INSTRUCTIONS: Final = 100  # of SQLite for a row; it needs 10 to 20
+_ROW_INSTRUCTIONS: Final = 100  # Instructions of SQLite that a row may take; it needs 10 to 20.
 _FEWEST_INSTRUCTIONS: Final = 1_000_000
 _TOPICS: Final = (
     f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {_MAX_TOPICS}"

@@ -24,9 +24,9 @@ from drivers.pseudo_terminal import TerminalCheck
 CONNECT_TRY_S: Final = 0.2
 STOPS_AT_CLOSE: Final = 3  # tries
 READ_LIMIT_BYTES: Final = 4096
-POLL_PERIOD_S: Final = 0.001  # between two checks for received bytes
-FRESH_SHARE: Final = 0.5  # of the watchdog's time; after a longer pause it may expire before a command arrives
-FIRST_WAIT_S: Final = 0.2  # between two tries to open the port; doubles with each try
+POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
+FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
+FIRST_WAIT_S: Final = 0.2  # First wait between two attempts to open the port; it doubles with each.
 LONGEST_WAIT_S: Final = 5.0
 _REASONS = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",

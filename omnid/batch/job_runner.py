@@ -27,7 +27,7 @@ RESULT_FILE: Final = "result.json"
 LOG_FILE: Final = "messages.txt"
 _ATTEMPT: Final = ".attempt-"
 _FETCHED: Final = "fetched"  # name of a log from an address, without its suffix
-_END_S: Final = 10.0  # for a program to end after SIGTERM
+_END_S: Final = 10.0  # A program is killed if it has not ended this long after SIGTERM.
 _MAX_MESSAGES: Final = 64 * 1024  # bytes of a program's messages that are kept
 # One thread for each program: as many programs run as there are cores.
 _ENVIRONMENT: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}

@@ -36,7 +36,7 @@ _HEAD: Final = (
     "time",
 )
 _FORMULA: Final = ("=", "+", "-", "@")  # first characters that spreadsheets execute
-MOST_CHARACTERS: Final = 5000  # of a cell, which may contain the path of a log
+MOST_CHARACTERS: Final = 5000  # Most characters of a cell, which may contain the path of a log.
 
 
 def write_tables(results: Sequence[JobResult], out: Path) -> list[Path]:

@@ -14,7 +14,7 @@ from omnid.batch.jobs import Job
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line
 
-MAX_ATTEMPTS: Final = 2  # of a job whose program was killed
+MAX_ATTEMPTS: Final = 2  # A job whose program was killed is attempted this often.
 _CONNECT_S: Final = 10.0
 
 Workers = Callable[[Sequence[Job]], Iterator[JobResult]]

@@ -17,7 +17,7 @@ from omnid.transport.codec import OK
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import CALIBRATION, Key
 
-ROWS: Final = 11  # of a disc; a letter is twice as high as wide
+ROWS: Final = 11  # Text rows of a disc; a letter is twice as high as wide.
 COLUMNS: Final = 2 * ROWS - 1
 GAP: Final = "    "
 NOTHING, NEWEST = ".", "@"

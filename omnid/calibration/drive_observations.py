@@ -34,9 +34,10 @@ Array = NDArray[np.float64]
 Topics = tuple[str | None, str | None]
 
 KEYFRAME_M, KEYFRAME_RAD = 0.12, np.deg2rad(8)
-MAX_KEYFRAMES = 80  # of all drives: keyframes are farther apart on long ones
+MAX_KEYFRAMES = 80  # Most keyframes of all drives: on long drives they are farther apart.
 MIN_KEYFRAMES = 15
-MIN_TURN_RAD = np.deg2rad(60)  # of all drives together; on a straight line tilt and direction of motion are one
+# Least turn of all drives together: on a straight line tilt and direction of motion are one.
+MIN_TURN_RAD = np.deg2rad(60)
 MIN_PATH_M = 2.0  # the same landmarks must be seen from near and from far
 MAX_LOST = 0.2  # share of the pairs
 NOISE_PX = 0.1

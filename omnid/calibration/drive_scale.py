@@ -15,9 +15,9 @@ from omnid.core.stereo.triangulation import common_perpendicular
 Array = NDArray[np.float64]
 
 GRADIENT_STEP = 0.01
-MAX_LEVEL_RAD = np.deg2rad(3.0)  # of a frame that was meant to be level
-MIN_EXTENT_M = 0.3  # of the smaller side of a path that shows its plane
-MAX_ROUGHNESS = 0.02  # of a plane: rms distance of the path from it, in parts of the smaller side
+MAX_LEVEL_RAD = np.deg2rad(3.0)  # Most tilt of a frame that was meant to be level.
+MIN_EXTENT_M = 0.3  # Least shorter side of a path that determines its plane.
+MAX_ROUGHNESS = 0.02  # Most rms distance of a path from its plane, by the shorter side.
 
 
 def scale_gradient(found: DriveAdjustment) -> Array:

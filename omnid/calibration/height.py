@@ -20,9 +20,9 @@ from omnid.errors import OmnidError
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
 
-RULER_SIGMA_M: Final = 0.01  # of a height by ruler: the viewpoint is inside of the mirror
+RULER_SIGMA_M: Final = 0.01  # Standard deviation of a height by ruler: the viewpoint is inside of the mirror.
 AGREED_SIGMAS: Final = 3.0
-TILT_SIGMAS: Final = 2.0  # from which on a tilt is written: a smaller one is as well that of the estimate
+TILT_SIGMAS: Final = 2.0  # Smaller tilts are not written, because they may be errors of the estimate.
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,8 +24,8 @@ PAPERS_MM: Final = {
     "letter": (215.9, 279.4),
     "tabloid": (279.4, 431.8),
 }
-EDGE_MM: Final = 8.0  # that printers leave free
-FOOT_MM: Final = 22.0  # below the board, for ruler and text
+EDGE_MM: Final = 8.0  # Margin that printers leave free.
+FOOT_MM: Final = 22.0  # Room below the board for ruler and text.
 RULER_MM: Final = 100.0
 _TEXT_MM: Final = 2.8
 _POINTS_PER_MM: Final = 72 / 25.4

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 
-IMAGES: Final = 10  # of each camera: the rim is searched in their maximum
+IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.
 SATURATED: Final = 250
 DARK_GREY, BRIGHT_SHARE = 25.0, 0.05
 NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without any content has no focus

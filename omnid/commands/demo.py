@@ -9,7 +9,7 @@ from pathlib import Path
 from omnid.commands.config import add_settings
 from omnid.commands.replay import Output, replay_and_print
 
-DRIVE_S = 90.0  # of simulated time at most
+DRIVE_S = 90.0  # Longest drive in simulated time.
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

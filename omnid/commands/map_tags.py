@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Tags by id, the poses of those that were found, and how many views were refused.
 Found: TypeAlias = "tuple[dict[int, MapTag], dict[int, TagEstimate], int]"
-LARGEST_M = 0.3  # that may be left at a landmark: beyond it, a number was mistaken
+LARGEST_M = 0.3  # A larger error at a landmark means that a number was mistyped.
 
 
 def add_tags(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -16,7 +16,7 @@ from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_map, map_settings
 
 AUTO, REAL_TIME = "auto", "1.0"
-IMU_BAUD = 115_200  # at which the stamps of the simulated gyro are right
+IMU_BAUD = 115_200  # Baud rate at which the stamps of the simulated gyro are right.
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.motors.simulated.simulated_base import Pose

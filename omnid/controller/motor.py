@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
 SIMULATED: Final = "simulated"
-ANSWER_SHARE: Final = 0.8  # of a tick's time may pass until the answer: a missing one must not make the next tick late
-WATCHDOG_TICKS: Final = 4  # at least, in watchdog_ms: after a pause of half of it the driver sends a stop first
+# Share of a tick's time that an answer may take: a missing one must not make the next tick late.
+ANSWER_SHARE: Final = 0.8
+WATCHDOG_TICKS: Final = 4  # Least watchdog_ms in ticks: after a pause of half of it the driver sends a stop first.
 
 
 def open_motor(config: MotorSettings, closing: ExitStack) -> tuple[SerialMotor, SimulatedMotor | None]:

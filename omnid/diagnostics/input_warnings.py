@@ -12,9 +12,9 @@ from omnid.stages.repeated_images import FROZEN_IMAGES
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
-DARK_SHARE: Final = 0.1  # of the pairs
-LOST_PARTS_SHARE: Final = 0.1  # of the pairs
-LOST_SHARE: Final = 0.1  # of the pairs; fewer are a gap, whose first pose may imply any speed
+DARK_SHARE: Final = 0.1  # Share of dark pairs from which there is a warning.
+LOST_PARTS_SHARE: Final = 0.1  # Share of pairs with lost parts from which there is a warning.
+LOST_SHARE: Final = 0.1  # Share of lost pairs; a smaller one is a gap, whose first pose may imply any speed.
 REPEATED: Final = {
     "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
     "use": "they were used, as pair.repeated_images says",

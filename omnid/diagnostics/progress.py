@@ -13,7 +13,7 @@ from omnid.messages import OdometryUpdate
 TERMINAL_PERIOD_S = 0.2
 JOURNAL_PERIOD_S = 5.0
 BAR_COLUMNS = 24
-DEFAULT_COLUMNS = 80  # of a terminal that does not report its size
+DEFAULT_COLUMNS = 80  # Used for a terminal that does not report its size.
 
 
 class Progress:

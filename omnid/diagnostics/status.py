@@ -23,8 +23,9 @@ from omnid.transport.commands import CommandReceiver
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import Key, time_key
 
-MAX_SKEW_DRIFT_NS: Final = 3_000_000  # of the skew between the cameras: their clocks do not run alike
-TIMEOUT_S: Final = 1.0  # without an image of a camera, or without a pose
+# If the skew between the cameras changes by more, their clocks run at different rates.
+MAX_SKEW_DRIFT_NS: Final = 3_000_000
+TIMEOUT_S: Final = 1.0  # An older image of a camera, or an older pose, is reported as missing.
 EXPECTED_STOPS: Final = ("", IDLE, ASKED, COMMAND_STALE)  # reasons to stand that are no fault
 REMEDY: Final = "send cmd/arm: `omnid arm`"
 LEVELS: Final = {TrackingState.TRACKING: OK, TrackingState.DEGRADED: WARN, TrackingState.LOST: ERROR}

@@ -12,7 +12,7 @@ from typing import Final
 from omnid.doctor.finding import Finding
 
 GROUPS: Final = ("video", "dialout")  # the unit's SupplementaryGroups
-OWN_NAME: Final = "omnid"  # of the processes of the daemon
+OWN_NAME: Final = "omnid"  # Name of the daemon's processes.
 _MAX_PROCESSES: Final = 100_000
 
 

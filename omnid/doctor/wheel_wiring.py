@@ -19,9 +19,9 @@ from omnid.controller.motor import open_motor
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.errors import OmnidError
 
-MOVE_S: Final = 1.0  # in each direction
-REST_S: Final = 0.3  # until the wheels stand
-LEAST_COMMANDS: Final = 2  # of a motion: the driver may send a stop in place of the first one
+MOVE_S: Final = 1.0  # Duration of a motion in each direction.
+REST_S: Final = 0.3  # The wheels come to rest in this time.
+LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 LARGEST_TURNS: Final = 1000.0
 # The setting that makes the number of turns right; controllers of other protocols take m/s, and know the rest.

@@ -20,7 +20,7 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 
 _TIMEOUT_S: Final = 2.0
-_MAX_ENDPOINTS: Final = 8  # that are tried
+_MAX_ENDPOINTS: Final = 8  # Most endpoints that are tried.
 _ENDPOINT = re.compile(r"(?P<protocol>[a-z-]+)/\[?(?P<host>[^\]/]+?)\]?:(?P<port>\d{1,5})(?:[?#].*)?")
 _STREAMS = ("tcp", "tls", "ws")  # protocols that are tried by a TCP connection
 

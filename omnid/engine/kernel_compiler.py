@@ -25,7 +25,7 @@ MAX_HELPERS: Final = 2  # each takes up to 280 MB, of the 768 that the service m
 # Without a new folder for so long, another program or a helper counts as hung. A file takes seconds; on a slow and
 # busy machine a minute.
 PATIENCE_S: Final = 300.0
-PROGRESS_S: Final = 3.0  # at least between two lines of progress
+PROGRESS_S: Final = 3.0  # Least time between two lines of progress.
 _POLL_S: Final = 0.05
 _LOCK: Final = "compiling.lock"
 Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line

@@ -32,8 +32,8 @@ from typing import Any, Final
 import omnid.core
 from omnid.core.compiled import KERNEL_FILES, Kernel, declared
 
-MAX_FOLDERS: Final = 100  # of other states, and of files that were not compiled now
-MAX_BYTES: Final = 64 << 20  # of a folder that is read: a larger one is none of ours
+MAX_FOLDERS: Final = 100  # Most folders of other states, and of files that were not compiled now.
+MAX_BYTES: Final = 64 << 20  # A larger folder is not read, because omnid writes none.
 DIGESTS: Final = "digests.json"
 CODE: Final = ".o"  # end of the names of files with the code of one function
 UNFINISHED: Final = "making-"  # begin of the names of folders that are being filled

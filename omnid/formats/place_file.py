@@ -34,11 +34,11 @@ WITHOUT_TAGS: Final = 2
 WITHOUT_FLOOR: Final = 3
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
-MAX_VALUE_BYTES: Final = 1 << 20  # of one value in the database
+MAX_VALUE_BYTES: Final = 1 << 20  # Limit of one value in the database.
 MAX_KEYFRAMES: Final = 100_000
 MAX_LINKS: Final = 1_000_000
 MAX_TAG_VIEWS: Final = 100_000
-MAX_INSTRUCTIONS: Final = 50_000_000  # that SQLite may take to read a map
+MAX_INSTRUCTIONS: Final = 50_000_000  # Instructions that SQLite may take to read a map.
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
     "missed INTEGER, T_map_rect BLOB, "

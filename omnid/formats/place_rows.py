@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 Row: TypeAlias = tuple[Any, ...]
 
 MAX_INTEGER: Final = 1 << 62
-MAX_FEATURES: Final = 4096  # of a keyframe
+MAX_FEATURES: Final = 4096  # Most features of a keyframe.
 MAX_POSITION_M: Final = 1e5
-MAX_PIXELS: Final = 1 << 15  # of the width and the height of a panorama
+MAX_PIXELS: Final = 1 << 15  # Largest width and height of a panorama.
 MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
-LEAST_VARIANCE: Final = 1e-16  # of a loop, in any direction, so that its covariance can be inverted
+LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
 RIGID: Final = 1e-6  # largest difference of R R^T from the identity
 THUMBNAIL: Final = (16, 128)
 DESCRIPTOR: Final = 128

@@ -24,12 +24,12 @@ from omnid.formats.tum import POSITION_LIMIT_M
 SIDE_LIMIT_PX = 2000
 _MIN_SIDE_PX = 4 * MARGIN_PX
 _SCALE_LIMIT_PX_PER_M = 100.0  # a small map is not enlarged beyond
-_MIN_EXTENT_M = 2.0  # of the drawn area, also of an empty map
-_DRAWN_QUANTILES = (0.005, 0.995)  # of the points: a few false far ones must not shrink the rest
+_MIN_EXTENT_M = 2.0  # Least side of the drawn area, also of an empty map.
+_DRAWN_QUANTILES = (0.005, 0.995)  # The area holds these quantiles: a few false far points must not shrink the rest.
 _BORDER = 1.06  # drawn area over the extent of points and path
 _MIN_ASPECT = 0.1  # shorter side over longer side, so that a straight path is visible
 _END_HALF_PX = 6  # half the side of the square at the end of the path
-_PATH_WIDTHS_PX = (7, 3)  # of the white rim and of the line
+_PATH_WIDTHS_PX = (7, 3)  # Widths of the white rim and of the line.
 
 
 def plan_view(

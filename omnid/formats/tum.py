@@ -15,12 +15,12 @@ from calib import se3
 from omnid.errors import OmnidError
 
 FILE_LIMIT_BYTES = 1 << 28  # about 2.5 million poses, days of driving; a log given by mistake is refused
-POSITION_LIMIT_M = 1e9  # of a coordinate, so that squares and sums cannot overflow
-STAMP_LIMIT_NS = 1 << 62  # so that the difference of two stamps fits int64
+POSITION_LIMIT_M = 1e9  # Largest coordinate, so that squares and sums cannot overflow.
+STAMP_LIMIT_NS = 1 << 62  # Largest stamp, so that the difference of two stamps fits int64.
 _DECIMALS = 9  # nanoseconds, nanometres
 _COLUMNS = 8  # t x y z qx qy qz qw
 _MIN_QUATERNION = 1e-9  # largest component below which a quaternion counts as zero
-_SHOWN_CHARACTERS = 60  # of a wrong value in a message
+_SHOWN_CHARACTERS = 60  # Most characters of a wrong value in a message.
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from omnid.transport.codec import OK, WARN
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import EXPOSURE, Key
 
-PERIOD_SHARE: Final = 0.9  # of the images' period, for the longest exposure: the rest reads the image out
+PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
 AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
 FLICKER_US: Final[Mapping[str, float]] = {"50": 1e6 / 100, "60": 1e6 / 120}  # lamps shine twice a period of the mains
 DARK_GREY, WHITE_GREY = 25.0, 230.0  # means beyond which images of cameras that regulate themselves are told

@@ -17,12 +17,12 @@ from omnid.light.grey_levels import GreyLevels
 # Grey levels: the mean that is aimed at, the least one that bright spots may push it to, the highest of bright spots,
 # and the level from which they count as saturated.
 TARGET, LEAST_MEAN, BRIGHT, SATURATED = 100.0, 60.0, 235.0, 250.0
-SATURATED_FACTOR: Final = 0.7  # of the exposure, while bright spots are saturated
+SATURATED_FACTOR: Final = 0.7  # The exposure is multiplied by this while bright spots are saturated.
 # No step for wanted factors between these: a step by one of them may not bring about the other one.
 LEAST_DOWN, LEAST_UP = 0.77, 1.4
-LARGEST_FACTOR: Final = 2.0  # of a step
-VERY_BRIGHT: Final = 0.6  # factor below which the exposure is lowered at once, beside the gain
-GAIN_STEPS: Final = 8  # of the range of the gain: the first step, since the unit of the gain is not known
+LARGEST_FACTOR: Final = 2.0  # Largest factor of a step.
+VERY_BRIGHT: Final = 0.6  # If the factor is smaller, the exposure is lowered at once, together with the gain.
+GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
 # Between two steps. Each step against the one before doubles it, two in one direction end that: so it does not hunt.
 STEP_S, LONGEST_STEP_S = 0.5, 32.0
 # A camera that does not answer: so many steps of the exposure time in a row, by at least the factor, that do not

@@ -15,7 +15,7 @@ from omnid.messages import FramePair
 SAMPLE_STEP: Final = 8  # columns and rows of the panorama from sample to sample: some thousand samples
 LEAST_COLUMNS: Final = 64
 BRIGHT_PERCENT: Final = 97.0
-MARGIN_PX: Final = 2.0  # from the rim and the hub
+MARGIN_PX: Final = 2.0  # Distance kept from the rim and the hub.
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,8 +13,8 @@ from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.transport.bus_config import BusConfig
 
-SILENCE_S: Final = 10.0  # without a report, after which the robot counts as gone
-SHOWN_S: Final = 0.5  # between two lines of progress
+SILENCE_S: Final = 10.0  # A robot that sends no report for this time counts as gone.
+SHOWN_S: Final = 0.5  # Time between two lines of progress.
 
 
 def connected(bus: BusConfig) -> Robot:

@@ -16,7 +16,7 @@ from omnid.transport.decode import Diagnostics, Pose, decode_diagnostics, decode
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
 
-NO_POSE_S: Final = 2.0  # without a pose, from which the state and the rate of the last poses are no longer shown
+NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
 _MAX_STATUSES: Final = 100
 _RATE_WINDOW: Final = 100  # poses

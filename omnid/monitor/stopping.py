@@ -12,8 +12,8 @@ from omnid.transport.driver import ANSWER_S, CONNECT_S
 from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from omnid.transport.stop_datagram import STOPPED, StopSender
 
-_DATAGRAM_S: Final = 0.15  # after which a stop goes over the bus, too: the robot is behind a router, or far away
-_REPEAT_S: Final = 0.2  # between two stops
+_DATAGRAM_S: Final = 0.15  # After this time a stop goes over the bus, too: the robot is behind a router, or far away.
+_REPEAT_S: Final = 0.2  # Time between two stops.
 
 
 def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = None) -> bool:

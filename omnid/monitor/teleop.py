@@ -24,11 +24,11 @@ from omnid.transport.codec import header_cdr
 from omnid.transport.status_names import WHEELS, Key
 from omnid.transport.topics import ARM
 
-PERIOD_S: Final = 0.05  # of the commands
-REST_S: Final = 0.5  # after a motion zero is sent for so long; then nothing, so that others may drive
+PERIOD_S: Final = 0.05  # Period of the commands.
+REST_S: Final = 0.5  # After a motion zero is sent for this time; then nothing, so that others may drive.
 HOLD_S: Final = 0.6  # a key counts as pressed for so long: longer than the pause before a terminal repeats it
 CONNECT_S: Final = 5.0
-FIRST_SHARE: Final = 0.4  # of the highest speeds, at the start
+FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
 SHARE_STEP: Final = 0.1
 READ_BYTES: Final = 256
 HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"

@@ -26,7 +26,7 @@ from omnid.transport.records import OdometryRecord, TwistRecord
 from omnid.transport.status_names import Key
 
 STATES: Final = tuple(TrackingState)
-MAX_ROWS: Final = 1 << 20  # of a series: 9 hours of poses at 30 Hz
+MAX_ROWS: Final = 1 << 20  # Most rows of a series: 9 hours of poses at 30 Hz.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,7 +18,7 @@ from omnid.report.downsampling import Corner
 from omnid.report.page import note, page, table
 from omnid.version import __version__
 
-_MOST_CORNERS: Final = 3000  # of the path in the figure
+_MOST_CORNERS: Final = 3000  # Most vertices of the path in the figure.
 HEAD: Final = ("round", "A to B", "B to A", "error of lengths", "way", "end beside start", "heading at the end")
 
 

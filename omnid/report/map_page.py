@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 CELL_M: Final = 0.05
 MAX_SIDE_PX: Final = 1000.0
 MARGIN_M: Final = 0.3
-FREE_GREY, UNKNOWN_GREY, OCCUPIED_GREY = 255, 225, 90  # of cells
+FREE_GREY, UNKNOWN_GREY, OCCUPIED_GREY = 255, 225, 90  # Grey levels of cells.
 STYLE: Final = """.after{fill:none;stroke:#111;stroke-width:1.7}
 .before{fill:none;stroke:#b33;stroke-width:1.4;stroke-dasharray:5 3}.loop{stroke:#06c;stroke-width:1;stroke-opacity:.6}
 .keyframe{fill:#111}.key{margin-left:.9em}.key svg{display:inline-block;width:34px;height:12px;margin-right:.3em}"""

@@ -23,7 +23,7 @@ from omnid.stages.decoder import Decoder
 
 WIDTH_PX: Final = 1200
 MAX_HEIGHT_PX: Final = 500
-MAX_FRAMES: Final = 40_000  # that are read: the first loss in a long log may be hours away
+MAX_FRAMES: Final = 40_000  # Most images that are read: the first loss in a long log may be hours away.
 
 
 class WantedImages(NamedTuple):

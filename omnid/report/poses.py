@@ -19,11 +19,11 @@ from omnid.transport.records import OdometryRecord
 
 STATES: Final = tuple(TrackingState)
 UNKNOWN: Final = -1  # rank of a state that is not recorded
-GAP_S: Final = 0.5  # without a pose; where poses are rare, GAP_PERIODS times their mean period
+GAP_S: Final = 0.5  # A gap is a time without pose; where poses are rare, GAP_PERIODS times their mean period.
 GAP_PERIODS: Final = 5.0
 MAX_KEPT: Final = 500_000  # whole poses, for the comparison with a truth: 4.6 h at 30 Hz, 32 MB
 _MAX_GAPS: Final = 200
-_PERIOD_GAIN: Final = 0.1  # of the running mean of the period
+_PERIOD_GAIN: Final = 0.1  # Gain of the running mean of the period.
 _SERIES: Final = ("speed", "yaw_rate", "sigma_position", "sigma_heading", "state", "height")
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ from omnid.report.truth_comparison import TruthComparison
 from omnid.transport.status_names import CAPTURE_TO_POSE, ODOMETRY, PLACES, Key, time_key
 
 _LEVELS: Final = ("", "warning", "error")
-_MAX_SOURCES: Final = 20  # of events that were left out
+_MAX_SOURCES: Final = 20  # Most sources that are named of the events that were left out.
 _MAX_LANDMARK_COUNTS: Final = 12
-_SAME_PATH_M: Final = 0.01  # between two paths that are one in the figure
+_SAME_PATH_M: Final = 0.01  # Paths that differ by less are drawn as one.
 
 
 def key_figures(data: ReportData) -> str:

@@ -14,7 +14,7 @@ from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import CAPTURE_TO_POSE, TICK_LATE, WORK, Key, short_name, time_key
 
 MAX_ENTRIES: Final = 64
-MAX_VALUES: Final = 64  # of an entry
+MAX_VALUES: Final = 64  # Most values of an entry.
 _MAX_NAME: Final = 80  # characters
 _MAX_VALUE: Final = 160  # characters
 _MAX_SERIES: Final = 128

@@ -19,7 +19,7 @@ from omnid.settings_dump import dump
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
 
-PERIOD_S: Final = 15.0  # between two lines about the progress
+PERIOD_S: Final = 15.0  # Time between two lines about the progress.
 
 
 def open_recorder(

@@ -30,7 +30,7 @@ class RouteFiles:
     A ticker calls it each PERIOD_S in a thread of its own.
     """
 
-    PERIOD_S: Final = 0.05  # so that a person does not notice it
+    PERIOD_S: Final = 0.05  # A person does not notice a delay of this size.
 
     def __init__(
         self,

@@ -19,8 +19,9 @@ from omnid.service.file_below import text_below, write_below
 from omnid.settings_dump import dump_minimal
 
 USER: Final = "omnid"
-SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # in the unit
-HIDDEN: Final = ("/home", "/root", "/tmp", "/run/user")  # from the unit: ProtectHome=, PrivateTmp=
+SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # The path of omnid in the shipped unit.
+# Folders that the unit does not see: ProtectHome=, PrivateTmp=.
+HIDDEN: Final = ("/home", "/root", "/tmp", "/run/user")
 ADD_USER: Final = ("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
 _REFUSED: Final = frozenset("\"'\\")
 _PLAIN: Final = re.compile(r"[\w./+-]+")  # a path that needs no quotes

@@ -33,11 +33,11 @@ from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 ROUTE: Final = "demo"
-STRAIGHT_M, RADIUS_M = 0.8, 0.7  # of the oval that is taught: 6 m
+STRAIGHT_M, RADIUS_M = 0.8, 0.7  # The oval that is taught: 6 m.
 ARC_STEPS: Final = 15
-ANSWER_S: Final = 0.5  # after a request, before its end is looked for
-RECOGNISED_S: Final = 5.0  # after the first drive, in which the robot must have recognised the start
-SHOWN_S: Final = 5.0  # between two lines of progress
+ANSWER_S: Final = 0.5  # Time after a request before its end is awaited.
+RECOGNISED_S: Final = 5.0  # Within this time after the first drive the robot must have recognised the start.
+SHOWN_S: Final = 5.0  # Time between two lines of progress.
 PX_PER_M: Final = 90.0
 BORDER_M: Final = 0.25  # around the world
 WALL_PX, SEEN_PX = 3, 9  # widths of lines

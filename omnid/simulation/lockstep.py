@@ -48,7 +48,7 @@ from omnid.stages.obstacles import controller_ring
 from omnid.stages.synchronise import Synchronise
 
 T = TypeVar("T")
-STOPPING_NS: Final = 2_000_000_000  # at the end, in which the wheels come to rest
+STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
 Array = NDArray[np.float64]
 
 

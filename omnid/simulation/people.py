@@ -12,8 +12,8 @@ from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]
 
-PATIENCE_S = 4.0  # for which somebody waits for the robot, then comes nearer, and after as much turns round if he can
-IMPATIENT = 0.5  # of the distance at which he waits: this near he comes then
+PATIENCE_S = 4.0  # A person waits so long for the robot, then comes nearer, and after as much turns round if possible.
+IMPATIENT = 0.5  # Distance to which the person then comes, by that at which he waits.
 
 
 @dataclass(frozen=True, slots=True)

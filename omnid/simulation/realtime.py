@@ -33,8 +33,8 @@ from omnid.simulation.robot import SimulatedRobot, traction
 from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
-POLL_S: Final = 0.002  # between two checks for the motion up to an exposure
-LONGEST_WAIT_S: Final = 0.2  # for the motion up to an exposure; then the newest pose is taken
+POLL_S: Final = 0.002  # Time between two checks whether the motion up to an exposure is known.
+LONGEST_WAIT_S: Final = 0.2  # Longest wait for the motion up to an exposure; then the newest pose is taken.
 SAMPLES: Final = 1  # per pixel and axis: textures are filtered, only edges of surfaces are not
 MOST_POSES: Final = 200_000  # kept of the truth: five hours; older ones give way
 

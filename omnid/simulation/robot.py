@@ -16,7 +16,7 @@ from drivers.motors.simulated.simulated_base import MotionLimits, Traction
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import Sensor
 
-CAMERA_HEIGHT_M: Final = 0.9  # of the lower viewpoint over the floor
+CAMERA_HEIGHT_M: Final = 0.9  # Height of the lower viewpoint over the floor.
 BASELINE_M: Final = 0.2
 IMAGE_PX: Final = 512
 

@@ -27,7 +27,7 @@ from omnid.simulation.robot import SimulatedRobot, traction
 from omnid.simulation.world import World
 
 Array = NDArray[np.float64]
-START_NS: Final = 1_000_000_000_000  # of the simulated clock
+START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.
 
 
 class Tick(NamedTuple):

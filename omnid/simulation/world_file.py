@@ -37,11 +37,11 @@ MAX_BYTES: Final = 1 << 18
 MOST_WALLS, MOST_BOXES, MOST_PEOPLE, MOST_POINTS, MOST_DOORS = 200, 200, 20, 100, 8
 LARGEST_M: Final = 60.0  # side of a world: its textures must fit into memory
 LARGEST_AREA_M2: Final = 1200.0  # of all painted surfaces, without posters
-PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # of the textures of walls, and of floor and ceiling
+PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # Textures of walls, and of floor and ceiling.
 ROUNDING_M: Final = 1e-6
 PERSON_M: Final = (0.25, 0.45, 1.7)  # depth, width, height
 RANDOM: Final = "random"
-KINDS: Final = ("brick", "plaster", "granite", "plaster")  # of a random wall
+KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a random wall.
 TEXTURES: Final = (*textures.PAINTERS, RANDOM)
 BOX_TEXTURES: Final = ("poster", *textures.PAINTERS)
 

@@ -16,7 +16,7 @@ from omnid.transport.navigation_codec import PATH_SCHEMA
 from omnid.transport.path_codec import driven_path_cdr
 
 MOST_POSES: Final = 1000
-_STEP_M: Final = 0.05  # between two poses at first; twice as much each time that the memory is full
+_STEP_M: Final = 0.05  # First spacing of the poses; it is doubled each time that the memory is full.
 _COS_HALF_TURN: Final = float(np.cos(np.radians(5.0)))  # a turn by 10 degrees is a step as well
 _PERIOD_NS: Final = 10**9
 

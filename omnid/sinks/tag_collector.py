@@ -18,10 +18,10 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-NOISE_PX: Final = 0.1  # of a corner of odometry: not used for tags
-MOVED_M: Final = 0.1  # between two frames that are searched
+NOISE_PX: Final = 0.1  # Noise of a corner of odometry: not used for tags.
+MOVED_M: Final = 0.1  # Motion between two frames that are searched.
 MOVED_RAD: Final = math.radians(10)
-MAX_VIEWS: Final = 1000  # of a tag
+MAX_VIEWS: Final = 1000  # Most views of a tag.
 
 
 class TagCollector:

@@ -23,7 +23,7 @@ from omnid.stages.geometry import Geometry
 
 NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
 BLUR_SHARE = 0.6  # sigma of the blur by the pixels that a pixel of the panorama covers beside its own
-MIN_SHARED_PART = 0.05  # of the panorama that both cameras must see
+MIN_SHARED_PART = 0.05  # Least share of the panorama that both cameras must see.
 
 
 class Dewarp:

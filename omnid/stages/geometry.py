@@ -21,7 +21,7 @@ from omnid.stages.decoder import Decoder
 
 Array = NDArray[np.float64]
 
-RIM_ATTEMPTS = 5  # to find the rims, each with more images than the one before
+RIM_ATTEMPTS = 5  # Attempts to find the rims, each with more images than the one before.
 FRAMES_PER_ATTEMPT = 12  # frames of both cameras added to the maximum image
 
 

@@ -24,10 +24,10 @@ Position: TypeAlias = tuple[float, float]  # x, y [m]
 MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run; one where there are fewer than 4
 FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
 SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2  # less motion shows the same points again
-STANDING_NS = 1_000_000_000  # between two pairs of the same view that enter the map
-FINEST_STEP_M = 0.001  # between two vertices of the path: a robot at rest adds none
-SPARSE_NS = 1_000_000_000  # between two pairs that enter the map at LoadLevel.SPARSE_MAP
-STAMP_JITTER_NS = 5_000_000  # so that a period of the cameras that divides that of the map does divide it
+STANDING_NS = 1_000_000_000  # Least time between two pairs of the same view that enter the map.
+FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
+SPARSE_NS = 1_000_000_000  # Time between two pairs that enter the map at LoadLevel.SPARSE_MAP.
+STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
 
 
 def _is_step(last: Position, new: Position, step_m: float) -> bool:

@@ -46,8 +46,8 @@ NavigationInput: TypeAlias = (
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
 RING_NS = 2_000_000_000  # older rings tell nothing: the collision monitor sees to it that the base does not drive on
-MOST_ANSWERS = 64  # that an update repeats, as many as requests may wait: a sink may miss updates
-FIRST_LEG_M = 1.0  # from the robot to a path, beyond which it is refused
+MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
+FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 
 
 class NavigationStage:

@@ -25,7 +25,8 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 
-COUNTED_NS: Final = 1_000_000_000  # between two counts, which take 1 ms of 1,000 keyframes; the status comes no oftener
+# Time between two counts, which take 1 ms for 1,000 keyframes; the status comes no oftener.
+COUNTED_NS: Final = 1_000_000_000
 
 
 class Places:

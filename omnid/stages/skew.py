@@ -10,8 +10,8 @@ import numpy as np
 
 SKEW_GAIN: Final = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
 RECENT: Final = 30  # pairs to which a line is fitted
-MIN_FITTED: Final = 8  # of fewer the median is taken
-JUMP_NS: Final = 5_000_000  # from the line: an image was lost, or a camera started again
+MIN_FITTED: Final = 8  # Of fewer pairs the median is taken.
+JUMP_NS: Final = 5_000_000  # A larger distance from the line means a lost image, or a camera that was started again.
 # Cameras that are triggered together have stamps that scatter about each other. Their mean difference is 0 unless it is
 # larger than twice the scatter and than the least that stamps can tell.
 SCATTERS: Final = 2.0

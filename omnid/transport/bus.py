@@ -32,8 +32,8 @@ from omnid.transport.topics import CLOCK, PUBLISHED, STOP
 __all__ = ["Bus", "BusConfig"]
 
 QUERY_PERIOD_S: Final = 0.01
-SEARCH_S: Final = 5.0  # between two searches for a robot of the same name that was found behind a router
-FLOOD_S: Final = 10.0  # for which the status warns of a flood that has ended
+SEARCH_S: Final = 5.0  # Time between two searches for a robot of the same name that was found behind a router.
+FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
 class Bus:

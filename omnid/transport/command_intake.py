@@ -15,7 +15,7 @@ from omnid.transport.requests import Request
 from omnid.transport.topics import ARM, REQUEST_TOPICS, STOP, request_key
 
 RequestCallback: TypeAlias = Callable[[Request], None]
-PERIOD_S: Final = 0.004  # between two passes
+PERIOD_S: Final = 0.004  # Time between two passes.
 _UNKNOWN: Final = "cmd/**"
 _LAST: Final = (ARM, STOP)
 

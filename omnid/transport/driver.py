@@ -14,7 +14,7 @@ from omnid.transport.navigation_codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
 from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TWIST, request_key
 
-CONNECT_S: Final = 2.0  # in which a connection is complete
+CONNECT_S: Final = 2.0  # A connection is complete within this time.
 ANSWER_S: Final = 10.0  # more than a disk takes for a map or a route
 _POLL_S: Final = 0.002
 _SEQUENCE: Final = 1 << 32  # zenoh counts messages of a source in 32 bits

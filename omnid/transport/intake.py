@@ -15,7 +15,7 @@ from typing import Any, Final, Generic, TypeVar
 from omnid.transport.topics import PATH, REQUEST_TOPICS
 
 T = TypeVar("T")
-MOST_SENDERS: Final = 64  # on a key, that are told apart
+MOST_SENDERS: Final = 64  # Most senders on a key that are distinguished.
 TAKEN_PER_DECODED: Final = 4  # messages that are taken for one that a sender may have decoded
 
 
@@ -29,7 +29,7 @@ class Budget:
 
 STREAM: Final = Budget(1000.0, 1024)  # setpoints, samples of wheels and gyro
 REQUEST: Final = Budget(20.0, 64)
-LONG_REQUEST: Final = Budget(2.0, 4)  # of up to 1 MiB
+LONG_REQUEST: Final = Budget(2.0, 4)  # A request of up to 1 MiB.
 UNKNOWN: Final = Budget(200.0, 128)  # topics that do not exist; of up to 1 MiB
 QUERY: Final = Budget(50.0, 64)
 _BUDGETS: Final = {**dict.fromkeys(REQUEST_TOPICS, REQUEST), PATH: LONG_REQUEST}

@@ -19,7 +19,7 @@ WHEEL_SCHEMA: Final = ODOMETRY
 IMU_SCHEMA: Final = IMU
 JOINT_SCHEMA: Final = JOINT_STATE
 LARGEST_RATE: Final = 100.0  # m/s and rad/s: larger ones are faults of the sender
-_UNKNOWN_VARIANCE: Final = 1e9  # of a pose that wheels do not give
+_UNKNOWN_VARIANCE: Final = 1e9  # Variance of the parts of a pose that wheels do not measure.
 _UNKNOWN: Final = np.array([-1.0, *[0.0] * 8])  # REP 145: the message has no orientation, and no acceleration
 
 

@@ -12,8 +12,8 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.session import open_session
 
-ALIVE: Final = "alive"  # below the robot's name
-MOST_NAMESAKES: Final = 64  # that are told apart; anyone may declare tokens where no users are configured
+ALIVE: Final = "alive"  # Key below the robot's name.
+MOST_NAMESAKES: Final = 64  # Most that are distinguished; anyone may declare tokens where no users are configured.
 _ALIVE_TIMEOUT_S: Final = 1.0
 
 

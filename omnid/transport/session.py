@@ -28,7 +28,7 @@ _MAX_RECEIVED_BYTES: Final = 1 << 20  # zenoh collects fragments up to its limit
 # zenoh's defaults are 100 places and 10 s.
 _MAX_PENDING: Final = 1000
 _ACCEPT_TIMEOUT_MS: Final = 1000
-_MAX_COMMAND_BYTES: Final = 16_384  # of all but paths
+_MAX_COMMAND_BYTES: Final = 16_384  # Limit of all commands but paths.
 _MAX_SESSIONS: Final = 128  # each holds received fragments in memory
 # Of each link and key: zenoh ends each query that a ring drops by a message of its own, which takes time. No program
 # that waits for its answers asks so often.

@@ -24,14 +24,14 @@ from omnid.transport.bus_config import BusConfig
 ASKED: Final = "asked"  # the daemon has passed the stop on
 STOPPED: Final = "stopped"  # the robot is disarmed by a stop
 REPEAT_S: Final = 0.05
-MOST_PER_PASS: Final = 16  # of a flood
+MOST_PER_PASS: Final = 16  # Most datagrams that one pass reads during a flood.
 _HEAD: Final = b"omnid stop 1 "
 _LONGEST: Final = 512  # bytes
-_WAIT_MS: Final = 100  # so long the end of a daemon waits for its listener
+_WAIT_MS: Final = 100  # Longest wait of the end of a daemon for its listener.
 _REQUEST: Final = re.compile(rb"omnid stop 1 ([0-9a-f]{16}) ([!-~]{1,256}) *")
 _ENDPOINT: Final = re.compile(r"(?:tcp|tls|ws)/(.+):(\d{1,5})(?:[?#].*)?")  # those whose UDP port is free
 _NONCE_BYTES: Final = 8
-_PADDING: Final = 8  # so that no answer is longer than its request
+_PADDING: Final = 8  # Added to requests, so that no answer is longer than its request.
 
 
 def addresses(endpoints: Sequence[str]) -> Iterator[tuple[str, int]]:

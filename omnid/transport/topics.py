@@ -11,7 +11,7 @@ from omnid.transport.scan_codec import SCAN_SCHEMA
 MAP_POSE: Final = "map_pose"
 SCAN: Final = "scan"
 PANORAMA: Final = "panorama"
-CLOCK: Final = "/clock"  # of runs whose time is not the computer's only
+CLOCK: Final = "/clock"  # Time of runs whose clock is not the computer's.
 IMAGE_SCHEMA: Final = "sensor_msgs/msg/CompressedImage"
 EMPTY_SCHEMA: Final = "std_msgs/msg/Empty"
 

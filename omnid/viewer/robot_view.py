@@ -24,7 +24,7 @@ from omnid.viewer.rerun_scene import RerunScene
 from omnid.viewer.targets import ViewerTarget
 
 CONNECT_TIMEOUT_S: Final = 2.0
-POLL_S: Final = 0.5  # between two checks for the end
+POLL_S: Final = 0.5  # Time between two checks for the end.
 MOST_POSES: Final = 100
 
 

@@ -13,8 +13,8 @@ from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
 
 STAGES: Final = ("pair", "dewarp", "stereo", "odometry", "mapping")
-LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # of rerun, by level of an entry
-STATISTICS: Final = ("p50", "p99")  # of times that are plotted
+LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # Levels of rerun by the level of an entry.
+STATISTICS: Final = ("p50", "p99")  # Statistics of times that are plotted.
 
 
 def latencies(diagnostics: Diagnostics) -> Iterator[tuple[tuple[str, ...], float]]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
-SIGMAS: Final = 3.0  # of the ellipsoid
+SIGMAS: Final = 3.0  # Radius of the ellipsoid in standard deviations.
 VISIBLE_M: Final = 0.05  # a smaller ellipsoid is magnified
 MOST_MAGNIFIED: Final = 1000
 FARTHEST_MM: Final = 65535

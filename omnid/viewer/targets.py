@@ -25,12 +25,12 @@ from omnid.errors import OmnidError
 ALTERNATIVES: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"
 APPLICATION: Final = "omnid"
 LOCALHOST: Final = "127.0.0.1"
-MEMORY_LIMIT: Final = "2GB"  # of the viewer's memory; it forgets the oldest
+MEMORY_LIMIT: Final = "2GB"  # Memory of the viewer; it forgets the oldest data.
 TIMEOUT_S: Final = 30.0
 FLUSH_PERIOD_S: Final = 10.0
-MIN_FREE_BYTES: Final = 64 << 20  # on the disk
+MIN_FREE_BYTES: Final = 64 << 20  # Least free space on the disk.
 _POLL_S: Final = 0.05
-_MAX_LOG_BYTES: Final = 2**14  # of the viewer's output, of which the last line is reported
+_MAX_LOG_BYTES: Final = 2**14  # Bytes of the viewer's output that are read, to report its last line.
 
 
 class ClosedError(OmnidError):

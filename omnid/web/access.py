@@ -23,7 +23,8 @@ from typing import Any, Final, NamedTuple
 from omnid.errors import OmnidError
 
 OPEN_PATHS: Final = ("/", "/login", "/static/login.css")  # answered without the token
-_ALPHABET: Final = "abcdefghjkmnpqrstuvwxyz23456789"  # without letters that look alike: a phone's user types them
+# Letters that are not mistaken for others, because a phone's user types them.
+_ALPHABET: Final = "abcdefghjkmnpqrstuvwxyz23456789"
 _GROUPS, _GROUP_LETTERS = 4, 5  # 99 bits
 _TOKEN: Final = re.compile(r"[!-~]{16,256}")
 _MAX_FILE_BYTES: Final = 4096
@@ -31,7 +32,7 @@ _HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+)(:\d{1,5})?")
 _OTHER_SITES: Final = ("cross-site", "same-site")
 _READING: Final = ("GET", "HEAD")
 _STOPPING: Final = ("stop", "logout")  # last parts of the addresses to which the token for stops may post
-COOKIE_S: Final = 30 * 86_400  # for which a browser keeps the cookie
+COOKIE_S: Final = 30 * 86_400  # A browser keeps the cookie for this time.
 MOST_ENDED: Final = 1000  # sessions
 _COOKIE: Final = re.compile(
     r"(?P<id>[0-9a-f]{16})\.(?P<role>all|stop)\.(?P<end_s>[0-9]{1,12})\."
@@ -62,7 +63,7 @@ class Role(StrEnum):
     """Rights of a token."""
 
     ALL = "all"
-    STOP = "stop"  # to see and to stop
+    STOP = "stop"  # may see and stop
 
 
 def new_token() -> str:

@@ -20,7 +20,7 @@ from omnid.web.channels import BrowserChannel, Encoded, Newest
 
 MOST_BROWSERS: Final = 32
 ANSWER_S: Final = 10.0  # a browser that has not answered within that is disconnected
-MOST_REQUESTS: Final = 1000  # of channels on request, by one browser
+MOST_REQUESTS: Final = 1000  # Most requests for channels by one browser.
 ANSWER: Final = "ok"
 TRY_LATER, POLICY_VIOLATION, GOING_AWAY = 1013, 1008, 1001  # codes of RFC 6455
 

@@ -9,10 +9,10 @@ from typing import Any, Final, NamedTuple, Protocol
 
 from omnid.core.mapping.thinned_path import ThinnedPath
 
-MOST_POINTS: Final = 4000  # of the path
+MOST_POINTS: Final = 4000  # Most points of the path.
 _FINEST_M: Final = 0.02
-_LARGEST_M: Final = 1e6  # of a coordinate that is drawn
-_GAP_M: Final = 1.0  # between two poses, from which the path is drawn with a gap
+_LARGEST_M: Final = 1e6  # Largest coordinate that is drawn.
+_GAP_M: Final = 1.0  # A larger distance between two poses is drawn as a gap.
 
 Encoded = str | bytes  # text is JSON; bytes are those of `with_header`
 

@@ -36,12 +36,12 @@ from omnid.web.snapshot import (
 )
 
 PERIOD_S: Final = 0.03  # least time between two messages of the state
-QUIET_S: Final = 0.5  # without a message of the robot, after which the state is sent all the same
+QUIET_S: Final = 0.5  # The state is sent after this time even without a message of the robot.
 RETRY_S: Final = 0.5
-REQUEST_S: Final = 0.2  # between two looks for channels that browsers ask for
+REQUEST_S: Final = 0.2  # Period with which requests of browsers for channels are handled.
 NAVIGATION: Final = "navigation"
 PANORAMA_S: Final = 0.4  # least time between two panoramas: what a robot publishes more often is left out
-MOST_POSES: Final = 100  # that are kept: a scan arrives later than the pose of its images
+MOST_POSES: Final = 100  # Most poses that are kept: a scan arrives later than the pose of its images.
 _LARGEST: Final = {
     "odom": 1 << 16,
     MAP_POSE: 1 << 16,

@@ -24,7 +24,7 @@ from omnid.web.snapshot import finite
 from omnid.web.wheel_commands import within
 
 SHOW_S: Final = 0.5
-STOP_S: Final = 10.0  # from the request until a robot that has not confirmed a stop is named
+STOP_S: Final = 10.0  # A robot that has not confirmed a stop after this time is named.
 REPEAT_S: Final = 0.2
 _RETRY_S: Final = 0.5
 _POLL_S: Final = 0.02
@@ -45,7 +45,7 @@ class FleetFeed:
         self._bus = bus
         self.state, self.inbox, self._tokens = FleetState(), Inbox(), Inbox()
         self.link = "not connected yet"  # why there is no connection; empty with one
-        self.stops = 0  # that were asked for
+        self.stops = 0  # stops that were requested
         self._fleet: Fleet | None = None
         self._channel = Newest("fleet", self._encode)
         self.browsers = Browsers((self._channel,))

@@ -23,7 +23,7 @@ from omnid.web.robot_page import RobotPage, answered
 from omnid.web.site import STATIC
 
 MOST_OPEN: Final = 8  # robots whose pages are open
-UNUSED_S: Final = 60.0  # without a browser, after which the connection to a robot ends
+UNUSED_S: Final = 60.0  # The connection to a robot ends after this time without a browser.
 _CHECK_S: Final = 5.0
 
 

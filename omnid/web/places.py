@@ -18,7 +18,7 @@ from typing import Any, Final
 MOST_CONNECTIONS: Final = 512
 HANDSHAKE_S: Final = 5.0
 BACKLOG: Final = 2048  # connections that wait for the event loop
-_RETRY_S: Final = 0.01  # where the system has no more files
+_RETRY_S: Final = 0.01  # Wait where the system has no more files.
 Address = tuple[str, int]
 
 

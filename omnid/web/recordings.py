@@ -17,7 +17,7 @@ from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
 
 MOST_LISTED: Final = 500  # the newest
-MOST_REPORTS: Final = 8  # that are kept
+MOST_REPORTS: Final = 8  # Most reports that are kept.
 REPORT_S: Final = 600.0  # time for a report
 NICE: Final = 10  # lower priority than the daemon's
 _WRONG_INPUT: Final = 2  # exit code of omnid for what the user can correct, told in its last line

@@ -38,7 +38,7 @@ from omnid.web.site import Site
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 SILENCE_S: Final = 5  # a connection on which nothing has come within that is accepted nevertheless
 REQUEST_S: Final = 5.0  # a connection that has not sent a whole request within that is closed
-END_S: Final = 2  # for browsers to finish at the end
+END_S: Final = 2  # Time that browsers have to finish at the end.
 LONGEST_MESSAGE: Final = 256  # bytes, of a browser's websocket
 _LISTEN: Final = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9._-]+):(\d{1,5})")
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]")

@@ -23,13 +23,13 @@ from omnid.web.channels import compact, with_header
 from omnid.web.remedies import remedy_of
 
 PATH_FRAME: Final = "odom"
-FRAMES: Final = (PATH_FRAME, "map")  # of a map that is drawn
+FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
 BASE_FRAME: Final = "base_link"
-MOST_SECTORS: Final = 720  # of a scan
+MOST_SECTORS: Final = 720  # Most sectors of a scan.
 _LARGEST_M: Final = 1e4  # range of a scan
 OLDEST_S: Final = 1.0  # age of the newest state that a page may have when it asks for a motion
 MOST_WARNINGS: Final = 20
-MOST_VALUES: Final = 60  # of a part
+MOST_VALUES: Final = 60  # Most values of a part of the status.
 LONGEST_VALUE: Final = 100  # characters
 LARGEST_MAP_PX: Final = 1024  # edge of the map as it is sent; larger ones are reduced
 MOST_CELLS: Final = 1 << 26

@@ -25,7 +25,7 @@ class WheelCommands:
         self._stopping: asyncio.Task[Answer] | None = None
         self._driver: Driver | None = None
         self._again = False  # a stop was asked for since the newest one was sent
-        self.stops = 0  # that were asked for
+        self.stops = 0  # stops that were requested
 
     @property
     def is_stopping(self) -> bool:

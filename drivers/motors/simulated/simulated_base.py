@@ -11,7 +11,7 @@ from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import Framer
 
-STEP_S = 0.005  # of the integration
+STEP_S = 0.005  # Step of the integration.
 REACHED = 1e-3  # m/s or rad/s: friction ends the lag
 LONGEST_ADVANCE_S = 60.0
 LEFT, RIGHT = SIDES = (0, 1)
@@ -53,7 +53,7 @@ class SimulatedBase:
         self.battery_v = 12.0
         self.pose: Pose = (0.0, 0.0, 0.0)
         self.velocity_mps = self.yaw_rate_radps = 0.0
-        self.travel_m = [0.0, 0.0]  # of the left and the right wheel
+        self.travel_m = [0.0, 0.0]  # left and right wheel
         self.goal_heading_rad: float | None = None  # in the world; steered to during motion, if set
         self.commanded_mps = [0.0, 0.0]  # left, right
         self.expired = [False, False]  # watchdogs: left, right

@@ -16,7 +16,7 @@ from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
 
 READ_LIMIT_BYTES = 4096
-POSES_KEPT = 1000  # with their times: seconds
+POSES_KEPT = 1000  # Number of poses that are kept with their times: those of some seconds.
 LONGEST_ABSENCE_S = 0.05  # a thread that was not scheduled for longer does not advance: the host was not late
 
 

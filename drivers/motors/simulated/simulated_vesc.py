@@ -9,7 +9,7 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.vesc import S_PER_MIN, PacketFramer
 from drivers.motors.simulated.simulated_base import SimulatedBase, reply_to
 
-_LOCAL_ID = 77  # of the controller on the port
+_LOCAL_ID = 77  # CAN id of the controller on the serial port.
 _SET_RPM, _GET_APPCONF, _ALIVE, _FORWARD_CAN, _GET_VALUES_SELECTIVE = 8, 17, 30, 34, 50  # COMM_PACKET_ID
 _ARGUMENT_BYTES = {_SET_RPM: 4, _GET_APPCONF: 0, _ALIVE: 0, _GET_VALUES_SELECTIVE: 4}
 _SIGNATURE = 0x1234ABCD  # any: the driver ignores it

@@ -12,7 +12,7 @@ from omnid.core.control.heading_controller import Twist
 
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
 STRAIGHT_RADPS: Final = 1e-3
-TINY: Final = 1e-9  # so that no division is by zero
+TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
 
 
 class Outline(NamedTuple):

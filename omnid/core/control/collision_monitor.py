@@ -24,15 +24,15 @@ LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on developm
 # A base that was stopped goes on in that direction only faster than this (half as fast as a slower command), because
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
-BRAKING_SHARE: Final = 0.8  # of the deceleration is counted on; because the rest is for lag
+BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
 # Consecutive ones without a range that make a direction unknown; by trial on development seeds.
 UNKNOWN_SECTORS: Final = 5
-BESIDE_M: Final = 0.05  # beyond the sides' room: corrections of the heading do not swing a corner so far in time_s
-MOVING_STEP_S: Final = 0.1  # of the prediction of moving obstacles; 0.15 m of a person at 1.5 m/s: fine enough
+BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
+MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
 NEW_MPS: Final = 0.4  # sigma of the velocity of who was seen twice; three looks make it smaller
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
-MOST_MOVING: Final = 16  # so that the time of a tick is bounded (docs/results/speed.md has it with so many)
+MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
 
 BLOCKED: Final = "an obstacle is in the way"
 NEAR: Final = "an obstacle is near"

@@ -13,7 +13,7 @@ from omnid.settings import knob
 
 OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
-MOST_SOURCES: Final = 8  # so that the table is bounded
+MOST_SOURCES: Final = 8  # Most sources, so that the table is bounded.
 _NAME: Final = re.compile(r"[a-z][a-z0-9_]{0,31}")
 # Topics below cmd/.
 _RESERVED: Final = ("twist", "heading", "stop", "arm", "bumper", "cliff", "goal", "path", "navigation", "route")

@@ -18,9 +18,9 @@ from omnid.core.mapping.range_scan import SECTORS, RangeScan, fill_gaps
 Array = NDArray[np.float64]
 Counts = NDArray[np.intp]
 
-HEIGHT_SIGMAS: Final = 2.0  # of the height, above the floor, so that 2 % of the floor's points are obstacles
+HEIGHT_SIGMAS: Final = 2.0  # Sigmas above the floor from which a point is an obstacle, so that 2 % of the floor's are.
 INVERSE_STEP: Final = 0.02  # 1/m: width of a bin; two of them are about four sigma of a usual rig
-NEAREST_M: Final = 0.2  # of the bins, from the middle of the base. By judgement; not measured.
+NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base. By judgement; not measured.
 
 
 class ScanLimits(NamedTuple):

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from omnid.errors import OmnidError
 
-_AXIS_BITS = 21  # of a packed key per axis; so that three of them fit the 63 bits of a positive key
+_AXIS_BITS = 21  # Bits of a packed key per axis, so that three of them fit the 63 bits of a positive key.
 # Voxel indices run from -2^20 to 2^20 - 1 on each axis; because zero is in the middle.
 _HALF_SPAN = 1 << (_AXIS_BITS - 1)
 _EMPTY = np.int64(-1)  # packed keys are never negative
 # Part of the table in use at which voxels are evicted; since a miss takes (1 + 1/0.3^2)/2 = 6 probes there.
 _MAX_LOAD = 0.7
-_LOAD_AFTER_EVICTION = 0.5  # so that evictions are rare: a fifth of the table is filled between two
-_BATCHES = 8  # at most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing ends
+_LOAD_AFTER_EVICTION = 0.5  # A fifth of the table is filled between two evictions, so that they are rare.
+_BATCHES = 8  # At most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing ends.
 # A voxel seen once and not again for so many frames is most likely a false match; by trial on development seeds.
 _OLD_FRAMES = 30
 _VARIANCE_RANGE_M2 = (1e-8, 1e8)  # standard deviations of 0.1 mm to 10 km, so that sums of weights cannot overflow
-_BLOCK_POINTS = 4096  # of a snapshot, computed at a time, so that it needs little extra memory
+_BLOCK_POINTS = 4096  # Points of a snapshot that are computed at a time, so that it needs little extra memory.
 _HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: Knuth's multiplicative hash
 
 

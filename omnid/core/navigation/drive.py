@@ -20,7 +20,7 @@ from omnid.navigation_state import NavigationState
 
 Array = NDArray[np.float64]
 
-PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # by trial on development seeds
+PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # A smaller motion is no progress; by trial on development seeds.
 
 
 @dataclass(slots=True)

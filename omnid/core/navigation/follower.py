@@ -20,10 +20,10 @@ Array = NDArray[np.float64]
 SETTLED: Final = 3  # poses one after the other that must be within the tolerance, standing
 SETTLED_RADPS: Final = 0.1
 SETTLED_MPS: Final = 0.03
-CORNER_M: Final = 0.03  # from the end of a leg that is not the last
-CORRECTIONS: Final = 3  # drives of what is missing to the goal
-BEHIND_RAD: Final = math.pi / 2  # what is missing lies behind: it is driven backwards
-SKIP_M: Final = 2.0  # before a corner, and after it, where a detour may cut it
+CORNER_M: Final = 0.03  # A leg ends this far from its end, unless it is the last one.
+CORRECTIONS: Final = 3  # Most short drives that correct the distance left to the goal.
+BEHIND_RAD: Final = math.pi / 2  # A goal in a direction beyond this is behind: the base drives backwards to it.
+SKIP_M: Final = 2.0  # Length before and after a corner within which a detour may cut it.
 SKIP_BESIDE_M: Final = 0.15
 STAND: Final = Setpoint(0.0, None, 0.0)  # exact zeros: no motion
 

@@ -20,14 +20,15 @@ Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
 HORIZON_S: Final = 4.0
-WAIT_S: Final = 10.0  # in which one that comes to the base in spite of its waiting is gone around instead
+WAIT_S: Final = 10.0  # Time ahead in which an object must reach the waiting base for the base to avoid it.
 STEPS: Final = 20
-SHARES: Final = (1.0, 0.75, 0.5, 0.25, 0.0)  # of the speed of the path
-LARGEST_SIGMA_M: Final = 0.15  # of a predicted place that is kept free: beyond it nothing would be free
+SHARES: Final = (1.0, 0.75, 0.5, 0.25, 0.0)  # Tried speeds, as shares of that on the path.
+LARGEST_SIGMA_M: Final = 0.15  # Most uncertainty of a prediction that is kept free: beyond it nothing would be free.
 OWN_POINTS_M: Final = 0.25  # beyond its radius, points of the ring are its own
-TRAIL_S: Final = 0.5  # the ring shows for so long where it was: pairs vote
-MEETING_S: Final = np.array([-0.6, 0.0, 0.6])  # about the time of a meeting, at which one counts as standing
-SLOWEST_MPS: Final = 0.1  # at which the base and one that comes to it near each other
+TRAIL_S: Final = 0.5  # The ring shows a moving obstacle where it was for this time, because pairs vote.
+# Set by trial: times about a predicted meeting at which the disc counts as an obstacle at rest.
+MEETING_S: Final = np.array([-0.6, 0.0, 0.6])
+SLOWEST_MPS: Final = 0.1  # Lower bound of the speed of approach, so that the time until a meeting is bounded.
 # 30 degrees apart, enough: a radius of 0.3 m errs by 1 cm between two.
 CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)
 LEAST_MPS: Final = 0.01

@@ -21,20 +21,20 @@ from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
 
-SPACING_M: Final = 0.1  # of the kept places: the least spacing of a path
-SHORTEST_M: Final = 0.3  # of a way back; by reason: a shorter one makes no room for anybody
-CLEAR_M: Final = 1.0  # of a way back to a wider place: nearer to the block it would still be in the way
+SPACING_M: Final = 0.1  # Spacing of the kept places: the least spacing of a path.
+SHORTEST_M: Final = 0.3  # Least length of a way back, because a shorter one makes no room for anybody.
+CLEAR_M: Final = 1.0  # Least way back to a wider place: nearer to the block the base would still be in the way.
 BACK_MPS: Final = 0.2  # slower than forwards: people do not expect a robot to back up
-LOOK_M: Final = 1.0  # of the way back that must be free now: the distance to stop, and a person's two steps
-PASS_M: Final = 0.8  # from the outline to what is nearest, where a person passes: shoulders of 0.6 m and some more
-REST_S: Final = 3.0  # at least, before it comes again: a person needs so long to go past a base
-SPREAD_S: Final = 4  # on top of it, by the time of the pose: two robots that met do not move alike
-RETRY_S: Final = 10.0  # after which it comes again in any case, to look for a way; then after twice the time
-LONGEST_RETRY_S: Final = 300.0  # so that it still looks now and then: twelve times an hour
-FREE_S: Final = 1.0  # for which the way ahead must be free: rings vote for half a second
-ARRIVED_M: Final = 0.1  # from the end of the way; enough: it is one spacing
-FAR_M: Final = 1e3  # so that it is farther than anything that is seen
-NARROWER_M: Final = 0.005  # from one place of the way to the next: more than rounding
+LOOK_M: Final = 1.0  # Length of the way back that must be free now: the distance to stop, and a person's two steps.
+PASS_M: Final = 0.8  # Room next to the outline in which a person passes: shoulders of 0.6 m, and a margin.
+REST_S: Final = 3.0  # Least time before the base returns: a person needs it to go past a base.
+SPREAD_S: Final = 4  # Added to it, by the stamp of the pose: two robots that met then move at different times.
+RETRY_S: Final = 10.0  # The base returns after this time in any case, to search a way; then after twice the time.
+LONGEST_RETRY_S: Final = 300.0  # Twelve attempts an hour, so that a way that becomes free is found.
+FREE_S: Final = 1.0  # The way ahead must be free for this time: rings vote for half a second.
+ARRIVED_M: Final = 0.1  # The way ends this far from its last point; enough: it is one spacing.
+FAR_M: Final = 1e3  # Distance where nothing is seen, so that it is larger than any that is measured.
+NARROWER_M: Final = 0.005  # Least change of width between two places of the way: more than rounding.
 
 
 class Trail:

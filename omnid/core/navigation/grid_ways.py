@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 # Set by trial on development seeds, where a line gives no other reason.
 # By trial on development seeds.
 CELL_M: Final = 0.05
-HALF_CELLS: Final = 64  # of the grid about the base: 3.2 m to each side
+HALF_CELLS: Final = 64  # Half the side of the grid about the base: 3.2 m to each side.
 # Way left where no way leads to the path; so that it is never chosen: longer than any way in the grid.
 FAR_M: Final = 1e3
 

@@ -33,25 +33,25 @@ from omnid.core.navigation.settings import NavigationSettings
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-AHEAD_M: Final = 2.0  # of the path, in which obstacles are looked for
-REJOIN_M: Final = 0.3  # of free path that the detour ends on, behind the obstacle
-REJOIN_WITHIN_M: Final = 3.0  # of the way: within the grid
-BACK_ON_PATH_M: Final = 0.12  # beside the path, from which it is followed again
-BEFORE_M: Final = 0.35  # from the outline to an obstacle on the path at which the base waits
-WAIT_MPS2: Final = 0.2  # deceleration towards it
+AHEAD_M: Final = 2.0  # Length of the path in which obstacles are searched.
+REJOIN_M: Final = 0.3  # Length of free path behind the obstacle at which a detour ends.
+REJOIN_WITHIN_M: Final = 3.0  # Most length of the way to the end of a detour: within the grid.
+BACK_ON_PATH_M: Final = 0.12  # Lateral distance from the path below which it is followed again.
+BEFORE_M: Final = 0.35  # Distance of the outline from an obstacle on the path at which the base waits.
+WAIT_MPS2: Final = 0.2  # Deceleration towards an obstacle at which the base waits.
 ARC_S: Final = 1.6  # length of an arc
 ARC_STEPS: Final = 8
 SPEEDS: Final = 4
 YAW_RATES: Final = 17
-SHARE: Final = 0.7  # of the speed, on a detour
-HEADING_M_PER_RAD: Final = 0.25  # weights of the judgement, as metres of way
-BACK_MPS: Final = -0.12  # to get out of a place that has become too narrow
+SHARE: Final = 0.7  # Share of the speed that is driven on a detour.
+HEADING_M_PER_RAD: Final = 0.25  # Cost of a radian of heading error, as metres of way.
+BACK_MPS: Final = -0.12  # Speed out of a place that has become too narrow.
 BACK_WEIGHT_M: Final = 0.5
-NARROW: Final = 2.0  # weight of narrow places
-NEAR_M: Final = 1.5  # of obstacles that arcs are tested against
+NARROW: Final = 2.0  # Weight of narrow places in the cost of a way.
+NEAR_M: Final = 1.5  # Obstacles within this distance are tested against arcs.
 NEARER_M: Final = 0.005
 CLEARANCE_WEIGHT_M: Final = 0.4
-MARGIN_M: Final = 0.02  # beside the room that the collision monitor demands
+MARGIN_M: Final = 0.02  # Room in addition to that which the collision monitor demands.
 # Cosine of the direction beyond which an obstacle is behind; 100 degrees; by trial on development seeds.
 BEHIND_SHARE: Final = -0.17
 

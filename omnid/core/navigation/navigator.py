@@ -29,16 +29,17 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 STOPS: Final = 5  # poses after an end at which a stop is sent: one might be lost
-BESIDE_M: Final = 0.3  # beyond the corridor, at which the path counts as left; by trial on development seeds
-PLANNED_M: Final = 4.0  # of the path that the local planner is given; enough: its grid ends at 3.2 m
+# Lateral distance beyond the corridor at which the path counts as left; by trial on development seeds.
+BESIDE_M: Final = 0.3
+PLANNED_M: Final = 4.0  # Length of the path that the local planner is given; enough: its grid ends at 3.2 m.
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
 GIVES_WAY: Final = "it drives back to let others pass"
 WAITS: Final = "it goes on by itself when the way is free"
-AGAIN_M: Final = 1.0  # of progress after which a block is a new one; by trial on development seeds
-MOST_DOUBLINGS: Final = 6  # of the time until it gives way again: to four minutes by default
-PAST_M: Final = 1.0  # of the path past the place where it was blocked, which must be free, too; by trial
+AGAIN_M: Final = 1.0  # Progress after which a block is a new one; by trial on development seeds.
+MOST_DOUBLINGS: Final = 6  # Most doublings of the time until the base gives way again: to four minutes by default.
+PAST_M: Final = 1.0  # Length of the path past the block that must be free, too; by trial on development seeds.
 
 
 class Navigator:

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 # The base turns, standing, towards a point that is farther aside; by trial on development seeds.
 TURN_RAD: Final = math.radians(45)
-TURNED_RAD: Final = math.radians(4)  # and until it is nearer than that; by trial on development seeds
-BRAKE_SHARE: Final = 0.7  # of the deceleration is planned: the base follows with a lag
+TURNED_RAD: Final = math.radians(4)  # The turn ends below this angle; by trial on development seeds.
+BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned: the base follows with a lag.
 APPROACH_HZ: Final = 1.2  # speed per distance to the end: the last centimetres are slow
 LAST_MPS: Final = 0.02  # least speed before the end; by trial on development seeds
 

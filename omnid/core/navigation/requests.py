@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from omnid.core.navigation.route import Route
 from omnid.errors import OmnidError
 
-MAX_LOOPS: Final = 10_000  # so that the number is bounded
+MAX_LOOPS: Final = 10_000  # Most rounds of a route, so that the number is bounded.
 LONGEST_TEXT: Final = 200  # characters of a request; so that messages of any size are refused
-LONGEST_NAME: Final = 64  # so that its file has a valid name: most file systems allow 255 bytes
+LONGEST_NAME: Final = 64  # Characters of a route's name, so that its file has a valid name: at most 255 bytes.
 _NAME: Final = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 _LOOPS: Final = re.compile(r"loops=([1-9][0-9]{0,4})")
 ROUTE_USAGE: Final = '"teach NAME [replace]", "finish", "repeat NAME [reverse] [loops=N] [from=here|start]" or "stop"'

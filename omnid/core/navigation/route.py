@@ -21,18 +21,18 @@ from omnid.errors import OmnidError
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-SPACING_M, SPACING_RAD = 0.1, math.radians(10)  # between the points of a recording
-MOST_POINTS: Final = 15_000  # so that a route is bounded: 1.5 km
+SPACING_M, SPACING_RAD = 0.1, math.radians(10)  # Motion between two points of a recording.
+MOST_POINTS: Final = 15_000  # Points of a route, so that it is bounded: 1.5 km.
 SHORTEST_ROUTE_M: Final = 0.5
-LEAST_MPS: Final = 0.1  # where it was driven more slowly, it is repeated at that speed
+LEAST_MPS: Final = 0.1  # Slower parts of the recording are repeated at this speed.
 STANDING_MPS: Final = 0.02
 SAME_MAP: Final = 0.3  # share of the keyframes noted with a route that must be in the map
-CLOSED_M: Final = 1.0  # from the end to the start of a route that is driven in rounds
-ENTRY_M: Final = 1.5  # from the robot to the route
-ENTRY_M_PER_RAD: Final = 0.5  # of heading, where several pieces of a route are near
-BESIDE_M: Final = 0.25  # from the robot to the route, beyond which it drives to a point ahead on it
-JOIN: Final = 2.5  # way along the route to that point, per distance beside it: at 22 degrees, which is no corner
-DECIMALS: Final = 6  # of a route, as its file has them: it is the same before and after it was read
+CLOSED_M: Final = 1.0  # Most distance between the ends of a route that is driven in rounds.
+ENTRY_M: Final = 1.5  # Most distance of the robot from a route that it repeats.
+ENTRY_M_PER_RAD: Final = 0.5  # Cost of a radian of heading error where several pieces of a route are near.
+BESIDE_M: Final = 0.25  # A robot farther from the route drives to a point ahead on it.
+JOIN: Final = 2.5  # Way along the route to that point by lateral distance: at 22 degrees, which is no corner.
+DECIMALS: Final = 6  # Decimals of a route, as in its file, so that reading it changes nothing.
 FarKeyframe = Callable[[int], "KeyframePose | None"]
 
 

@@ -17,7 +17,7 @@ Words = NDArray[np.uint16]
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.int32]
 
-LARGEST = np.uint16(65535)  # of 16 bits: exact
+LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 # Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
 LEAST_LIKELIHOOD = np.float32(1e-3)

@@ -25,44 +25,44 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
-CELL_M: Final = 0.05  # By judgement; not measured.
-CELLS: Final = 256  # on each side of the square: the largest range on both sides, and the way until it is moved
+CELL_M: Final = 0.05  # Side of a cell. By judgement; not measured.
+CELLS: Final = 256  # Cells of a side: twice the largest range, and the way until the square is moved.
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
-VIEW_CELLS: Final = 90  # on either side of the robot, that a pair changes: it must be less than the margin
+VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
 NEVER: Final = np.iinfo(np.int64).min
 
 # Layers: floor against what stands up, against planes just above it, and just below it; surface.
 FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
 FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
-LIMIT: Final = 6.0  # of all log-odds: what changes is believed after a few pairs
+LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = 1.0
-FREE_ODDS: Final = 1.5  # of the floor, for a cell that is free
-TAKEN_ODDS: Final = 0.0  # of a surface
-CONTRADICTION: Final = -2.5  # to a surface where the floor is seen and no surface; by trial on development seeds
-APART_M: Final = 0.05  # between places whose errors differ
-APART_S: Final = 0.2  # of pairs from one place that are one more
+FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
+TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
+CONTRADICTION: Final = -2.5  # Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
+APART_M: Final = 0.05  # Least distance between places from which errors are independent.
+APART_S: Final = 0.2  # Time after which a pair from the same place counts in full.
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
 # below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
 PLACE_PAIRS: Final = 18.0
 FRESH_NS: Final = 500_000_000  # time constant of the mean evidence by which a cell is watched
-MOST_FRESH: Final = 1.2  # evidence of floor or surface in a pair that counts in it: what ends is told in half a second
-LEAST_FRESH: Final = 0.4  # mean in a cell that is watched; that of noise is 0.2
-FLOOD_MPS: Final = 1.6  # speed at which something may come in unseen
-NARROW_CELLS: Final = 5  # what comes in is wider
+MOST_FRESH: Final = 1.2  # Most evidence of a pair in the mean: an object that leaves is noticed in half a second.
+LEAST_FRESH: Final = 0.4  # Mean evidence from which a cell is watched; that of noise is 0.2.
+FLOOD_MPS: Final = 1.6  # Speed at which an object may enter hidden cells.
+NARROW_CELLS: Final = 5  # An object that enters is wider.
 GAP: Final = np.ones((3, 3), np.uint8)  # nothing comes through narrower gaps, which noise opens in walls
-ONCE_FREE_S: Final = 30.0  # for which a cell that was free and is hidden now is a way by which something may have come
+ONCE_FREE_S: Final = 30.0  # For this time an object may have come through a cell that was free and is hidden now.
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
-WIDE_CELLS: Final = 3  # of something low, and of an edge: the noise of single cells would be an obstacle that stays
+WIDE_CELLS: Final = 3  # Side of the mean that shows a low object or an edge, because single cells are noisy.
 # The same where no step is seen either, because what hides so little floor is no higher than one.
 LEVEL_SPECK_CELLS: Final = 9
 THIN_M: Final = 0.03  # width of the thinnest obstacle
-END_BINS: Final = 2  # a cell takes the evidence of a patch so much farther: one at the foot of something shows both
-END_M: Final = 0.1  # before the end of the free floor, for the same reason
-PAST_SECTORS: Final = 3  # on either side, that see past a place too near to be seen
-OPEN_SHARE: Final = 0.9  # of the longest range, up to which an open direction is free
+END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
+END_M: Final = 0.1  # Distance before the end of the free floor, for the same reason.
+PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
+OPEN_SHARE: Final = 0.9  # Share of the longest range up to which an open direction is free.
 
 
 class GridRing(NamedTuple):

@@ -25,7 +25,7 @@ LEARNED: Final = np.float32(0.5)  # share of a pair that counts in full in the m
 HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden: two disparities in full
 BIN_SIGMA: Final = 0.3  # sigma of the range at which hidden floor begins, in disparities: within one
 NEAR_SIGMA: Final = 0.3  # the same where nearer floor is not in view, as a share of the range: anywhere before it
-GAP_M: Final = 0.1  # of floor that was not free lately, which ends the way along a direction: a base of something
+GAP_M: Final = 0.1  # Length of floor that was not free lately and ends a free way: the base of an object.
 
 
 class Arrivals(NamedTuple):

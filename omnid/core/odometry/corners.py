@@ -22,7 +22,7 @@ BLOCK_PX = 5  # window over which the gradients of a corner are summed
 # landmarks of one piece of texture.
 APART_PX = 9
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
-NOISE_RESPONSE = 2.5e-5  # that noise of one grey level reaches in one pixel of a hundred: it grows with its square
+NOISE_RESPONSE = 2.5e-5  # Response that noise of one grey level reaches in 1 % of the pixels: it grows with its square.
 CROSS_PX = 0.7  # largest horizontal error of a vertical match: corner noise and error of the calibration
 REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 

@@ -24,7 +24,7 @@ Indices = NDArray[np.intp]
 # Spacing of the points at which the correction is computed exactly. The fields follow the azimuth and the row smoothly,
 # so that interpolation over 16 px, 5 degrees of a panorama of 1300 columns, loses little.
 GRID_PX = 16
-DISPARITIES_PX = (8.0, 40.0)  # at which the exact correction is computed
+DISPARITIES_PX = (8.0, 40.0)  # Disparities at which the exact correction is computed.
 
 
 class CorrectedPixels(NamedTuple):

@@ -18,7 +18,7 @@ from omnid.core.odometry.motion_filter import START_VELOCITY_VARIANCE, MotionFil
 Array = NDArray[np.float64]
 
 MEMORY = 12.0  # steps over which means are taken. By judgement; not measured.
-MIN_STEPS = 4  # of fewer the errors are not known: the filter is believed
+MIN_STEPS = 4  # With fewer steps the filter's covariance is used, because their scatter is not known.
 LEAST_SIGMA = np.repeat([1e-3, 1e-3], 3)  # m/s, rad/s: of the mean
 
 # After a start or a sudden turn: the variance of the filter's own start.

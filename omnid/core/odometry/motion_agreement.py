@@ -44,25 +44,25 @@ LEAST_LAG_S, MOST_LAG_S, LAG_STEP_S = -0.5, 1.5, 0.05
 # Sigma of the lag of clocks that are in order, because motors follow commands and exposures last; motion within it may
 # be shown by one account before the other.
 LAG_SIGMA_S: Final = 0.1
-DOUBT_SHARE: Final = 0.5  # of a limit, from which on the base drives slowly; by trial on development seeds
+DOUBT_SHARE: Final = 0.5  # Share of a limit from which on the base drives slowly; by trial on development seeds.
 # The same of the newest second alone: 0.1 m, and a third of the way, as of images that play at half of the speed.
 SOON_S, SOON_M, SOON_SHARE = 1.0, 0.1, 1 / 3
-LEAST_M: Final = 0.05  # that counts, because an allowed delay moves a base of 0.2 m/s so far
+LEAST_M: Final = 0.05  # Least motion that counts, because an allowed delay moves a base of 0.2 m/s so far.
 TURN_RAD: Final = np.radians(5.0)  # because a gyro's bias is estimated to less than half a degree a second
 # Wheels whose diameters differ by 0.7 %, as those of the simulation, turn by 4 degrees over 3 m: that is no doubt yet.
 WHEEL_TURN_RAD: Final = np.radians(15.0)
 # Sigmas of a step beside those that its residuals show: roughness of floor and images; by trial on development seeds.
 STEP_M, STEP_RAD = 0.003, 0.003
-EVIDENCE: Final = 50.0  # log-likelihood ratio, doubled: seven sigma, because a lag is looked for in each pair
+EVIDENCE: Final = 50.0  # Log-likelihood ratio, doubled: seven sigma, because a lag is sought in each pair.
 WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, because slip makes both of them large
-LATE_S: Final = 0.5  # for which a lag must be found before it is a fault, because the newest steps are the most noisy
-SCALES: Final = (0.3, 3.0)  # of the motion in the search of a lag, because images may be slow as well as late
-STILL_S, STILL_M, STILL_RAD = 2.0, 0.02, 0.04  # because 1 cm/s and a degree a second are noise of a base that stands
-LEAST_SAMPLE_S: Final = 0.01  # between two that are kept, because floods must not shorten what is remembered
-LONGEST_GAP_S: Final = 0.3  # between two samples, because the motion in a longer gap is not known
+LATE_S: Final = 0.5  # A lag is a fault after this time, because the newest steps are the most noisy.
+SCALES: Final = (0.3, 3.0)  # Scales of the motion in the search of a lag, because images may be slow as well as late.
+STILL_S, STILL_M, STILL_RAD = 2.0, 0.02, 0.04  # Limits of rest, because 1 cm/s and a degree a second are noise.
+LEAST_SAMPLE_S: Final = 0.01  # Samples that follow sooner are dropped, because floods must not shorten the memory.
+LONGEST_GAP_S: Final = 0.3  # Longest gap between two samples, because the motion in a longer one is not known.
 MOST_KEPT: Final = 2048  # samples and steps, because WINDOW_S and MOST_LAG_S at LEAST_SAMPLE_S have 1150
-LEAST_STEPS: Final = 8  # that are compared, because fewer show no delay
-EVERY_S: Final = 0.1  # between two comparisons, because each takes a millisecond
+LEAST_STEPS: Final = 8  # Steps that are needed for a comparison, because fewer show no delay.
+EVERY_S: Final = 0.1  # Time between two comparisons, because each takes a millisecond.
 
 
 class _Step(NamedTuple):

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 # Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz: what a wheeled robot does.
 JERK_PSD = (10.0, 40.0)
-START_VELOCITY_VARIANCE = 1.0  # of a motion that is not known yet, (m/s)^2 and (rad/s)^2
+START_VELOCITY_VARIANCE = 1.0  # (m/s)^2 and (rad/s)^2 of a motion that is not known yet.
 START_ACCELERATION_VARIANCE = 4.0  # (m/s^2)^2 and (rad/s^2)^2
 MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
 

@@ -27,26 +27,26 @@ DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
 START: Final = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 START_SIGMA: Final = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
 WALK_SIGMA: Final = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
-LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])  # after many steps that do not agree
+LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])  # The same after many steps that do not agree.
 # Errors of a step that are independent of those of other steps, by sigma.
-DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02  # of the wheels' distance and turn: roughness, slack
-WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # of the wheels: steps of the encoders
+DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02  # Shares of the wheels' distance and turn: roughness, slack.
+WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # Least errors of the wheels: steps of the encoders.
 SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4  # across, by distance and by turn of wheels that cannot move sideways
-GYRO_RADPS_SQRT_S = 1e-3  # of the gyro, for one second. By judgement; not measured.
-TILT_RAD = 1e-3  # about x and y without a gyro. By judgement; not measured.
-CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # of the cameras' step, beside its covariance. By judgement; not measured.
-STILL_M, STILL_RAD = 1e-4, 5e-5  # of a base that stands. By judgement; not measured.
+GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not measured.
+TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
+CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
+STILL_M, STILL_RAD = 1e-4, 5e-5  # Motion of a base at rest. By judgement; not measured.
 # m/s and rad/s below which they read nothing, beside a bias. By judgement; not measured.
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
-STILL_BEFORE_S = 0.2  # for which they must have stood before the step, so that none swings on
+STILL_BEFORE_S = 0.2  # The sensors must have been at rest this long before the step, so that none swings on.
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
 # mean of the squared differences by their expected values. Ratios beyond the limit do not count: slip is no noise.
 NOISE_GAIN, RATIO_LIMIT = 0.02, 16.0
-OUTLIER_SIGMA = 5.0  # by which a step of a sensor differs from the cameras' when it slips or is wrong
-SLIPPING = 2  # consecutive ones of wheels: a single one may be a bump
-MOST_OUTLIERS = 40  # consecutive ones, after which the sensor counts as not calibrated
-SANE_SCALE = (0.5, 2.0)  # of wheels: beyond it their settings are wrong
-UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2  # sigma of what no sensor measures in a step
+OUTLIER_SIGMA = 5.0  # A larger difference from the cameras' step means that a sensor slips or is wrong.
+SLIPPING = 2  # Consecutive outliers of wheels that mean slip: a single one may be a bump.
+MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not calibrated.
+SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales: beyond them their settings are wrong.
+UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2  # Sigma of a motion that no sensor measures in a step.
 
 
 class MotionSensors:

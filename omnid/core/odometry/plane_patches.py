@@ -32,7 +32,7 @@ SAME_SURFACE_PX = 2.0  # disparities that differ more belong to another surface.
 # px^2, weight of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936
 # px^2, so that the slope is 0.7 % too flat.
 SLOPE_PRIOR = 50.0
-MIN_NOISE_GREY = 1.0  # of images: rounding and what the model leaves out
+MIN_NOISE_GREY = 1.0  # Least noise of images: rounding, and errors of the model.
 
 
 def plane_templates(

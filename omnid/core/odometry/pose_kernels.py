@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 # efficiency of least squares remains (2.385: 95 %, Holland and Welsch 1977).
 KERNEL_WIDTH = 2.5
 DAMPING = 1e-9  # added to the normal equations' diagonal, so that few landmarks do not make them singular
-SMALL_RAD = 1e-4  # below which the series of exp is as exact as the formula
+SMALL_RAD = 1e-4  # For smaller angles the series of exp is as exact as the formula.
 
 
 @inner

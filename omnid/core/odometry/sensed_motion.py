@@ -11,7 +11,7 @@ from calib import se3
 
 Array = NDArray[np.float64]
 
-LONGEST_GAP_S = 0.15  # between two samples, and from the last to the end of an interval. By judgement; not measured.
+LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval. By judgement; not measured.
 
 
 class RateHistory:

@@ -25,7 +25,7 @@ UNKNOWNS = 5  # exact: shift along column and row, slopes along column and row, 
 SLOPE_SIGMA = 0.1  # px/px, of the start: those of dense stereo are a third too flat, its windows being upright
 # Enough: 59 fits of test_plane_patches.py take 3 to 5. A last step is below the errors: of slopes about 0.008.
 ITERATIONS, CONVERGED_PX, CONVERGED_SLOPE = 10, 0.005, 5e-4
-MAX_SHIFT_PX = 1.5  # from where the patch was found before. By judgement; not measured.
+MAX_SHIFT_PX = 1.5  # Most distance from where the patch was found before. By judgement; not measured.
 DAMPING = 1e-3  # grey^2, of the shifts: keeps patches without texture from being singular
 
 

@@ -27,7 +27,7 @@ SAME_LEVEL = 6  # grey levels: largest difference that counts as unchanged
 MIN_CONTRAST = 25  # grey levels within REACH_PX: without contrast nothing can be seen to keep its place
 REACH_PX = 4  # at half resolution
 EVIDENCE = 5  # consecutive comparisons in which a pixel stayed the same before it counts as fixed
-MAX_EVIDENCE = 4 * EVIDENCE  # so that what was wrongly taken for fixed is released after a few changes
+MAX_EVIDENCE = 4 * EVIDENCE  # Limit, so that a pixel that was wrongly taken for fixed is released after a few changes.
 
 
 class StaticMask:

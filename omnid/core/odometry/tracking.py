@@ -18,7 +18,7 @@ Image = NDArray[np.uint8]
 CONVERGED_PX = 0.01  # OpenCV's default: an iteration that moves the window less is the last one
 # Levels of a pyramid: a panorama of 380 rows has 6 rows left on the sixth, too few for a window.
 MAX_LEVELS = 6
-MIN_EIGENVALUE = 1e-4  # of the window's gradients, OpenCV's default: below it the window has no texture
+MIN_EIGENVALUE = 1e-4  # Of the window's gradients; OpenCV's default: below it the window has no texture.
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ Flags = NDArray[np.bool_]
 NEIGHBOURS = 5  # known landmarks whose median disparity counts: two of them may be of another surface
 # Ratio of disparities beyond which they are not of one surface: slopes change them by 0.15 px/px.
 OTHER_RATIO = 1.25
-SIDE_PX = 15  # of a patch, as the tracker's window
+SIDE_PX = 15  # Side of a patch, as the tracker's window.
 # Rows about the neighbours' disparity in which the patch is searched, as a share of it: that of the slopes.
 SEARCH_SHARE = 0.2
 # By how much the correlation of the patch at its own disparity must exceed that at the neighbours': identical bricks

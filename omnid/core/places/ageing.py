@@ -16,10 +16,10 @@ from omnid.core.places.place_map import UNUSED, KeyframeUse, PlaceMap
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-BESIDE_M: Final = 0.3  # a keyframe so near to a frame shows the same, if nothing has changed
-FOUND_INLIERS: Final = 20  # with which a keyframe counts as recognised
-VISIT_M: Final = 3.0  # of path between two visits of a place
-AGED_MISSES: Final = 3  # visits at which a keyframe is missed, one after the other, before the next such one drops it
+BESIDE_M: Final = 0.3  # A keyframe so near to a frame shows the same view, if nothing has changed.
+FOUND_INLIERS: Final = 20  # Inliers with which a keyframe counts as recognised.
+VISIT_M: Final = 3.0  # Length of path between two visits of a place.
+AGED_MISSES: Final = 3  # Consecutive visits at which a keyframe is missed, before the next one drops it.
 
 
 class Ageing:

@@ -17,11 +17,11 @@ from omnid.core.places.pose_graph import PoseEdges, optimise
 Array = NDArray[np.float64]
 
 LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
-FITS_M, FITS_RAD = 0.01, 0.003  # a loop that the map fits so well needs no optimisation
+FITS_M, FITS_RAD = 0.01, 0.003  # A loop that the map fits within this needs no optimisation.
 LOOPS_THAT_FIT: Final = 3  # wait for the next optimisation, more of them in a large map; by trial on development seeds
 KEYFRAMES_PER_LOOP: Final = 50  # for each so many keyframes, one loop more waits; by trial on development seeds
 ACCEPTED: Final = 0.5  # least weight of a loop that counts; the middle is enough, because weights end at 0 or 1
-RECENT: Final = 8  # loops that tell the present drift; one that is refused may count later, while it is among them
+RECENT: Final = 8  # Loops that show the present drift; a refused one may count later, while it is among them.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from omnid.core.types.panorama import PaddedPanorama
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-LEVELS: Final = 4  # of the pyramid; because sides are 16 to 240 px, log2(240 / 16) = 3.9
+LEVELS: Final = 4  # Levels of the pyramid; because sides are 16 to 240 px, log2(240 / 16) = 3.9.
 # Standard deviation of the weights of a patch, as a share of its side; half of it, as in SIFT (Lowe 2004).
 WINDOW: Final = 0.5
 

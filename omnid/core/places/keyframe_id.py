@@ -4,4 +4,4 @@ from __future__ import annotations
 
 from typing import Final
 
-NO_KEYFRAME: Final = -1  # in place of an id, because ids are never negative
+NO_KEYFRAME: Final = -1  # Used in place of an id, because ids are never negative.

@@ -40,9 +40,9 @@ LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometr
 TIES: Final = 50  # newest keyframes that are kept where the map stays as it is, so that memory is bounded
 # Largest error of odometry, and its growth with the path; by trial on development seeds.
 GATE_M, GATE_PER_M = 0.15, 0.05
-GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # by trial on development seeds
+GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
 TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
-RECENT_M: Final = 15.0  # of path since the last recognition, up to which a pose counts as localised
+RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 
 
 class MapLocaliser:

@@ -20,9 +20,9 @@ Array = NDArray[np.float64]
 
 # Difference up to which two recognised keyframes agree about where the maps lie; by trial on development seeds.
 SAME_M: Final = 0.5
-SAME_RAD: Final = math.radians(5)  # by trial on development seeds
+SAME_RAD: Final = math.radians(5)  # The same of their headings; by trial on development seeds.
 MIN_CONSISTENT: Final = 3  # keyframes that must agree
-MIN_SHARE: Final = 0.6  # of the recognised keyframes that must agree
+MIN_SHARE: Final = 0.6  # Share of the recognised keyframes that must agree.
 
 
 def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:

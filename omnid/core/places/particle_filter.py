@@ -27,19 +27,19 @@ Array = NDArray[np.float64]
 PARTICLES: Final = 1000
 DRAWN_PER_M2: Final = 400  # poses that a search of the whole map draws
 MAX_DRAWN: Final = 100_000
-BEST_DRAWN: Final = 200  # of them that are improved
-ROUNDS: Final = 6  # of improving them: random changes, smaller each time
+BEST_DRAWN: Final = 200  # The best of them, which are improved.
+ROUNDS: Final = 6  # Rounds of improvement: random changes, smaller each time.
 CHANGE: Final = np.array([0.15, 0.15, 0.15])  # m, rad: standard deviation of the changes of the first round
-SEED_SIGMA: Final = np.array([0.2, 0.2, 0.1])  # m, rad: of the poses that signatures propose
+SEED_SIGMA: Final = np.array([0.2, 0.2, 0.1])  # m, rad: standard deviation of the poses that signatures propose.
 SEEDED: Final = 0.7  # share of the particles at the start that stand at such poses
 MOTION_SIGMA: Final = np.array([0.02, 0.02, 0.01])  # m, rad: added with each motion, so that particles differ
-MOTION_RATIO: Final = 0.05  # of the motion, added too
+MOTION_RATIO: Final = 0.05  # The same by the length of the motion.
 SCANS: Final = 8  # last scans that decide whether there is another pose
 GROUP_M, GROUP_RAD = 0.8, math.radians(25)  # distance up to which poses are one group
-SHARE: Final = 0.9  # of the weight in one group, from which it may be the pose
-SIGMA_XY_M, SIGMA_YAW_RAD = 0.2, math.radians(5)  # largest standard deviations of it
+SHARE: Final = 0.9  # Share of the weight in one group from which it may be the pose.
+SIGMA_XY_M, SIGMA_YAW_RAD = 0.2, math.radians(5)  # Largest standard deviations of a group that is the pose.
 FITTING: Final = 0.75  # share of the beams that must end at obstacles of the map, in the mean of the last scans
-MARGIN: Final = 10.0  # of the log likelihood, by which it must be better than any other pose
+MARGIN: Final = 10.0  # Log likelihood by which the pose must be better than any other.
 # With less fitting beams, after which the whole map is searched again; 1 m of motion; by trial on development seeds.
 LOST_UPDATES: Final = 5
 

@@ -15,8 +15,8 @@ from omnid.core.places.map_tags import MapTags
 
 Array = NDArray[np.float64]
 
-MOST_LOOPS = 4  # that a dropped keyframe leaves to its neighbour: the most certain ones
-OVERHEAD_BYTES = 1500  # of a keyframe beside its large arrays: poses, covariance, links
+MOST_LOOPS = 4  # Most loops that a dropped keyframe leaves to its neighbour: the most certain ones.
+OVERHEAD_BYTES = 1500  # Bytes of a keyframe without its large arrays: poses, covariance, links.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

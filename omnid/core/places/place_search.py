@@ -21,8 +21,8 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-NEAR_M: Final = 1.5  # a place is looked for among keyframes so near to where odometry expects it
-ENOUGH_INLIERS: Final = 50  # of a place that is enough
+NEAR_M: Final = 1.5  # Keyframes so near to the pose by odometry are searched.
+ENOUGH_INLIERS: Final = 50  # Inliers of a place with which the search ends.
 
 
 class Effort(NamedTuple):
@@ -32,8 +32,8 @@ class Effort(NamedTuple):
     compared: int  # of them, those with most votes
 
 
-NEAR_EFFORT: Final = Effort(16, 3)  # where odometry says about where the robot is; by trial on development seeds
-FAR_EFFORT: Final = Effort(200, 8)  # where it does not; by trial on development seeds
+NEAR_EFFORT: Final = Effort(16, 3)  # Effort where the pose is known roughly by odometry; by trial on development seeds.
+FAR_EFFORT: Final = Effort(200, 8)  # Effort where it is not; by trial on development seeds.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 SIGMA_PX: Final = 0.3  # standard deviation of a disparity; by trial on development seeds
 MAX_SIGMA_M: Final = 0.3  # largest standard deviation of a landmark that is shown; by trial on development seeds
-VOXEL_M: Final = 0.05  # in which landmarks of several keyframes are fused; as in the grids
+VOXEL_M: Final = 0.05  # Side of the voxels in which landmarks of several keyframes are fused; as in the grids.
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,17 +21,18 @@ Indices = NDArray[np.intp]
 RATIO: Final = 0.85  # largest distance of a match, as a share of the second best one's (Lowe 2004)
 # A match's azimuth differs at most so much from that of the turn between both views; by trial on development seeds.
 YAW_WINDOW_RAD: Final = 1.2
-SIGMA_PX: Final = 0.7  # standard deviation of corners and of the disparities beside them; by trial on development seeds
+SIGMA_PX: Final = 0.7  # Standard deviation of corners and their disparities; by trial on development seeds.
 THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set; by trial on development seeds
 MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose; by trial on development seeds
-REACH_PX: Final = 3.0  # of the second search, about the predicted views: the next brick is not far
+REACH_PX: Final = 3.0  # Reach of the second search about the predicted views: the next brick is not far.
 # Distance of descriptors that may match in the second search; by trial on development seeds.
 LARGEST_SQUARED: Final = 0.35 * 512**2
 # Squared Mahalanobis distance (4 sigma) from which a view is an outlier; so that 0.1 % of right ones are lost.
 OUTLIER_SQUARED: Final = 16.0
 CORRELATED: Final = 4.0  # features that count as one in the covariance; by trial on development seeds
-FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2  # m, rad: what no number of features undercuts
-SECTORS: Final = 8  # of azimuth, among which inliers are counted; of 45 degrees; by trial on development seeds
+# m, rad: least standard deviations, however many features there are.
+FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
+SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted; of 45 degrees; by trial on development seeds.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

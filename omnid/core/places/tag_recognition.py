@@ -15,7 +15,7 @@ from omnid.core.places.recognition import Recognition
 from omnid.core.places.tags import TagFinder, TagPose, in_tag_axes
 from omnid.core.types.stereo_model import StereoModel
 
-CORNERS_SEEN: Final = 8  # of a tag, in both panoramas; because all four are needed in each
+CORNERS_SEEN: Final = 8  # Corners of a tag in both panoramas; because all four are needed in each.
 
 
 class TagRecogniser:

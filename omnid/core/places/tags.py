@@ -23,9 +23,9 @@ from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-MAX_TAG: Final = 586  # of the family 36h11; exact: it has 587
+MAX_TAG: Final = 586  # Largest number of the family 36h11; exact: it has 587.
 MAX_NAME: Final = 64  # characters; so that files of any origin are bounded
-SIZES_M: Final = (0.005, 10.0)  # of a tag's edge; so that nonsense is refused
+SIZES_M: Final = (0.005, 10.0)  # Limits of a tag's edge, so that nonsense is refused.
 # Standard deviation of a corner, that of the curvature in the panorama included; by trial on development seeds.
 SIGMA_PX: Final = 0.35
 # Mean squared error of the corners, in SIGMA_PX, of what is a tag of the known size; because it is three standard

@@ -11,7 +11,7 @@ from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.places.recognition import RATIO, distances
 
 VOTERS: Final = 64  # features of a frame that vote; they are evenly spread, the strongest ones first
-BINS: Final = 24  # of the turn; three neighbours count together
+BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
 
 
 def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, float]:

@@ -30,7 +30,7 @@ SIGMAS: Final = 4.0
 # points with contrast are counted: a smaller part of them that match means a broken rig.
 MIN_MATCHED_PART: Final = 0.08
 MIN_CONTRAST_POINTS: Final = 400
-SECTORS: Final = 12  # of azimuth, 30 deg each: about the width of a wall in a room
+SECTORS: Final = 12  # Sectors of azimuth, 30 deg each: about the width of a wall in a room.
 # Matches for the median of a sector, so that it is known to 1.25 / sqrt(20), about a quarter of the spread.
 MIN_IN_SECTOR: Final = 20
 # Median residual of the sectors. A camera whose intrinsics have changed bends the columns all around; the matches of

@@ -8,11 +8,11 @@ from enum import StrEnum
 class RigState(StrEnum):
     """State of a rig by the images; ARCHITECTURE.md has a figure of the transitions."""
 
-    UNCHECKED = "unchecked"  # the images show too little, or nothing was checked yet
+    UNCHECKED = "unchecked"  # The images show too little, or nothing was checked yet.
     FITS = "fits"
-    DRIFTED = "drifted"  # by some tenths of a degree: poses are less accurate
-    EXCHANGED = "exchanged"  # the lower camera is taken for the upper one
-    BROKEN = "broken"  # by degrees: a mirror was knocked, a camera is covered, or the rig is of other cameras
+    DRIFTED = "drifted"  # The rig is off by some tenths of a degree: poses are less accurate.
+    EXCHANGED = "exchanged"  # The lower camera was taken for the upper one.
+    BROKEN = "broken"  # The rig is off by degrees: a mirror was knocked, a camera covered, or it is of other cameras.
 
     @property
     def is_contradicted(self) -> bool:

@@ -25,9 +25,10 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 CELL_PX = 32  # side of a cell: longer than the courses of most brick walls are high
-MAX_ROUNDS = 64  # of propagation: cells that anchors can cross
-LONG_LINE_SAMPLES = 16  # of a line to the anchor of a neighbouring cell; enough: every fourth pixel of two cells
-SHORT_LINE_SAMPLES = 8  # of a line to the nearest anchor; enough: every fourth pixel of a cell
+MAX_ROUNDS = 64  # Rounds of propagation: cells that anchors can cross.
+# Samples on the line to the anchor of a neighbouring cell; enough: every fourth pixel of two cells.
+LONG_LINE_SAMPLES = 16
+SHORT_LINE_SAMPLES = 8  # Samples on the line to the nearest anchor; enough: every fourth pixel of a cell.
 NEW_ANCHOR_MARGIN = 2.0  # grey levels by which the runner-up of a new anchor must be worse: an error would propagate
 CLEAR_MARGIN = 1.0  # the same of an ordinary point; by trial on development seeds
 CHUNK_LINES = 4_000  # lines sampled at a time, so that their pixels stay in the processor's cache

@@ -20,17 +20,17 @@ Flags = NDArray[np.bool_]
 TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
 LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene
 NOTHING_BUT_NOISE = 0.5  # contrast to noise: corners and patches are then those of noise
-LEAST_NOISE_GREY = 0.3  # that of rounding
-MAX_GAIN = 8.0  # of 8 bit images: more only magnifies their steps
+LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
+MAX_GAIN = 8.0  # Largest gain of 8 bit images: more only magnifies their steps.
 # Noise is the difference of two Gaussian blurs in the smoothest blocks: texture is stronger than noise elsewhere.
 FINE_PX, COARSE_PX = 0.8, 1.6
 BLOCK_PX = 8
-LIGHT_EVERY_PX = 3  # of rows and columns: a ninth of the pixels tells mean and contrast as well
+LIGHT_EVERY_PX = 3  # Spacing of the rows and columns: a ninth of the pixels gives mean and contrast as well.
 SMOOTHEST_PERCENT = 5.0
 # Noise of a panorama by that measure: simulated with white noise of 1.5 to 13 grey levels, JPEG, remapped bilinearly.
 NOISE_SCALE = 6.1
 BANDS, BAND_ROWS = 4, 24  # rows in which noise is measured: all would take milliseconds
-MIN_BLOCKS = 20  # fewer visible ones tell nothing
+MIN_BLOCKS = 20  # With fewer visible blocks the noise is not known: the smoothest of few have texture.
 UNKNOWN_NOISE = 1.0  # grey levels
 
 

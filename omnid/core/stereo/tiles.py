@@ -34,9 +34,10 @@ SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 # narrowest part that matters.
 TILE_COLUMNS: Final = 60
 TILE_ROWS: Final = 4  # 63 rows at scale 1
-JUDGED_SHARE: Final = 0.5  # of a tile that shows the world; one of which less does is not judged
+JUDGED_SHARE: Final = 0.5  # Share of a tile that must show the world; tiles that show less are not judged.
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts; one may be a glitch of a driver
-LEAST_ALIVE: Final = 0.1  # of the judged tiles that must change before others are dead: else the whole image stands
+# Share of the judged tiles that must change before others are dead: else the whole image is still.
+LEAST_ALIVE: Final = 0.1
 # Mean change between two images with independent normal noise of sigma: 2 sigma / sqrt(pi), exact to 0.03 %.
 NOISE_CHANGE: Final = 1.128
 # Of it. The noise is that of the smoothest blocks, and pixels of a panorama are interpolated from compressed images:
@@ -54,9 +55,9 @@ SATURATED_GREY, SATURATED_SHARE = 250, 0.8
 # is all the texture of a column: 0.15 was left in rendered corridors. A drop leaves less.
 BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
-LEAST_ENERGY: Final = 2.0  # of a column, in variances of the noise: with less texture no blur is seen
-COMPARED_COLUMNS: Final = 15  # that have so much, at least: else a single poster decides what is usual
-BLIND_SHARE: Final = 0.5  # of the judged tiles of a column, of which more blind ones make its direction unknown
+LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise: with less texture no blur is seen.
+COMPARED_COLUMNS: Final = 15  # Columns that must have this energy: else a single poster decides what is usual.
+BLIND_SHARE: Final = 0.5  # A column's direction is unknown if a larger share of its judged tiles is blind.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

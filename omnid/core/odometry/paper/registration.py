@@ -13,8 +13,8 @@ from omnid.core.odometry.pose_estimation import rigid_fit
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-HYPOTHESES = 200  # of RANSAC: where half of the points are wrong, (1 - 0.5^3)^200 = 3e-12 of the searches fail
-STEPS = 10  # of Gauss-Newton; enough: 351 motions of test_paper_odometry.py took 2 to 5
+HYPOTHESES = 200  # RANSAC: if half of the points are wrong, (1 - 0.5^3)^200 = 3e-12 of the searches fail.
+STEPS = 10  # Gauss-Newton steps; enough: 351 motions of test_paper_odometry.py took 2 to 5.
 CONVERGED = 1e-9  # rad and m: a smaller step is the last one
 MIN_POINTS = 3  # because fewer leave a rotation about their line open
 
