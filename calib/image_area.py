@@ -1,7 +1,7 @@
 """One image that holds both views of a rig: two mirrors before one camera, the halves of a double fisheye.
 
 Each view is calibrated in its own area of the image as if it was a camera's; the rig of the whole image has the same
-cameras with their centres shifted, and masks that tell which part is whose.
+cameras with their centres shifted, and masks that state which part belongs to which camera.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class TwoViews:
         return replace(rig, lower=sides[0], upper=sides[1])
 
     def _mask(self, mounted: MountedCamera, area: ImageArea) -> Mask:
-        """Return the mask in the whole image: where none is known, and where it is painted, nothing beside the area."""
+        """Return the mask in the whole image. An unknown or painted mask shows nothing outside of the area."""
         mask = mounted.mask or whole_image(mounted.camera)
         center = (mask.center[0] + area.left, mask.center[1] + area.top)
         if mounted.mask is not None and mask.image is None:

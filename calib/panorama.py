@@ -28,7 +28,7 @@ SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # wider than what is seen.
 SECTOR_STEPS = 96
 SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
-# Least azimuth that no camera pair shares beside which a panorama is a sector: a strut or a mast hides less.
+# A panorama is a sector if the cameras do not share an azimuth of at least this width: a strut or a mast hides less.
 MIN_UNSEEN_RAD = math.radians(45)
 # Least elevations that both cameras see: 15 degrees have 60 rows at scale 1, four windows of the tracker.
 MIN_SHARED_DEG = 15.0
@@ -96,7 +96,7 @@ class Cylinder:
     def pixels(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3) relative to the viewpoint, in the rectified frame.
 
-        What a sector does not show has columns beside it: each point is at most half a turn from the middle.
+        What a sector does not show has columns outside of it: each point is at most half a turn from the middle.
         """
         r = np.hypot(points[:, 0], points[:, 1])
         column = (self.left_rad - np.arctan2(points[:, 1], points[:, 0])) * self.focal_px - 0.5

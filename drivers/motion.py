@@ -1,4 +1,4 @@
-"""Motion of the base as sensors beside the cameras measure it: wheels and gyro."""
+"""Motion of the base as wheels and gyro measure it."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ def _pseudo_terminal(path: Path) -> _Found | None:
             links.append(_mark(path.lstat()))
             path = path.parent / path.readlink()
     except (OSError, ValueError):
-        return None  # the opening tells why
+        return None  # the opening reports why
     is_terminal = stat.S_ISCHR(end.st_mode) and os.major(end.st_rdev) in MAJORS
     return _Found(path, _mark(end), tuple(links)) if is_terminal else None
 

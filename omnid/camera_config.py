@@ -76,7 +76,7 @@ class PairConfig:
 
 @dataclass(frozen=True, slots=True)
 class TimingConfig:
-    """Times of exposure of the cameras, beside the stamps; 0: as the rig's file says, see `omnid calibrate drive`."""
+    """Times of exposure relative to the stamps; 0: as the rig's file says, see `omnid calibrate drive`."""
 
     line_time_us: float = knob(
         0.0,

@@ -1,4 +1,4 @@
-"""Settings that one command uses and another ignores: told, or refused where somebody asked for them."""
+"""Settings that one command uses and another ignores: a warning, or an error where somebody asked for them."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ class OdometryUpdate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapKeyframes:
-    """The keyframes of the map as they are at a pose, by id in ascending order: copies, for the map goes on."""
+    """The keyframes of the map as they are at a pose, by id in ascending order: copies, because the map changes."""
 
     stamps_ns: Mapping[int, int]
     T_map_rect: Mapping[int, Array]  # (4, 4) of the rectified frame

@@ -40,7 +40,7 @@ class Keys:
     renamed: Mapping[str, str]
 
     def moved(self, path: Path) -> OmnidError | None:
-        """Return the error for a key that was renamed or removed, itself or with a section that it stood in."""
+        """Return the error for a key that was renamed or removed, itself or with a section that it was in."""
         for depth in range(len(path), 0, -1):
             new = self.renamed.get(".".join(path[:depth]))
             if new is None:

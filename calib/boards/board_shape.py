@@ -26,7 +26,7 @@ FEW_CORNERS, FEW_MAX_SPREAD, FEW_MIN_STEPS = 20, 0.08, 0.9
 # Least share of right steps in the outermost ring of squares. By judgement; not measured.
 MIN_AROUND = 0.85
 # Largest share, on any side, of steps beyond the board of at least BEYOND_STEP of the median step. A light margin next
-# to the squares yields about a quarter, a pattern that goes on 1: the limit is near the middle.
+# to the squares yields about a quarter, a pattern that continues 1: the limit is near the middle.
 MAX_BEYOND, BEYOND_STEP = 0.65, 0.4
 
 

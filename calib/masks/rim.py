@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib.models.camera import Array, Mask
 
-AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would tell the same
+AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
 MIN_SIDE_PX = 64  # Shorter side of the smallest image. By judgement; not measured.
 # The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least.
 CORNER_PART, MIN_CORNER_PX = 1 / 32, 4

@@ -148,7 +148,7 @@ class EquidistantCamera:
 
 
 LensCamera = DoubleSphereCamera | ExtendedUnifiedCamera | EquidistantCamera
-# Parameters of each model beside the focal lengths and the centre, by the names of their keys in files.
+# Parameters of each model in addition to the focal lengths and the centre, by their keys in files.
 LENS_KEYS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"ds": ("xi", "alpha"), "eucm": ("alpha", "beta"), "equidistant": ("k1", "k2", "k3", "k4")}
 )

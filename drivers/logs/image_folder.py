@@ -1,9 +1,10 @@
 """Folders of images with stamps, one folder for each camera.
 
 The stamp of an image is its name without suffix (1403636579763555584.png, 1305031102.175304.jpg), or the line of its
-number in timestamps.txt or times.txt beside the images or in the folder above. A stamp is in nanoseconds where it is a
-whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers may have been
-meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say what is meant.
+number in timestamps.txt or times.txt in the folder of the images or the one above. A stamp is in nanoseconds where it
+is a whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers may have
+been meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say what is
+meant.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ class ImageFolder:
             yield LoggedImage(file.topic, file.stamp_ns, partial(_read, file))
 
     def attachments(self) -> dict[str, bytes]:
-        """Return the rig.toml beside the folders, if there is a regular file of at most 16 MiB."""
+        """Return the rig.toml in the folder of the folders, if it is a regular file of at most 16 MiB."""
         try:
             _require_own_files(self._path, [self._path / ATTACHMENT])
             data = _read_regular(self._path / ATTACHMENT, _MAX_ATTACHMENT_BYTES + 1)
@@ -187,7 +188,7 @@ def _read_regular(path: Path, most_bytes: int) -> bytes:
 
 
 def _stamp_lines(folder: Path) -> list[str] | None:
-    """Return the lines of the list of stamps beside the images or above; None without one."""
+    """Return the lines of the list of stamps in the folder of the images or above; None without one."""
     for path in (place / name for place in (folder, folder.parent) for name in STAMP_FILES):
         try:
             if path.is_file() and path.stat().st_size <= _MAX_STAMP_BYTES:

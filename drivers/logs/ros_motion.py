@@ -54,7 +54,7 @@ def parse_motion(
             rates = tuple(members.number("d") for _ in range(3))
     except struct.error as error:
         raise FrameDecodeError(f"a {schema_name} of {len(message)} bytes is truncated") from error
-    must_be_known = rates[:1] if schema_name == ODOMETRY else rates  # wheels may not tell their turn
+    must_be_known = rates[:1] if schema_name == ODOMETRY else rates  # wheels may not report their turn
     if not all(map(math.isfinite, must_be_known)) or any(map(math.isinf, rates)):
         raise FrameDecodeError(f"a {schema_name} has rates that are not finite")
     return MotionReading(stamp_ns, rates)

@@ -104,7 +104,7 @@ def row_values(result: JobResult) -> dict[str, Any]:
 
 
 def _attempt(job: Job, folder: Path) -> dict[str, Any]:
-    """Return the values of a row beside name, log, time and key."""
+    """Return the values of a row without name, log, time and key."""
     try:
         log = _local(job.log, folder)
     except Exception as error:  # any of the many that the file systems raise
@@ -141,7 +141,7 @@ def _local(log: str, folder: Path) -> Path:
 
 
 def _omnid(words: list[str], folder: Path, timeout_s: float) -> tuple[int | None, str]:
-    """Run omnid in a folder; return its exit code, None after the time, and what it printed."""
+    """Run omnid in a folder; return its exit code, None after the time, and its output."""
     with (folder / LOG_FILE).open("ab") as messages:
         process = subprocess.Popen(
             python("-m", "omnid", *words),
@@ -214,7 +214,7 @@ def _counters(text: str) -> dict[str, Any]:
 
 
 def _truth(job: Job, log: Path) -> Path | None:
-    """Return the truth beside a log, if there is one."""
+    """Return the truth in the folder of a log, if there is one."""
     path = (log if log.is_dir() else log.parent) / job.options.truth
     return path if job.options.truth and not is_url(job.log) and path.is_file() else None
 

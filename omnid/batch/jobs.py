@@ -27,8 +27,8 @@ _UNSAFE: Final = re.compile(r"[^\w.-]+")
 class BatchOptions:
     """The same for all logs. Paths are absolute, because a worker may run elsewhere."""
 
-    arguments: tuple[str, ...] = ()  # of `omnid replay`, beside log and outputs
-    truth: str = "truth.txt"  # name of a trajectory beside a log, which is compared where it exists; "": none
+    arguments: tuple[str, ...] = ()  # of `omnid replay`, in addition to log and outputs
+    truth: str = "truth.txt"  # name of a trajectory in the folder of a log, which is compared where it exists; "": none
     record: bool = False  # keep a recording and a report of each log
     timeout_s: float = 3600.0  # for one log
 
@@ -81,7 +81,7 @@ def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
 
 
 def _distinct(names: Iterable[str]) -> list[str]:
-    """Return names of which none stands twice: a.mcap and a.db3 are two logs."""
+    """Return names of which none occurs twice: a.mcap and a.db3 are two logs."""
     seen: dict[str, int] = {}
     found = []
     for name in names:

@@ -1,4 +1,4 @@
-"""Pairs of images from two cameras that look at something that does not move."""
+"""Pairs of images from two cameras that view a scene that does not move."""
 
 from __future__ import annotations
 

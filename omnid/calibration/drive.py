@@ -53,7 +53,7 @@ MIN_TIME, TIME_SIGMAS = {UPPER_DELAY: 0.5, LINE_TIME: 1.0}, 4.0
 
 @dataclass(frozen=True, slots=True)
 class DriveCalibration:
-    """The rig that fits the drives, beside the one before."""
+    """The rig that fits the drives, and the one before."""
 
     before: Rig
     rig: Rig  # with its covariance

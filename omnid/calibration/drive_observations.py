@@ -158,7 +158,7 @@ class DriveCollector:
 
 
 def _stamp_delay_s(seen: Panoramas, rig: Rig) -> float:
-    """Return the upper minus the lower stamp of a pair; the rig's delay of the exposures is a parameter beside it."""
+    """Return the upper minus the lower stamp of a pair; the rig's delay of the exposures is a separate parameter."""
     return seen.times.skew_s - rig.times.upper_delay_s
 
 
@@ -169,7 +169,7 @@ def _spacing(reader: LogReader, most: int) -> int:
 
 
 class KeyframeChoice:
-    """Chooses the poses that lie apart far enough to tell something new."""
+    """Chooses the poses that are far enough apart to add information."""
 
     def __init__(self, apart: int = 1, apart_m: float = KEYFRAME_M, apart_rad: float = KEYFRAME_RAD) -> None:
         """apart: pairs at least; and one of metres and radians."""
@@ -225,7 +225,7 @@ def tracked_updates(reader: LogReader, front_end: FrontEnd, config: Config, log:
 
 
 def require_motion(T_rig_odom: Array, drives: int) -> None:
-    """Raise OmnidError where the drives are too short or too straight to tell."""
+    """Raise OmnidError where the drives are too short or too straight."""
     if len(T_rig_odom) < MIN_KEYFRAMES:
         raise OmnidError(
             f"calibrate drive: only {len(T_rig_odom)} views {KEYFRAME_M} m or "

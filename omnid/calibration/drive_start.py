@@ -53,11 +53,11 @@ def straightened(log: Path, parameters: RigParameters, topics: Topics, config: C
             f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
             "and is there enough to see?"
         )
-    # Errors of a centre look like a shifted viewpoint, which is none: only the rotation is a start.
+    # Errors of a centre have the effect of a shifted viewpoint, which is none: only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
     prior = prior_information(parameters, rig)
     if float(np.median([abs(pair.skew_s) for pair in pairs])) > SYNCHRONOUS_S:
-        return steps  # the motion between the exposures would look like errors of the centres
+        return steps  # the motion between the exposures would be taken for errors of the centres
     for _ in range(PAIR_ROUNDS):
         state, observations = observe_pairs(pairs, parameters.at(steps), config)
         steps = adjust_pairs(parameters, replace(state, steps=steps), observations, prior)

@@ -35,7 +35,7 @@ class PairOutcome(StrEnum):
 
 
 class LiveBoards:
-    """Takes pairs of images one after the other; keeps those that tell something new."""
+    """Takes pairs of images one after the other; keeps those that add information."""
 
     def __init__(self, board: AnyBoard) -> None:
         self._board = board
@@ -65,7 +65,7 @@ class LiveBoards:
     def process(self, images: Sequence[Image], *, need_still: bool) -> PairOutcome:
         """Search the board in the images of the lower and the upper camera at one instant.
 
-        need_still: they count only where the board stood at the same place in the pair before.
+        need_still: they count only where the board was at the same place in the pair before.
         """
         # 1. Search the board.
         self._update_rims(images)

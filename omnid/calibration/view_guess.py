@@ -1,6 +1,6 @@
 """View of a camera: does it see the world in a mirror or directly through a lens? From images of a board.
 
-A flat checkerboard looks the same either way: its poses are then the mirror images of each other. What tells:
+A flat checkerboard appears the same either way: its poses are then mirror images of each other. It is decided by:
 
 - markers, which a mirror reflects;
 - the rim of a mirror with the dark hub in its middle, where the camera sees itself;
@@ -35,7 +35,7 @@ VIEW_HELP: Final = (
 AGREED: Final = 0.8
 # Side of the patches in the corners and in the middle, in parts of the smaller side of the image; their least
 # brightness in parts of the median of the image, to which a lens shades its corners; and the least grey level of that
-# median, below which dark and light are not told apart.
+# median, below which dark and light are not distinguished.
 PATCH: Final = 1 / 16
 LIT: Final = 0.4
 LIGHT_GREY: Final = 40.0

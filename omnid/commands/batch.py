@@ -119,7 +119,7 @@ def _options(args: argparse.Namespace) -> BatchOptions:
     from omnid.batch.jobs import BatchOptions
     from omnid.config import load_config
 
-    load_config(args.config, args.overrides)  # a mistake is told now, and not by each log
+    load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
     arguments: list[str] = []
     for option, path in (("--rig", args.rig), ("--config", args.config)):
         if path is not None:

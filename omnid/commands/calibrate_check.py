@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
         )
     found = check_rig(pairs, rig, Config().panorama)
     if skewed:
-        # The motion between the exposures would look like a drift.
+        # The motion between the exposures would be taken for a drift.
         found = replace(found, finding=moving_rig_finding(args.log, rig, (args.lower, args.upper), Config()))
     _require_matches(found.finding, len(pairs))
     print(report(found, len(pairs)))

@@ -143,7 +143,7 @@ def replay_and_print(log: Path, config: Config, options: ReplayOptions, output: 
 def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, failed: bool = False) -> None:
     """Print warnings on stderr and the summary on stdout, or also on stderr where a file goes to stdout.
 
-    failed: by an error, which is told after this; of the files only those that are there are named.
+    failed: by an error, which is reported later; of the files only those that exist are named.
     """
     from omnid.diagnostics.run_summary import folded_entry, run_summary
     from omnid.sinks.files import on_stdout

@@ -101,7 +101,7 @@ def _devices(config: Config) -> OpenCamera:
 
     if not config.cameras.is_one_device:
         return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
-    # One device: its images hold both views, and the rig's masks tell which part is whose.
+    # One device: its images hold both views, and the rig's masks state which part belongs to which camera.
     read_rig(Path(config.cameras.rig)).of_one_image(config.cameras.lower)
     opened = deque[SharedCamera](maxlen=1)
 

@@ -30,9 +30,9 @@ UNTIL_ARMED = "they stay stopped until cmd/arm (`omnid arm`)"
 class Controller:
     """Take poses and setpoints, of which the newest count; each call is one tick.
 
-    The law (omnid.core.control.control_law) decides; this class keeps the rhythm of the ticks, and tells the law what
-    became of its motions: an unanswered or failed command, a motor controller that had stopped by itself.
-    Not thread-safe.
+    The law (omnid.core.control.control_law) decides; this class keeps the rhythm of the ticks, and reports to the law
+    what became of its motions: an unanswered or failed command, a motor controller that had stopped by itself. Not
+    thread-safe.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Controller:
         self._law.arm(request)
 
     def end(self) -> None:
-        """Stop the wheels for good."""
+        """Stop the wheels permanently."""
         self._law.end()
 
     def tick(self) -> TickReport:
@@ -112,7 +112,7 @@ class Controller:
         self._report_slowing()
         self._report_obstacles()
         self._count_stop(output.reason)
-        # 3. Send its motion, and tell the law what became of it.
+        # 3. Send its motion, and report to the law whether it was sent.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
         self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
@@ -155,7 +155,7 @@ class Controller:
         state.source = "" if self._law.reason or commands.current is None else commands.current.source
 
     def _report_slowing(self) -> None:
-        """Keep the reason to drive slowly; report the start of one that a person should look at."""
+        """Keep the reason to drive slowly; report the start of one that a person should examine."""
         before, self.state.slowed_by = self.state.slowed_by, self._law.plausibility.slowed_by
         self.state.slowed += bool(self.state.slowed_by and not before)
         slowed_by = self.state.slowed_by
@@ -191,7 +191,7 @@ class Controller:
         """Send the command; return the motor controller's answer, None where it gave none."""
         try:
             status = self._driver.send(command)
-        except LateReplyError:  # the command was sent and most likely received: the law goes on from its motion
+        except LateReplyError:  # the command was sent and most likely received: the law continues from its motion
             self.state.late += 1
             return None
         except DriverError as error:
@@ -212,7 +212,7 @@ class Controller:
         self.state.expiries += status.watchdog_expired
         self.state.fault, self.state.battery_v = status.fault, status.battery_v
         self._law.contacts.update(MOTOR, ContactState(status.bumper, status.cliff))
-        if status.watchdog_expired:  # it stands: the command was not obeyed
+        if status.watchdog_expired:  # the base is at rest: the command was not obeyed
             self._law.stand()
         self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
         # One that holds a heading decides about its yaw rate itself.

@@ -45,7 +45,7 @@ class Channel:
         return pickle.loads(packet)
 
     def finish_sending(self) -> None:
-        """Send the end: the other end's `receive` raises EOFError after what was sent. Receiving goes on."""
+        """Send the end: the other end's `receive` raises EOFError after what was sent. Receiving is still possible."""
         with suppress(OSError):
             self._end.shutdown(socket.SHUT_WR)
 

@@ -108,7 +108,7 @@ class ControllerLink:
         self._send(None)
 
     def touch(self, contact: str, *, holds: bool) -> None:
-        """Report a bumper or a cliff sensor (BUMPER, CLIFF); as long as it holds, the base stands. From one thread."""
+        """Report a bumper or a cliff sensor (BUMPER, CLIFF); the base stays at rest while it holds. From one thread."""
         self._contacts = self._contacts.after(contact, holds=holds)
         self._send(None)
 

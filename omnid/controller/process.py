@@ -40,7 +40,7 @@ class ControllerLoop:
         self._until_ns = 0  # once the daemon sends no more: when the wheels must have stopped
 
     def run(self) -> None:
-        """Run until the daemon sends no more and the wheels stand."""
+        """Run until the daemon sends no more and the wheels are at rest."""
         while not self._ended():
             self._receive_until_due()
             report = self._controller.tick()
@@ -91,7 +91,7 @@ class ControllerLoop:
 def run_controller(channel: Channel) -> int:
     """Run as the daemon's first message says; return the exit code, 2 where the motor controller cannot be opened."""
     with ExitStack() as closing:
-        closing.callback(channel.close)  # last of all, when the wheels stand
+        closing.callback(channel.close)  # last of all, when the wheels are at rest
         start: ControllerStart = channel.receive(START_MESSAGE_S)
         try:
             driver, _ = open_motor(start.motor, closing)

@@ -5,7 +5,7 @@ e_i = z_i + h - a x_i - b y_i and its noise sigma_i, a point within a span S of 
 
     p N(e_i; sigma_i) + (1 - p) ((1 - FALSE) Phi(e_i / sigma_i) + FALSE) / S
 
-A part p lies on the floor, the others stand on it, evenly over S (walls, furniture), and few are false. So little may
+A part p lies on the floor, the others above it, evenly over S (walls, furniture), and few are false. So little may
 lie below the floor: a table is none. The prior of a and b is 0 +- 1 degree. h is searched on a grid, with S = h;
 then expectation maximisation (Dempster, Laird, Rubin 1977) finds h, a, b, p and the noise's scale, with S = SPAN_M.
 The evidence for a floor is the log of the ratio of the likelihoods with it (p) and without (p = 0). Points of one
@@ -26,7 +26,7 @@ from omnid.core.floor_kernels import densities, level_floors
 
 Array = NDArray[np.float64]
 
-TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base that stands on its wheels
+TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base on its wheels
 # Searched heights; their step is finer than the noise that the prior's tilt adds.
 HEIGHTS_M: Final = np.arange(0.1, 3.0, 0.02)
 SPAN_M: Final = 0.3  # Points so near to the floor are compared with it: 3 sigma of the noisiest ones.

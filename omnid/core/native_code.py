@@ -1,9 +1,9 @@
 """Machine code of compiled functions (compiled.py), made by numba so that it runs without numba.
 
-numba's own entry from Python needs numba's library beside the code. The entry made here takes numpy's arrays as they
-lie in memory (struct PyArrayObject, the same in numpy 1 and 2 on all processors of 64 bits), checks type, axes, layout
-and writability, and returns 0, the number of a wrong array below zero, or numba's status above zero. Of numba's library
-a function needs the memory of its arrays only; those few functions become part of its code.
+numba's own entry from Python needs numba's library in addition to the code. The entry made here takes numpy's arrays as
+they lie in memory (struct PyArrayObject, the same in numpy 1 and 2 on all processors of 64 bits), checks type, axes,
+layout and writability, and returns 0, the number of a wrong array below zero, or numba's status above zero. Of numba's
+library a function needs the memory of its arrays only; those few functions become part of its code.
 
 The functions within a function are compiled as far as LLVM's code only, and become part of it: numba's way, which
 optimises each of them and makes it callable as well, takes 1.5 times the processor time and gives the same bytes.

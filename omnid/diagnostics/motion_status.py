@@ -1,4 +1,4 @@
-"""Status of wheels and gyro beside the cameras."""
+"""Status of wheels and gyro."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from omnid.transport.status_names import Key, time_key
 # If the skew between the cameras changes by more, their clocks run at different rates.
 MAX_SKEW_DRIFT_NS: Final = 3_000_000
 TIMEOUT_S: Final = 1.0  # An older image of a camera, or an older pose, is reported as missing.
-EXPECTED_STOPS: Final = ("", IDLE, ASKED, COMMAND_STALE)  # reasons to stand that are no fault
+EXPECTED_STOPS: Final = ("", IDLE, ASKED, COMMAND_STALE)  # reasons for a stop that are no fault
 REMEDY: Final = "send cmd/arm: `omnid arm`"
 LEVELS: Final = {TrackingState.TRACKING: OK, TrackingState.DEGRADED: WARN, TrackingState.LOST: ERROR}
 _CAMERA_COUNTERS: Final = ("frames", Key.DROPS, Key.ERRORS, "restamped", Key.RESTARTS, Key.LOSSES, "reopens")

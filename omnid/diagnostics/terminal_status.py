@@ -23,7 +23,7 @@ class TerminalStatus:
         statistics: RunStatistics,
         ready: str,
     ) -> None:
-        """show: rewrites the line. line: what it says. report: takes lines that stay. ready: of the start."""
+        """show: rewrites the line. line: its text. report: takes lines that stay. ready: of the start."""
         self._show, self._line, self._report = show, line, report
         self._statistics, self._ready = statistics, ready
 

@@ -79,7 +79,7 @@ class WiringTest:
         self._speed_mps, self._turns, self._move_s, self._rest_s = speed_mps, turns, move_s, rest_s
 
     def run(self) -> DriveSettings:
-        """Return the settings of the drive as the wiring is. Raise OmnidError where the answers do not tell it."""
+        """Return the settings of the drive as the wiring is. Raise OmnidError where the answers do not determine it."""
         plain = replace(self._config.drive, swapped=False, reverse_left=False, reverse_right=False)
         with ExitStack() as closing:
             motor, _ = open_motor(replace(self._config, drive=plain), closing)
@@ -139,7 +139,7 @@ class WiringTest:
                 return rescaled(drive, SCALES[self._config.protocol], turns / commanded)
 
     def _move(self, motor: SerialMotor, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
-        """Drive for so long, then stand; return the time for which it drove, s."""
+        """Drive for this time, then stop; return the time for which it drove, s."""
         period_s = 1 / self._config.rate_hz
         motor.send(stop_command(0))  # after a pause the driver sends one in place of the first command
         begin_s = next_s = time.monotonic()

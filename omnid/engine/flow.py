@@ -91,7 +91,7 @@ class Slot(Generic[T]):
 
 
 def nothing(*_: object) -> None:
-    """Do nothing: stands in for a method that a stage does not have."""
+    """Do nothing: used in place of a method that a stage does not have."""
 
 
 class Node:

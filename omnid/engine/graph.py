@@ -126,7 +126,7 @@ class Graph:
         return ticker
 
     def settle(self) -> None:
-        """Wait until all messages have been processed, or the run ends: for a source whose time stands still meanwhile.
+        """Wait until all messages have been processed, or the run ends: for a source whose time is stopped meanwhile.
 
         What a stage does after it has passed on its result counts. Inline, nothing ever waits.
         """

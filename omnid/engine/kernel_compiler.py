@@ -37,7 +37,7 @@ def compile_missing(folders: Mapping[str, Path], report: Report) -> None:
     A file that fails to compile leaves its folder missing. Raises OSError where nothing can be written.
     """
     with _lock_file() as lock:
-        # 1. One program at a time. It goes on without the lock where the holder makes no progress.
+        # 1. One program at a time. It continues without the lock where the holder makes no progress.
         if not _is_locked(lock):
             report(logging.INFO, "another program compiles the functions: waiting for it")
             if not _wait(lambda: _is_locked(lock), folders, report):

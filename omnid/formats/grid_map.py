@@ -25,7 +25,7 @@ free_thresh: 0.196
 
 
 def write_grid(path: Path, grid: Grid) -> None:
-    """Write `path`, which ends in .yaml, and the image beside it, whose name ends in .pgm.
+    """Write `path`, which ends in .yaml, and the image in the same folder, whose name ends in .pgm.
 
     Raises OmnidError if they cannot be written.
     """

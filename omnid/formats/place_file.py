@@ -1,7 +1,7 @@
 """Map files (.omap): a map of places as an SQLite database; the format is described in OMAP.md.
 
-A map is written to a temporary file beside it, synced and renamed, so that a program that is killed leaves the old map
-whole. What is read is checked: the schema by its text, each row by its checksum, each value by its range.
+A map is written to a temporary file in the same folder, synced and renamed, so that a program that is killed leaves the
+old map whole. What is read is checked: the schema by its text, each row by its checksum, each value by its range.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Files that are replaced at once, never written in part: a robot may be switched off at any time.
 
-A file is written under a temporary name beside it, synced and renamed. Where its name is a symbolic link, the file that
-the link leads to is replaced, and the link stays.
+A file is written under a temporary name in its folder, synced and renamed. Where its name is a symbolic link, the file
+that the link leads to is replaced, and the link stays.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Regulate the exposure of both live cameras by their pairs, and tell in the status how bright they are."""
+"""Regulate the exposure of both live cameras by their pairs, and report in the status how bright they are."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from omnid.transport.status_names import EXPOSURE, Key
 PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
 AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
 FLICKER_US: Final[Mapping[str, float]] = {"50": 1e6 / 100, "60": 1e6 / 120}  # lamps shine twice a period of the mains
-DARK_GREY, WHITE_GREY = 25.0, 230.0  # means beyond which images of cameras that regulate themselves are told
+DARK_GREY, WHITE_GREY = 25.0, 230.0  # means beyond which images of cameras that regulate themselves are reported
 ADVICE: Final[Mapping[str, str]] = {
     "too dark": "switch lights on, drive more slowly and raise cameras.exposure_limit_ms, or clean the mirrors",
     "too bright": "shade the mirrors, or put a filter before the lenses",

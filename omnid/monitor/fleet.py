@@ -166,7 +166,7 @@ def _line(name: str, state: RobotState, narrow: bool) -> str:
 
 
 def check_all(robot: str | None, files: Mapping[str, object]) -> None:
-    """Raise OmnidError for options of one robot beside --all."""
+    """Raise OmnidError for options of one robot together with --all."""
     given = [name for name, value in {"--robot": robot, **files}.items() if value is not None]
     if given:
         raise OmnidError(f"--all shows every robot, so {given[0]} does not go with it: leave one of them out")

@@ -1,4 +1,4 @@
-"""Drive a robot by the keys of a terminal, which tells no release of a key: a motion ends when no key repeats it."""
+"""Drive a robot by the keys of a terminal, which reports no release of a key: a motion ends when no key repeats it."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def _act(driver: Driver, stick: Stick, status: str) -> None:
     if stick.stop_asked:
         driver.stop()
     elif stick.arm_asked:
-        driver.send(ARM, header_cdr(time.time_ns()))  # the status tells the answer: the next key may be a stop
+        driver.send(ARM, header_cdr(time.time_ns()))  # the status has the answer: the next key may be a stop
     stick.stop_asked = stick.arm_asked = False
     now_s = time.monotonic()
     velocity_mps, yaw_rate_radps = stick.twist(now_s)

@@ -1,6 +1,6 @@
 """The acceptance drive: a robot goes to and fro between two marks on the floor whose distance was measured.
 
-A round is mark A, mark B, mark A. The distance tells the error of lengths, the return to A the error at the end of a
+A round is mark A, mark B, mark A. The distance shows the error of lengths, the return to A the error at the end of a
 round, and several rounds how well positions repeat.
 """
 
@@ -31,7 +31,7 @@ STAND_S: Final = 2.0
 NEAR_PART: Final = 0.2
 # Error of a robot that is placed on a mark by eye, of the two placings of a length or a return.
 PLACING_M: Final = 0.01
-# Headings are compared if the robot stands on the mark as it did the first time, turned by less than this.
+# Headings are compared if the robot is on the mark as it was the first time, turned by less than this.
 SAME_WAY_RAD: Final = math.radians(20.0)
 
 
@@ -53,7 +53,7 @@ class Round:
     way_m: float  # length of the path
     length_error_ratio: float  # of both distances against the measured one; negative: too short
     end_error_m: float  # distance of A at the end from A at the start
-    end_heading_rad: float  # NaN where the robot stands another way round
+    end_heading_rad: float  # NaN where the robot has another heading
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class Acceptance:
 
 
 def visits_by_standing(path: Trajectory, distance_m: float) -> list[Visit]:
-    """Return the visits of the marks at which the robot stood; A is where it stood first.
+    """Return the visits of the marks at which the robot rested; A is where it rested first.
 
     Places far from both marks are left out, as the robot may wait. Raises OmnidError where no round is found.
     """

@@ -22,8 +22,8 @@ from omnid.errors import OmnidError
 from omnid.formats.whole_file import write_whole
 from omnid.refinement.estimate import RigChange
 
-# Larger changes against the calibration are told and not written: the rig was knocked, or is another one. A mirror that
-# is mounted again lies within these limits.
+# Larger changes against the calibration are reported and not written: the rig was knocked, or is another one. A mirror
+# that is mounted again lies within these limits.
 MAX_LENGTHS, MAX_RAD = 0.05, np.deg2rad(1.0)
 
 ANOTHER: Final = "it refines another calibration than {rig}, which was calibrated since: it is not used; delete it"

@@ -1,4 +1,4 @@
-"""The poses in the map of a recording, beside those of odometry."""
+"""The poses in the map of a recording, compared with those of odometry."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MapPoseHistory:
         if T_odom_base is None or not (np.abs(position) <= POSITION_LIMIT_M).all():
             return
         self.path.add(Corner(float(position[0]), float(position[1]), t_s, _NO_STATE))
-        # Where the pose is in the map, beside where odometry has it: the part of map -> odom that is seen at the robot.
+        # The pose in the map relative to that of odometry: the part of map -> odom that is seen at the robot.
         self.moved_m.add(t_s, float(np.linalg.norm(position[:2] - T_odom_base[:2, 3])))
         turned = float(se3.yaw(pose.T_map_base @ se3.inverse(T_odom_base)))
         self.turned_deg.add(t_s, math.degrees(turned))

@@ -100,7 +100,7 @@ def _event_text(event: Event) -> str:
 
 
 def motion(data: ReportData, clock: Clock) -> list[str]:
-    """Return the section with speed, yaw rate and height, beside the commands."""
+    """Return the section with speed, yaw rate and height, and the commands."""
     series, drives = data.poses.series, data.drives
     speed, yaw_rate = [curve("measured", series["speed"])], [curve("measured", series["yaw_rate"])]
     for topic, name in ((DRIVE, "sent to the wheels"), (TWIST_COMMAND, "commanded")):

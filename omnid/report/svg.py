@@ -84,7 +84,7 @@ def coord(value: float) -> str:
 
 
 def label(value: float) -> str:
-    """Return the text of a value beside a tick."""
+    """Return the text of a value at a tick."""
     return f"{value + 0.0:.6g}" if abs(value) < 1e5 or value == 0 else f"{value:.0e}"
 
 

@@ -81,7 +81,7 @@ class LiveRun:
             try:
                 self._graph.run()
             except BaseException:
-                with suppress(OmnidError):  # the error that ended the run is the one that is told
+                with suppress(OmnidError):  # the error that ended the run is the one that is reported
                     run_places.finish()
                 raise
             run_places.finish()
@@ -122,13 +122,13 @@ def _graph_that_waits(config: Config) -> Graph:
 
 
 def _read_kernels() -> None:
-    """Read the compiled functions while images are awaited; where that fails, `prepare_kernels` tells why."""
+    """Read the compiled functions while images are awaited; where that fails, `prepare_kernels` reports why."""
     with suppress(Exception):
         read_kept_kernels()
 
 
 def _import_rarely_used() -> None:
-    """Import what the first loop of the map and the first goal need, beside the first poses and not beside those."""
+    """Import what the first loop and the first goal need while the first poses are computed."""
     with suppress(Exception):
         for name in ("scipy.sparse.linalg", "scipy.spatial"):
             import_module(name)

@@ -23,7 +23,7 @@ class LiveRobot(Protocol):
 
     @property
     def waits(self) -> bool:
-        """True if its time stands still until the run has answered: nothing is dropped or given up under load."""
+        """True if its time is stopped until the run has answered: nothing is dropped or omitted under load."""
 
     @property
     def brings_samples(self) -> bool:

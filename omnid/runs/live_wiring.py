@@ -144,7 +144,7 @@ class LiveWiring:
         add_status_tickers(session, StatusCollector(sources), bus, recorder)
 
     def _sinks(self, live_rig: LiveRig, bus: Bus, *, own_time: bool) -> Sinks:
-        """Return the sinks of a run that neither drives nor records; own_time: ticks of its wheels tell the time."""
+        """Return the sinks of a run that neither drives nor records; own_time: ticks of its wheels give the time."""
         session, config = self._session, self._session.config
         poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
         if config.bus.panorama_hz:

@@ -1,4 +1,4 @@
-"""Saving of the map of a live run while it goes on: now and then, and when it is asked for."""
+"""Saving of the map during a live run: now and then, and on request."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.records import DiagnosticStatus
 
-# Pairs that are read before a replay: ten seconds of a log at 30 Hz. In the dark the run goes on checking.
+# Pairs that are read before a replay: ten seconds of a log at 30 Hz. In the dark the run continues to check.
 MOST_PAIRS: Final = 300
 
 

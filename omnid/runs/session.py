@@ -97,9 +97,9 @@ class Session:
         return link
 
     def with_obstacles_known(self, settings: ControllerSettings) -> ControllerSettings:
-        """Return the settings, without the collision monitor where no obstacles are looked for, which is told.
+        """Return the settings, without the collision monitor where no obstacles are searched, which is reported.
 
-        Images that are too small to see the floor are told, too: the base would stop without a reason in view.
+        Images that are too small to see the floor are reported, too: the base would stop without a reason in view.
         """
         collision = settings.collision
         if collision.check and self.config.obstacles.enabled and collision.unknown == STOP:

@@ -63,7 +63,7 @@ def stalled_stages(stages: Collection[StageStats], now_ns: int, timeout_s: float
 class Service:
     """The action of a ticker: notifies systemd that the daemon is ready, and of its status, and feeds the watchdog.
 
-    The watchdog is not fed while a stage is stalled. A stage that stalls, or goes on, is logged once.
+    The watchdog is not fed while a stage is stalled. A stage that stalls, or resumes, is logged once.
     """
 
     def __init__(self, telemetry: Telemetry, status: Callable[[], str], stall_timeout_s: float) -> None:

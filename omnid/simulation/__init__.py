@@ -1,1 +1,1 @@
-"""A simulated robot in a simulated world, in lock-step with the stages or in real time beside them."""
+"""A simulated robot in a simulated world, in lock-step with the stages or in real time."""

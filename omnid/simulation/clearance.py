@@ -1,4 +1,4 @@
-"""Distance of a robot's outline, a disc, from what stands in its world."""
+"""Distance of a robot's outline, a disc, from the objects in its world."""
 
 from __future__ import annotations
 

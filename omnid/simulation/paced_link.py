@@ -69,7 +69,7 @@ class PacedLink:
         self._post(lambda controller, at_ns: controller.arm(request._replace(arrival_ns=at_ns)))
 
     def end(self) -> None:
-        """Let `commands` end when the last ones are taken; the simulation sees to it that the wheels stand."""
+        """Let `commands` end when the last ones are taken; the simulation makes sure that the wheels are at rest."""
         self._ended = True
 
     def commands(self) -> Iterator[VelocityCommand]:
@@ -88,7 +88,7 @@ class PacedLink:
 
     def take(self, report: TickReport) -> None:
         """Take the report of a tick; wait until its command has room."""
-        self.statistics.add(report._replace(state=copy.deepcopy(report.state)))  # the controller goes on with its own
+        self.statistics.add(report._replace(state=copy.deepcopy(report.state)))  # the controller changes its own
         while report.command is not None and not self._ended:
             try:
                 self._commands.put(report.command, timeout=POLL_S)

@@ -2,7 +2,7 @@
 
 Between two pairs of images the controller ticks, in the thread that renders. Its ticks up to the next pair need no
 answer to the last one, since a pose takes that long to reach the wheels: so the next pair is rendered while the daemon
-works on the last. Then time stands still until the daemon has answered. Deadlines, ramps and watchdogs are judged by
+works on the last. Then time is stopped until the daemon has answered. Deadlines, ramps and watchdogs are judged by
 this one clock.
 """
 

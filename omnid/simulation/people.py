@@ -18,7 +18,7 @@ IMPATIENT = 0.5  # Distance to which the person then comes, by that at which he 
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """A box of a person's size that walks along a path and looks ahead."""
+    """A box of a person's size that walks along a path and faces ahead."""
 
     faces: tuple[Rectangle, ...]  # in a frame on the floor below the middle, x ahead
     path: tuple[Point, ...]  # m
@@ -26,7 +26,7 @@ class Person:
     repeat: str = "once"  # once | loop | back and forth
     start_s: float = 0.0
     starts_within_m: float = 0.0  # waits until the robot is so near to the last point of the path; 0: does not wait
-    waits_within_m: float = 0.0  # stands rather than come nearer than that to the robot; 0: walks on
+    waits_within_m: float = 0.0  # stops rather than come nearer than this to the robot; 0: walks on
 
     def place(self, walked_s: float) -> tuple[float, float, float]:
         """Return x, y [m] and heading [rad] after so much time of walking."""
@@ -75,7 +75,7 @@ class Walkers:
                 self._started_s[number] = time_s
 
     def _polite(self, number: int, started_s: float, passed_s: float, robot: Point) -> float:
-        """Return when somebody started who waits for the robot: later by the step, if he stands."""
+        """Return when somebody started who waits for the robot: later by the step, while waiting."""
         person, walked_s = self._people[number], self.time_s - started_s
         before_m, now_m = (math.dist(person.place(at_s)[:2], robot) for at_s in (walked_s - passed_s, walked_s))
         if now_m >= before_m or now_m >= person.waits_within_m:

@@ -1,4 +1,4 @@
-"""A simulated world: what stands in it, who walks in it, how light it is, where the robot starts."""
+"""A simulated world: its objects, its people, its light, and the start of the robot."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
 
 NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
-BLUR_SHARE = 0.6  # sigma of the blur by the pixels that a pixel of the panorama covers beside its own
+BLUR_SHARE = 0.6  # sigma of the blur by the additional pixels that a pixel of the panorama covers
 MIN_SHARED_PART = 0.05  # Least share of the panorama that both cameras must see.
 
 

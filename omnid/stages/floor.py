@@ -40,7 +40,7 @@ class CameraFloor:
         return self.stated is None and not self._estimator.is_final
 
     def add(self, depth: DensePoints) -> None:
-        """Look for the floor in the points of a pair, where the rig does not state its height."""
+        """Search for the floor in the points of a pair, where the rig does not state its height."""
         if self.wants_points:
             points = se3.apply(self._T_base_rig, depth.points) - self.view
             self._estimator.add(points, depth.variance_m2)

@@ -52,7 +52,7 @@ class LockstepDrive:
         return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
 
     def _tick_until(self, stamp_ns: int) -> None:
-        """Tick between the last pose and the next; once the wheels stand, more ticks change nothing and are omitted."""
+        """Tick between the last pose and the next; ticks are omitted once the wheels are at rest."""
         if self._last_ns is None:
             return
         ticks = range(self._last_ns + self._period_ns, stamp_ns, self._period_ns)

@@ -45,7 +45,7 @@ NavigationInput: TypeAlias = (
 )
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
-RING_NS = 2_000_000_000  # older rings tell nothing: the collision monitor sees to it that the base does not drive on
+RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
 

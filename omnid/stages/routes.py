@@ -22,7 +22,7 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 
-MOST_NOTED: Final = 200  # keyframes that tell a map from others: a route of the same map has most of them
+MOST_NOTED: Final = 200  # keyframes that identify a map: a route of the same map has most of them
 
 
 class RouteMap:
@@ -102,7 +102,7 @@ class Routes:
         self._recorder, self._resets = RouteRecorder(name), now.resets
 
     def record(self, now: Situation, tie: KeyframeTie | None) -> str:
-        """Add the newest pose; return why the recording has ended, empty while it goes on."""
+        """Add the newest pose; return why the recording has ended, empty while it continues."""
         if self._recorder is None or tie is None or now.in_map is None or now.in_map.state is MapState.LOST:
             return ""
         if now.resets != self._resets and now.in_map.state is not MapState.LOCALIZED:
@@ -129,7 +129,7 @@ class Routes:
         self.taught, self._finished, self._recorder = TaughtRoute(route, id), self._recorder, None
 
     def written(self, refusal: str) -> None:
-        """End the writing. Raise OmnidError with the refusal: then the recording goes on, unless another has begun."""
+        """End the writing. Raise OmnidError with the refusal; the recording then continues, unless another began."""
         if refusal:
             self._recorder = self._recorder or self._finished
         self.taught, self._finished = None, None

@@ -1,4 +1,4 @@
-"""Skew between the two cameras: its statistics, and the time between the exposures that it tells."""
+"""Skew between the two cameras: its statistics, and the time between the exposures that follows from it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ RECENT: Final = 30  # pairs to which a line is fitted
 MIN_FITTED: Final = 8  # Of fewer pairs the median is taken.
 JUMP_NS: Final = 5_000_000  # A larger distance from the line means a lost image, or a camera that was started again.
 # Cameras that are triggered together have stamps that scatter about each other. Their mean difference is 0 unless it is
-# larger than twice the scatter and than the least that stamps can tell.
+# larger than twice the scatter and than the least that stamps resolve.
 SCATTERS: Final = 2.0
 LEAST_NS, LEAST_AT_START_NS = 1_000_000, 3_000_000
 
@@ -45,7 +45,7 @@ class Skew:
         return self.mean_ns - self._settled_ns
 
     def _between_exposures(self, skew_ns: int) -> float:
-        """Return the skew without the scatter of the stamps; 0 where it cannot be told from simultaneous exposures.
+        """Return the skew without the scatter of the stamps; 0 where the exposures may be simultaneous.
 
         Free-running cameras drift against each other, so a line is fitted to the recent skews.
         """

@@ -47,7 +47,7 @@ class FrameMatcher:
     there is one within the tolerance: waiting for a nearer one would delay every pair by a period.
 
     tolerance_ns 0: half the period of the faster camera, so that every image of the slower one finds its nearest
-    partner however the cameras stand to each other. Before the period is known, all but very close frames wait.
+    partner whatever the phase between the cameras. Before the period is known, all but very close frames wait.
     """
 
     def __init__(self, tolerance_ns: int) -> None:

@@ -123,7 +123,7 @@ def _is_user(line: str) -> bool:
 
 
 def _missing(config: BusConfig) -> Iterator[str]:
-    """Yield the knobs that are missing beside those that are set."""
+    """Yield the knobs that are missing next to those that are set."""
     for a, b in _PAIRS:
         for given, other in ((a, b), (b, a)):
             if getattr(config, given) and not getattr(config, other):

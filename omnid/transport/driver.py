@@ -133,7 +133,7 @@ class Driver:
         )
 
     def send(self, topic: str, payload: bytes) -> None:
-        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which tells senders apart.
+        """Send CDR bytes on a topic such as cmd/goal, with the identity of this program, which distinguishes senders.
 
         The time of sending is attached: it is the stamp of a message that has none of its own.
         """

@@ -56,7 +56,7 @@ def goal_from_cdr(payload: bytes) -> PlanarGoal:
 
 
 def path_cdr(stamp_ns: int, frame: str, xy: ArrayLike, heading_rad: float | None = None) -> bytes:
-    """Encode a path through positions (N, 2); its poses look along it, the last one to the heading, if there is one."""
+    """Encode a path through positions (N, 2); its poses point along it, the last one to the given heading."""
     points = np.asarray(xy, np.float64).reshape(-1, 2)
     steps = np.diff(points, axis=0, append=points[-1:])
     headings: list[float | None] = [float(math.atan2(dy, dx)) for dx, dy in steps]

@@ -1,7 +1,7 @@
 """Samples of wheels and gyro from the network, validated: `cmd/wheel_odom` (nav_msgs/msg/Odometry), `cmd/imu` (Imu),
 `cmd/joint_states` (JointState).
 
-They stand below `cmd`, because they move the pose while the cameras show nothing: only programs that may command the
+They are below `cmd`, because they move the pose while the cameras show nothing: only programs that may command the
 robot may write them.
 """
 

@@ -1,4 +1,4 @@
-"""Stops by datagrams, beside the sessions of zenoh: they need no place, so no crowd of connections keeps them out.
+"""Stops by datagrams, apart from the sessions of zenoh: they need no connection, so no crowd keeps them out.
 
 A daemon takes them at the UDP port of the same number as each endpoint that it listens on. Where the configuration asks
 for users or certificates, at that port of this machine's own address only: everyone who can connect may stop, and a
@@ -35,7 +35,7 @@ _PADDING: Final = 8  # Added to requests, so that no answer is longer than its r
 
 
 def addresses(endpoints: Sequence[str]) -> Iterator[tuple[str, int]]:
-    """Yield host and port of those endpoints of zenoh beside which a stop may be sent."""
+    """Yield host and port of those endpoints of zenoh to which a stop may be sent by datagram."""
     for endpoint in endpoints:
         found = _ENDPOINT.fullmatch(endpoint)
         if found is not None and 0 < int(found[2]) < 65536:

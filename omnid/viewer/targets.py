@@ -51,7 +51,7 @@ class ViewerTarget(Protocol):
         """True if the user has closed the viewer."""
 
     def finish(self) -> str:
-        """End it once everything is drawn. Return a line for the user that tells where to find it."""
+        """End it once everything is drawn. Return a line for the user that states where it is."""
 
     def abandon(self) -> None:
         """End it after an error, so that no process is left running."""

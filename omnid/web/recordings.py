@@ -20,7 +20,7 @@ MOST_LISTED: Final = 500  # the newest
 MOST_REPORTS: Final = 8  # Most reports that are kept.
 REPORT_S: Final = 600.0  # time for a report
 NICE: Final = 10  # lower priority than the daemon's
-_WRONG_INPUT: Final = 2  # exit code of omnid for what the user can correct, told in its last line
+_WRONG_INPUT: Final = 2  # exit code of omnid for what the user can correct, named in its last line
 _SUFFIXES: Final = (".mcap", f".mcap{PART_SUFFIX}")
 
 

@@ -108,7 +108,7 @@ def parts_message(state: RobotState) -> str:
 def map_message(grid: Map) -> bytes:
     """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated.
 
-    Without cells if the grid is neither in the frame of the path, odom, nor in map, of which the state tells where it
+    Without cells if the grid is neither in the frame of the path, odom, nor in map, of which the state says where it
     lies in odom.
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:

@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class WheelCommands:
-    """Sends stops. One goes on until the robot's status confirms it; any number of browsers may ask for it."""
+    """Sends stops. One is repeated until the robot's status confirms it; any number of browsers may ask for it."""
 
     def __init__(self, feed: RobotFeed) -> None:
         self._feed = feed

@@ -80,7 +80,7 @@ class Prior:
     sigma: Array  # (P,)
 
     def weights(self, kernel_px: float) -> Array:
-        """Return the weights (P,) of squared differences beside squared residuals, for a width of Huber's kernel."""
+        """Return the weights (P,) of squared differences by those of residuals, for a width of Huber's kernel."""
         return np.asarray((kernel_px / HUBER_WIDTH / self.sigma) ** 2)
 
 

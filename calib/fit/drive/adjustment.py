@@ -2,8 +2,8 @@
 
 What a drive shows of a rig: the centre of each camera and the tilt between them, from the columns; the mapping from
 radius to elevation, because the same landmark is seen from near and from far. A stretch of that mapping along the
-baseline looks the same as a stretched world as long as the rig moves in one plane and does not tilt; only the form of
-the camera model and the prior hold it. The baseline keeps its length, for images alone do not show it.
+baseline cannot be distinguished from a stretched world as long as the rig moves in one plane and does not tilt; only
+the form of the camera model and the prior hold it. The baseline keeps its length, for images alone do not show it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LOOSE_LANDMARK, LOOSE_OBSERVATION = 2.0, 6.0
 # Rounds of leaving out loose landmarks, because without them the rig moves, and others become loose.
 SELECTIONS = 3
 # A bound for the steps of a search. Its relative gain at the end is rough while landmarks are selected, because the
-# search goes on with the next selection, and fine in the last one.
+# search continues with the next selection, and fine in the last one.
 MAX_STEPS = 30
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
 # About six times the number of parameters of a rig: fewer landmarks would not show that one of them is wrong.
@@ -64,7 +64,7 @@ class DriveAdjustment:
 
     @property
     def seen(self) -> Flags:
-        """True (P,) for the parameters of which the drive told more than the prior."""
+        """True (P,) for the parameters that the drive determines better than the prior."""
         return np.asarray(self.sigmas < np.sqrt(np.diag(np.linalg.inv(self.prior))) / 2)
 
 
@@ -80,7 +80,7 @@ def adjust_drive(
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
     prior: information (P, P) of the steps about zero. fixed: keyframes whose pose stays, one for each drive. alike:
-    number of observations that tell no more than one, which gives the prior more weight. CalibError where fewer than
+    number of observations that are no more than one, which gives the prior more weight. CalibError where fewer than
     MIN_LANDMARKS landmarks agree.
     """
     problem = DriveProblem(parameters, observations, alike * prior, np.asarray(fixed))

@@ -14,7 +14,7 @@ from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 
 # Terms of omni cameras, in ascending order of their number. Tangential ones hold a camera that is tilted under its
-# mirror. A drive on a floor hardly tells radial ones from a stretched world: they are the last resort.
+# mirror. A drive on a floor hardly distinguishes radial ones from a stretched world: they are the last resort.
 DISTORTIONS: tuple[tuple[str, ...], ...] = ((), ("p1", "p2"), ("k1", "p1", "p2"))
 # A model with more terms is chosen where it lowers the error of landmarks held out by this part.
 # By judgement; not measured.

@@ -1,6 +1,6 @@
 """A line protocol for a base with a heading input: messages <-> bytes, no I/O.
 
-Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus sign; CR may stand before LF):
+Grammar (ASCII; numbers are decimal integers of at most 6 digits without a plus sign; CR may precede LF):
 
     line    = "$" body "*" crc LF        at most 64 bytes
     crc     = 4 hexadecimal digits: CRC-16/CCITT-FALSE (polynomial 0x1021, start 0xFFFF) of the bytes of body

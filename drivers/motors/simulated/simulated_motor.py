@@ -89,7 +89,7 @@ class SimulatedMotor:
             time.sleep(STEP_S)
 
     def unplug(self) -> None:
-        """Close the pty for good, as a plug that is pulled; the controller goes on, its watchdog stops the wheels."""
+        """Close the pty permanently, as a pulled plug does; the controller runs on, its watchdog stops the wheels."""
         self._unplugging.set()
         while self._device is not None and self._thread.is_alive():
             time.sleep(STEP_S)

@@ -1,6 +1,6 @@
 """Time until the outline of a moving base touches a point, on the arc of its motion; exact, in plain Python.
 
-The base moves with (v, w): in its own frame a point that stands turns with -w about the centre (0, v / w).
+The base moves with (v, w): in its own frame a point at rest turns with -w about the centre (0, v / w).
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from omnid.core.nanoseconds import S_PER_NS
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
 TURN_MPS: Final = 0.01  # slower motions turn on the spot; in 0.1 s no more than 1 mm
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
-# A base that was stopped goes on in that direction only faster than this (half as fast as a slower command), because
+# A base that was stopped resumes in that direction only faster than this (half as fast as a slower command), because
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
@@ -30,7 +30,7 @@ UNKNOWN_SECTORS: Final = 5
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
 MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
-NEW_MPS: Final = 0.4  # sigma of the velocity of who was seen twice; three looks make it smaller
+NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs; a third one makes it smaller.
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
 MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
 
@@ -47,7 +47,7 @@ IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names
 
 
 class MovingPoint(NamedTuple):
-    """A moving obstacle in the base frame of its ring, whose axes stand still; m, m/s."""
+    """A moving obstacle in the base frame of its ring, whose axes do not move; m, m/s."""
 
     x_m: float
     y_m: float
@@ -90,7 +90,8 @@ class CollisionMonitor:
         """deceleration_mps2: with which the base can brake."""
         self._settings, self._deceleration = settings, deceleration_mps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
-        # Nothing may be free any more where the images show nothing: no way is left ahead, but room for turns beside.
+        # Nothing may be free any more where the images show nothing: no way is left ahead, but room for turns at the
+        # sides.
         side_m = settings.half_width_m + settings.side_m + BESIDE_M
         self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
         self._stamp_ns: int | None = None
@@ -236,7 +237,7 @@ class CollisionMonitor:
 
     def _before_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
         """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be, and
-        to slow_mps where a new one may be there, within one sigma: two looks tell roughly where somebody goes.
+        to slow_mps where a new one may be there, within one sigma: two pairs show roughly where somebody goes.
         """
         settings, stop = self._settings, self._stop_polygon(motion)
         slow = FREE

@@ -42,7 +42,7 @@ class SourceSettings:
     )
 
     def __post_init__(self) -> None:
-        """Raise OmnidError for names that cannot be part of a topic, stand twice, or are too many."""
+        """Raise OmnidError for names that cannot be part of a topic, occur twice, or are too many."""
         if not 1 <= len(self.names) <= MOST_SOURCES or len(set(self.names)) < len(self.names):
             raise OmnidError(
                 f"controller.sources.names has {len(self.names)} names; give 1 to {MOST_SOURCES}, each once"

@@ -98,7 +98,7 @@ class HeadingController:
         return Twist(_clamp(setpoint.velocity_mps, limits.velocity_mps), _clamp(rate_radps, limits.yaw_rate_radps))
 
     def _rate(self, error_rad: float, yaw_rate_radps: float) -> float:
-        """Return the yaw rate for a heading error; near half a turn the base goes on to the side it turns to."""
+        """Return the yaw rate for a heading error; near half a turn the base keeps the side to which it turns."""
         size_rad = abs(error_rad)
         braking_radps = math.sqrt(2 * BRAKING_SHARE * self.limits.yaw_acceleration_radps2 * size_rad)
         side = error_rad

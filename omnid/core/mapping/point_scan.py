@@ -93,5 +93,5 @@ def _with_next(sums: Array) -> Array:
 
 
 def _of_neighbours(sums: Array) -> Array:
-    """Return the sums over each sector and those beside it."""
+    """Return the sums over each sector and its two neighbours."""
     return np.asarray(sums + np.roll(sums, 1, axis=0) + np.roll(sums, -1, axis=0))

@@ -79,7 +79,7 @@ class Follower:
         return 0.0 if self._pursuit is None else self._pursuit.leg.length_m - self._pursuit.s_m
 
     def skip_corner(self, pose: Array) -> None:
-        """Go on with the next leg where the base, on a detour, has come to it beside the end of this one."""
+        """Go on with the next leg where the base, on a detour, has come to it without reaching the end of this one."""
         pursuit = self._pursuit
         if pursuit is None or self._number + 1 >= len(self._legs) or self.leg_left_m > SKIP_M:
             return

@@ -1,6 +1,6 @@
 """Moving obstacles on a path: where they will be, and how fast the path can be driven so that they have passed.
 
-Each goes on at its velocity (van den Berg, Lin, Manocha 2008, "Reciprocal velocity obstacles", ICRA: the obstacle's
+Each keeps its velocity (van den Berg, Lin, Manocha 2008, "Reciprocal velocity obstacles", ICRA: the obstacle's
 constant velocity is the usual assumption over some seconds). Speeds along the path are tried from the highest one down
 (Kant, Zucker 1986, "Toward efficient trajectory planning: the path-velocity decomposition", IJRR).
 """

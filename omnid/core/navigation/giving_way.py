@@ -1,6 +1,6 @@
 """Giving way: a base that is blocked drives back along the way that it came, waits there, and comes again.
 
-Robots and people who wait for each other in a door or a corridor are told apart from what stands there for good by the
+Robots and people who wait for each other in a door or a corridor are distinguished from permanent obstacles by the
 same rule: the base goes back once, to where others can pass, and again after twice the time, and so on. The way back
 is the one that it has just driven, as far as it is seen to be free now.
 """
@@ -104,7 +104,7 @@ class GivingWay:
         return np.vstack([pose[None, :2], self._xy[: self._nearest(pose)][::-1]])
 
     def move_on(self, pose: Array, dt_s: float, is_open: bool) -> bool:
-        """Begin to return where the way has become free, or to look once more after a while; False at the block.
+        """Begin to return where the way has become free, or to try once more after a while; False at the block.
 
         is_open: the way from the pose (3,) to the place where it was blocked, and past it, is free. A base that was
         blocked again on its return goes back again.

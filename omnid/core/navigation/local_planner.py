@@ -68,7 +68,7 @@ class Detour(NamedTuple):
 
 
 class LocalPlanner:
-    """Decide at each pose whether the path can be followed, and go around what stands on it. All in odom."""
+    """Decide at each pose whether the path can be followed, and go around obstacles on it. All in odom."""
 
     def __init__(self, settings: NavigationSettings, collision: CollisionSettings) -> None:
         """collision: the outline of the base, and the room that the collision monitor demands."""
@@ -77,7 +77,7 @@ class LocalPlanner:
         self._ahead = collision.front_m + collision.stop_m, collision.rear_m  # m, of the base that drives on
         self._behind = collision.front_m, collision.rear_m + collision.stop_m
         self._turning = collision.front_m, collision.rear_m
-        # Around the origin, while it moves and while it stands, of what moves, too.
+        # Around the origin, in motion and at rest, moving obstacles included.
         self._moving_room_m = max(self._half_m + settings.clearance_m, collision.front_m + collision.stop_m)
         self._standing_room_m = max(self._half_m, collision.front_m, collision.rear_m)
         self._width_m = collision.half_width_m
@@ -112,7 +112,7 @@ class LocalPlanner:
         """Return the motion: that of the path where it is free.
 
         pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2), with those of
-        `moving` among them. wanted: the motion on the path. leg_left_m: way to the next corner: what stands behind it
+        `moving` among them. wanted: the motion on the path. leg_left_m: way to the next corner: obstacles behind it
         does not matter yet. speed_mps: of the base, as measured.
         """
         if moving is None or not (self._avoiding or wanted.velocity_mps > 0):
@@ -126,7 +126,7 @@ class LocalPlanner:
             self._standing_room_m,
         )
         share, coming = yielding(path, leg_left_m, moving, pace)
-        # The base goes around those that come to where it would stand.
+        # The base goes around those that come to where it would wait.
         outlines = moving.outlines(coming, pose[:2], SHARE * pursuit.velocity_mps)
         obstacles = np.vstack([moving.others(obstacles), outlines])
         detour = self._around_standing(pose, path, obstacles, wanted, leg_left_m, moving)
@@ -137,7 +137,7 @@ class LocalPlanner:
     def _around_standing(
         self, pose: Array, path: Array, obstacles: Array, wanted: Setpoint, leg_left_m: float, moving: Forecast | None
     ) -> Detour:
-        """Return the motion along the path, or around what stands on it, or up to it."""
+        """Return the motion along the path, around an obstacle on it, or up to the obstacle."""
         settings = self._settings
         offset_m = float(np.hypot(*(path[0] - pose[:2])))
         if not len(obstacles) or not (self._avoiding or wanted.velocity_mps > 0):
@@ -148,7 +148,7 @@ class LocalPlanner:
         near = ways <= min(AHEAD_M, leg_left_m + CELL_M)
         room_m = _distances(path, obstacles)
         is_blocked = room_m < self._half_m + settings.clearance_m
-        leaves = is_blocked[0] and _gets_farther(room_m)  # it stands there already, and drives away
+        leaves = is_blocked[0] and _gets_farther(room_m)  # it is there already, and drives away
         first_m = math.inf if leaves or not is_blocked[near].any() else float(ways[np.argmax(is_blocked)])
         if first_m == math.inf and (not self._avoiding or offset_m < BACK_ON_PATH_M):
             self._avoiding = False

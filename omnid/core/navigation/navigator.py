@@ -251,7 +251,7 @@ class Navigator:
                 return Navigation(following.setpoint, self.state, self.reason, drive.gave_way_m)
             giving.rest()
             drive.nearest_m = math.inf
-        # 2. Rest until the way is free, or it is time to look for another one.
+        # 2. Wait until the way is free, or it is time to search for another one.
         if giving.phase is Phase.REST:
             way = np.vstack([giving.way_to_block(now.pose), drive.path_ahead(now, PAST_M)])
             room_m = self._half_width_m + self._settings.clearance_m

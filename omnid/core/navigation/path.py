@@ -45,7 +45,7 @@ class PathLeg:
     def project(self, position: ArrayLike, around_m: float) -> float:
         """Return the way s of the nearest point of the path to a position (2,), searched around a known way [m].
 
-        Past the end it goes on along the last heading, so that it tells by how much the end was passed.
+        Past the end it continues along the last heading, so that it gives the distance past the end.
         """
         x, y = np.asarray(position, np.float64)[:2]
         first = max(0, int(np.searchsorted(self.s, around_m - BACK_M)) - 1)
@@ -58,7 +58,7 @@ class PathLeg:
         return float(self.s[k] + max(-STEP_M, min(limit_m, along_m)))
 
     def at(self, s_m: float) -> Array:
-        """Return x, y, heading (3,) at a way; beyond the ends it goes on straight."""
+        """Return x, y, heading (3,) at a way; beyond the ends the path continues straight."""
         inside = min(max(s_m, 0.0), self.length_m)
         x, y, heading = (float(np.interp(inside, self.s, v)) for v in (self.xy[:, 0], self.xy[:, 1], self.heading))
         beyond = s_m - inside

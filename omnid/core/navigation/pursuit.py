@@ -18,7 +18,7 @@ from omnid.core.navigation.settings import PursuitSettings
 
 Array = NDArray[np.float64]
 
-# The base turns, standing, towards a point that is farther aside; by trial on development seeds.
+# The base turns on the spot towards a point at a larger angle; by trial on development seeds.
 TURN_RAD: Final = math.radians(45)
 TURNED_RAD: Final = math.radians(4)  # The turn ends below this angle; by trial on development seeds.
 BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned: the base follows with a lag.
@@ -61,14 +61,14 @@ class Pursuit:
         # 1. The nearest point of the path, from where the last one was.
         self.s_m = self.leg.project(pose, self.s_m)
         left_m, offset_m = self.leg.length_m - self.s_m, self.leg.offset_m(pose, self.s_m)
-        # 2. The point to drive to, at a distance that grows with the speed; beyond the end it goes on straight.
+        # 2. The point to drive to, at a distance that grows with the speed; beyond the end the path continues straight.
         low_m, high_m = s.lookahead_m
         reach_m = min(max(low_m, abs(speed_mps) * s.lookahead_s), high_m)
         target = self.leg.at(self.s_m + reach_m)
         course_rad = pose[2] + (math.pi if self.leg.backwards else 0.0)
         bearing_rad = math.atan2(target[1] - pose[1], target[0] - pose[0])
         aside_rad = wrap_angle(bearing_rad - course_rad)
-        # 3. Turn towards it, standing, where it is far aside.
+        # 3. Turn towards it on the spot if its angle is large.
         if abs(aside_rad) > TURN_RAD or (self._turning and abs(aside_rad) > TURNED_RAD and dt_s > 0):
             self._turning, self._speed_mps = True, 0.0
             heading_rad = wrap_angle(bearing_rad + (math.pi if self.leg.backwards else 0.0))
@@ -86,7 +86,7 @@ class Pursuit:
         return Approach(Setpoint(sign * self._speed_mps, None, yaw_rate), self.s_m, left_m, offset_m, False)
 
     def _regulated(self, curvature: float, reach_m: float, obstacle_m: float) -> float:
-        """Return the speed in curves, here and ahead, and beside obstacles (equations 5 to 7 of the paper)."""
+        """Return the speed in curves, here and ahead, and near obstacles (equations 5 to 7 of the paper)."""
         s = self._settings
         highest_mps = min(s.velocity_mps, self.leg.speed_at(self.s_m))
         wanted_mps = highest_mps

@@ -39,7 +39,7 @@ FarKeyframe = Callable[[int], "KeyframePose | None"]
 class KeyframePose(NamedTuple):
     """A keyframe of the map."""
 
-    stamp_ns: int  # of its images, which tells it apart from one of the same number in another map
+    stamp_ns: int  # of its images, which distinguishes it from one of the same number in another map
     pose: Array  # x, y, yaw (3,) of the base in the map
 
 
@@ -129,7 +129,7 @@ class RouteRecorder:
         self._points.append((pose, speed_mps, keyframe, relative(keyframe_pose, pose)))
 
     def route(self, keyframe: FarKeyframe, noted: Mapping[int, int], created_s: int, map_name: str) -> Route:
-        """Return the route in the map as it is now; noted: stamps of keyframes that tell the map.
+        """Return the route in the map as it is now; noted: stamps of keyframes that identify the map.
 
         Raise OmnidError for one that is too short.
         """
@@ -220,7 +220,7 @@ def _start(poses: Array, pose: Array) -> int:
 
 
 def _joined(poses: Array, speeds: Array, first: int, pose: Array) -> int:
-    """Return the point ahead of the nearest one to which a robot beside the route drives, before the next corner."""
+    """Return the point, before the next corner, to which a robot drives that is off the route."""
     away_m = math.dist(poses[first, :2], pose[:2])
     if away_m <= BESIDE_M:
         return first

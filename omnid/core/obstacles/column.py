@@ -28,7 +28,7 @@ Bytes = NDArray[np.uint8]
 Tables = NDArray[np.int32]
 
 # Directions without floor in view side by side, 15 degrees, in which nothing is assumed about it: struts and masts are
-# narrower, and the robot looks past them as it moves.
+# narrower, and the robot sees past them as it moves.
 UNSEEN_RUN: Final = 20
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
@@ -163,7 +163,7 @@ class Columns:
             np.float32(STRIP_PRIOR),
             surface,
         )
-        # A surface fits a little at the disparities beside its own.
+        # A surface fits a little at the disparities next to its own.
         peak = np.ones_like(surface, bool)
         peak[1:] &= surface[1:] >= surface[:-1]
         peak[:-1] &= surface[:-1] >= surface[1:]

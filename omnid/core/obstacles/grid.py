@@ -31,7 +31,7 @@ MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
 NEVER: Final = np.iinfo(np.int64).min
 
-# Layers: floor against what stands up, against planes just above it, and just below it; surface.
+# Layers: floor against upright surfaces, against planes just above it, and just below it; surface.
 FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
 FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
@@ -114,7 +114,7 @@ class ObstacleGrid:
         at = np.floor(place).astype(np.int64) - corner
         rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
         if self._start_ns is None:
-            # The robot stands where nothing else can be: the floor too near to be seen counts until it is reached.
+            # The robot is where nothing else can be: the floor too near to be seen counts until it is reached.
             self._start_ns = stamp_ns
             self._nearest_m = evidence.nearest_floor_m
             self._assume_free(at, T_odom_base, evidence)
@@ -267,7 +267,7 @@ class ObstacleGrid:
     def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
         """End the flood too near to be seen where what is behind it is watched: a person would hide that.
 
-        Behind it is the nearest floor in view, or a surface that stands nearer, as the walls of a corridor do.
+        Behind it is the nearest floor in view, or a nearer surface, such as the walls of a corridor.
         """
         if not nearest_m or not self._flooded.any():
             return

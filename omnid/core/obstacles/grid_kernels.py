@@ -27,7 +27,7 @@ def gather(
     cells: Floats,
 ) -> None:
     """Write the evidence (4, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
-    floor against planes above and below it; a surface that stands anywhere in it.
+    floor against planes above and below it; an upright surface anywhere in it.
 
     floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
     compared.
@@ -130,7 +130,7 @@ def hidden_from(
     from where the latter is least. Each disparity counts once, however many cells it has.
     hidden (H, W): log-odds of cells; was_free, taken (H, W): 1 where so. origin (5,): place in cells, size of a cell
     [m], longest way [m], disparity at 1 m. bounds (2,): least sum, and gap [m] in what was free that ends a way: the
-    floor behind what stands there may be hidden by it.
+    floor behind an object there may be hidden by it.
     """
     height, width = hidden.shape
     cell, longest, at_1m = origin[2], origin[3], origin[4]

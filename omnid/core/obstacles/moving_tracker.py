@@ -1,4 +1,4 @@
-"""Tracks of moving obstacles: clusters of the ring that stand where the ring was free before, filtered in odom.
+"""Tracks of moving obstacles: clusters of the ring where it was free before, filtered in odom.
 
 Association to the nearest predicted track within a gate; a Kalman filter of constant velocity each (Bar-Shalom, Li,
 Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", 6.3).
@@ -21,9 +21,7 @@ from omnid.core.obstacles.usual_floor import Arrivals
 Array = NDArray[np.float64]
 
 MOST_TRACKS: Final = 16  # Most tracks, so that the memory is bounded.
-SAME_SURFACE_M: Final = (
-    0.15  # step in range between sectors of one cluster, beside the noise. By judgement; not measured.
-)
+SAME_SURFACE_M: Final = 0.15  # Step in range between sectors of one cluster without noise. By judgement; not measured.
 # Sigmas of a range, so that 0.5 % of the steps within a surface are larger: 2.8 of a difference.
 NOISE_SIGMAS: Final = 4.0
 SECTOR_GAP: Final = 2  # sectors without range within a cluster. By judgement; not measured.

@@ -52,7 +52,7 @@ class UsualFloor:
         seen = np.clip(np.where(in_view, floor, 0), -MOST_RATIO, MOST_RATIO)
         hidden = np.clip(mean / 2 * (mean / 2 - seen), -MOST_RATIO, MOST_RATIO)
         hidden[~in_view] = 0
-        # 2. What is hidden tells nothing of the floor.
+        # 2. Hidden cells are no evidence of the floor.
         mean += LEARNED * weight * in_view / (1 + np.exp(hidden)) * (seen - mean)
         np.maximum(mean, 0, out=mean)
         found = np.zeros_like(self.mean)
@@ -64,13 +64,13 @@ class UsualFloor:
     ) -> Arrivals:
         """Return what has come, along directions (N,).
 
-        hidden (H, W): log-odds of cells; was_free: lately; taken: by what stands there. origin (5,): place [cells],
+        hidden (H, W): log-odds of cells; was_free: lately; taken: occupied by an object. origin (5,): place [cells],
         size of a cell [m], longest range [m], disparity at 1 m; nearest_m: of the floor in view.
         """
         found = np.empty(len(azimuths))
         flags = was_free.view(np.uint8), taken.view(np.uint8)
         kernels.hidden_from(hidden, *flags, origin, azimuths, np.array([HIDDEN_SUM, GAP_M]), found)
-        # What hides the nearest floor in view may stand anywhere before it.
+        # An object that hides the nearest floor in view may be anywhere before it.
         is_near = found < nearest_m + 2 * origin[2]
         sigma_m = np.where(is_near, NEAR_SIGMA * found, found**2 * (BIN_SIGMA / origin[4]))
         return Arrivals(found.astype(np.float32), sigma_m.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Bridge over frames that show nothing: the pose goes on by wheels and gyro, for a limited time."""
+"""Bridge over frames that show nothing: the pose is continued by wheels and gyro, for a limited time."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ Flags = NDArray[np.bool_]
 # Side of the cells among which the corners are shared out evenly: in a panorama of 1300 x 380 px there are about 200
 # cells, so that each has two or three of the 500 landmarks wanted.
 CELL_PX = 48
-# More cells than a row of any panorama has, so that one index stands for row and column.
+# More cells than a row of any panorama has, so that one index encodes row and column.
 MAX_CELLS = 4096
 BLOCK_PX = 5  # window over which the gradients of a corner are summed
 # Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two

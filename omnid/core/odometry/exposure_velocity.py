@@ -1,4 +1,4 @@
-"""Velocity of the rig during the exposures of a pair, before the pair itself tells it.
+"""Velocity of the rig during the exposures of a pair, before the pair itself is measured.
 
 A vehicle drives and turns smoothly, which the motion filter extrapolates. It also vibrates: heave, roll and pitch
 change from pair to pair, and an extrapolation of them is worse than their mean. Which component is which depends on the

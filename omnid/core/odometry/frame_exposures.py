@@ -26,8 +26,8 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# The depths of the first frame are measured as if it stood still, so the motion is wrong by a few per cent of what
-# happens between two exposures: each round of starting the map again reduces the error by this ratio.
+# The depths of the first frame are measured as if the rig were at rest, so the motion is wrong by a few per cent of
+# what happens between two exposures: each round of starting the map again reduces the error by this ratio.
 START_ROUNDS = 2
 
 

@@ -107,8 +107,8 @@ class LandmarkStore:
         """Add a keyframe with new landmarks; return their ids (N,), -1 for views that cannot be triangulated.
 
         They are observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
-        noise: covariance (N, 3, 3) [px^2] of the views beside that of the model; None: none. pixels (N, 2) in the
-        keyframe's panorama; None: those of the views, which are the same unless it was exposed at several times.
+        noise: covariance (N, 3, 3) [px^2] of the views in addition to that of the model; None: none. pixels (N, 2) in
+        the keyframe's panorama; None: those of the views, which are the same unless it was exposed at several times.
         Those views are left out. The oldest keyframe beyond the bound leaves.
         """
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)

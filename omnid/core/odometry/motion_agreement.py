@@ -12,7 +12,8 @@ of them is consistent in itself. Three accounts of the same drive are not:
 2. Scale. The sums of both over the newest 3 m or 10 s, whichever is shorter, at the likeliest lag within 0.3 s.
 
 The account that two others contradict, which agree, is named; of two it is not known which one is wrong. A
-part of a limit is a doubt. Once all have stood for STILL_S everything is forgotten: a person may arm and try again.
+part of a limit is a doubt. Once all have been at rest for STILL_S everything is forgotten: a person may arm and try
+again.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ LEAST_M: Final = 0.05  # Least motion that counts, because an allowed delay move
 TURN_RAD: Final = np.radians(5.0)  # because a gyro's bias is estimated to less than half a degree a second
 # Wheels whose diameters differ by 0.7 %, as those of the simulation, turn by 4 degrees over 3 m: that is no doubt yet.
 WHEEL_TURN_RAD: Final = np.radians(15.0)
-# Sigmas of a step beside those that its residuals show: roughness of floor and images; by trial on development seeds.
+# Sigmas of a step that are added to those of its residuals: roughness of floor and images; by trial on development
+# seeds.
 STEP_M, STEP_RAD = 0.003, 0.003
 EVIDENCE: Final = 50.0  # Log-likelihood ratio, doubled: seven sigma, because a lag is sought in each pair.
 WORSE: Final = 3.0  # ratio of the sums of squares that the lag must explain, because slip makes both of them large

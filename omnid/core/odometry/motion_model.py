@@ -68,7 +68,7 @@ class MotionModel:
     ) -> RigVelocity | None:
         """Update the filter with the step that the cameras found (eq. 11); after a sudden one begin from standstill.
 
-        Returns the velocity at the pair before the step, where the steps around it tell it.
+        Returns the velocity at the pair before the step, where the steps around it determine it.
         """
         is_sudden = not exposed_at_once and self.is_sudden(T_prev_curr, dt_s)
         self._filter.update(T_prev_curr, covariance, dt_s)
@@ -97,6 +97,6 @@ class MotionModel:
         self._exposures.reset()
 
     def is_sudden(self, T_prev_curr: Array, dt_s: float) -> bool:
-        """True if a motion differs so much from the predicted one that it tells no velocity during the exposures."""
+        """True if a motion differs so much from the predicted one that it gives no velocity during the exposures."""
         change = se3.log(T_prev_curr) - self._filter.velocity * dt_s
         return bool(np.linalg.norm(change[3:]) > SUDDEN_RAD)

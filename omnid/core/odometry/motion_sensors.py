@@ -1,4 +1,4 @@
-"""Wheels and gyro beside the cameras: the motion that they measure, and what they get wrong, estimated on the way.
+"""Wheels and gyro: the motion that they measure, and their errors, which are estimated on the way.
 
 The motion of cameras is the reference while they track. A Kalman filter of seven states (scale of the wheels' distance
 and of their turn, clock offsets of wheels and gyro, bias of the gyro) takes the difference of both motions in each
@@ -36,7 +36,7 @@ GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not
 TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
 CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
 STILL_M, STILL_RAD = 1e-4, 5e-5  # Motion of a base at rest. By judgement; not measured.
-# m/s and rad/s below which they read nothing, beside a bias. By judgement; not measured.
+# m/s and rad/s, without the bias, below which they are at rest. By judgement; not measured.
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
 STILL_BEFORE_S = 0.2  # The sensors must have been at rest this long before the step, so that none swings on.
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the

@@ -1,4 +1,4 @@
-"""Settings of wheels and gyro beside the cameras."""
+"""Settings of wheels and gyro."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from omnid.settings import knob
 
 @dataclass(frozen=True, slots=True)
 class MotionSensorSettings:
-    """Wheels and gyro beside the cameras. Scales, bias and offsets of their clocks are estimated on the way."""
+    """Wheels and gyro in addition to the cameras. Scales, bias and offsets of their clocks are estimated on the way."""
 
     wheels: str = knob(
         "auto",

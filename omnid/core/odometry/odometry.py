@@ -150,7 +150,8 @@ class VisualOdometry:
         if estimate is None or self._status.refused_frames:
             return estimate  # from an unknown place displacements lead anywhere: relocalisation decides
         # How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors of
-        # steps for independent, which those of runners-up are not; wheels, which measure each step, tell more.
+        # steps for independent, which those of runners-up are not; wheels, which measure each step, are better
+        # evidence.
         sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
         is_measured = frame.sensed is not None and frame.sensed.is_complete
         doubt = None if is_measured or not self._in_doubt else self._doubt

@@ -268,7 +268,7 @@ def solve(
 def write_covariance(inverse: Array, residual: float, gain: float, covariance: Array) -> None:
     """Write the covariance (2, 2) [px^2] of a shift from the mean squared residual and the fitted gain."""
     variance = residual * PIXELS / (PIXELS - 4) / gain**2
-    # Noise in the template looks like texture: its part of the gradients' matrix is taken off.
+    # Noise in the template is taken for texture: its part of the gradients' matrix is taken off.
     determinant = inverse[0, 0] * inverse[1, 1] - inverse[0, 1] ** 2
     trace = (inverse[0, 0] + inverse[1, 1]) / max(determinant, 1e-12)
     noise = GRADIENT_NOISE * PIXELS * variance / 2

@@ -75,7 +75,7 @@ def whitening(
 ) -> Array:
     """Return W (N, 3, 3) with W S W^T = I for the covariance S of each view's error: corner and landmark noise.
 
-    noise: covariance (N, 3, 3) [px^2] of the views beside sigma_px; None: none.
+    noise: covariance (N, 3, 3) [px^2] of the views in addition to sigma_px; None: none.
     A view without the upper row (NaN) gets a row of zeros there.
     """
     W = np.empty((len(landmarks), 3, 3))

@@ -1,4 +1,4 @@
-"""Runner-up motions: displacements from which the images would look nearly the same, as along identical bricks.
+"""Runner-up motions: displacements from which the images would be nearly the same, as along identical bricks.
 
 With the landmarks' patches A_i of the last panorama and the view pi(T^-1 p_i) of landmark i from a pose T in the new
 panorama B, the likelihood of a displacement d [m] of the pose follows

@@ -37,7 +37,7 @@ def track(
     """Track points (N, 2) of a into b, from a guess (N, 2), with the forward-backward check.
 
     Returns the pixels (N, 2) in b and flags (N,) of those that the track back leads to where they started. Columns are
-    returned in [0, width). The status of Lucas-Kanade is no evidence: it only tells that the iteration ended.
+    returned in [0, width). The status of Lucas-Kanade is no evidence: it only states that the iteration ended.
     """
     if not len(points):
         return points.copy(), np.zeros(0, bool)

@@ -1,4 +1,4 @@
-"""State machine of the tracking state: all its transitions stand in one pure function.
+"""State machine of the tracking state: all its transitions are in one pure function.
 
 NOT_STARTED ----------------------------------------------> LOST
 STARTED, ACCEPTED ----------------------------------------> TRACKING

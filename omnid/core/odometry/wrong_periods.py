@@ -1,10 +1,10 @@
 """Wrong periods of the disparity: along a column, texture that repeats matches at several rows of the upper panorama.
 
 Dense stereo chooses by its surroundings, and at the ends of a sector these are few: bricks at 5 m were taken for ones
-at 50 m, twenty in a row. They hardly move as the robot steps aside, so that they tell that from a turn, and moved the
-pose by seven sigmas. The landmarks that the map knows nearby have been seen from several places, which show their
-depth. A new one whose disparity is not theirs, and whose patch fits as well at theirs, is left out; where it fits at
-its own only it is another surface.
+at 50 m, twenty in a row. They hardly move with the robot's lateral motion, so that they distinguish it from a turn, and
+moved the pose by seven sigmas. The landmarks that the map knows nearby have been seen from several places, which show
+their depth. A new one whose disparity is not theirs, and whose patch fits as well at theirs, is left out; where it fits
+at its own only it is another surface.
 """
 
 from __future__ import annotations

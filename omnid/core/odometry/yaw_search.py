@@ -33,7 +33,7 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PE
 
     Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded.
     Structure that is fixed to the rig must be left out by usable (H, W), because it holds the peak at zero.
-    turn_px: columns of a full turn, in which a sector shows nothing beside itself; 0: all are shown.
+    turn_px: columns of a full turn, of which a sector shows only its own; 0: all are shown.
     """
     width = turn_px or before.shape[1]
     spectrum = np.conj(_spectrum(before, usable, width)) * _spectrum(after, usable, width)

@@ -44,7 +44,7 @@ def fit(seen: Mapping[int, Landmark], known: Mapping[int, Landmark]) -> tuple[Ar
     """Return the transform T_plan_map (4, 4), level, and the distance [m] that is left at each common landmark.
 
     Least squares (Kabsch) over the landmarks, and where both facings are known over the points AHEAD_M before them.
-    Raises ValueError where they do not tell the heading: one landmark without facing, or none.
+    Raises ValueError where they do not determine the heading: one landmark without facing, or none.
     """
     common = sorted(seen.keys() & known.keys())
     here, there = (np.array([marks[id].xyz_m for id in common]).reshape(-1, 3) for marks in (seen, known))

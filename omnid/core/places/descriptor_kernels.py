@@ -71,7 +71,7 @@ def write_row(length: Floats, direction: Floats, weights: Floats, of_row: Floats
         for k in range(BINS):
             of_row[cell, k] = ZERO
     for column in range(SAMPLES):
-        # A gradient counts in the two directions beside its own, and in the cells around it.
+        # A gradient counts in the two directions next to its own, and in the cells around it.
         low = int(direction[column])
         share = direction[column] - np.float32(low)
         first, second = length[column] * (np.float32(1) - share), length[column] * share

@@ -1,6 +1,6 @@
 """Features of a place: corners of known depth, described upright and at one metric size.
 
-A robot that drives stays upright, and the depth of a corner tells the size at which it is seen: so neither orientation
+A robot that drives stays upright, and the depth of a corner gives the size at which it is seen: so neither orientation
 nor scale has to be searched for.
 """
 

@@ -78,7 +78,7 @@ class MapLocaliser:
         self._path_m = 0.0
         self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
-        self._by_tag = False  # it was a tag, which tells the pose less exactly than a view
+        self._by_tag = False  # it was a tag, which gives the pose less exactly than a view
         self._last_T: Array | None = None
         self._scans: tuple[object, KeyframeScans] | None = None  # what they depend on, and they
         self._by_scan = ScanLocaliser(self.places) if limits.by_scan and self.places.keyframes else None
@@ -107,7 +107,7 @@ class MapLocaliser:
                 self._close_loop(frame, found, self._newest)
                 if not found.by_tag:
                     self._age(found)
-        # 4. In a saved map of which nothing is recognised, the shape of the room may tell.
+        # 4. In a saved map of which nothing is recognised, the shape of the room may give the pose.
         if self._by_scan is not None and self._recognised_at is None and self._schedule.wants_scans:
             by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan, self._proposed(frame))
             if by_scan is not None:

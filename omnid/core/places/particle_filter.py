@@ -146,7 +146,7 @@ class ParticleFilter:
     def _improved(self, poses: Array, away_from: Array | None) -> tuple[Array, float]:
         """Return a pose (3,) near some of the poses (K, 3) that explains the last scans best, and its log likelihood.
 
-        Random changes, smaller in each round; the better half of the poses goes on twice.
+        Random changes, smaller in each round; the better half of the poses is continued twice.
         """
         poses = np.resize(poses, (BEST_DRAWN, 3))
         score = self._joint(poses)
@@ -161,7 +161,7 @@ class ParticleFilter:
         return poses[score.argmax()], float(score.max())
 
     def _joint(self, poses: Array) -> Array:
-        """Return the log likelihoods (K,) of the last scans, if the robot stands at poses (K, 3) now."""
+        """Return the log likelihoods (K,) of the last scans, if the robot is at poses (K, 3) now."""
         return np.asarray(
             sum(self._model.log_likelihood(self._at(poses, odometry), scan) for scan, odometry in self._scans)
         )

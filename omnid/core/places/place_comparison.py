@@ -21,9 +21,9 @@ Array = NDArray[np.float64]
 
 # Least inliers, and sectors of azimuth that hold them, where odometry agrees; by trial on development seeds.
 NEAR_INLIERS, NEAR_SECTORS = 20, 4
-# The same where it cannot tell; other worlds gave 10 inliers in 600 queries: docs/notes/places.md.
+# The same where it gives no pose; other worlds gave 10 inliers in 600 queries: docs/notes/places.md.
 FAR_INLIERS, FAR_SECTORS = 24, 5
-# At most so many of the keyframes that are compared lie so near together; by trial on development seeds.
+# At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other; by trial on development seeds.
 PER_PLACE, SAME_PLACE_M = 3, 1.5
 # Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
 RUNNER_UP: Final = 0.6
@@ -78,7 +78,7 @@ def is_elsewhere(a: Array, b: Array) -> bool:
 def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
     """Return the first of ranked places (N,) at positions (N, 3), at most so many, and at most PER_PLACE near another.
 
-    So a second place that looks the same is compared as well, although all neighbours of the first look more similar.
+    So a second, similar place is compared as well, although all neighbours of the first are more similar.
     """
     chosen: list[int] = []
     for n in ranked.tolist():

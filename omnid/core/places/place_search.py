@@ -26,7 +26,7 @@ ENOUGH_INLIERS: Final = 50  # Inliers of a place with which the search ends.
 
 
 class Effort(NamedTuple):
-    """Keyframes that a search takes a closer look at: fewer at each step, as each step costs more."""
+    """Numbers of keyframes in the steps of a search: fewer at each step, as each step costs more."""
 
     voted: int  # of the most similar signatures: on these the features vote
     compared: int  # of them, those with most votes
@@ -83,7 +83,7 @@ class PlaceSearch:
     ) -> Recognition | None:
         """Return the best recognition among keyframes (ids) of which odometry does not know where they are.
 
-        T_map_rect: the pose by other evidence, which settles which of several places that look alike it is.
+        T_map_rect: the pose by other evidence, which decides between several similar places.
         """
         found = supported(self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1))
         if T_map_rect is not None:

@@ -45,7 +45,7 @@ class Recognition:
     inliers: int
     matches: int
     sectors: int  # of SECTORS that hold inliers
-    by_tag: bool = False  # an AprilTag tells the place, whose corners are the inliers
+    by_tag: bool = False  # an AprilTag gives the place, whose corners are the inliers
 
 
 def recognise(

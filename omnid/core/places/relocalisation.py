@@ -52,7 +52,7 @@ class Relocaliser:
         keyframes = {keyframe.seq: keyframe for _, keyframe in self._kept}
         poses = {seq: keyframe.T_odom_rect for seq, keyframe in keyframes.items()}
         found = compare(here, self._features, poses, len(keyframes), FEATURES + 1, self._model)
-        # 3. Take the best one, unless another place looks alike.
+        # 3. Take the best one, unless another place is as similar.
         best = unambiguous(supported(found.values(), near=True), poses)
         if best is None:
             return None

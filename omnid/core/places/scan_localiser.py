@@ -63,7 +63,7 @@ class ScanLocaliser:
         # 1. Draw the map when it is first asked for.
         if self._filter is None:
             self._filter = ParticleFilter(scan_grid(self._scans, self._poses, CELL_M))
-        # 2. Move the particles by odometry; a robot that stands shows nothing new.
+        # 2. Move the particles by odometry; a robot at rest shows nothing new.
         if self._last_T is not None:
             moved = se3.inverse(self._last_T) @ T_odom_rect
             if np.linalg.norm(moved[:3, 3]) < UPDATE_M and abs(float(se3.yaw(moved))) < UPDATE_RAD:

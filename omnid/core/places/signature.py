@@ -23,7 +23,7 @@ Thumbnail = NDArray[np.int8]
 def thumbnail(panorama: PaddedPanorama) -> Thumbnail:
     """Return the panorama (H, W) at (ROWS, COLUMNS) of a full turn without its slow changes of brightness.
 
-    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast, and beside a sector.
+    The root mean square is THUMBNAIL_SCALE; zeros for a panorama without contrast, and outside of a sector.
     """
     contrast = _contrast(panorama)
     scaled = np.rint(THUMBNAIL_SCALE * math.sqrt(contrast.size) * contrast)

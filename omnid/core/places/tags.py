@@ -38,7 +38,7 @@ CORNERS: Final = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5,
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TagPose:
-    """Pose of a tag: origin in its middle, x to the right and y up as one looks at it, z out of its face."""
+    """Pose of a tag: origin in its middle, x to the right and y up for a viewer in front of it, z out of its face."""
 
     id: int
     T_rect_tag: Array  # (4, 4)

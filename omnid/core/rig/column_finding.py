@@ -16,7 +16,7 @@ from omnid.core.rig.rig_state import RigState
 
 Array = NDArray[np.float64]
 
-# Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be told apart.
+# Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be distinguished.
 MIN_MATCHES: Final = 120
 # Rotation of the upper camera: rigs as calibrated, rendered and real, are measured below 0.1 deg.
 DRIFTED_DEG: Final = 0.2

@@ -85,7 +85,7 @@ class Matches:
 
 
 def is_motion_unknown(pair: PanoramaPair, exposure: Exposure | None) -> bool:
-    """True if a pair was exposed at several times and the motion in between is unknown: it looks like a drift."""
+    """True if a pair has several exposures and the unknown motion in between would be taken for a drift."""
     return not pair.times.is_at_once and (exposure is None or not exposure.is_known)
 
 

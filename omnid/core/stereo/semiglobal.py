@@ -31,7 +31,7 @@ REACH_PX = 2  # Reach of the search about the prior; because a pixel of the prio
 
 
 class ColumnShift(NamedTuple):
-    """Columns by which pixels appear aside in the upper panorama: the rig moved between the exposures."""
+    """Columns by which pixels are displaced in the upper panorama: the rig moved between the exposures."""
 
     at_infinity: Floats  # (H, W) px
     per_disparity: Floats  # (H, W) px/px

@@ -1,13 +1,13 @@
 """Live parts of images: tiles of a panorama that are dead or blind, and the directions in which nothing is known.
 
-A whole image that repeats is left out before (stages/repeated_images.py). A part of one goes on in a pair that tracks:
+A whole image that repeats is left out before (stages/repeated_images.py). A part of one is used in a pair that tracks:
 a region that a driver no longer writes, dirt or a drop on a mirror, darkness, glare. Each is a property of a tile:
 
     dead      each pixel is as in the image before, or less changed than the noise of a live image changes it,
               twice in a row, while other tiles change. Noise changes a live tile even where nothing moves.
     dark      its mean is not above black, and hardly anything is in it but noise
     glaring   most of its pixels are saturated
-    blurred   a column of tiles has lost its gradient energy beside the same column of the other camera, which sees the
+    blurred   a column of tiles has less gradient energy than the same column of the other camera, which sees the
               same things from 0.1 to 0.4 m above or below; the median over all columns is the two cameras' own ratio
 
 The last three are blind. A direction is unknown where one tile of either camera is dead, or too many are blind.
@@ -44,7 +44,7 @@ NOISE_CHANGE: Final = 1.128
 # in the sample log live tiles change by a fifth of it at least.
 NOISE_SHARE: Final = 0.1
 MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, and says nothing about a tile
-# Cameras that remove noise repeat plain tiles while the base stands: a tile without texture is dead only if it has
+# Cameras that remove noise repeat plain tiles while the base is at rest: a tile without texture is dead only if it has
 # changed in nearly all pairs before, by the mean of the newest 1 / LIVELY_GAIN.
 TEXTURE_GREY: Final = 4.0  # standard deviation, more than what such a camera leaves of the noise
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
@@ -101,7 +101,7 @@ class TileMonitor:
         self._share = _means(self._visible, columns)
         self._judged = self._share >= JUDGED_SHARE
         half = (visible.shape[1] // 2, visible.shape[0] // 2)
-        # Pixels at half resolution, all of which show the world, and so do those beside them.
+        # Pixels at half resolution, all of which show the world, and so do their neighbours.
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))
         self._half = (cv2.resize(shown.astype(np.float32), half, interpolation=cv2.INTER_AREA) >= 1).astype(np.float32)
         self._half_share = cv2.resize(self._half, (columns, 1), interpolation=cv2.INTER_AREA)[0]
@@ -185,7 +185,7 @@ class TileMonitor:
         ends = BLURRED_COLUMNS + 1 if self._columns < TILE_COLUMNS else 0
         is_faint = np.pad(is_faint, ends)
         wide = np.logical_and.reduce([np.roll(is_faint, -shift) for shift in range(BLURRED_COLUMNS)])
-        # All of such a run, and the columns beside it, which dirt covers in part.
+        # All of such a run, and the columns next to it, which dirt covers in part.
         is_faint = np.logical_or.reduce([np.roll(wide, shift) for shift in range(-1, BLURRED_COLUMNS + 1)])
         is_faint = np.asarray(is_faint)[ends : ends + self._columns]
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)

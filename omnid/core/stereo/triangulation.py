@@ -69,7 +69,7 @@ def point_covariance(
 ) -> Array:
     """Return covariances (N, 3, 3) [m^2] of points triangulated from views of sigma_px in each coordinate.
 
-    noise: covariance (N, 3, 3) [px^2] of the views beside it; None: none.
+    noise: covariance (N, 3, 3) [px^2] of the views in addition to it; None: none.
     """
     J = np.linalg.inv(view_jacobian(points, cylinder, baseline_m))
     of_views = sigma_px**2 * np.eye(3) + (0.0 if noise is None else noise)

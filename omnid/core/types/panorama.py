@@ -16,7 +16,7 @@ Flags = NDArray[np.bool_]
 class PaddedPanorama:
     """Panorama with pad_px columns more on either side, so that windows run across the seam of a full turn.
 
-    Those of a full turn repeat its first and last columns; beside a sector they show what the images show there.
+    Those of a full turn repeat its first and last columns; those of a sector show what the images show there.
     """
 
     image: Image  # (H, W + 2 pad) uint8
@@ -50,7 +50,7 @@ class PaddedPanorama:
         return np.asarray((columns + self.first) % self.period_px)
 
     def padded(self, columns: Array) -> Array:
-        """Return columns (N,) of the padded image: of a full turn within it, beside a sector at most at its border."""
+        """Return columns (N,) of the padded image: of a full turn within it, for a sector at most at its border."""
         if self.period_px > self.width:
             return np.asarray(np.clip(columns, -self.pad_px, self.width - 1 + self.pad_px) + self.pad_px)
         return self.own(columns) + self.pad_px

@@ -37,7 +37,7 @@ def pyramid(texture: Texture) -> list[NDArray[np.uint8]]:
 
 
 def make_atlas(textures: Sequence[Texture]) -> Atlas:
-    """Return the atlas of textures; one that stands there several times is stored once."""
+    """Return the atlas of textures; one that occurs several times is stored once."""
     first: dict[int, tuple[int, int]] = {}
     images: list[NDArray[np.uint8]] = []
     for texture in textures:

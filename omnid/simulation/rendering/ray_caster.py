@@ -90,7 +90,7 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array) -> Floats:
 def tiles_that_see(table: RayTable, corners: Array, turned_rad: float, aside_rad: Array) -> NDArray[np.bool_]:
     """Return the mask (M, R) of tiles whose cone overlaps the cone through the corners (R, 4, 3) of a rectangle.
 
-    Rays that start beside the camera's origin see a point up to aside_rad (R,) beside its direction.
+    Rays that start off the camera's origin see a point up to aside_rad (R,) off its direction.
     """
     rays = corners / np.maximum(np.linalg.norm(corners, axis=2, keepdims=True), MIN_DISTANCE_M)
     axes = rays.sum(axis=1)

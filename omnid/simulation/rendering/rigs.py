@@ -1,4 +1,4 @@
-"""Rigs of two cameras that look up into mirrors, with given misalignments."""
+"""Rigs of two cameras that face up into mirrors, with given misalignments."""
 
 from __future__ import annotations
 
