@@ -139,12 +139,6 @@ def adjoint(T: ArrayLike) -> Array:
     return A
 
 
-def interpolate(T_a: ArrayLike, T_b: ArrayLike, s: float) -> Array:
-    """Return the pose at fraction s of the screw motion from T_a (s = 0) to T_b (s = 1)."""
-    T_a = np.asarray(T_a, float)
-    return np.asarray(T_a @ exp(s * log(inverse(T_a) @ np.asarray(T_b, float))))
-
-
 def quaternion(R: ArrayLike) -> Array:
     """Return the unit quaternion (..., 4) = (x, y, z, w), w >= 0, of R (..., 3, 3)."""
     R = np.asarray(R, float)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
-from calib.fit.derivatives import central_differences
 from calib.fit.parameterisation import parameterise
 from calib.models.camera import Array
 from calib.models.ocam import has_wavefront
@@ -146,3 +146,8 @@ def _pixels_by_parameters(rig: Rig, in_rig: Array, scaled: tuple[tuple[str, ...]
         )
 
     return central_differences(pixels, SIGMA_STEP * np.ones(len(names)))
+
+
+def central_differences(function: Callable[[Array], Array], steps: Array) -> Array:
+    """Return the derivatives (..., P) of a function about zero, by steps (P,) of its argument."""
+    return np.stack([(function(step) - function(-step)) / (2 * np.abs(step).max()) for step in np.diag(steps)], axis=-1)

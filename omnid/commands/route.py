@@ -91,8 +91,7 @@ def _add(
 def run_teach(args: argparse.Namespace) -> int:
     """Record until Enter is pressed; Ctrl-C drops the recording."""
     from omnid.core.navigation.requests import route_name
-    from omnid.monitor.navigation import connected, granted
-    from omnid.monitor.teaching import record_until_enter
+    from omnid.monitor.navigation import connected, granted, record_until_enter
 
     name = route_name(args.name)
     with connected(config_of(args).bus) as robot:

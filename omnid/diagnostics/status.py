@@ -15,6 +15,7 @@ from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
+from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
@@ -283,3 +284,16 @@ class StatusTick:
         statuses = self._report()
         for consume in self._consumers:
             consume(statuses)
+
+
+class Latency:
+    """A sink of poses; `to_pose` holds the latencies [s]."""
+
+    def __init__(self, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        """clock_ns: the clock of the poses' stamps."""
+        self._clock_ns = clock_ns
+        self.to_pose = Histogram()
+
+    def process(self, odometry: OdometryUpdate) -> None:
+        """Add the latency of a pose."""
+        self.to_pose.add((self._clock_ns() - odometry.stamp_ns) * 1e-9)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.errors import OmnidError
 from omnid.formats.whole_file import write_whole
 
 _VERTEX = np.dtype([("xyz", "<f4", 3), ("confidence", "<f4"), ("frames", "<i4"), ("age", "<i4")])
@@ -24,7 +22,6 @@ property int frames
 property int age
 end_header
 """
-_HEADER_PATTERN = re.compile(re.escape(_HEADER).replace(r"\{count\}", r"(\d{1,12})").encode("ascii"))
 
 
 def write_ply(path: str | Path, points: MapPoints) -> None:
@@ -36,21 +33,3 @@ def write_ply(path: str | Path, points: MapPoints) -> None:
     for name in ("xyz", "confidence", "frames", "age"):
         vertices[name] = getattr(points, name)
     write_whole(Path(path), _HEADER.format(count=len(vertices)).encode("ascii") + vertices.tobytes())
-
-
-def read_ply(path: str | Path) -> MapPoints:
-    """Return the points of a file of `write_ply`; OmnidError for any other PLY."""
-    try:
-        raw = Path(path).read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise OmnidError(f"{path}: cannot read the map: {error}") from error
-    header = _HEADER_PATTERN.match(raw)
-    if header is None:
-        raise OmnidError(f"{path}: expected a PLY map written by omnid, found another header")
-    body, expected = raw[header.end() :], int(header[1]) * _VERTEX.itemsize
-    if len(body) != expected:
-        raise OmnidError(
-            f"{path}: expected {expected} bytes of points, found {len(body)}: the file is damaged, write the map again"
-        )
-    vertices = np.frombuffer(body, dtype=_VERTEX)
-    return MapPoints(*(np.ascontiguousarray(vertices[name]) for name in ("xyz", "confidence", "frames", "age")))

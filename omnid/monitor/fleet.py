@@ -55,9 +55,9 @@ class FleetState:
         return self.robots[name]
 
 
-def listen_to_all(bus: BusConfig, seconds: float | None, out: IO[str] | None = None) -> int:
+def listen_to_all(bus: BusConfig, seconds: float | None) -> int:
     """Show all robots until Ctrl-C or for so many seconds. Return the exit code, 1 where there was none."""
-    fleet, stream = FleetState(), out or sys.stdout
+    fleet, stream = FleetState(), sys.stdout
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with suppress(KeyboardInterrupt):
         connection = _connected(bus, end_s)

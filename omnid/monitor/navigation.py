@@ -1,8 +1,9 @@
-"""Requests of commands, and the progress of goals and routes until their end."""
+"""Requests of commands, and the progress of goals, routes and the teaching of a route until their end."""
 
 from __future__ import annotations
 
 import math
+import select
 import sys
 import time
 from collections.abc import Callable
@@ -86,3 +87,27 @@ def drive_to_end(robot: Robot, driver: Driver) -> int:
     line.end()
     print(f"{report.state}: {report.reason}" if report.reason else report.state)
     return int(report.state != NavigationState.REACHED)
+
+
+def record_until_enter(robot: Robot, name: str) -> int:
+    """Show how long the route is until Enter, then have it written; Ctrl-C drops it. Return the exit code."""
+    driver, reports = robot.driver(), robot.subscribe(NavigationReport)
+    print(f"records {name}: drive it; Enter writes it, Ctrl-C drops it", flush=True)
+    try:
+        while not select.select([sys.stdin], [], [], SHOWN_S)[0]:
+            report = reports.wait(SHOWN_S)
+            if report is None:
+                continue
+            if report.teaching != name:
+                raise OmnidError(f"the recording of {name} has ended: {report.refusal or 'by another program'}")
+            if sys.stdout.isatty():
+                sys.stdout.write(f"\r\x1b[K{report.taught_m:.1f} m")
+                sys.stdout.flush()
+        sys.stdin.readline()
+        granted(robot, driver.route("finish"))
+    except KeyboardInterrupt:
+        driver.route("stop")
+        print(f"\n{name} is dropped")
+        return 130
+    print(f"{name} is written")
+    return 0

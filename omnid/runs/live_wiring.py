@@ -15,11 +15,10 @@ from omnid.controller.link import DriveLink
 from omnid.core.control.command_sources import PLANNER
 from omnid.diagnostics.floor_status import floor_status
 from omnid.diagnostics.images_status import ImagesStatus
-from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.places_status import places_status
-from omnid.diagnostics.status import StatusCollector, StatusSources
+from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.diagnostics.threads_status import ThreadsStatus
 from omnid.engine.graph import NEWEST, Sink
 from omnid.formats.route_file import RouteFolder

@@ -12,8 +12,7 @@ from calib import se3
 from omnid.core.mapping.thinned_path import ThinnedPath
 from omnid.messages import OdometryUpdate
 from omnid.sinks.encoder import Encoder, OutgoingMessage
-from omnid.transport.navigation_codec import PATH_SCHEMA
-from omnid.transport.path_codec import driven_path_cdr
+from omnid.transport.navigation_codec import PATH_SCHEMA, driven_path_cdr
 
 MOST_POSES: Final = 1000
 _STEP_M: Final = 0.05  # First spacing of the poses; it is doubled each time that the memory is full.

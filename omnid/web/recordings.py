@@ -10,11 +10,16 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Route
+
 from drivers.logs.file_lock import is_locked
 from drivers.logs.log_folder import PART_SUFFIX
 from omnid.engine.python_program import python, python_environment
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
+from omnid.web.guard import REPORT_POLICY
 
 MOST_LISTED: Final = 500  # the newest
 MOST_REPORTS: Final = 8  # Most reports that are kept.
@@ -126,3 +131,22 @@ def _state(path: Path) -> str:
     if is_locked(path):
         return "being written"
     return "cut: omnid log recover" if path.name.endswith(PART_SUFFIX) else "whole"
+
+
+def recordings_routes(recordings: Recordings) -> list[BaseRoute]:
+    """Return the addresses."""
+
+    async def list_all(_: Request) -> Response:
+        return JSONResponse(await asyncio.to_thread(recordings.described))
+
+    async def report(request: Request) -> Response:
+        """POST: make the report, answered when it is ready; GET: show it."""
+        try:
+            page = await recordings.report(request.path_params["key"])
+        except OmnidError as error:
+            return JSONResponse({"done": False, "text": str(error)}, 409)
+        if request.method == "POST":
+            return JSONResponse({"done": True, "text": ""})
+        return FileResponse(page, media_type="text/html", headers={"Content-Security-Policy": REPORT_POLICY})
+
+    return [Route("/recordings", list_all), Route("/recordings/{key}/report", report, methods=["GET", "POST"])]

@@ -30,8 +30,7 @@ from omnid.web.fleet_feed import FleetFeed
 from omnid.web.fleet_page import FleetPage
 from omnid.web.guard import Guard
 from omnid.web.places import BACKLOG, Acceptor, ConnectionPlaces
-from omnid.web.recordings import Recordings
-from omnid.web.recordings_page import recordings_routes
+from omnid.web.recordings import Recordings, recordings_routes
 from omnid.web.robot_page import RobotPage
 from omnid.web.site import Site
 

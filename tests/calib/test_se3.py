@@ -54,14 +54,6 @@ def test_quaternion_order_and_sign() -> None:
     np.testing.assert_allclose(se3.quaternion(se3.rotation(q)[3]), q[3], rtol=0, atol=1e-9)
 
 
-def test_interpolates_along_the_screw_motion() -> None:
-    T_a, T_b = se3.exp([1, 2, 3, 0.1, 0.2, 2.9]), se3.exp([-1, 0, 2, -0.4, 0.2, 0.1])
-    np.testing.assert_allclose(se3.interpolate(T_a, T_b, 0), T_a, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(se3.interpolate(T_a, T_b, 1), T_b, rtol=0, atol=1e-12)
-    half = se3.inverse(T_a) @ se3.interpolate(T_a, T_b, 0.5)
-    np.testing.assert_allclose(half @ half, se3.inverse(T_a) @ T_b, rtol=0, atol=1e-12)
-
-
 def test_inverse_and_apply_equal_matrix_algebra_on_stacks() -> None:
     T = se3.exp(np.random.default_rng(2).normal(size=(5, 6)))
     points = np.random.default_rng(3).normal(size=(7, 3))

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 from calib import se3
 from calib.rig_file import parse_rig, read_rig, write_rig
 from omnid.config import Config, load_config
-from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -25,6 +24,7 @@ from omnid.transport.decode import decode_diagnostics, decode_map
 from omnid.transport.status_names import SUMMARY, stage_name
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, STORE, UPPER, Entry, compressed, write_log
+from tests.ply import read_ply
 from tests.replay.command import Command, rows
 from tests.replay.edited import images
 

@@ -19,11 +19,11 @@ from mcap.reader import make_reader
 
 from drivers.motor import is_stop
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
-from omnid.formats.ply import read_ply
 from omnid.formats.tum import read_tum
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.records import OdometryRecord
 from tests.conftest import PAIRS
+from tests.ply import read_ply
 from tests.replay.command import Command, Result, rows
 from tests.replay.edited import images, save
 

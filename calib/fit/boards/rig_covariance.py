@@ -6,7 +6,7 @@ import numpy as np
 
 from calib import se3
 from calib.fit.boards.rig_fit import RigCalibration
-from calib.fit.derivatives import central_differences
+from calib.fit.rig_uncertainty import central_differences
 from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.corners import clear_around, corners
+from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
@@ -88,3 +89,16 @@ class Keyframes:
         """Return the number of landmarks wanted in a keyframe."""
         limits = self._limits
         return max(min(limits.features, limits.good_inliers), round(self._features() * limits.features))
+
+
+class KeyframeLocaliser(Protocol):
+    """A bounded store of keyframes that gives the pose of a frame among them; see core/places."""
+
+    def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
+        """Keep a keyframe and its frame."""
+
+    def clear(self) -> None:
+        """Drop all keyframes."""
+
+    def locate(self, frame: StereoFrame) -> PoseEstimate | None:
+        """Return the pose of a frame among the keyframes; None if it fits none."""

@@ -182,19 +182,6 @@ class LandmarkStore:
         known = np.isin(ids, self.table.id) & (seq in self.keyframes)
         self._observe(ids[known], seq, views[known])
 
-    def move_keyframe(self, seq: int, T_odom_rect: Array, covariance: Array) -> None:
-        """Set the pose of a keyframe and its covariance (6, 6), and compute its landmarks' points in odom again.
-
-        Keyframes are immutable: a caller that holds the old one (the relocaliser) keeps the old pose. Raises KeyError
-        for a keyframe that is not kept.
-        """
-        keyframe = replace(self.keyframes[seq], T_odom_rect=T_odom_rect, covariance=covariance)
-        self.keyframes[seq] = keyframe
-        own = self.table.anchor == seq
-        points, spread = self.table.points.copy(), self.table.covariance.copy()
-        points[own], spread[own] = _in_odom(keyframe, self.table.anchor_points[own], self.table.anchor_covariance[own])
-        self.table = replace(self.table, points=points, covariance=spread)
-
     def update_depths(self, rows: Indices, disparity: Array, variance: Array, T_odom_rect: Array) -> None:
         """Correct the points of landmarks (rows (M,) of the table) by disparities (M,) [px] measured at a pose.
 

@@ -18,8 +18,7 @@ from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimat
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
-from omnid.core.odometry.keyframe_localiser import KeyframeLocaliser
-from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
+from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel

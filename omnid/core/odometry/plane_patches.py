@@ -85,14 +85,14 @@ def moved_slopes(surfaces: tuple[Array, Array], T_curr_ref: Array, model: Stereo
     return moved
 
 
-def disparity_slopes(disparity: Floats, points: Array, centre: Array, reach_px: int = SLOPE_REACH_PX) -> Array:
+def disparity_slopes(disparity: Floats, points: Array, centre: Array) -> Array:
     """Return slopes (N, 2) of the disparity [px/px] along column and row at points (N, 2) with disparity centre (N,).
 
     A plane through the centre by regularised least squares; neighbours that differ by more than SAME_SURFACE_PX are
     left out, and all where the centre is NaN. Dense stereo matches upright windows, so these slopes are too flat.
     """
     height, width = disparity.shape
-    offsets = np.arange(-reach_px, reach_px + 1)
+    offsets = np.arange(-SLOPE_REACH_PX, SLOPE_REACH_PX + 1)
     dx, dy = (grid.ravel() for grid in np.meshgrid(offsets, offsets))
     columns = (np.rint(points[:, :1]).astype(int) + dx) % width
     rows = np.clip(np.rint(points[:, 1:]).astype(int) + dy, 0, height - 1)

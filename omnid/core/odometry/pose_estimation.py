@@ -93,7 +93,6 @@ class GaussNewtonResult:
     covariance: Array
     squared: Array  # (N,) squared Mahalanobis distance
     shared: Array  # (K,) the shared error that was found
-    shared_covariance: Array  # (K, K)
 
 
 def gauss_newton(
@@ -135,4 +134,4 @@ def gauss_newton(
         spread,
         squared,
     )
-    return GaussNewtonResult(T, spread[:6, :6], squared, error, spread[6:, 6:])
+    return GaussNewtonResult(T, spread[:6, :6], squared, error)

@@ -12,21 +12,21 @@ from calib import se3
 Array = NDArray[np.float64]
 
 LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval. By judgement; not measured.
+MOST_SAMPLES = 512  # Samples that are kept, so that memory is bounded: two seconds of a sensor of 250 Hz.
 
 
 class RateHistory:
     """The newest samples of one sensor: times [s] and rates, in the order of the times."""
 
-    def __init__(self, size: int, most: int = 512) -> None:
-        """size: numbers of a sample. most: samples that are kept."""
+    def __init__(self, size: int) -> None:
+        """size: numbers of a sample."""
         self._times, self._rates = np.zeros(0), np.zeros((0, size))
-        self._most = most
 
     def add(self, times_s: Array, rates: Array) -> None:
         """Add samples at times (N,) with rates (N, size); one at a known time replaces the other."""
         times, first = np.unique(np.concatenate([times_s, self._times]), return_index=True)
         rates = np.concatenate([rates, self._rates])[first]
-        self._times, self._rates = times[-self._most :], rates[-self._most :]
+        self._times, self._rates = times[-MOST_SAMPLES:], rates[-MOST_SAMPLES:]
 
     def integral(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
         """Return the integral (size,) of the rates over an interval, and their change (size,) from start to end.

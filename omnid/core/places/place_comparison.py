@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_map import PlaceFeatures
-from omnid.core.places.recognition import Recognition, recognise
-from omnid.core.places.votes import votes
+from omnid.core.places.recognition import RATIO, Recognition, distances, recognise
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -28,6 +27,8 @@ PER_PLACE, SAME_PLACE_M = 3, 1.5
 # Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
 RUNNER_UP: Final = 0.6
 RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
+VOTERS: Final = 64  # features of a frame that vote; they are evenly spread, the strongest ones first
+BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
 
 
 def compare(
@@ -88,3 +89,24 @@ def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
         if len(chosen) == most:
             break
     return chosen
+
+
+def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, float]:
+    """Return how many features of a frame have a match in a keyframe at one turn, and that turn [rad].
+
+    The turn is the yaw from the keyframe to the frame; width: columns of the panorama. Of places that are not the same,
+    the matches are few, and their turns differ.
+    """
+    if len(there.views) < 2 or not len(here.views):
+        return 0, 0.0
+    here = PlaceFeatures(here.descriptors[:VOTERS], here.views[:VOTERS])
+    squared = distances(here, there)
+    best = squared.argmin(axis=1)
+    nearest, second = np.partition(squared, 1, axis=1)[:, :2].T
+    voting = np.flatnonzero(nearest < RATIO**2 * second)
+    # A turn to the left moves the world to the right.
+    turned = (here.views[voting, 0] - there.views[best[voting], 0]) % width
+    counts = np.bincount((turned * (BINS / width)).astype(np.intp) % BINS, minlength=BINS)
+    together = counts + np.roll(counts, 1) + np.roll(counts, -1)
+    bin = int(together.argmax())
+    return int(together[bin]), (bin + 0.5) * 2 * math.pi / BINS

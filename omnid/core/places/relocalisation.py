@@ -24,17 +24,14 @@ KEYFRAMES_APART_M: Final = 0.3  # a keyframe nearer to the last one replaces it;
 class Relocaliser:
     """Keep at most max_keyframes keyframes, and find the pose of a frame relative to them."""
 
-    def __init__(
-        self, model: StereoModel, max_keyframes: int = MAX_KEYFRAMES, apart_m: float = KEYFRAMES_APART_M
-    ) -> None:
+    def __init__(self, model: StereoModel, max_keyframes: int = MAX_KEYFRAMES) -> None:
         self._model = replace(model, cylinder=model.cylinder.full_turn)  # which the columns of features are of
-        self._apart_m = apart_m
         self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=max_keyframes)
         self._features: dict[int, PlaceFeatures] = {}
 
     def add(self, frame: StereoFrame, keyframe: Keyframe) -> None:
         """Keep a frame and its keyframe; one near the last keyframe replaces it. It is described when it is needed."""
-        if self._kept and _distance_m(self._kept[-1][1], keyframe) < self._apart_m:
+        if self._kept and _distance_m(self._kept[-1][1], keyframe) < KEYFRAMES_APART_M:
             self._kept.pop()
         self._kept.append((frame, keyframe))
 

@@ -6,7 +6,7 @@ live run (`drive`). Each of the two threads sets its own finding in one assignme
 
 from __future__ import annotations
 
-from typing import Final, Literal
+from typing import Final
 
 from calib.panorama import Cylinder
 from omnid.core.odometry.exposure_times import Exposure
@@ -16,8 +16,6 @@ from omnid.core.rig.driving_views import DrivingViews
 from omnid.core.rig.first_pairs import FirstPairs, StartFinding
 from omnid.core.rig.rig_state import RigState
 from omnid.errors import OmnidError
-
-CheckMode = Literal["refuse", "warn", "off"]
 
 EXCHANGE: Final = (
     "exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "

@@ -25,11 +25,11 @@ class SadVolume:
         self.planes = np.full((min(disparities, shape[0]), *shape), NO_MATCH, np.uint16)
         self._difference = np.empty(shape, np.uint8)
 
-    def fill(self, lower: Image, upper: Image, disparities: range | None = None) -> None:
-        """Compute the planes for a pair of panoramas (H, W): all of them, or those of some disparities."""
+    def fill(self, lower: Image, upper: Image) -> None:
+        """Compute the planes for a pair of panoramas (H, W)."""
         window = (self.window_px, self.window_px)
-        for d in disparities or range(len(self.planes)):
-            rows, plane = lower.shape[0] - d, self.planes[d]
+        for d, plane in enumerate(self.planes):
+            rows = lower.shape[0] - d
             difference = cv2.absdiff(lower[:rows], upper[d:], self._difference[:rows])
             cv2.boxFilter(
                 difference, cv2.CV_16U, window, plane[:rows], normalize=False, borderType=cv2.BORDER_REPLICATE

@@ -8,22 +8,27 @@ cone of directions overlaps its own. With a rolling shutter every row has a pose
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from calib.models.camera import Array
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.atlas import cached_atlas
 from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast
 from omnid.simulation.rendering.ray_table import Floats, RayTable, cached_table
-from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
 # A cone bounds a rectangle between its corners only if it is narrower than a half space.
 MAX_CONE_RAD = 1.5
 # Guards against division by zero at a rectangle through the viewpoint [m].
 MIN_DISTANCE_M = 1e-9
+# Number of scenes whose textures are kept.
+MAX_ATLASES = 3
+SMALLEST_PX = 8
+_atlases: list[Atlas] = []  # the one used last at the end
 
 
 def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
@@ -107,3 +112,51 @@ def _distances_m(corners: Array) -> Array:
     parts = [np.clip(-(first * edge).sum(axis=1) / (edge * edge).sum(axis=1), 0, 1)[:, None] for edge in (u, v)]
     nearest = np.linalg.norm(first + parts[0] * u + parts[1] * v, axis=1)
     return np.asarray(np.maximum(nearest, MIN_DISTANCE_M))
+
+
+@dataclass(frozen=True, slots=True)
+class Atlas:
+    """All levels of textures, and where those of R of them are."""
+
+    textures: tuple[Texture, ...]  # all; kept, so that their ids stay unique
+    texels: NDArray[np.uint8]  # (K,) of all levels, row by row
+    pyramids: NDArray[np.int64]  # (R, 2) first level of each texture, number of its levels
+    levels: NDArray[np.int64]  # (L, 3) first texel, height, width
+
+
+def pyramid(texture: Texture) -> list[NDArray[np.uint8]]:
+    """Return a texture at halved sizes (box filter), all with the same outline, until a side is below 8 px."""
+    exact, levels = texture.astype(np.float32), [texture]
+    while min(exact.shape) >= SMALLEST_PX:
+        height, width = exact.shape
+        exact = np.asarray(cv2.resize(exact, (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.float32)
+        levels.append(np.rint(exact).astype(np.uint8))
+    return levels
+
+
+def make_atlas(textures: Sequence[Texture]) -> Atlas:
+    """Return the atlas of textures; one that occurs several times is stored once."""
+    first: dict[int, tuple[int, int]] = {}
+    images: list[NDArray[np.uint8]] = []
+    for texture in textures:
+        if id(texture) not in first:
+            made = pyramid(texture)
+            first[id(texture)] = (len(images), len(made))
+            images += made
+    sizes = np.array([image.size for image in images], np.int64)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    levels = np.array([(start, *image.shape) for start, image in zip(starts, images, strict=True)], np.int64)
+    texels = np.concatenate([image.ravel() for image in images])
+    return Atlas(tuple(textures), texels, np.array([first[id(texture)] for texture in textures], np.int64), levels)
+
+
+def cached_atlas(textures: Sequence[Texture]) -> Atlas:
+    """Return the atlas of textures; the texels of one that has them all are shared, whatever their order."""
+    for number, atlas in enumerate(_atlases):
+        rows = {id(texture): row for row, texture in enumerate(atlas.textures)}
+        if all(id(texture) in rows for texture in textures):
+            _atlases.append(_atlases.pop(number))
+            return replace(atlas, pyramids=atlas.pyramids[[rows[id(texture)] for texture in textures]])
+    del _atlases[: len(_atlases) - MAX_ATLASES + 1]
+    _atlases.append(make_atlas(textures))
+    return _atlases[-1]

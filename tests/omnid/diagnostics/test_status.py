@@ -21,9 +21,8 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
-from omnid.diagnostics.latency import Latency
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.diagnostics.status import TIMEOUT_S, StatusCollector, StatusSources, StatusTick
+from omnid.diagnostics.status import TIMEOUT_S, Latency, StatusCollector, StatusSources, StatusTick
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose

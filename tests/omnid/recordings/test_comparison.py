@@ -14,9 +14,9 @@ from calib import se3
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
 from omnid.recordings import run_series
+from omnid.recordings.comparison import table_differences
 from omnid.recordings.run_series import read_run_series
 from omnid.recordings.series_differences import Series, gaps, pose_excess
-from omnid.recordings.settings_differences import table_differences
 from omnid.transport import codec
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY

@@ -15,7 +15,7 @@ from omnid.messages import OdometryUpdate
 from omnid.sinks.driven_path import MOST_POSES, DrivenPath
 from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport import codec
-from omnid.transport.path_codec import driven_path_cdr
+from omnid.transport.navigation_codec import driven_path_cdr
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 T_BASE_RIG = se3.exp([0.2, -0.1, 0.5, 0.1, -0.2, 1.0])

@@ -7,7 +7,7 @@ import pytest
 
 from calib import se3
 from omnid.viewer import style
-from omnid.viewer.thinning import Thinning
+from omnid.viewer.rerun_scene import Thinning
 
 
 def test_an_ellipsoid_has_the_axes_of_the_covariance() -> None:

@@ -47,9 +47,7 @@ def euler_parameters(M: Array) -> Array:
     return np.concatenate([angles, M[:3, 3]])
 
 
-def consensus(
-    a: Array, b: Array, rng: np.random.Generator, threshold_m: float, hypotheses: int = HYPOTHESES
-) -> tuple[Array, Flags]:
+def consensus(a: Array, b: Array, rng: np.random.Generator, threshold_m: float) -> tuple[Array, Flags]:
     """Return the motion M (4, 4), b = M a, with the largest consensus set within threshold_m, and its flags (N,).
 
     Three pairs of points (N, 3) give a hypothesis. The paper finds it by Gauss-Newton on eq. (9); the closed form has
@@ -57,21 +55,21 @@ def consensus(
     """
     if len(a) < MIN_POINTS:
         return np.eye(4), np.zeros(len(a), bool)
-    triples = rng.random((hypotheses, len(a))).argpartition(2, axis=1)[:, :3]
+    triples = rng.random((HYPOTHESES, len(a))).argpartition(2, axis=1)[:, :3]
     motions = rigid_fit(a[triples], b[triples])
     agree = np.linalg.norm(se3.apply(motions, a) - b, axis=-1) < threshold_m
     best = int(agree.sum(axis=1).argmax())
     return motions[best], agree[best]
 
 
-def register(a: Array, b: Array, M: Array, steps: int = STEPS) -> Registration:
+def register(a: Array, b: Array, M: Array) -> Registration:
     """Return the motion that minimises sum |b - M a|^2 over points (N, 3), N > 2, from a start M: eq. (9).
 
     Gauss-Newton; the unknowns are the paper's three angles and three translations. The covariance is estimated from the
     residuals (White 1980), so it includes that far points are noisier, which eq. (9) ignores; it excludes the bias.
     """
     parameters = euler_parameters(M)
-    for _ in range(steps):
+    for _ in range(STEPS):
         J, error = _linearised(a, b, parameters)
         step = np.linalg.lstsq(J.reshape(-1, 6), error.ravel(), rcond=None)[0]
         parameters = parameters + step

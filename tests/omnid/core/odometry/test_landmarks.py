@@ -66,25 +66,6 @@ def test_views_that_cannot_be_triangulated_are_left_out(store: LandmarkStore) ->
     np.testing.assert_array_equal(store.observations.views, store.table.views)
 
 
-def test_moving_a_keyframe_moves_its_landmarks_and_no_others(store: LandmarkStore) -> None:
-    for seq in (1, 2):
-        add(store, keyframe(seq), views(30))
-    before, own = store.table, store.table.anchor == 1
-    T_moved = se3.exp([0.3, 0.1, 0, 0, 0, -0.2]) @ POSE
-    store.move_keyframe(1, T_moved, 4e-6 * np.eye(6))
-    np.testing.assert_allclose(store.table.points[own], se3.apply(T_moved, before.anchor_points[own]))
-    R = T_moved[:3, :3]
-    np.testing.assert_allclose(store.table.covariance[own], R @ before.anchor_covariance[own] @ R.T)
-    np.testing.assert_array_equal(store.table.points[~own], before.points[~own])
-    np.testing.assert_array_equal(store.table.anchor_points, before.anchor_points)
-    assert store.keyframes[1].covariance[0, 0] == 4e-6
-    np.testing.assert_array_equal(store.keyframes[1].T_odom_rect, T_moved)
-    store.move_keyframe(1, POSE, 1e-6 * np.eye(6))
-    np.testing.assert_allclose(store.table.points, before.points, atol=1e-12)
-    with pytest.raises(KeyError):
-        store.move_keyframe(7, POSE, np.eye(6))
-
-
 def test_disparities_of_later_frames_correct_the_depths_of_their_landmarks(store: LandmarkStore) -> None:
     """Depths that are wrong by two sigma come right with the frames, and their covariance says so."""
     truth = views(60)

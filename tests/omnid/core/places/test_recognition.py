@@ -10,10 +10,10 @@ import pytest
 from calib import se3
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import FEATURES, describe
+from omnid.core.places.place_comparison import VOTERS, votes
 from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.places.recognition import recognise
 from omnid.core.places.signature import signature_of, similarities, thumbnail
-from omnid.core.places.votes import VOTERS, votes
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor
 from tests.simulation.paths import planar_poses
