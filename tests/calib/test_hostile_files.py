@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import struct
-import tomllib
 import zlib
 from contextlib import nullcontext
 from itertools import pairwise
@@ -12,10 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from calib.bounded_toml import MAX_BYTES, MAX_DOTS, parse_toml
-from calib.bounded_yaml import parse_yaml
 from calib.errors import CalibError
-from calib.kalibr import export_kalibr, parse_kalibr
 from calib.models.unified import UnifiedCamera
 from calib.ocam_file import parse_ocam
 from calib.panorama import Cylinder, fit_cylinder, remap_tables
@@ -146,52 +142,6 @@ def test_an_embedded_mask_is_a_png(omni_rig: Rig, name: str) -> None:
     image = base64.b64encode(start + bytes(100)).decode()
     with pytest.raises(CalibError, match=r"lower\.mask\.image: expected a PNG"):
         parse_rig(rig_toml(omni_rig) + f'\n[lower.mask]\ncenter = [1, 1]\nimage = "data:image/png;base64,{image}"\n')
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "a.b.c = 1.5e-3\n",
-        "[a.b]\r\nc = '...........'\r\n",
-        '"a.b.c.d.e.f.g.h.i.j.k" = 1',
-        "a = 1 # ..........",
-        'a = """\n"quoted" ""two\\""" .........."""',
-        "a = '''...'....''...........'''",
-        "a = '''x'''''",
-        'a = """x"""""',
-        "a = ''\nb = \"\"",
-        'a = "\\"#.........."',
-        "a = 'it is \"'\nb = '\\'",
-        "a = 2001-01-01T00:00:00.5Z",
-        "a = [" + "1.5, " * 5000 + "]",
-        f"a = '{'0' * 10000}'",
-        "# it's\na = 1",
-        "a . b = { c = [ 0.1 , 0.2 ] }",
-    ],
-)
-def test_parses_the_same_as_tomllib(text: str) -> None:
-    assert parse_toml(text) == tomllib.loads(text)
-
-
-@pytest.mark.parametrize("text", ["a = '", 'a = "x\ny"', 'a = """x', "a = '''x''", 'a = """"', "a = ''''"])
-def test_refuses_a_string_without_an_end(text: str) -> None:
-    with pytest.raises(ValueError, match="a string has no end"):
-        parse_toml(text)
-
-
-def test_limits_of_toml() -> None:
-    parse_toml(".".join("a" * (MAX_DOTS + 1)) + " = 1")
-    with pytest.raises(ValueError, match="found 10"):
-        parse_toml(".".join("a" * (MAX_DOTS + 2)) + " = 1")
-    parse_toml("a = '" + "x" * MAX_BYTES + "'")
-
-
-def test_kalibr_files_are_far_below_the_limits(omni_rig: Rig) -> None:
-    text = export_kalibr(omni_rig)
-    several = "".join(text.replace("cam0", f"cam{2 * pair}").replace("cam1", f"cam{2 * pair + 1}") for pair in range(4))
-    assert len(parse_yaml(several + "# a & b *c\nnote: 'a & *b'\n")) == 9
-    assert parse_kalibr(text).baseline_m == pytest.approx(omni_rig.baseline_m)
 
 
 def enlarged(rig: Rig, factor: float) -> Rig:

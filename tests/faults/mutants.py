@@ -36,7 +36,7 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
     "omnid/controller": CONTROL_TESTS,
     "omnid/core/navigation": (
         "tests/omnid/core/navigation",
-        "tests/omnid/stages/test_navigation_stage.py",
+        "tests/omnid/stages/test_navigation.py",
         "tests/omnid/stages/test_navigation_random_walk.py",
     ),
     "omnid/transport/access.py": ("tests/omnid/transport",),

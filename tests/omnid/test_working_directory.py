@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from omnid.cli import _parser
-from tests.omnid.batch.test_batch import rows, short_log
+from tests.omnid.batch.test_job_runner import rows, short_log
 from tests.omnid.test_cli import leaves
 
 ROOT = Path(__file__).parents[2]

@@ -9,8 +9,7 @@ import pytest
 
 from calib import se3
 from calib.fit.rig_drift import CORRELATED_POINTS, apply_drift, estimate_rig_drift
-from calib.masks.rim_check import rim_shift
-from calib.models.camera import Array, Mask
+from calib.models.camera import Array
 from calib.rig import Rig
 from tests.simulation.rigs import with_upper_rotated
 
@@ -71,18 +70,3 @@ def test_is_robust_to_false_matches_and_sigmas_are_consistent(rig: Rig, around: 
 
 def test_returns_none_for_too_few_points(rig: Rig, around: Array) -> None:
     assert estimate_rig_drift(*rays(rig, around[:29], rig)) is None
-
-
-@pytest.mark.parametrize(
-    ("moved", "radius", "fits"),
-    [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False), ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)],
-)
-def test_detects_a_moved_rim(moved: tuple[float, float], radius: float, fits: bool) -> None:
-    v, u = np.indices((260, 260))
-    center = (130.0 + moved[0], 128.0 + moved[1])
-    grey = np.random.default_rng(0).integers(120, 200, (260, 260))
-    image = np.where(np.hypot(u - center[0], v - center[1]) <= radius, grey, 5).astype(np.uint8)
-    shift = rim_shift(image, Mask((130.0, 128.0), 0.0, 100.0))
-    assert shift is not None and shift.fits == fits
-    assert shift.moved_px == pytest.approx(moved, abs=0.5) and shift.wider_px == pytest.approx(radius - 100, abs=2.5)
-    assert rim_shift(image, None) is None and rim_shift(np.zeros_like(image), Mask((130.0, 128.0), 0, 100)) is None

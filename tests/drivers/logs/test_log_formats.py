@@ -17,7 +17,6 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
-from drivers.logs.image_folder import parse_stamp
 from drivers.logs.log_formats import log_info
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_info import LogState
@@ -198,33 +197,6 @@ def test_an_image_without_stamp_is_refused(tmp_path: Path) -> None:
     folder = write_folders(tmp_path / "images", pairs(1), lambda stamp: f"frame{stamp % 100}")
     with pytest.raises(DriverError, match=r"is named 'frame0'; expected a stamp.* timestamps\.txt"):
         LogReader(folder)
-
-
-@pytest.mark.parametrize(
-    ("text", "stamp_ns"),
-    [
-        ("1403636579763555584", 1403636579763555584),
-        ("1305031102.175304", 1305031102175304000),
-        ("1305031102.1753041239", 1305031102175304123),
-        ("7", 7_000_000_000),
-        ("4611686018.427387903", 2**62 - 1),
-        ("4611686018.427387904", None),
-        ("1.036336e-01", 103_633_600),
-        ("2011-09-26 13:02:25.951199337", 1317042145951199337),
-        ("2011-09-26T13:02:25", 1317042145000000000),
-        ("frame1", None),
-        ("", None),
-        ("-1", None),
-        ("nan", None),
-        ("1e30", None),
-        ("9" * 400, None),
-        ("1.2.3", None),
-        ("2011-09-26 13:02:25.x", None),
-        ("1969-01-01", None),
-    ],
-)
-def test_stamps_are_exact(text: str, stamp_ns: int | None) -> None:
-    assert parse_stamp(text) == stamp_ns
 
 
 @pytest.mark.parametrize("kind", ["mcap", "db3", "bag", "folder"])

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import random
-from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,6 @@ from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from drivers.logs import mcap_index
 from drivers.logs.log_reader import LogReader
-from drivers.logs.reorder_buffer import ReorderBuffer
-from drivers.logs.ros_image import RosImage
 from tests.drivers.logs.mcap_logs import (
     BARE,
     COMPRESSED,
@@ -176,13 +173,6 @@ def test_sorts_frames_within_the_window(tmp_path: Path, seed: int) -> None:
     frames, reader = read(write_log(tmp_path / "log.mcap", [entries[index] for index in moved]), window=16)
     assert places(frames) == in_order(60)
     assert not reader.warnings
-
-
-def test_limits_the_bytes_of_waiting_frames() -> None:
-    data = memoryview(bytes(64 * 2**20))
-    order = ReorderBuffer(32, Counter())
-    given = [len(list(order.push("lower", RosImage(stamp, "mono8", data)))) for stamp in range(1, 8)]
-    assert given == [0, 0, 0, 0, 1, 1, 1]
 
 
 def test_drops_and_counts_frames_after_their_window(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from drivers.logs.mcap_records import MAGIC
 from drivers.logs.mcap_recovery import Recovery, recover
 from drivers.logs.mcap_writer import LogWriter
 from tests.drivers.logs.mcap_logs import BARE, START_NS, Entry, pairs, text, write_log
-from tests.drivers.logs.test_mcap_damage import HOSTILE, LAYOUTS
+from tests.drivers.logs.test_mcap_records import HOSTILE, LAYOUTS
 
 RIG = [("rig.toml", b"version = 1"), ("big", bytes(3 * 2**20))]
 

@@ -6,7 +6,6 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -16,11 +15,8 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.serial_motor import LateReplyError, SerialMotor
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.controller.controller import Controller
-from omnid.controller.statistics import ControllerState
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.collision_monitor import BLOCKED, ControllerRing
-from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
@@ -30,7 +26,6 @@ from tests.omnid.controller.bench import (
     LIMITS,
     PERIOD_NS,
     PERIOD_S,
-    SETTINGS,
     UNATTENDED,
     Bench,
 )
@@ -421,31 +416,6 @@ def test_reports_each_tick(driving: Bench) -> None:
     tick = driving.controller.tick()
     assert tick.command is None and math.isnan(tick.to_wheel_s)
     assert tick.late_s == pytest.approx(3 * PERIOD_S) and tick.state.missed == 3
-
-
-def test_counts_commands_and_stops_before_obstacles() -> None:
-    bench = Bench(replace(SETTINGS, collision=CollisionSettings()))
-
-    def drive(ranges: tuple[float, ...], ticks: int) -> ControllerState:
-        for _ in range(ticks):
-            bench.send_pose()
-            bench.controller.set_ring(ControllerRing(bench.now_ns, ranges))
-            bench.send_setpoint()
-            bench.tick()
-        return bench.controller.state
-
-    bench.send_pose()
-    bench.arm()
-    bench.tick()
-    free = (math.inf,) * 360
-    state = drive(free, 20)
-    assert state.sent == len(bench.wheels.commands) == 21 and not state.blocked and not state.obstacle
-    slowed = drive(tuple(0.9 if 150 <= k < 210 else math.inf for k in range(360)), 3)
-    assert slowed.obstacle and not slowed.blocked and slowed.obstacle_stops == 0
-    for number in (1, 2):
-        stopped = drive(tuple(0.38 if 150 <= k < 210 else math.inf for k in range(360)), 10)
-        assert stopped.blocked and stopped.obstacle == BLOCKED and stopped.obstacle_stops == number
-        assert not drive(free, 10).blocked
 
 
 @pytest.mark.parametrize("known", [True, False])

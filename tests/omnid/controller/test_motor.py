@@ -9,10 +9,8 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from omnid.config import Config
 from omnid.controller.motor import open_motor
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
-from omnid.settings import parse
 
 SLOW_HZ = 1.0  # so that a machine under load has a second to answer
 
@@ -32,11 +30,6 @@ def test_simulates_every_protocol(protocol: str) -> None:
 def test_refuses_a_watchdog_of_fewer_than_four_ticks() -> None:
     with ExitStack() as closing, pytest.raises(DriverError, match="give at least 200, 4 ticks"):
         open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)
-
-
-def test_reads_the_drive_from_its_section() -> None:
-    config = parse(Config, b"[motor.drive]\ntrack_m = 0.62\nreverse_left = true\ncan_id = 7", origin="test")
-    assert config.motor.drive == DriveSettings(track_m=0.62, reverse_left=True, can_id=7)
 
 
 def test_a_missing_answer_leaves_time_in_the_tick() -> None:

@@ -11,7 +11,6 @@ import pytest
 
 import omnid.core
 from omnid.core.compiled import KERNEL_FILES, compiled, inner
-from omnid.core.native_code import inner_dispatcher
 
 FILES = sorted(Path(omnid.core.__path__[0]).rglob(KERNEL_FILES))
 
@@ -80,15 +79,6 @@ def test_numbers_tuples_and_named_arguments_are_passed() -> None:
         listed(1, 2.5, 3.0, (1.0, 2.0), table, flags, out)  # type: ignore[arg-type]
 
 
-def test_an_inner_function_becomes_part_of_others_only() -> None:
-    """Code of its own, which nothing would call, takes a fifth of all compilation."""
-    dispatcher = inner_dispatcher(twice.function)
-    dispatcher.compile((numba.float64,))
-    found = dispatcher.overloads[(numba.float64,)]
-    engine = found.library.codegen._engine
-    assert not engine.is_symbol_defined(found.fndesc.llvm_func_name)
-
-
 def test_a_function_that_returns_something_is_refused() -> None:
     @compiled("(f8,)")
     def returned(value: float) -> float:
@@ -99,7 +89,6 @@ def test_a_function_that_returns_something_is_refused() -> None:
 
 
 def test_an_array_that_is_not_named_as_written_cannot_be_written() -> None:
-    import numba
 
     @compiled("(f8[::1],)")
     def wrong(values: np.ndarray) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import grp
 import json
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -22,14 +21,10 @@ from drivers.cameras.v4l2_devices import CaptureDevice
 from drivers.cameras.v4l2_modes import Mode, SizeRange
 from drivers.cameras.v4l2_settings import V4l2Settings
 from omnid.cli import main
-from omnid.config import RecordConfig
-from omnid.doctor import machine
-from omnid.doctor.cameras import CameraStream, buses, cameras
+from omnid.doctor.cameras import cameras
 from omnid.doctor.devices import access, holders, memberships
-from omnid.doctor.finding import Finding, summary
-from omnid.doctor.machine import BUILT_S, clock, compiled_functions, disk, is_synchronised, programs
+from omnid.doctor.finding import Finding
 from omnid.doctor.wiring import bus, motor, rig
-from omnid.engine.kernel_store import cache_folder
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
@@ -135,50 +130,6 @@ def test_finds_a_camera_open_in_another_process(robot: Robot) -> None:
     with opened_elsewhere(robot.root / "dev/video0"):
         assert "is open in python" in robot.examined()[0].found
     assert robot.examined()[0].level == "ok"
-
-
-@pytest.mark.parametrize(
-    ("streams", "level", "words"),
-    [
-        (
-            [CameraStream("lower", "YUYV", 147.5, "1", 480), CameraStream("upper", "YUYV", 147.5, "1", 480)],
-            "ok",
-            "295 of 384",
-        ),
-        (
-            [CameraStream("lower", "YUYV", 195, "1", 480), CameraStream("upper", "YUYV", 195, "1", 480)],
-            "error",
-            "390 Mbit/s over",
-        ),
-        (
-            [CameraStream("lower", "YUYV", 590, "1", 480), CameraStream("upper", "GREY", 9, "1", 480)],
-            "error",
-            "would send 590",
-        ),
-        (
-            [CameraStream("lower", "MJPG", 0, "1", 480), CameraStream("upper", "MJPG", 0, "1", 480)],
-            "warning",
-            "share a USB 2 bus",
-        ),
-        (
-            [CameraStream("lower", "YUYV", 590, "2", 5000), CameraStream("upper", "YUYV", 590, "2", 5000)],
-            "ok",
-            "5000 Mbit/s",
-        ),
-        ([CameraStream("lower", "GREY", 900, "", 0), CameraStream("upper", "GREY", 900, "", 0)], "ok", "not on USB"),
-        ([CameraStream("lower", "MJPG", 0, "1", 480)], "ok", "480 Mbit/s"),
-    ],
-)
-def test_checks_the_bandwidth_of_usb(streams: list[CameraStream], level: str, words: str) -> None:
-    (found,) = buses(streams)
-    assert found.level == level and words in found.found
-    assert (found.level == "ok") == (not found.advice)
-
-
-def test_checks_each_bus_alone() -> None:
-    streams = [CameraStream("lower", "YUYV", 195, "1", 480), CameraStream("upper", "YUYV", 195, "3", 480)]
-    found = [(finding.level, finding.subject) for finding in buses(streams)]
-    assert found == [("ok", "usb bus 1"), ("ok", "usb bus 3")]
 
 
 @pytest.fixture
@@ -292,24 +243,6 @@ def test_finds_a_rig_that_cannot_be_read(tmp_path: Path, text: str | None) -> No
     assert found.level == "error" and ("omnid calibrate" in found.found) != ("omnid calibrate" in found.advice)
 
 
-@pytest.mark.parametrize(
-    ("now_s", "synchronised", "level"),
-    [(BUILT_S + 1e8, True, "ok"), (BUILT_S + 1e8, False, "warning"), (0.0, True, "error")],
-)
-def test_checks_the_system_time(now_s: float, synchronised: bool, level: str, tmp_path: Path) -> None:
-    assert next(clock(now_s, synchronised, tmp_path)).level == level
-    assert is_synchronised() in (True, False)
-
-
-@pytest.mark.parametrize(("source", "level"), [("tsc", "ok"), ("arch_sys_counter", "ok"), ("hpet", "warning")])
-def test_checks_the_clock_source(source: str, level: str, tmp_path: Path) -> None:
-    folder = tmp_path / "sys/devices/system/clocksource/clocksource0"
-    folder.mkdir(parents=True)
-    (folder / "current_clocksource").write_text(f"{source}\n")
-    found = list(clock(BUILT_S + 1e8, True, tmp_path))[1]
-    assert found.level == level and source in found.found
-
-
 def test_checks_the_rights_of_this_user() -> None:
     script = (
         "import os, resource; from omnid.doctor.machine import rights\n"
@@ -323,59 +256,8 @@ def test_checks_the_rights_of_this_user() -> None:
     assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
 
 
-def test_checks_the_space_for_recordings() -> None:
-    (found,) = disk(machine.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
-    assert found.level == "ok" and f"free at {machine.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
-    full = 10**9
-    (found,) = disk(machine.STATE, RecordConfig(free_mb=full), 1e6)
-    assert found.level == "warning" and f"record.free_mb = {full}" in found.found
-    (found,) = disk(machine.STATE, RecordConfig(enabled=True, free_mb=full), 1e6)
-    assert found.level == "error"
-
-
-def test_warns_of_a_folder_outside_the_state_directory(tmp_path: Path) -> None:
-    *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
-    assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.advice
-    unit = (ROOT / "systemd" / "omnid.service").read_text()
-    assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
-
-
-def test_checks_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
-    (found,) = programs()
-    assert found.level == "ok" and "cv2" in found.found and "zenoh 1." in found.found
-    monkeypatch.setitem(machine.PACKAGES, "missing-package", "missing_part")  # type: ignore[attr-defined]
-    assert [finding.level for finding in programs()] == ["error", "ok"]
-
-
 def router(endpoint: str) -> list[Finding]:
     return [finding for finding in bus(BusConfig(connect=(endpoint,))) if finding.subject == "router"]
-
-
-def test_tells_whether_functions_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nowhere = tmp_path / "no service"
-    (kept,) = compiled_functions(nowhere)
-    assert kept.level == "ok" and " functions in " in kept.found, "conftest.py has compiled them"
-    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "empty"))
-    (empty,) = compiled_functions(nowhere)
-    assert empty.level == "ok" and "will be compiled at the next start" in empty.found
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    (refused,) = compiled_functions(nowhere)
-    assert refused.level == "warning" and "Not a directory" in refused.found and "OMNID_CACHE_DIR" in refused.advice
-
-
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root reads the service's cache")
-def test_root_learns_of_the_services_functions(tmp_path: Path) -> None:
-    service = tmp_path / "service"
-    shutil.copytree(cache_folder(), service, ignore=shutil.ignore_patterns("making-*"))
-    for path in (service, *service.rglob("*")):
-        os.chown(path, UNPRIVILEGED, UNPRIVILEGED)
-    (kept,) = compiled_functions(service)
-    assert kept.level == "ok" and str(service) in kept.found and " functions in " in kept.found
-    for folder in service.glob("kernels-*"):
-        folder.chmod(0o777)
-    (open_to_all,) = compiled_functions(service)
-    assert "will be compiled" in open_to_all.found
 
 
 def test_checks_that_a_router_answers() -> None:
@@ -458,11 +340,3 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
 def test_the_command_refuses_a_wrong_configuration(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("found", "line"),
-    [(["ok", "ok"], "all 2 checks are ok"), (["ok", "error", "warning"], "1 errors, 1 warnings, 1 ok")],
-)
-def test_summarises_the_findings(found: list[str], line: str) -> None:
-    assert summary([Finding(level, "", "") for level in found]) == line  # type: ignore[arg-type]

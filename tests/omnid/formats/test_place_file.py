@@ -16,10 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import se3
-from calib.panorama import Cylinder
 from omnid.core.places.place_map import PlaceMap
-from omnid.core.places.place_rig import seen_by
 from omnid.errors import OmnidError
 from omnid.formats.place_file import APPLICATION_ID, MAX_VALUE_BYTES, SCHEMA_2, read_places, write_places
 from omnid.formats.place_rows import checksum
@@ -304,16 +301,3 @@ def test_a_program_that_is_killed_while_it_writes_leaves_the_old_map(tmp_path: P
         assert len(places) == 60 or path.read_bytes() == before
     write_places(path, old, RIG)
     assert os.listdir(tmp_path) == ["a.omap"]
-
-
-def test_a_map_is_seen_by_the_same_rig_with_another_horizon_but_not_by_another_rig() -> None:
-    places, shifted = some_places(2), dataclasses.replace(RIG, cylinder=Cylinder(1304, 380, 130.75))
-    before = places.keyframes[1].features.views.copy()
-    assert RIG.difference(shifted) == ""
-    seen_by(places, RIG, shifted)
-    np.testing.assert_allclose(places.keyframes[1].features.views - before, [[0, 2, 2]] * 256, atol=1e-4)
-    smaller = dataclasses.replace(RIG, cylinder=Cylinder(1000, 378, 128.75))
-    assert "panoramas of 1304 columns, not 1000" in RIG.difference(smaller)
-    assert "0.2400 m, not 0.3000 m" in RIG.difference(dataclasses.replace(RIG, baseline_m=0.3))
-    turned = dataclasses.replace(RIG, T_rig_rect=RIG.T_rig_rect @ se3.exp([0, 0, 0, 0, 0, 0.1]))
-    assert "5.7 degrees" in RIG.difference(turned)

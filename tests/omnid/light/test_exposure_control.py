@@ -80,18 +80,6 @@ class Robot:
             exposure.in_force = request.setting or ExposureSetting(5000, 0)
 
 
-def test_measures_where_the_panorama_is(rig: Rig, area: UsefulArea) -> None:
-    pair = []
-    for mounted in (rig.lower, rig.upper):
-        image = np.full((240, 240), 255, np.uint8)
-        v, u = np.mgrid[:240, :240]
-        pixels = np.column_stack([u.ravel(), v.ravel()]).astype(float)
-        image.ravel()[mounted.visible.contains(pixels)] = 50
-        pair.append(image)
-    lower, upper = area.levels(FramePair(0, 0, pair[0], pair[1] // 2))
-    assert (lower.mean, lower.bright) == (50, 50) and (upper.mean, upper.bright) == (25, 25)
-
-
 def test_both_cameras_get_the_same_values_between_two_pairs(area: UsefulArea) -> None:
     robot = Robot(area, 0.03)
     status = robot.drive(15.0)

@@ -16,7 +16,6 @@ from omnid.cli import main
 from omnid.recordings import run_series
 from omnid.recordings.comparison import table_differences
 from omnid.recordings.run_series import read_run_series
-from omnid.recordings.series_differences import Series, gaps, pose_excess
 from omnid.transport import codec
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY
@@ -279,20 +278,3 @@ def test_names_keys_by_their_paths() -> None:
         ("flag", "True", "1"),
     ]
     assert found[2].path == "new" and found[2].a == "nothing" and found[2].b.endswith("(102 characters)")
-
-
-def test_finds_gaps() -> None:
-    whole, other = (Series(np.array(stamps), np.zeros((len(stamps), 1))) for stamps in ([1, 2, 3, 4, 5, 6], [2, 5]))
-    found = gaps(whole, other)
-    assert (found.missing, found.stretches, found.longest, found.longest_ns) == (4, 3, 2, 3)
-    assert gaps(other, whole).missing == 0
-
-
-def test_small_angles_are_exact() -> None:
-    stamps = np.array([1, 2])
-    angles = (1e-9, 1e-4)
-    a = Series(stamps, np.tile([0, 0, 0, *se3.quaternion(se3.rotation_exp((0.4, -2.0, 1.0)))], (2, 1)))
-    turned = [se3.quaternion(se3.rotation_exp((0.4, -2.0, 1.0)) @ se3.rotation_exp((0, angle, 0))) for angle in angles]
-    b = Series(stamps, np.array([[0, 0, 0, *q] for q in turned]))
-    np.testing.assert_allclose(pose_excess(a, b, 0, 0).amounts[:, 1], angles, rtol=1e-5)
-    assert pose_excess(a, a, 0, 0).first_different is None

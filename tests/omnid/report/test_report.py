@@ -27,7 +27,7 @@ from omnid.report.report_data import ReportData, collect_report_data
 from omnid.report.truth_comparison import compare_with_truth
 from omnid.runs.log_rig import attached_rig
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, camera_name, stage_name
+from omnid.transport.status_names import ODOMETRY, PLACES, SUMMARY, WHEELS, camera_name, stage_name
 from tests.omnid.report.recorded_logs import (
     T_odom_base,
     at,
@@ -127,13 +127,6 @@ def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.Capture
     assert "://" not in out.read_text("utf-8")
 
 
-def test_poses_have_the_state_reported_after_them(tmp_path: Path) -> None:
-    data = collect_report_data(save(tmp_path / "log.mcap", run(100, lost=range(40, 50))))
-    assert data.poses.states == {0: 90, 2: 10}
-    assert event_texts(data) == [("state", "lost"), ("state", "tracking")]
-    assert [round(event.start_s, 6) for event in data.events.in_order()] == [4.0, 5.0]
-
-
 def test_reports_gaps_resets_and_lost_cameras(tmp_path: Path) -> None:
     camera = camera_name("upper")
     entries = [
@@ -168,25 +161,6 @@ def test_reports_gaps_resets_and_lost_cameras(tmp_path: Path) -> None:
     assert data.statuses.resets == 1
     page = Page(report_html(tmp_path / "log.mcap", data))
     assert "images dropped (5)" in page.text and "upper camera" in page.text
-
-
-def test_orders_status_from_before_the_first_pose_and_late_status(tmp_path: Path) -> None:
-    entries = [
-        status(
-            -20,
-            DiagnosticStatus(ODOMETRY, 3, "no pose yet", {}),
-            DiagnosticStatus(PAIRING, 1, "none", {}),
-        ),
-        odom(0),
-        state(0, "tracking"),
-        odom(5),
-        state(5, "lost"),
-        state(4, "tracking"),
-        odom(6),
-    ]  # status from before the loss, recorded after it
-    data = collect_report_data(save(tmp_path / "log.mcap", entries))
-    assert data.poses.states == {0: 1, 2: 2}
-    assert event_texts(data)[0] == ("pairing", "none") and data.events.in_order()[0].start_s == -2.0
 
 
 def test_shows_stages_and_latencies(tmp_path: Path) -> None:
@@ -442,8 +416,3 @@ def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction
     assert sum(attributes.get("class") == "pm" for _, attributes in page.tags) == 2  # the path and its key
     plain = report_html(tmp_path / "b.mcap", collect_report_data(save(tmp_path / "b.mcap", run())))
     assert "In the map" not in plain and "class='pm'" not in plain
-
-
-def test_a_pose_in_the_map_without_its_pose_of_odometry_is_left_out(tmp_path: Path) -> None:
-    data = collect_report_data(save(tmp_path / "a.mcap", [odom(0), map_pose(1, np.eye(4)), odom(2)]))
-    assert not data.map_poses.path.vertices

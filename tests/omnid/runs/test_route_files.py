@@ -22,7 +22,7 @@ from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate
 from omnid.navigation_state import NavigationState
 from omnid.runs.route_files import MOST_WAITING, RouteFiles
-from tests.omnid.stages.test_navigation_stage import Robot
+from tests.omnid.stages.test_navigation import Robot
 
 TEACH, FINISH = RouteRequest(RouteAction.TEACH, "hall"), RouteRequest(RouteAction.FINISH)
 REPEAT = RouteRequest(RouteAction.REPEAT, "hall")

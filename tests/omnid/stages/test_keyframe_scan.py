@@ -53,8 +53,3 @@ def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:
     camera_floor.add(seen)
     assert np.isnan(keyframe_scan(seen, camera_floor, np.eye(4), RingSettings())).all()
     assert "call nothing free" in camera_floor.summary()
-
-
-def test_the_floor_in_the_base_frame_states_the_height_too() -> None:
-    camera_floor = CameraFloor(make_rig(), -HEIGHT_M)
-    assert camera_floor.floor is not None and camera_floor.floor.height_m == pytest.approx(HEIGHT_M)

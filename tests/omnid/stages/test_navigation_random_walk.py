@@ -44,7 +44,7 @@ from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
-from tests.omnid.stages.test_navigation_stage import FixedMap
+from tests.omnid.stages.test_navigation import FixedMap
 
 Array = NDArray[np.float64]
 TICK_S, TICKS_A_POSE = 0.02, 5

@@ -22,16 +22,14 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import Graph, Stream
 from omnid.engine.playback_clock import PlaybackClock
 from omnid.formats.tum import read_tum
-from omnid.messages import DensePoints, FramePair, MapUpdate, OdometryUpdate, Panoramas, StereoDepth
+from omnid.messages import DensePoints, FramePair, MapUpdate, OdometryUpdate, StereoDepth
 from omnid.runs.pipeline import RunParts, Sinks, wire
-from omnid.stages.dense_stereo import DenseStereo
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.mapping import Mapping
 from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
-from tests.omnid.core.scenery import texture, wrapped
 from tests.simulation import build, make_rig, render_grey
 
 CONFIG = Config()
@@ -117,22 +115,6 @@ def test_points_project_to_the_pixels_they_were_matched_at() -> None:
             [cv2.remap(t, column.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR).ravel() for t in tables]
         )
         assert np.abs(seen - expected).max() < 0.05
-
-
-@pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])
-def test_the_search_reaches_the_nearest_points(min_range_m: float, found: bool) -> None:
-    """A wall whose disparity is 60 px stands 0.6 m away."""
-    rig_geometry = geometry(make_rig(size=768, baseline_m=0.2), CONFIG.panorama)
-    shape = (rig_geometry.cylinder.height, rig_geometry.cylinder.width)
-    lower = texture(1, shape, sigma_px=3)
-    upper = np.roll(lower, 60, axis=0)
-    inner = np.zeros(shape, bool)
-    inner[10:-80] = True
-    depth = DenseStereo(rig_geometry, replace(CONFIG.stereo, min_range_m=min_range_m)).compute(
-        Panoramas(0, 0, wrapped(lower), wrapped(upper), inner)
-    )
-    right = np.abs(depth.disparity - 60) < 1
-    assert (right.sum() > 5000) == found
 
 
 def test_the_visible_region_has_a_margin(rig_geometry: Geometry, frames: list[Frame]) -> None:
@@ -293,18 +275,3 @@ def dropped(rig_geometry: Geometry, frames: list[Frame], slow: type) -> dict[str
     graph.run()
     assert statistics.poses == PAIRS
     return {stage.name: stage.dropped for stage in graph.telemetry.stages}
-
-
-@pytest.mark.parametrize("threaded", [True, False])
-def test_the_pipeline_reads_any_iterable_of_frames(rig_geometry: Geometry, frames: list[Frame], threaded: bool) -> None:
-    poses: list[OdometryUpdate] = []
-
-    class Keep:
-        def process(self, message: OdometryUpdate) -> None:
-            poses.append(message)
-
-    graph = Graph(threaded=threaded)
-    pair, pairs = paired(graph, rig_geometry, frames)
-    wire(graph, pairs, front_end(rig_geometry), CONFIG, Sinks(poses={"keep": Keep()}))
-    graph.run()
-    assert [p.seq for p in poses] == list(range(PAIRS)) and pair.counts["pairs"] == PAIRS

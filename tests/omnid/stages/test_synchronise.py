@@ -15,7 +15,6 @@ from drivers.frame import Camera, Frame
 from drivers.motion import GyroSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.messages import FramePair
-from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.synchronise import MAX_WAITING, Synchronise
 from tests.simulation import build
 
@@ -169,16 +168,6 @@ def test_samples_go_along_with_the_pair_that_ends_their_step(pair: Synchronise) 
     first, second = made(pair, *(shot(camera, index) for index in range(2) for camera in ("lower", "upper")))
     assert first.motion == (wheels[0], wheels[2], gyro)
     assert second.motion == (wheels[2], wheels[1], wheels[4], gyro, wheels[3])
-
-
-def test_samples_of_another_clock_and_too_many_are_dropped_and_counted() -> None:
-    inbox = MotionInbox()
-    for k in range(5000):
-        inbox.add(WheelSample(k, 0.0, 0.0))
-    assert inbox.dropped == 5000 - 4096 and len(inbox.take(10**4)) == 4096
-    inbox.add(WheelSample(10**12, 0.0, 0.0))
-    assert not inbox.take(10**4) and not inbox.take(10**12)
-    assert inbox.dropped == 5000 - 4096 + 1
 
 
 def test_skew_statistics(pair: Synchronise) -> None:

@@ -175,11 +175,6 @@ def test_empty_point_cloud() -> None:
     assert message.width == 0 and len(message.data) == 0
 
 
-def test_point_cloud_needs_a_confidence_for_each_point() -> None:
-    with pytest.raises(OmnidError, match="2 confidences for 3 points"):
-        map_codec.point_cloud_cdr(STAMP_NS, "rig", np.zeros((3, 3)), np.zeros(2))
-
-
 def test_diagnostics() -> None:
     payload = codec.diagnostics_cdr(
         STAMP_NS, [DiagnosticStatus("omnid/odometry", 1, "degraded", {"inliers": "12", "fps": "9.8"})]

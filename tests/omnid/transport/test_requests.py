@@ -6,7 +6,6 @@ import contextlib
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
 
 import pytest
 import zenoh
@@ -17,8 +16,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.open_requests import OpenRequests
 from omnid.transport.requests import MOST_OPEN, Request, answer_of
-from omnid.transport.session import open_session
-from omnid.transport.topics import REQUEST_TOPICS, SERVED, command_topics
+from omnid.transport.topics import REQUEST_TOPICS, command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 
 
@@ -103,45 +101,6 @@ def test_large_requests_are_dropped_before_they_wait() -> None:
         with pytest.raises(OmnidError, match="has not answered"):
             program.driver().ask("cmd/path", lambda _: bytes(20_000), timeout_s=0.2)
         assert [request.topic for request in received] == ["cmd/path"]
-
-
-def test_queries_for_several_keys_at_once_are_all_answered() -> None:
-    endpoint, keys = free_endpoint(), [f"omnid/{name}" for name in ("map", "tf_static", "status", *SERVED)]
-    answered: list[str] = []
-    with (
-        open_session(BusConfig(listen=(endpoint,))) as daemon,
-        Robot(connect=(endpoint,)) as program,
-        ExitStack() as stack,
-    ):
-        for key in keys:
-            stack.enter_context(daemon.declare_queryable(key, lambda query: query.reply(query.key_expr, b"")))
-        wait_until(lambda: any(reply.ok for reply in program._session.get(keys[-1], timeout=5.0)))
-        for key in keys:
-            program._session.get(key, lambda reply: answered.append(str(reply.ok.key_expr)), timeout=5.0)
-        wait_until(lambda: sorted(answered) == sorted(keys))
-
-
-def test_queries_of_a_link_are_bounded_before_they_reach_a_ring() -> None:
-    """A listener in the place of the ring counts what zenoh lets through; another link is not in its way."""
-    endpoint, count = free_endpoint(), [0]
-    with (
-        open_session(BusConfig(listen=(endpoint,))) as daemon,
-        Robot(connect=(endpoint,)) as one,
-        Robot(connect=(endpoint,)) as other,
-    ):
-
-        def take(query: zenoh.Query) -> None:
-            count[0] += 1
-            query.reply(query.key_expr, b"")
-
-        key = "omnid/@request/arm"
-        with daemon.declare_queryable(key, take):
-            wait_until(lambda: any(reply.ok for reply in one._session.get(key, timeout=5.0)))
-            before, begin_s = count[0], time.monotonic()
-            for _ in range(3000):
-                one._session.get(key, lambda _: None, timeout=1.0)
-            wait_until(lambda: any(reply.ok for reply in other._session.get(key, timeout=5.0)))
-            assert count[0] - before <= 1100 * (time.monotonic() - begin_s) + 2
 
 
 def test_requests_that_wait_take_bounded_memory() -> None:

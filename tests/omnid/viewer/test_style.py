@@ -7,7 +7,6 @@ import pytest
 
 from calib import se3
 from omnid.viewer import style
-from omnid.viewer.rerun_scene import Thinning
 
 
 def test_an_ellipsoid_has_the_axes_of_the_covariance() -> None:
@@ -74,16 +73,3 @@ def test_points_are_thinned_evenly_and_coloured_by_height() -> None:
     grey = style.by_height(points).astype(int).sum(axis=1)
     assert grey[0] < grey[500] < grey[-1]
     assert style.by_height(points[:0]).shape == (0, 3) and style.by_height(points[:1]).shape == (1, 3)
-
-
-def test_thinning_keeps_few_messages_of_a_long_run() -> None:
-    keep = Thinning(100)
-    kept = [number for number in range(100_000) if keep()]
-    assert kept[:100] == list(range(100)) and 100 * 9 < len(kept) < 100 * 12
-    assert np.diff(kept).max() <= 2048
-
-
-def test_thinning_is_even_with_a_known_number() -> None:
-    keep = Thinning(100, expected=1050)
-    kept = [number for number in range(1050) if keep()]
-    assert kept == list(range(0, 1050, 11))

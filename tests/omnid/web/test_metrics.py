@@ -5,22 +5,10 @@ from __future__ import annotations
 import re
 
 from omnid.monitor.robot_state import RobotState
-from omnid.transport import status_names
 from omnid.transport.decode import Diagnostics
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import (
-    CALIBRATION,
-    PREFIX,
-    SIMULATION,
-    STAGE_PREFIX,
-    SUMMARY,
-    THREADS,
-    WHEELS,
-    camera_name,
-)
 from omnid.web.browsers import Browsers
 from omnid.web.metrics import metrics
-from omnid.web.remedies import remedy_of
 
 LINE = re.compile(r'[a-z_]+(\{[a-z]+="(\\.|[^"\\\n])*"(,[a-z]+="(\\.|[^"\\\n])*")*\})? -?[0-9.e+-]+')
 
@@ -41,13 +29,3 @@ def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
     assert not any("quantile" in line for line in samples), "no latency is known yet"
     names = [line.split()[2] for line in lines if line.startswith("# TYPE")]
     assert len(names) == len(set(names)) and {re.split(r"[{ ]", line)[0] for line in samples} <= set(names)
-
-
-def test_every_part_that_can_warn_has_a_remedy() -> None:
-    names = {value for value in vars(status_names).values() if isinstance(value, str) and value.startswith(PREFIX)}
-    silent = {PREFIX, STAGE_PREFIX, SUMMARY, CALIBRATION, SIMULATION, THREADS}
-    parts = {*names - silent, camera_name("lower"), camera_name("upper")}
-    assert WHEELS in parts and len(parts) > 8
-    assert [name for name in parts if not remedy_of(DiagnosticStatus(name, 1, "", {}))] == []
-    assert remedy_of(DiagnosticStatus("omnid: wheels", 1, "", {"remedy": "send cmd/arm"})) == "send cmd/arm"
-    assert remedy_of(DiagnosticStatus("omnid: stage pair", 0, "", {})) == ""

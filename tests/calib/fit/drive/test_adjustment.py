@@ -10,7 +10,6 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.fit.drive.adjustment import adjust_drive, adjust_pairs, held_out_error, observation_sigma
-from calib.fit.drive.camera_terms import DISTORTIONS, DriveModelScore, best_model
 from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion, project
 from calib.fit.drive.problem import DriveProblem
 from calib.fit.drive.rig_parameters import LINE_TIME, UPPER_DELAY, RigParameters
@@ -227,21 +226,6 @@ def test_rays_that_do_not_meet_in_one_point_are_found(truth: Rig) -> None:
     assert found.sigma_px == pytest.approx(NOISE_PX, rel=0.15)
     np.testing.assert_allclose(parameters.wavefronts_at(found.state.steps), waves, atol=3e-4)
     assert np.median(rays_apart_deg(found.rig, truth)) < 0.01
-
-
-@pytest.mark.parametrize(
-    ("held_out", "expected"),
-    [
-        ((0.2, 0.05, 0.0499), ("p1", "p2")),
-        ((0.2, 0.199, 0.1985), ()),
-        ((0.2, 0.1, 0.05), ("k1", "p1", "p2")),
-    ],
-)
-def test_the_fewest_terms_that_no_more_improve_are_chosen(
-    held_out: tuple[float, ...], expected: tuple[str, ...]
-) -> None:
-    scores = [DriveModelScore(terms, error) for terms, error in zip(DISTORTIONS, held_out, strict=True)]
-    assert best_model(scores).distortion == expected
 
 
 def test_observations_that_are_alike_leave_more_to_the_prior(truth: Rig) -> None:

@@ -14,9 +14,8 @@ from omnid.core.navigation.navigator import GIVES_WAY, STOPS, WAITS, Navigation,
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.navigation_state import NavigationState
-from omnid.tracking_state import MapState, TrackingState
+from omnid.tracking_state import TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
@@ -160,34 +159,6 @@ def test_a_hold_of_the_collision_monitor_is_a_block_with_its_reason() -> None:
     answer = base.navigator.step(base.seen()._replace(wheels=wheels))
     assert answer.state is NavigationState.BLOCKED and answer.reason == f"an obstacle is in the way: {WAITS}"
     assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0, "the monitor lets go by itself"
-
-
-@pytest.mark.parametrize(
-    ("change", "frame", "words"),
-    [
-        ({"wheels": WheelState(False, True, "not armed since the start")}, "odom", "omnid arm"),
-        ({"state": TrackingState.LOST}, "odom", "odometry is lost"),
-        ({"in_map": None}, "map", "not localised"),
-        ({"in_map": MapPosition(np.zeros(3), MapState.ODOMETRY_ONLY, 0.01)}, "map", "not localised"),
-        ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, 0.5)}, "map", "uncertain by 0.50 m"),
-        ({"in_map": MapPosition(np.zeros(3), MapState.LOCALIZED, math.nan)}, "map", "uncertain"),
-        ({"in_map": None}, "odom", ""),
-    ],
-)
-def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: str) -> None:
-    now = Situation(
-        0,
-        np.zeros(3),
-        0.0,
-        0.0,
-        TrackingState.TRACKING,
-        0,
-        WheelState(True, False),
-        MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02),
-    )._replace(**change)  # type: ignore[arg-type]
-    refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
-    assert words in refusal and bool(refusal) == bool(words) and "\n" not in refusal
-    assert "no pose" in refusal_to_drive(None, NavigationFrame(frame), 0.3)
 
 
 def test_nothing_is_sent_before_a_request() -> None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
-from omnid.core.odometry import patch_kernels
 from omnid.core.odometry.patch_fit import WINDOW_PX, PatchFit, fit_patches
 
 Array = NDArray[np.float64]
@@ -94,11 +92,3 @@ def test_no_patches() -> None:
     none = np.zeros((0, CELL_PX, CELL_PX), np.uint8)
     fit = fit_patches(none, none, np.zeros(0, np.intp), 1.0)
     assert fit.shift.shape == (0, 2) and fit.covariance.shape == (0, 2, 2) and fit.fits.shape == (0,)
-
-
-@pytest.mark.parametrize("count", [1, 2, 3, 8, 57])
-def test_median(count: int) -> None:
-    """As numpy's, of the first values alone."""
-    values = np.random.default_rng(count).integers(0, 20, 60) / 8
-    expected = np.median(values[:count])
-    assert patch_kernels.median_of(values, count) == expected

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.pose_estimation import gauss_newton, ransac, rigid_fit, whitening
-from omnid.core.odometry.ransac_kernels import rigid_motion, triple
-from omnid.core.odometry.view_kernels import linearise
+from omnid.core.odometry.ransac_kernels import rigid_motion
 from omnid.core.stereo.triangulation import point_covariance, view
 from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import motion_errors
@@ -60,22 +59,6 @@ def test_the_motion_of_three_points_is_that_of_least_squares() -> None:
         assert rigid_motion(points, seen, 0, 1, 2, T)
         np.testing.assert_allclose(T, rigid_fit(points, seen), atol=1e-9)
     assert not rigid_motion(points, np.outer([0.0, 1, 2], seen[0]), 0, 1, 2, T)
-
-
-def test_triples_are_of_different_landmarks_each_as_often() -> None:
-    count, state = np.zeros((4, 4, 4), int), np.uint64(7)
-    with np.errstate(over="ignore"):
-        for _ in range(2400):
-            a, b, c, state = triple(4, state)
-            count[a, b, c] += 1
-    assert (count > 0).sum() == 24 and count[count > 0].min() > 60 and count.max() < 140
-
-
-def test_errors_wrap_at_the_seam() -> None:
-    T, J, error = np.eye(4), np.zeros((3, 6)), np.zeros(3)
-    for column in (0.0, 1303.5):
-        linearise(np.array([-2.0, 0.001, 0.1]), np.array([column, 0, np.nan]), MODEL.camera, T, J, error)
-        assert abs(error[0]) < 2 and error[2] == 0
 
 
 def test_ransac_finds_the_motion_among_outliers() -> None:

@@ -16,9 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from omnid.batch.job_runner import FAILED, KILLED, OK, JobResult, run_job, stored_result
+from omnid.batch.job_runner import KILLED, OK, run_job, stored_result
 from omnid.batch.jobs import BatchOptions, find_logs, jobs
-from omnid.batch.tables import write_tables
 from omnid.batch.workers import dask_workers
 from omnid.errors import OmnidError
 
@@ -155,22 +154,6 @@ def test_a_log_that_takes_too_long_is_ended(tmp_path: Path) -> None:
     assert run_job(job).status == "timed out"
 
 
-def test_finds_logs(tmp_path: Path) -> None:
-    for name in ("a/1.mcap", "a/2.mcap", "a/notes.txt", "b/bag_0.db3", "b/bag_1.db3", "b/metadata.yaml", "c/x.bag"):
-        path = tmp_path / name
-        path.parent.mkdir(exist_ok=True)
-        path.touch()
-    (tmp_path / "a/circle").symlink_to(tmp_path)
-    everything = [str(tmp_path / name) for name in ("a/1.mcap", "a/2.mcap", "b", "c/x.bag")]
-    assert find_logs([str(tmp_path)]) == everything
-    assert find_logs([str(tmp_path / "*/*.mcap"), str(tmp_path / "a/1.mcap")]) == everything[:2]
-    assert [job.name for job in jobs(everything, tmp_path, BatchOptions())] == ["a-1", "a-2", "b", "c-x"]
-    assert [job.name for job in jobs(["/x/a.mcap", "/x/a.db3"], tmp_path, BatchOptions())] == ["a", "a-2"]
-    for missing in ("nowhere.mcap", "nowhere/*.mcap"):
-        with pytest.raises(OmnidError, match="batch: no log"):
-            find_logs([str(tmp_path / missing)])
-
-
 def test_reads_logs_at_addresses(tmp_path: Path) -> None:
     pytest.importorskip("fsspec")
     log = short_log(tmp_path / "logs" / "log.mcap")
@@ -180,15 +163,6 @@ def test_reads_logs_at_addresses(tmp_path: Path) -> None:
     assert result.status == OK and not list(job.folder.glob("*.mcap"))
     with pytest.raises(OmnidError, match="nothing at"):
         find_logs([f"file://{tmp_path}/logs/*.bag"])
-
-
-def test_tables_hold_names_that_are_no_formulas_and_no_html(tmp_path: Path) -> None:
-    write_tables(
-        [JobResult("=1+1", "/logs/<b>.mcap", FAILED, "<script>alert(1)</script>"), JobResult("a", "/a", OK)], tmp_path
-    )
-    assert "'=1+1" in rows(tmp_path)
-    text = (tmp_path / "index.html").read_text()
-    assert "<script>" not in text and "&lt;script&gt;" in text
 
 
 def test_names_that_are_no_text_are_escaped_everywhere(tmp_path: Path) -> None:

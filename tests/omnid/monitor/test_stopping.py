@@ -1,0 +1,51 @@
+"""Stop a robot from another program, and wait until it confirms that."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+
+from omnid.errors import OmnidError
+from omnid.monitor.stopping import stop
+from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.requests import Request
+from tests.omnid.transport.bus_fixtures import free_endpoint, script
+
+CROWD = """
+import json, sys, time, zenoh
+held = []
+while True:
+    config = zenoh.Config()
+    for name, value in (("mode", "client"), ("connect/endpoints", [sys.argv[1]]), ("scouting/multicast/enabled", False),
+                        ("connect/timeout_ms", 1000)):
+        config.insert_json5(name, json.dumps(value))
+    try:
+        held.append(zenoh.open(config))
+    except zenoh.ZError:
+        break
+print("ready", flush=True)
+time.sleep(1000)
+"""
+
+
+def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None:
+    endpoint, stopped, few = free_endpoint(), [False], tmp_path / "few.json5"
+    few.write_text("{transport: {unicast: {max_sessions: 4}}}")
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), config=str(few)))) as bus:
+        commands: list[str] = []
+
+        def execute(request: Request) -> None:
+            commands.append(request.topic)
+            stopped[0] = request.topic == "cmd/stop"
+
+        bus.subscribe_commands(execute, {}, lambda: stopped[0])
+        with script(CROWD, endpoint):
+            assert stop(BusConfig(connect=(endpoint,)))
+    assert set(commands) == {"cmd/stop"}
+
+
+def test_without_a_robot_there_the_error_is_that_of_the_bus() -> None:
+    with pytest.raises(OmnidError, match="cannot reach"):
+        stop(BusConfig(connect=(free_endpoint(),)), answer_s=1.0)
