@@ -23,7 +23,7 @@ Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 # Grid on which the common field of view is measured, and the least share of the azimuths, of a full turn or of the
 # sector, at which a slope is visible.
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
-# A sector begins and ends at one of so many steps of a full turn, each of a whole number of columns. Steps of 3.75
+# A sector begins and ends at one of SECTOR_STEPS steps of a full turn, each of a whole number of columns. Steps of 3.75
 # degrees are five directions of the obstacles, so that both share their borders, and a sector is at most two of them
 # wider than what is seen.
 SECTOR_STEPS = 96

@@ -84,7 +84,7 @@ class ValidatedTable:
         return ValidatedTable(self.values[key], self.file, self._dotted(key))
 
     def tables(self, key: str, most: int) -> list[ValidatedTable]:
-        """Return the tables of an array under a key, at most so many; none where the key is missing."""
+        """Return the tables of an array under a key, at most `most`; none where the key is missing."""
         found = self.values.get(key, [])
         if not (isinstance(found, list) and len(found) <= most and all(isinstance(item, Mapping) for item in found)):
             self.fail(key, f"at most {most} tables [[{self._dotted(key)}]]")

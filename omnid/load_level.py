@@ -1,4 +1,4 @@
-"""Level of load shedding: what a live run gives up while the computer is too slow. Imports no numpy."""
+"""Level of load shedding: the work that a live run omits while the computer is too slow. Imports no numpy."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TypeAlias
 
 
 class LoadLevel(IntEnum):
-    """Level of load shedding; each level gives up what the levels before it do, and more.
+    """Level of load shedding; each level omits the work that the levels before it omit, and more.
 
-    The map gives way first: it changes slowly, and its dense stereo costs half as much as a pose.
+    The map is omitted first: it changes slowly, and its dense stereo costs half as much as a pose.
     """
 
     FULL = 0  # all is computed
@@ -23,5 +23,5 @@ Load: TypeAlias = Callable[[], LoadLevel]  # the level now; stages call it for e
 
 
 def full_load() -> LoadLevel:
-    """Return the level of a run that gives up nothing, such as a replay."""
+    """Return the level of a run that omits nothing, such as a replay."""
     return LoadLevel.FULL

@@ -39,8 +39,8 @@ class FramePair:
     stamp_ns: int
     lower: NDArray[np.uint8]  # (H, W)
     upper: NDArray[np.uint8]  # (H, W)
-    skew_s: float = 0.0  # from the lower to the upper exposure
-    motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
+    skew_s: float = 0.0  # upper minus lower exposure
+    motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
@@ -54,7 +54,7 @@ class Panoramas:
     visible: NDArray[np.bool_]  # (H, W) both cameras show the world here and in a tracking window around
     times: PixelTimes = AT_ONCE
     light: Light = field(default_factory=Light)
-    motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
+    motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     tiles: TileStates = ALL_LIVE  # the parts of the images that are dead or blind
 
     @property
@@ -98,14 +98,15 @@ class OdometryUpdate:
     inliers: int  # landmarks that agree with the pose
     tracks: int  # landmarks that were tracked
     depth: StereoDepth
-    features: Features = field(default_factory=Features)  # for viewers; empty with the method of the paper
+    features: Features = field(default_factory=Features)  # shown by viewers; empty with the method of the paper
     light: Light = field(default_factory=Light)
-    motion: tuple[MotionSample, ...] = ()  # of wheels and gyro since the pair before
+    motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
     is_keyframe: bool = False  # odometry needs its dense depth in any case
     witness: Witness = AGREE  # whether images, wheels and gyro show the same motion
     refused_mps: float = 0.0  # speed of a pose that was refused for it alone; 0: none was
     T_odom_rect: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) the same pose, as it was estimated
-    covariance_rect: Array = field(default_factory=lambda: np.zeros((6, 6)))  # of it, [t; r] in the rectified axes
+    # covariance of T_odom_rect, [t; r] in the rectified axes
+    covariance_rect: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def __repr__(self) -> str:
         """Return one line: number, state, position, heading and sigma of the position."""
@@ -145,9 +146,10 @@ class PlaceUpdate:
     T_map_rig: Array  # (4, 4)
     covariance: Array  # (6, 6) of T_map_rig, [t; r] in the axes of the rig, m^2 and rad^2
     state: MapState
-    keyframe: int = -1  # of the map, to which the pose belongs; -1: none
+    keyframe: int = -1  # id of the keyframe to which the pose belongs; -1: none
     T_keyframe_rig: Array = field(default_factory=lambda: np.eye(4))  # (4, 4) in it, by odometry
-    scans: KeyframeScans | None = None  # of the part of the map in which the pose is; the same object while it stays
+    # scans of the part of the map in which the pose is; the same object until they change
+    scans: KeyframeScans | None = None
     keyframes: MapKeyframes | None = None  # the same object while the map stays
 
 
@@ -155,7 +157,7 @@ class PlaceUpdate:
 class GridUpdate:
     """Occupancy grid of the map, in the axes of the base at its start."""
 
-    seq: int  # of the newest pair that it knows
+    seq: int  # number of the newest pair that it contains
     stamp_ns: int
     grid: Grid
 
@@ -192,8 +194,8 @@ class MapUpdate:
 class RequestAnswer(NamedTuple):
     """Answer to a request to the navigation."""
 
-    id: int  # of the request; 0: none was sent, the recording of a route has ended by itself
-    request: str  # in a word
+    id: int  # id of the request; 0: none was sent, the recording of a route has ended by itself
+    request: str  # one word
     refusal: str  # the reason, with the remedy; empty: it is accepted
 
 
@@ -203,7 +205,7 @@ class NavigationPlan:
 
     frame: str  # map or odom
     xy: Array  # (N, 2) m
-    heading_rad: float | None  # at the end; None: as it comes
+    heading_rad: float | None  # heading at the end; None: any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,17 +216,17 @@ class NavigationUpdate:
     stamp_ns: int
     setpoint: Setpoint | None  # heading in odom; None: nothing is sent, and the wheels stop
     state: NavigationState
-    reason: str = ""  # of a halt or an end, in words
+    reason: str = ""  # reason of a halt or an end, in words
     task: str = ""  # such as "goal" or "route NAME"
     command_ns: int = 0  # stamp of the request that it follows from
     left_m: float = math.nan  # way to the end of the path
-    offset_m: float = math.nan  # of the base to the left of the path
-    loops_left: int = 0  # of a route, this one included
+    offset_m: float = math.nan  # distance of the base to the left of the path
+    loops_left: int = 0  # rounds of a route that are left, this one included
     teaching: str = ""  # name of the route that is recorded
     taught_m: float = 0.0  # its length so far
-    taught: TaughtRoute | None = None  # that is to be written; the same object until that is done
-    answers: tuple[RequestAnswer, ...] = ()  # to the newest requests, the newest one last
-    plan: NavigationPlan | None = None  # where it differs from that of the message before
+    taught: TaughtRoute | None = None  # route that is to be written; the same object until that is done
+    answers: tuple[RequestAnswer, ...] = ()  # answers to the newest requests, the newest one last
+    plan: NavigationPlan | None = None  # None where the plan is that of the message before
 
     @property
     def answer(self) -> RequestAnswer | None:

@@ -57,7 +57,7 @@ PARTIAL = 0.6
 MIN_LONE_PART = 0.9
 # Larger grids are not grown: in parts of the board's corners, and at least.
 FLOOR_PART, MIN_FLOOR_CORNERS = 3, 200
-# What shares more than so much of its corners with a floor is a part of it. By judgement; not measured.
+# A grid that shares more than this part of its corners with a floor belongs to it. By judgement; not measured.
 MAX_SHARED = 0.5
 # A smaller grid is not reported as a board of another size, because bricks and letters form a few squares by chance.
 MIN_HINT_CORNERS = 12

@@ -203,7 +203,7 @@ class LogMotion:
 
 
 def _scaled(sample: MotionSample, stamp_ns: int, factor: float) -> MotionSample:
-    """Return the sample of a log that is played so many times as fast."""
+    """Return the sample of a log that is played faster by a factor."""
     if isinstance(sample, WheelSample):
         return WheelSample(stamp_ns, factor * sample.velocity_mps, factor * sample.yaw_rate_radps)
     return GyroSample(stamp_ns, factor * sample.x_radps, factor * sample.y_radps, factor * sample.z_radps)

@@ -35,7 +35,7 @@ class V4l2Settings:
     power_line: str = "keep"  # keep, off, 50, 60 (Hz) or auto: suppresses the flicker of lamps
     controls: tuple[str, ...] = ()  # any others, as `v4l2-ctl --list-ctrls` names them: "sharpness=2"
     buffers: int = 4  # v4l2loopback needs exactly this number
-    timeout_s: float = 2.0  # without an image for so long, the device is opened again
+    timeout_s: float = 2.0  # the device is opened again after this time without an image
     retry_s: float = 2.0  # longest wait between two tries to open a lost device
 
     def __post_init__(self) -> None:

@@ -180,7 +180,7 @@ def _require_own_files(top: Path, paths: Sequence[Path]) -> None:
 
 
 def _read_regular(path: Path, most_bytes: int) -> bytes:
-    """Return at most so many bytes of a file; raise OSError for what is none, without waiting for a pipe."""
+    """Return the first bytes of a file. Raise OSError for anything but a file; a pipe is not waited for."""
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is no regular file")

@@ -107,7 +107,7 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
 
 
 def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int) -> Drives:
-    """Return at most so many keyframes of one drive, its landmarks, and their pixels in the images."""
+    """Return keyframes of one drive, at most the given number, its landmarks, and their pixels in the images."""
     reader = open_log(log, topics, place.rig)
     try:
         front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))

@@ -55,7 +55,7 @@ class Controller:
         self._law = ControlLaw(settings, self._clock_ns())
         self._last_ns = self._due_ns = 0  # the last tick, and when the next one is due
         self._driven_ns = 0  # capture of the newest pose that a command has followed from
-        self._motor_stopped = False  # by itself, before the last tick
+        self._motor_stopped = False  # True if the motor controller stopped by itself before the last tick
         self.state = ControllerState()
 
     @property

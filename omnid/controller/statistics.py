@@ -26,10 +26,10 @@ class ControllerState:
     disarmed_by: str = STARTED  # empty while armed
     needs_request: bool = False  # only cmd/arm lets the wheels turn again
     arm_answer: ArmAnswer = NO_ANSWER
-    source: str = ""  # of the commands that drive; empty while none does
+    source: str = ""  # source of the commands that drive; empty while none does
     failed: bool = False  # the motor controller did not take the last command
     fault: int = 0  # the motor controller's own number
-    battery_v: float = math.nan  # by its report
+    battery_v: float = math.nan  # voltage that the motor controller reports
     slowed_by: str = ""  # why the base drives slowly; empty: it need not
     slowed: int = 0  # how often it began to
     obstacle: str = ""  # why the collision monitor slows down or stops the base; empty: it does not
@@ -42,18 +42,19 @@ class ControllerState:
     missed: int = 0  # ticks that were left out
     lost_reports: int = 0  # reports of ticks that the daemon was too slow to take
     refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
-    stops: Counter[str] = field(default_factory=Counter)  # of wheels that turned, by reason
+    stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
 
 
 class TickReport(NamedTuple):
     """The result of one tick."""
 
-    command: VelocityCommand | None  # that the motor controller took
-    late_s: float  # after the time at which the tick was due
+    command: VelocityCommand | None  # command that the motor controller accepted
+    late_s: float  # delay of the tick
     work_s: float
-    to_wheel_s: float  # from the capture of a pose's images to this, the first command that follows from it; else NaN
+    # time from the capture of a pose's images to this command, the first that follows from it; else NaN
+    to_wheel_s: float
     state: ControllerState
-    wheels: WheelSample | None = None  # by the motor controller's report
+    wheels: WheelSample | None = None  # wheels as the motor controller reports them
 
 
 class ControllerStatistics:

@@ -37,11 +37,11 @@ class Argument:
     """Type of an argument: an array, a number, or a tuple of numbers."""
 
     name: str
-    kind: str  # of the numbers, as numpy names it: f8
-    dimensions: int = 0  # of an array; 0: no array
+    kind: str  # type of the numbers, as numpy names it: f8
+    dimensions: int = 0  # number of axes of an array; 0: no array
     is_contiguous: bool = False
     is_written: bool = False
-    count: int = 0  # of a tuple; 0: no tuple
+    count: int = 0  # length of a tuple; 0: no tuple
 
 
 class Kernel(Generic[P, R]):

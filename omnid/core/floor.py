@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base on its wheels
 # Searched heights; their step is finer than the noise that the prior's tilt adds.
 HEIGHTS_M: Final = np.arange(0.1, 3.0, 0.02)
-SPAN_M: Final = 0.3  # Points so near to the floor are compared with it: 3 sigma of the noisiest ones.
+SPAN_M: Final = 0.3  # Points within this distance of the floor are compared with it: 3 sigma of the noisiest ones.
 FALSE: Final = 0.05  # Share of the points that lie on no surface: false matches.
 FIRST_PART: Final = 0.1  # Share of the points on the floor at the start of the search: that of a narrow corridor.
 STEEP: Final = math.tan(math.radians(15))  # Slope below the horizon; flatter rays measure the floor's height badly.

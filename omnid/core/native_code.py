@@ -170,7 +170,7 @@ def _is_wrong(builder: Any, array: Any, argument: Argument, array_type: Any) -> 
 
 
 def _field(builder: Any, struct: Any, at: int, kind: Any) -> Any:
-    """Return a field of a struct, so many bytes from its start."""
+    """Return a field of a struct at an offset [bytes]."""
     return builder.load(builder.bitcast(builder.gep(struct, [I64(at)]), kind.as_pointer()))
 
 

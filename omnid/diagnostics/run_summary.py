@@ -71,7 +71,7 @@ def run_summary(
 
 
 def folded_entry(name: str, text: str, columns: int = 0) -> list[str]:
-    """Return an entry as lines of at most so many columns; the texts stay below each other. 0: as one line."""
+    """Return an entry as lines of at most `columns` columns; the texts stay below each other. 0: as one line."""
     line = f"{name:<{_NAME_COLUMNS}} {text}"
     if columns <= 2 * _NAME_COLUMNS:
         return [line]

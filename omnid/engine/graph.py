@@ -65,7 +65,7 @@ class Graph:
         self._sinks_wait = sinks_wait
         self._in_flight = InFlight()
         self._sources: list[Source] = []
-        self._inboxes: dict[str, StageInbox] = {}  # by the name of the stage
+        self._inboxes: dict[str, StageInbox] = {}  # inboxes by the name of the stage
         self._tickers: list[Ticker] = []
         self._threads: list[threading.Thread] = []
         self._ended: set[str] = set()  # names of threads
@@ -101,7 +101,7 @@ class Graph:
     def bound(self, head: str, tail: str) -> None:
         """Let the stage `head` take a message only when `tail`, a stage after it, will soon be able to take the result.
 
-        So at most one message is under way between both, and under overload the head's inbox drops what is old before
+        So at most one message is between both, and under overload the head's inbox drops what is old before
         any work is done for it: the tail gets the newest. Inline, nothing ever waits.
         """
         if self._threaded:

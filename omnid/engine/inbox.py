@@ -23,7 +23,7 @@ class InFlight:
         self._changed = threading.Condition()
 
     def add(self, count: int) -> None:
-        """Add so many messages; fewer than 0: they are done or dropped."""
+        """Add to the number of messages; a negative count: they are done or dropped."""
         with self._changed:
             self._count += count
             if not self._count:
@@ -47,18 +47,18 @@ class StageInbox:
         self._in_flight, self._has_taken = in_flight, False
         self._stats, self._writers, self._depth, self._policy = stats, writers, depth, policy
         self._capacity = depth * writers
-        self._messages: deque[tuple[int, object]] = deque()  # with the number of the writer
+        self._messages: deque[tuple[int, object]] = deque()  # messages with the number of the writer
         self._changed = threading.Condition()
         self._closed = False
         self._taken_ns = 0  # when the reader took the message it works on; 0: it is idle
         self._passed_ns = 0  # when the result of that message was passed on; 0: not yet
         self._work_s = 0.0  # how long the reader works on a message, see passed_on
         self._after_s = 0.0  # how long it works after it has passed on the result, where it does: a moving mean
-        self._behind: StageInbox | None = None  # of the stage for which the reader prepares messages
-        self._ahead: list[StageInbox] = []  # of readers that prepare messages for this one
+        self._behind: StageInbox | None = None  # inbox of the stage for which the reader prepares messages
+        self._ahead: list[StageInbox] = []  # inboxes of readers that prepare messages for this one
 
     def prepare_for(self, behind: StageInbox) -> None:
-        """Let the reader take messages only so early that the other inbox's reader can take the results at once."""
+        """Let the reader take messages no earlier than the other inbox's reader can take the results."""
         self._behind = behind
         behind._ahead.append(self)
 
@@ -128,8 +128,8 @@ class StageInbox:
     def _spare_s(self) -> float:
         """Return for how long the result of a message taken now would wait for its reader, s.
 
-        Where a result waits already, none is prepared, except towards the end of what the reader does after a message:
-        that lasts so long that what was prepared has become old, and is replaced by the newest.
+        Where a result waits already, none is prepared, except towards the end of the reader's work after a message.
+        That work is long: the result that waits has become old by then, and the newest replaces it.
         """
         behind = self._behind
         if behind is None:

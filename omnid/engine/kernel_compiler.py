@@ -22,7 +22,7 @@ from omnid.engine import kernel_store as store
 from omnid.engine.python_program import python, python_environment
 
 MAX_HELPERS: Final = 2  # each takes up to 280 MB, of the 768 that the service may have
-# Without a new folder for so long, another program or a helper counts as hung. A file takes seconds; on a slow and
+# Without a new folder for this time, another program or a helper counts as hung. A file takes seconds; on a slow and
 # busy machine a minute.
 PATIENCE_S: Final = 300.0
 PROGRESS_S: Final = 3.0  # Least time between two lines of progress.

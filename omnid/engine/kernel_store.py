@@ -39,7 +39,7 @@ CODE: Final = ".o"  # end of the names of files with the code of one function
 UNFINISHED: Final = "making-"  # begin of the names of folders that are being filled
 _IMPORTED: Final = re.compile(r"^(?:from|import) (omnid\.core\.\S*_kernels)\b", re.MULTILINE)
 _OWN_ONLY: Final = 0o022  # bits of a mode by which others could write: what is read here is run
-_DAY_S: Final = 86400.0  # a folder that was begun so long ago will not be finished
+_DAY_S: Final = 86400.0  # a folder that was begun longer ago will not be finished
 
 
 def cache_folder() -> Path:

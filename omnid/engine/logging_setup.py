@@ -69,7 +69,7 @@ class StderrHandler(logging.Handler):
         super().__init__()
         self._stream, self._clock_s = stream, clock_s
         self._kinds: dict[str, _Kind] = {}  # the most recent one is the last
-        self._shown = ""  # below the lines of a terminal
+        self._shown = ""  # line that is shown below the others on a terminal
         self.suppressed = 0  # lines in all
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -18,7 +18,7 @@ class Poller:
         self._thread.start()
 
     def close(self) -> None:
-        """End the calls; one that is under way ends first, unless this is it."""
+        """End the calls; a running one ends first, unless this is it."""
         self._closing.set()
         if threading.current_thread() is not self._thread:
             self._thread.join()

@@ -114,7 +114,7 @@ def name_thread(name: str) -> None:
 
 
 def limit_realtime_runs(max_run_ms: int) -> None:
-    """Let the kernel end the daemon by SIGXCPU when a SCHED_FIFO thread runs so long without a wait; 0: never.
+    """Let the kernel end the daemon by SIGXCPU when a SCHED_FIFO thread runs this long without a wait; 0: never.
 
     A stricter limit of the parent process stays.
     """

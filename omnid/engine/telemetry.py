@@ -106,7 +106,7 @@ class StageStats:
     dropped: int = 0
     busy_since_ns: int = 0
     wall: Histogram = field(default_factory=Histogram)
-    cpu: Histogram = field(default_factory=Histogram)  # of the calling thread only
+    cpu: Histogram = field(default_factory=Histogram)  # time of the processor, of the calling thread only
 
     def timed(self, call: Callable[..., T], *args: Any) -> T:
         """Return `call(*args)`, counted and timed; a call that raises is not counted."""
@@ -124,7 +124,7 @@ class StageStats:
             watch = Stopwatch()
 
     def count(self, watch: Stopwatch) -> None:
-        """Stop a running stopwatch, and count a message that took so long."""
+        """Stop a running stopwatch, and count a message with the time that it took."""
         watch.pause()
         wall_ns, cpu_ns = watch.elapsed_ns
         self.wall.add(wall_ns * 1e-9)

@@ -160,7 +160,7 @@ class _Reader:
             raise BadRowError("its tables are not those of a map")
 
     def rows(self, table: str, most: int) -> Iterator[place_rows.Row]:
-        """Yield the rows of a table without their checksums, at most so many."""
+        """Yield the rows of a table without their checksums, at most the given number."""
         for number, row in enumerate(self._database.execute(f"SELECT * FROM {table} ORDER BY rowid")):
             if number >= most:
                 raise BadRowError(f"more than {most} rows of {table}")

@@ -25,7 +25,7 @@ VERY_BRIGHT: Final = 0.6  # If the factor is smaller, the exposure is lowered at
 GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
 # Between two steps. Each step against the one before doubles it, two in one direction end that: so it does not hunt.
 STEP_S, LONGEST_STEP_S = 0.5, 32.0
-# A camera that does not answer: so many steps of the exposure time in a row, by at least the factor, that do not
+# A camera does not answer if this number of successive steps of the exposure time, by at least the factor, do not
 # change the mean as much as ANSWER while it is neither black nor white.
 DEAF_STEPS, DEAF_FACTOR, ANSWER, SEEN_GREY = 4, 1.2, 1.02, (10.0, 245.0)
 
@@ -82,7 +82,7 @@ class ExposureLaw:
         if wanted == self.setting:
             self.state = "too dark" if direction > 0 else "too bright"
             return None
-        # 3. A camera whose images do not follow is given up.
+        # 3. A camera whose images do not follow is no longer regulated.
         if self._is_deaf(wanted, math.sqrt(lower.mean * upper.mean)):
             self.state = "no answer"
             return None

@@ -35,7 +35,7 @@ class FleetState:
 
     def __init__(self) -> None:
         self.robots: dict[str, RobotState] = {}
-        self.refused: set[str] = set()  # as many at most
+        self.refused: set[str] = set()  # at most MAX_ROBOTS names
 
     def process(self, message: ReceivedMessage) -> None:
         """Take a message whose topic is the whole key: the robot's name and the topic's."""
@@ -56,7 +56,7 @@ class FleetState:
 
 
 def listen_to_all(bus: BusConfig, seconds: float | None) -> int:
-    """Show all robots until Ctrl-C or for so many seconds. Return the exit code, 1 where there was none."""
+    """Show all robots until Ctrl-C or for a number of seconds. Return the exit code, 1 where there was none."""
     fleet, stream = FleetState(), sys.stdout
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with suppress(KeyboardInterrupt):

@@ -75,7 +75,7 @@ Writer: TypeAlias = TumWriter | BusLogWriter
 def listen(
     bus: BusConfig, tum: Path | None, mcap: Path | None, seconds: float | None, *, shows_load: bool = False
 ) -> int:
-    """Show the robot until Ctrl-C or for so many seconds. Return the exit code, 1 where no pose arrived.
+    """Show the robot until Ctrl-C or for a number of seconds. Return the exit code, 1 where no pose arrived.
 
     shows_load: the share of each of its threads, in place of its state.
     """

@@ -105,7 +105,7 @@ def _percent(share: float) -> str:
 
 
 def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:
-    """Return the lines cut to a terminal of so many columns and rows; its last row is for the cursor."""
+    """Return the lines cut to the columns and rows of a terminal; its last row is for the cursor."""
     cut = [line if len(line) <= columns else f"{line[: max(0, columns - 1)]}\N{HORIZONTAL ELLIPSIS}" for line in lines]
     if len(cut) < rows:
         return cut

@@ -26,7 +26,7 @@ from omnid.transport.topics import ARM
 
 PERIOD_S: Final = 0.05  # Period of the commands.
 REST_S: Final = 0.5  # After a motion zero is sent for this time; then nothing, so that others may drive.
-HOLD_S: Final = 0.6  # a key counts as pressed for so long: longer than the pause before a terminal repeats it
+HOLD_S: Final = 0.6  # time for which a key counts as pressed: longer than the pause before a terminal repeats it
 CONNECT_S: Final = 5.0
 FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
 SHARE_STEP: Final = 0.1

@@ -60,7 +60,7 @@ def other_rig(updates: Iterable[OdometryUpdate], front_end: FrontEnd, finding: S
     updates: poses of a log by the front end, with the rig as it is. finding: of its first pairs, if these were seen at
     one time.
     """
-    # 1. Keyframes; where poses are lost too often, those that there are decide.
+    # 1. Keyframes; where poses are lost too often, the existing ones decide.
     start = _FirstPairs(DriveCollector(front_end.geometry, front_end.dense, LANDMARKS))
     with suppress(OmnidError):
         start = _first_keyframes(updates, start, front_end)

@@ -102,13 +102,13 @@ class RigRefinement:
             self._extend(update)
 
     def finish(self) -> None:
-        """Wait for the estimate under way: a log has ended."""
+        """Wait for the running estimate: a log has ended."""
         if self._child is not None:
             self._child.wait()
             self._take_answer()
 
     def close(self) -> None:
-        """End the estimate under way."""
+        """End the running estimate."""
         if self._child is not None:
             self._child.close()
             self._child = None

@@ -49,7 +49,7 @@ def page(title: str, parts: Sequence[str], style: str = "", script: str = "") ->
 
 
 def tiles(figures: Sequence[str], shown: int) -> str:
-    """Return small figures in rows; those after the first so many can be unfolded."""
+    """Return small figures in rows; those after the first `shown` can be unfolded."""
     rest = figures[shown:]
     more = f"<details><summary>{len(rest)} more</summary><div class='tiles'>{''.join(rest)}</div></details>"
     return f"<div class='tiles'>{''.join(figures[:shown])}</div>{more if rest else ''}"

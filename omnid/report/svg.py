@@ -53,7 +53,7 @@ class Axis:
         return self.start_px + share * (self.end_px - self.start_px)
 
     def ticks(self, most: int) -> list[float]:
-        """Return at most so many round values within the axis."""
+        """Return round values within the axis, at most the given number."""
         if self.log:
             return _decades(self.low, self.high)
         step = round_step((self.high - self.low) / most)

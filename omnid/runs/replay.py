@@ -71,7 +71,7 @@ class ReplayOptions:
 
     rig: Path | Rig | None = None  # None: the rig.toml that is attached to the log
     topics: Topics = (None, None)  # of the images; None: those of the rig, else by their names
-    span_s: tuple[float, float] = WHOLE  # the part of the log, from and until so many seconds after its first image
+    span_s: tuple[float, float] = WHOLE  # the part of the log, from and until in seconds after its first image
     tum: Path | None = None
     map_tum: Path | None = None
     map_live_tum: Path | None = None  # poses in the map as they were known when they were computed

@@ -122,7 +122,7 @@ class Session:
             )
 
     def encoder(self, rig: Rig, cloud_points: int) -> Encoder:
-        """Return an encoder that gives at most so many points of the map."""
+        """Return an encoder that limits the number of points of the map."""
         encoding = map_encoding(self.config, cloud_points)
         return Encoder(rig.T_base_rig, encoding, self.offset_ns, rig)
 

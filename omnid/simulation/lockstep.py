@@ -131,7 +131,7 @@ def simulate(
     faults: Iterable[Fault] = (),
     tamper: Tamper | None = None,
 ) -> SimulatedRun:
-    """Drive for so many seconds of simulated time and return the run.
+    """Drive for a number of seconds of simulated time and return the run.
 
     tamper: changes the images; None: they are as the simulated cameras make them.
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed

@@ -19,7 +19,7 @@ from omnid.core.control.control_law import ControllerPose
 from omnid.engine.flow import nothing
 from omnid.engine.telemetry import StageStats
 
-MOST_COMMANDS: Final = 64  # If so many commands wait for the stages, the simulated time waits, too.
+MOST_COMMANDS: Final = 64  # If this number of commands waits for the stages, the simulated time waits, too.
 POLL_S: Final = 0.1
 
 # Hands a message to the controller; its argument is the arrival by the simulated clock [ns].

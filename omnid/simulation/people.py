@@ -12,7 +12,7 @@ from omnid.simulation.rendering.surfaces import Rectangle
 
 Point = tuple[float, float]
 
-PATIENCE_S = 4.0  # A person waits so long for the robot, then comes nearer, and after as much turns round if possible.
+PATIENCE_S = 4.0  # A person waits this long, then comes nearer, and after as long again turns round if possible.
 IMPATIENT = 0.5  # Distance to which the person then comes, by that at which he waits.
 
 
@@ -25,11 +25,11 @@ class Person:
     speed_mps: float
     repeat: str = "once"  # once | loop | back and forth
     start_s: float = 0.0
-    starts_within_m: float = 0.0  # waits until the robot is so near to the last point of the path; 0: does not wait
+    starts_within_m: float = 0.0  # waits until the robot is this near to the last point of the path; 0: does not wait
     waits_within_m: float = 0.0  # stops rather than come nearer than this to the robot; 0: walks on
 
     def place(self, walked_s: float) -> tuple[float, float, float]:
-        """Return x, y [m] and heading [rad] after so much time of walking."""
+        """Return x, y [m] and heading [rad] after a time of walking."""
         points = np.array(self.path)
         reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         along_m, back, total_m = self.speed_mps * max(walked_s, 0.0), False, float(reached_m[-1])

@@ -99,7 +99,7 @@ class RealtimeRobot:
         return time.time_ns() - time.monotonic_ns()
 
     def pose_at(self, stamp_ns: int) -> Pose:
-        """Return the pose at a time, as soon as the base has come to it."""
+        """Return the pose at a time, as soon as it is known."""
         until_s = time.monotonic() + LONGEST_WAIT_S
         poses = self._motor.poses
         while (not poses or poses[-1][0] < stamp_ns) and time.monotonic() < until_s:

@@ -22,7 +22,7 @@ from omnid.stages.obstacles import controller_ring
 from omnid.transport.requests import Answer
 
 NAVIGATION_SENDER: Final = "navigation"  # identity of the sender: no other program drives on its source meanwhile
-FAILED_S: Final = 3.0  # a motor controller that has failed for so long ends a replay
+FAILED_S: Final = 3.0  # a motor controller that has failed for this time ends a replay
 
 
 class LiveDrive:

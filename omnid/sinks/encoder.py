@@ -46,7 +46,7 @@ class MapEncoding(NamedTuple):
 
 
 def map_encoding(config: Config, points: int) -> MapEncoding:
-    """Return the encoding of the configuration, with at most so many points."""
+    """Return the encoding of the configuration with a limit on the number of points."""
     return MapEncoding(points, config.obstacles.ring.max_range_m)
 
 

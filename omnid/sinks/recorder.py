@@ -26,7 +26,7 @@ Recorded: TypeAlias = Frame | Outgoing
 FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
 
 _PENDING: Final = 256  # messages of other threads that may wait
-_HELD: Final = 128  # beyond so many, they are written before their time: the clock may have been set
+_HELD: Final = 128  # more than these are written before their time: the clock may have been set
 _PATH_S_PER_POSE: Final = 0.02
 _POSE_AGE_NS: Final = 10**9  # a pose is recorded after it has been found, seldom later than that after its images
 

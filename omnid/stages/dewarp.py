@@ -30,7 +30,7 @@ class Dewarp:
     """Rectifies both images of a pair."""
 
     def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
-        self._noise_grey: dict[Side, float] = {}  # of each camera before its gain
+        self._noise_grey: dict[Side, float] = {}  # noise of each camera before its gain
         self._pairs = 0
         self._pad_px = config.pad_px
         timing = timing or TimingConfig()

@@ -61,7 +61,7 @@ class Mapping:
         self._newest: tuple[int, int] | None = None
         self._min_gap_ns = round(1e9 / config.rate_hz) if config.rate_hz else 0
         self._mapped: tuple[int, Array] | None = None  # stamp and pose of the last pair that entered the map
-        self._frames = 0  # that entered the map
+        self._frames = 0  # number of pairs that entered the map
 
     @property
     def counts(self) -> dict[str, int]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from drivers.motion import GyroSample, MotionSample, WheelSample
 
 MOST_WAITING: Final = 4096  # samples: ten seconds of a gyro of 400 Hz
-AHEAD_NS: Final = 5 * 10**9  # a sample so far after a pair has a stamp of another clock
+AHEAD_NS: Final = 5 * 10**9  # a sample that is later than a pair by more has a stamp of another clock
 
 
 class MotionInbox:

@@ -76,7 +76,7 @@ class NavigationStage:
         self._seq = 0
         self._halted = 0  # id of the newest request to halt: those from before it that come later begin nothing
         self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
-        self._plan: NavigationPlan | None = None  # that was not given yet
+        self._plan: NavigationPlan | None = None  # plan that is not yet part of a message
         self._given: tuple[object, ...] = ()  # the state that was given last
         self._given_ns = -REPEAT_NS
 

@@ -51,7 +51,7 @@ class Obstacles:
         self._period_ns = 1e9 / config.rate_hz if config.rate_hz else 0.0
         self._settings = config.ring
         self.floor = CameraFloor(geometry.rig, config.ring.floor_m)
-        self._of_floor: Floor | None = None  # for which the columns were made
+        self._of_floor: Floor | None = None  # floor for which the columns were made
         self._columns: Columns | None = None
         self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, config.ring)
         self._tracker = MovingTracker()

@@ -60,7 +60,7 @@ class Places:
         self.floor = CameraFloor(geometry.rig, config.obstacles.ring.floor_m)
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._to_rig = se3.adjoint(self._T_rig_rect)
-        self.state = MapState.ODOMETRY_ONLY  # of the newest pose
+        self.state = MapState.ODOMETRY_ONLY  # state of the newest pose
         self.counts = self._localiser.counts  # sizes and counters of the map; each second, and at the end
         self._counted_ns = 0
         self._keyframes: tuple[object, MapKeyframes] | None = None  # what they depend on, and they

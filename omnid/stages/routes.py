@@ -72,9 +72,9 @@ class Routes:
     def __init__(self, places: RouteMap | None) -> None:
         self._places = places
         self._recorder: RouteRecorder | None = None
-        self._resets = 0  # of odometry when the recording began
-        self._finished: RouteRecorder | None = None  # that of the route that is to be written
-        self.taught: TaughtRoute | None = None  # that is to be written
+        self._resets = 0  # resets of odometry when the recording began
+        self._finished: RouteRecorder | None = None  # recorder of the route that is to be written
+        self.taught: TaughtRoute | None = None  # route that is to be written
 
     @property
     def teaching(self) -> str:

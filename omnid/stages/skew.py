@@ -27,7 +27,7 @@ class Skew:
         self._settled_ns = math.nan  # running mean once it has averaged over its whole memory
         self._pairs = 0
         self._recent: deque[int] = deque(maxlen=RECENT)
-        self.exposure_ns = 0.0  # from the lower to the upper exposure of the newest pair
+        self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
 
     def add(self, skew_ns: int) -> None:
         """Add the skew of a pair."""

@@ -1,4 +1,4 @@
-"""Intake of the bus from the messages that others send: so many of each key, and of each sender on it.
+"""Intake of the bus from the messages that others send, with a limit for each key, and for each sender on it.
 
 zenoh puts messages into a ring without any Python, where the newest replace the oldest. A thread takes a bounded number
 of them, so that no flood takes the time of the stages: with a Python callback, each message would.
@@ -24,7 +24,7 @@ class Budget:
     """Messages that one sender may have decoded on one key."""
 
     rate_hz: float
-    burst: int  # at once; so many wait in the ring, too
+    burst: int  # number at once, and in the ring
 
 
 STREAM: Final = Budget(1000.0, 1024)  # setpoints, samples of wheels and gyro

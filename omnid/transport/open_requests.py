@@ -13,7 +13,7 @@ from omnid.transport.requests import MOST_OPEN, Answer
 
 
 class OpenRequests:
-    """The queries that wait for their answers. Where there are too many, the oldest one is given up."""
+    """The queries that wait for their answers. Where there are too many, the oldest one is dropped."""
 
     def __init__(self) -> None:
         self._numbers = count(1)

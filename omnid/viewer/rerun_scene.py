@@ -267,7 +267,7 @@ def _points_3d(points: NDArray[Any], size_px: float) -> Any:
 class Thinning:
     """Keeps every message at first, then every 2nd, 4th, 8th ...
 
-    Each rate serves for `most` kept messages, so that of n about most * log2(n / most) are kept. expected: number of
+    Each rate serves for `most` kept messages: of n messages about most * log2(n / most) are kept. expected: number of
     messages, where it is known; they are thinned evenly then.
     """
 

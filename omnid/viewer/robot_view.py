@@ -37,7 +37,7 @@ class RobotView:
         self.broken = 0
 
     def follow(self, bus: BusConfig, target: ViewerTarget, seconds: float | None) -> None:
-        """Draw until a signal or the viewer's end, or for so many seconds. Raise Unreachable without a robot."""
+        """Draw until a signal or the viewer's end, or for a number of seconds. Raise Unreachable without a robot."""
         end_s = math.inf if seconds is None else time.monotonic() + seconds
         signals: list[int] = []
         stopping = handle_stop_signals(lambda number, _: signals.append(number))

@@ -114,7 +114,7 @@ def depth_range(distance_mm: NDArray[np.uint16]) -> tuple[float, float]:
 
 
 def evenly(most: int, *rows: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """Return at most so many rows of each array, evenly chosen, the same rows of all."""
+    """Return rows of each array, evenly chosen, at most the given number, the same rows of all."""
     step = max(1, -(-len(rows[0]) // most))
     return tuple(each[::step] for each in rows)
 

@@ -27,7 +27,7 @@ _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
 class RobotRequests:
     """Passes requests on to the robot.
 
-    A request occupies a thread until it is answered, so only one of each kind is under way. arms: number of requests to
+    A request occupies a thread until it is answered, so only one of each kind is open. arms: number of requests to
     arm so far.
     """
 

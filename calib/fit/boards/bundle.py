@@ -55,7 +55,7 @@ class Observations:
 
     pixels: Array
     points: Array
-    cameras: int = 1  # the points of a view are equal parts of so many cameras
+    cameras: int = 1  # number of cameras that share the points of a view in equal parts
     modes: Array | None = None
 
     @property

@@ -23,8 +23,8 @@ from calib.rig import Rig
 
 # Observations that fit no better than to a pixel are not of one rigid world: patches are matched to a tenth of it.
 MAX_SIGMA_PX = 1.0
-# A landmark is not one point of one surface if the RMS of its errors exceeds so many sigmas; an observation farther off
-# is a wrong match. The kernel alone would leave a part of their weight.
+# A landmark is not one point of one surface if the RMS of its errors exceeds this number of sigmas; an observation
+# farther off is a wrong match. The kernel alone would leave a part of their weight.
 LOOSE_LANDMARK, LOOSE_OBSERVATION = 2.0, 6.0
 # Rounds of leaving out loose landmarks, because without them the rig moves, and others become loose.
 SELECTIONS = 3

@@ -54,14 +54,14 @@ class MovingPoint(NamedTuple):
     vx_mps: float
     vy_mps: float
     radius_m: float
-    sigma_m: float = 0.0  # of the place
-    sigma_mps: float = 0.0  # of the velocity
+    sigma_m: float = 0.0  # standard deviation of the place
+    sigma_mps: float = 0.0  # standard deviation of the velocity
 
 
 class ControllerRing(NamedTuple):
     """The part of an obstacle ring that the monitor needs; sector k is about azimuth -pi + (k + 0.5) 2 pi / N."""
 
-    stamp_ns: int  # of the capture
+    stamp_ns: int  # time of the capture
     ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
     free_m: tuple[float, ...] = ()  # (N,) up to which an unknown direction was seen to be free; empty: 0
     moving: tuple[MovingPoint, ...] = ()
@@ -96,13 +96,13 @@ class CollisionMonitor:
         self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
         self._stamp_ns: int | None = None
         self._points: list[Point] = []  # obstacles in the frame of the ring
-        self._unknown: list[Point] = []  # where the way that was seen to be free ends, nothing is known
+        self._unknown: list[Point] = []  # ends of the way that was seen to be free: nothing is known beyond
         self._unwatched: list[Point] = []  # around the outline, where the images show nothing
         self._is_blind = False  # they show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
-        self.reason = ""  # of the last step: why the motion was changed
-        self.share = 1.0  # of the motion that was allowed
+        self.reason = ""  # why the last step changed the motion
+        self.share = 1.0  # share of the motion that was allowed
         self._stopped_mps = 0.0  # motion that the last step stopped
 
     def set_ring(self, ring: ControllerRing) -> None:

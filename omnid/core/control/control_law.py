@@ -84,8 +84,8 @@ class ControllerSettings:
 class ControllerPose(NamedTuple):
     """The part of a pose that the controller needs."""
 
-    stamp_ns: int  # of the capture
-    heading_rad: float  # of the base in odom
+    stamp_ns: int  # time of the capture
+    heading_rad: float  # heading of the base in odom
     yaw_rate_radps: float
     state: str  # tracking | degraded | lost
     velocity_mps: float = math.nan  # forward; NaN if unknown
@@ -108,7 +108,7 @@ class ControlOutput(NamedTuple):
     """The result of one step."""
 
     motion: Twist
-    heading_rad: float  # for motor controllers that hold a heading themselves, in their own count
+    heading_rad: float  # heading in the count of a motor controller that holds one itself
     reason: str  # why the wheels must stop; empty where they may turn
 
 
@@ -134,8 +134,8 @@ class ControlLaw:
         self.contacts = Contacts()
         self.commands = CommandSelector(settings.sources)
         self.collision = CollisionMonitor(settings.collision, settings.limits.deceleration_mps2)
-        self.motion = STOP  # that the base follows now: the next step continues from it
-        self.reason = IDLE  # of the last step
+        self.motion = STOP  # motion of the base now, from which the next step continues
+        self.reason = IDLE  # reason of the last step
 
     @property
     def pose(self) -> ControllerPose | None:

@@ -35,8 +35,8 @@ class HeadingGoal:
     def __init__(self, heading: HeadingLimits, velocity: VelocityLimits) -> None:
         self._longest_rad = longest_lead_rad(heading, velocity)
         self._highest_radps = OVERSPEED * min(heading.yaw_rate_radps, velocity.yaw_rate_radps)
-        self._goal_rad: float | None = None  # of the last tick, while the base turns or drives
-        self._counted_rad = self._rate_radps = 0.0  # as last reported
+        self._goal_rad: float | None = None  # goal of the last tick, while the base turns or drives
+        self._counted_rad = self._rate_radps = 0.0  # values of the last report
 
     def update(self, counted_rad: float, rate_radps: float) -> None:
         """Take the heading and the yaw rate that the motor controller reported; NaN where it knows none."""

@@ -28,7 +28,7 @@ MOST_ACCOUNTS: Final = 2048  # kept of each kind: 10 s at the highest rate of co
 SIGMAS: Final = 3.0  # Of right differences 0.3 % exceed this, so that false alarms are rare.
 # Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.
 RECOVERY: Final = 0.5
-# Commanded to stand for so long, the base begins again with nothing unexplained; by trial on development seeds.
+# After this time at rest by command, all unexplained motion is forgotten; by trial on development seeds.
 REST_S: Final = 2.0
 
 NOT_SEEN: Final = "the images do not show the commanded motion"
@@ -50,7 +50,7 @@ class Witness(NamedTuple):
     """Account of the motion (images, wheels, gyro) that differs slowly from the others."""
 
     reason: str = ""  # one of WITNESSES; empty: all agree
-    detail: str = ""  # by how much
+    detail: str = ""  # size of the disagreement, in words
     is_fault: bool = False  # False: a doubt
 
 

@@ -32,7 +32,7 @@ class Plausibility:
         self._pose, self._motor = PoseTrust(trust), MotorTrust(trust)
         self._monitor = MotionMonitor(motion)
         self._degraded, self._checks = False, motion.check
-        self.witness = AGREE  # of the newest pose
+        self.witness = AGREE  # witness of the newest pose
 
     @property
     def slowed_by(self) -> str:

@@ -34,18 +34,18 @@ class SafetyInputs:
 
     pose_age_s: float
     pose_state: str  # tracking | degraded | lost
-    command_age_s: float  # of a setpoint that arrived after the last stop
+    command_age_s: float  # age of a setpoint that arrived after the last stop
     late_s: float = 0.0
     pose_jumped: bool = False  # the heading differs from the one before by more than the base can turn
-    motor_failed: bool = False  # at the last tick
+    motor_failed: bool = False  # True if the motor controller failed at the last tick
     pose_reset: bool = False  # odometry has lost its map and begun again
     pose_unsure: bool = False  # the velocity has been too uncertain for too long
-    motor_stopped: bool = False  # by the motor controller itself, before the last tick
-    motor_faulty: bool = False  # by its own report
+    motor_stopped: bool = False  # True if the motor controller stopped by itself before the last tick
+    motor_faulty: bool = False  # True if the motor controller reports a fault
     battery_empty: bool = False
     contact: str = ""  # BUMPER or CLIFF
-    disagreement: str = ""  # between commanded, reported and seen motion
-    stop_asked: bool = False  # and not released by cmd/arm
+    disagreement: str = ""  # disagreement between commanded, reported and seen motion
+    stop_asked: bool = False  # True if a stop was requested and cmd/arm has not released it
     armed: bool = True
     ending: bool = False
 
@@ -53,7 +53,7 @@ class SafetyInputs:
 class Rule(NamedTuple):
     """One reason to stop the wheels."""
 
-    reason: str  # in a few words
+    reason: str  # a few words
     disarms: bool  # a fault: with controller.arming = "manual" the wheels stay stopped after it until cmd/arm
     holds: Callable[[SafetyInputs, Deadlines], bool]
 

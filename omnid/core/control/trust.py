@@ -80,7 +80,7 @@ class MotorTrust:
     def __init__(self, settings: TrustSettings) -> None:
         self._settings = settings
         self._low_since_ns: int | None = None
-        self.faulty = False  # at the last report
+        self.faulty = False  # state of the last report
         self.battery_empty = False
 
     def add_report(self, now_ns: int, fault: int, battery_v: float) -> None:

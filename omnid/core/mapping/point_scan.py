@@ -26,10 +26,10 @@ NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base. B
 class ScanLimits(NamedTuple):
     """Limits of what is an obstacle, as the settings obstacles.ring give them."""
 
-    heights_m: tuple[float, float]  # above the floor
+    heights_m: tuple[float, float]  # range of heights above the floor
     tilt_rad: float  # sigma of the base's tilt against the floor
     max_range_m: float
-    min_points: int  # that make an obstacle
+    min_points: int  # least number of points of an obstacle
 
 
 def point_scan(points: Array, sigma_m: Array, view: Array, limits: ScanLimits, floor_sigma_m: float = 0.0) -> RangeScan:

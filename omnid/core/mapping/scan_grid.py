@@ -35,7 +35,7 @@ OCCUPIED_FROM: Final = 14
 FREE_UNTIL: Final = -8
 # Factor [1/m] of the squared range: the free space ends by this much before the obstacle, as the noise of stereo grows.
 SHORTER: Final = 0.02
-# Sectors to each side whose nearest range ends the free space, because an edge may be measured so far off.
+# Sectors to each side whose nearest range ends the free space, because an edge may be measured that far off.
 EDGE_SECTORS: Final = 2
 # Fractional bits of the polygons' corners: a sixteenth of a cell is enough.
 SHIFT: Final = 4

@@ -1,4 +1,4 @@
-"""A drive that is under way, and the motion that follows from it."""
+"""A drive, and the motion that follows from it."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ PROGRESS_M, PROGRESS_RAD = 0.05, math.radians(5)  # A smaller motion is no progr
 
 @dataclass(slots=True)
 class Drive:
-    """A drive that is under way."""
+    """A drive from its start to its end."""
 
-    task: str  # in words
+    task: str  # description in words
     frame: NavigationFrame
     paths: list[DrivePath]  # one after the other
     follower: Follower
@@ -37,10 +37,10 @@ class Drive:
     waits: dict[NavigationState, float] = field(default_factory=dict)  # s, by what is waited for
     unlocalised_m: float = 0.0  # way since the pose in the map was known
     nearest_m: float = math.inf  # way left, at the last progress
-    heading_rad: float = 0.0  # at the last progress
+    heading_rad: float = 0.0  # heading at the last progress
     stuck_s: float = 0.0  # since then
-    last_xy: Array | None = None  # in odom
-    giving_way: GivingWay | None = None  # while it does
+    last_xy: Array | None = None  # last position in odom
+    giving_way: GivingWay | None = None  # None unless the base gives way now
     gave_way: int = 0  # times, at the block before which it was
     gave_way_m: float = math.inf  # way left there
 
@@ -71,8 +71,8 @@ class Drive:
 class Navigation(NamedTuple):
     """The result of a step."""
 
-    setpoint: Setpoint | None  # in odom; None: nothing is sent
+    setpoint: Setpoint | None  # setpoint in odom; None: nothing is sent
     state: NavigationState
     reason: str
     left_m: float = math.nan  # way to the end of the path
-    offset_m: float = math.nan  # of the base to the left of the path
+    offset_m: float = math.nan  # distance of the base to the left of the path

@@ -33,7 +33,7 @@ class Following(NamedTuple):
 
     setpoint: Setpoint  # its heading is in the frame of the path
     left_m: float  # way to the end of the path
-    offset_m: float  # to the left of the path
+    offset_m: float  # distance to the left of the path
     turning: bool
     done: bool = False
     missed_m: float = 0.0  # distance to the goal, where done
@@ -59,7 +59,7 @@ class Follower:
         return self._pursuit
 
     def path_ahead(self, way_m: float) -> Array:
-        """Return the path (N, 2) from the nearest point on, so far and some more, through the next legs if need be."""
+        """Return the path (N, 2) from the nearest point on, of at least a length, through the next legs if need be."""
         if self._pursuit is None:
             return self.path.goal[None]
         leg = self._pursuit.leg
@@ -79,7 +79,7 @@ class Follower:
         return 0.0 if self._pursuit is None else self._pursuit.leg.length_m - self._pursuit.s_m
 
     def skip_corner(self, pose: Array) -> None:
-        """Go on with the next leg where the base, on a detour, has come to it without reaching the end of this one."""
+        """Continue with the next leg where the base, on a detour, has reached it without the end of this one."""
         pursuit = self._pursuit
         if pursuit is None or self._number + 1 >= len(self._legs) or self.leg_left_m > SKIP_M:
             return

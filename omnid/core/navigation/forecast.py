@@ -94,8 +94,8 @@ class Pace:
     speed_mps: float  # now
     highest_mps: float
     acceleration_mps2: float
-    moving_room_m: float  # that the base needs around its origin while it moves
-    standing_room_m: float  # while it stands
+    moving_room_m: float  # room around the base's origin in motion
+    standing_room_m: float  # room around the base's origin at rest
 
     def ways(self, cap_mps: float, t_s: Array) -> tuple[Array, Array]:
         """Return way and speed (T,) at equal times with a highest speed."""
@@ -108,7 +108,7 @@ class Pace:
 class Yielding(NamedTuple):
     """Speed at which what moves has passed, and what does not pass."""
 
-    share: float  # of the speed
+    share: float  # share of the path's speed
     coming: NDArray[np.bool_]  # (K,) which of them come to where the base would wait: no speed lets them pass
 
 

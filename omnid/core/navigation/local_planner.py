@@ -245,7 +245,7 @@ def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
 
 
 def _slower(wanted: Setpoint, speed_mps: float) -> Setpoint:
-    """Return the motion on the same arc, at most so fast."""
+    """Return the motion on the same arc, limited to a speed."""
     if wanted.velocity_mps <= speed_mps:
         return wanted
     share = speed_mps / wanted.velocity_mps

@@ -29,8 +29,7 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 STOPS: Final = 5  # poses after an end at which a stop is sent: one might be lost
-# Lateral distance beyond the corridor at which the path counts as left; by trial on development seeds.
-BESIDE_M: Final = 0.3
+BESIDE_M: Final = 0.3  # The path counts as left this far beyond the corridor; by trial on development seeds.
 PLANNED_M: Final = 4.0  # Length of the path that the local planner is given; enough: its grid ends at 3.2 m.
 LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
@@ -43,7 +42,7 @@ PAST_M: Final = 1.0  # Length of the path past the block that must be free, too;
 
 
 class Navigator:
-    """Holds the drive that is under way, if there is one."""
+    """Holds the present drive, if there is one."""
 
     def __init__(self, settings: NavigationSettings, collision: CollisionSettings | None = None) -> None:
         """collision: the outline of the base; None: the default one."""
@@ -57,7 +56,7 @@ class Navigator:
         self.drive: Drive | None = None
         self.state = NavigationState.IDLE
         self.reason = ""
-        self.task = ""  # of the drive, also after its end
+        self.task = ""  # description of the drive, kept after its end
         self.command_ns = 0
 
     @property

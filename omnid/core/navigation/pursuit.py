@@ -31,8 +31,8 @@ class Approach(NamedTuple):
 
     setpoint: Setpoint  # its heading is in the frame of the path
     s_m: float  # way on the leg
-    left_m: float  # to its end; below 0 past it
-    offset_m: float  # to the left of the path
+    left_m: float  # way to the end of the leg; below 0 past it
+    offset_m: float  # distance to the left of the path
     turning: bool  # standing, towards the path
 
 
@@ -44,7 +44,7 @@ class Pursuit:
         self.leg = leg
         self.s_m = s_m
         self._settings = settings
-        self._turning = True  # until the first step finds that there is no need
+        self._turning = True  # True until the first step finds that no turn is needed
         self._speed_mps = 0.0
         self._last_ns: int | None = None
 

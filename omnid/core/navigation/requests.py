@@ -29,7 +29,7 @@ class NavigationFrame(StrEnum):
 
 
 class NavigationVerb(StrEnum):
-    """Requests about what is under way."""
+    """Requests about the present drive."""
 
     CANCEL = "cancel"
     PAUSE = "pause"
@@ -61,7 +61,7 @@ class PathRequest:
 
     frame: NavigationFrame
     xy: NDArray[np.float64]  # (N, 2) m
-    heading_rad: float | None = None  # at the end; None: as it comes
+    heading_rad: float | None = None  # heading at the end; None: any
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class RouteRequest:
     loops: int = 1
     from_start: bool = False  # the whole route; else from where the robot is on it
     replace: bool = False  # teach in the place of a route of that name
-    route: Route | None = None  # that is to be repeated, as its file has it
+    route: Route | None = None  # route that is to be repeated, as read from its file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +82,7 @@ class TaughtRoute:
     """A route that is to be written; as a request: it was written, or its refusal says why not."""
 
     route: Route
-    id: int  # of the request to finish it
+    id: int  # id of the request to finish the recording
 
 
 NavigationRequest: TypeAlias = GoalRequest | PathRequest | NavigationVerb | RouteRequest | TaughtRoute
@@ -92,9 +92,9 @@ class NavigationCommand(NamedTuple):
     """A request and its times."""
 
     request: NavigationRequest
-    arrival_ns: int  # of Unix time
-    stamp_ns: int = 0  # of the sender, of Unix time; 0: it has none
-    id: int = 0  # of the message that asks; the answer has it too
+    arrival_ns: int  # Unix time
+    stamp_ns: int = 0  # Unix time by the sender's clock; 0: it has none
+    id: int = 0  # id of the request; the answer has the same
     refusal: str = ""  # why it is refused already, as by a file that is missing
 
 

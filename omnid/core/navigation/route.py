@@ -39,7 +39,7 @@ FarKeyframe = Callable[[int], "KeyframePose | None"]
 class KeyframePose(NamedTuple):
     """A keyframe of the map."""
 
-    stamp_ns: int  # of its images, which distinguishes it from one of the same number in another map
+    stamp_ns: int  # stamp of its images, which distinguishes it from one of the same number in another map
     pose: Array  # x, y, yaw (3,) of the base in the map
 
 
@@ -52,8 +52,8 @@ class Route:
     speeds: Array  # (N,) m/s with which each point was reached, below 0 with the back ahead
     keyframes: NDArray[np.int64]  # (N,) that the points are tied to, NO_KEYFRAME without
     in_keyframe: Array  # (N, 3) pose in it
-    stamps_ns: Mapping[int, int]  # of keyframes of the map, those of the points and others
-    created_s: int = 0  # of Unix time
+    stamps_ns: Mapping[int, int]  # stamps by id of keyframes of the map, those of the points and others
+    created_s: int = 0  # Unix time
     map_name: str = ""
 
     @property

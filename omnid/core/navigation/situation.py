@@ -23,7 +23,7 @@ class WheelState(NamedTuple):
     needs_request: bool  # only cmd/arm lets the wheels turn again
     disarmed_by: str = ""  # empty while armed
     reason: str = ""  # why the wheels must stop now; empty: they may turn
-    source: str = ""  # of the commands that drive; empty while none does
+    source: str = ""  # source of the commands that drive; empty while none does
     held_by: str = ""  # why the collision monitor stops the base; empty: it does not
 
 
@@ -32,7 +32,7 @@ class MapPosition(NamedTuple):
 
     T_map_odom: Array  # x, y, yaw (3,), of the base's frames
     state: MapState
-    sigma_m: float  # of the base's position in the map
+    sigma_m: float  # standard deviation of the base's position in the map
 
 
 class Situation(NamedTuple):
@@ -48,7 +48,7 @@ class Situation(NamedTuple):
     in_map: MapPosition | None = None  # None: nothing is known yet
     obstacles: Array | None = None  # (N, 2) positions in odom, m; None: none are known
     moving: Forecast | None = None  # those of them that move
-    obstacle_m: float = math.inf  # from the outline of the base to the nearest one that is not behind it
+    obstacle_m: float = math.inf  # distance of the outline from the nearest obstacle that is not behind the base
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:
         """Return the pose of odom in a frame (3,)."""

@@ -76,7 +76,7 @@ class ColumnEvidence(NamedTuple):
     floor: Floats  # (K, DIRECTIONS) of the floor from disparity k to k + 1, NaN where both cameras cannot see it
     surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
     level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
-    nearest_floor_m: float  # that both cameras see, 0: none
+    nearest_floor_m: float  # nearest floor that both cameras see, 0: none
 
 
 def floor_plane(T_rect_floor: Array) -> FloorPlane:

@@ -38,8 +38,8 @@ class CorrectedPixels(NamedTuple):
 class DenseCorrection:
     """Fields (H, W, 2) of a and b of a + b disparity, for disparities as seen between the exposures, px."""
 
-    view: tuple[Floats, Floats, Floats]  # from the pixel and its upper row as seen to the view at the stamp
-    column: Floats  # from the lower column to that of the upper panorama
+    view: tuple[Floats, Floats, Floats]  # corrections from the pixel and its upper row as seen to the view at the stamp
+    column: Floats  # correction from the lower column to that of the upper panorama
     sigma: Floats  # standard deviation of the corrected disparity by the uncertainty of the velocity
     wraps: bool = True  # the panoramas show a full turn
 

@@ -37,7 +37,7 @@ class PoseEstimate:
     pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (M, 2) px of them in the lower panorama
     variance: Array = field(default_factory=lambda: np.zeros(0))  # (M,) px^2 of the disparity of each view by noise
     rejected: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (K, 2) px of tracked landmarks, no inliers
-    assumed: AssumedMotion = NOTHING_ASSUMED  # by which the disparities were corrected
+    assumed: AssumedMotion = NOTHING_ASSUMED  # motion by which the disparities were corrected
     # Mean cost of a landmark in view: half of the Cauchy kernel's value, by the landmarks that count as one.
     cost: float = 0.0
     in_view: int = 0  # landmarks by which it is meant

@@ -61,7 +61,7 @@ class Keyframes:
         self._most_inliers = self._frames = 0  # since the last keyframe
 
     def is_due(self, inliers: int) -> bool:
-        """True if the local map needs a keyframe at the next accepted frame, which has so many inliers."""
+        """True if the local map needs a keyframe at the next accepted frame; inliers: their number there."""
         limits = self._limits
         if limits.keyframes == 1:  # frame to frame: all landmarks are new, the old ones leave with their keyframe
             return True

@@ -76,7 +76,7 @@ class LocalMap:
     ) -> Tracks:
         """Track landmarks of the last panorama into a new one, from the pixels that a guessed pose predicts.
 
-        most: only about so many, evenly chosen; None: all. With another turn, others are chosen. near: the guess is
+        most: about this number of landmarks, evenly chosen; None: all. turn: selects which ones. near: the guess is
         good to a few pixels, so that no pyramid is needed; where it is not, wrong tracks pass the check.
         """
         rows, predicted = self.visible(T_odom_rect)

@@ -79,7 +79,7 @@ class _Step(NamedTuple):
 class _Finding(NamedTuple):
     """Comparison of one account with the images, or of wheels with the gyro."""
 
-    lag_s: float = 0.0  # of the images; beyond the allowed ones where there is evidence
+    lag_s: float = 0.0  # delay of the images; beyond the allowed ones where there is evidence
     excess: float = 0.0  # difference of the sums in parts of its limit; 1 and more is a fault
     text: str = ""
 

@@ -96,7 +96,7 @@ class MotionModel:
         self._exposures.reset()
 
     def is_sudden(self, T_prev_curr: Array, dt_s: float) -> bool:
-        """True if a motion differs so much from the predicted one that it gives no velocity during the exposures."""
+        """True if a motion differs too much from the predicted one to give the velocity during the exposures."""
         change = se3.log(T_prev_curr) - self._filter.velocity * dt_s
         return bool(np.linalg.norm(change[3:]) > SUDDEN_RAD)
 
@@ -115,7 +115,7 @@ class Bridge:
         """Begin again from a pose of the cameras."""
         self._time_s = 0.0
         self._systematic = np.zeros(6)  # sum of the standard deviations
-        self._variance_m2 = 0.0  # of the position
+        self._variance_m2 = 0.0  # variance of the position
 
     def carries(self, sensed: SensedMotion, dt_s: float) -> bool:
         """True if the pose may go on by a sensed step of dt_s, within the limits of time and uncertainty."""

@@ -29,7 +29,7 @@ class NewLandmarks:
     views: Array  # (N, 3) px, at the stamp
     slopes: Array  # (N, 2) px/px of the disparity, at the stamp
     noise: Array  # (N, 3, 3) px^2 of the views, that of the motion left out
-    assumed: AssumedMotion  # by which the views were corrected
+    assumed: AssumedMotion  # motion by which the views were corrected
 
     @property
     def whole_noise(self) -> Array:

@@ -35,11 +35,12 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # Standard deviation of the velocity while poses are refused, m/s and rad/s. Where one is refused for its speed alone,
-# that speed, as the vehicle may be so fast: at 10 m/s the position was 11 sigmas off.
+# that speed, as the vehicle may have it: at 10 m/s the position was 11 sigmas off.
 UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
-TEXTURED_CORNERS = 2  # corners per landmark of the smallest map that make a frame textured: not all will be located
-COUNTED_CORNERS = 4  # corners per landmark of the smallest map that are looked for in that test
+# Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
+TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
+
 # Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
 # limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
 AGAIN_SHARE = 1 / 3
@@ -69,9 +70,9 @@ class VisualOdometry:
         self._status = TrackingStatus()
         self._resets = 0
         self._untracked_mps = UNTRACKED_SPEED_SIGMA
-        self._doubt: Doubt | None = None  # which of several motions was made
-        self._step: tuple[Array, Array] | None = None  # from the frame before, by the cameras, and its covariance
-        self._requested: KeyframeRequest | None = None  # by the last frame, see complete
+        self._doubt: Doubt | None = None  # other motions that may have been made in place of the chosen ones
+        self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
+        self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
         self._added: int | None = None  # seq of the keyframe that the last frame became
         self._exposures = FrameExposures(
             self._motion,
@@ -147,7 +148,7 @@ class VisualOdometry:
         last = LastFrame(self._T_odom_rect, self._previous)
         estimate = self._search.find(frame, usable, last, T_predicted, dt_s)
         if estimate is None or self._status.refused_frames:
-            return estimate  # from an unknown place displacements lead anywhere: relocalisation decides
+            return estimate  # displacements from an unknown place lead anywhere: relocalisation decides
         # How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors of
         # steps for independent, which those of runners-up are not; wheels, which measure each step, are better
         # evidence.
@@ -228,7 +229,7 @@ class VisualOdometry:
     ) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
-        elsewhere: the frame was recognised so far from the predicted pose; None: it was not recognised elsewhere.
+        elsewhere: distance of the recognised from the predicted pose; None: it was not recognised elsewhere.
         """
         carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and elsewhere is None
         self._advance(

@@ -46,7 +46,7 @@ def align(
 ) -> AlignedPatches:
     """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
 
-    groups (N,): patches that come from one image have one number. reach_px: a patch that has to move so far was
+    groups (N,): patches that come from one image have one number. reach_px: a patch that has to move this far was
     predicted wrongly.
     """
     cells = _cut(current, np.rint(predicted), WINDOW_PX + 2 * reach_px)

@@ -30,7 +30,7 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-LANDMARKS = 120  # whose patches are compared, evenly chosen: the mean of as many correlations errs by less than 0.1
+LANDMARKS = 120  # whose patches are compared, evenly chosen: the mean of 120 correlations errs by less than 0.1
 # Side of a patch in samples, and their distance, px: as wide as the tracker's window, and blurred by as much as a step
 # of the grid moves it.
 SAMPLES, SAMPLE_PX = 7, 2
@@ -81,7 +81,7 @@ class Doubt:
     displacement: Array  # (6,) [t; r] from it to the one by the runners-up
     chosen_mps: Array  # (3,) velocities of the last step in odom, as chosen and by the runner-up
     runner_up_mps: Array
-    is_right: bool = True  # as far as is known: the velocities that were chosen follow from each other
+    is_right: bool = True  # False if the velocities that were chosen contradict each other
     clear_steps: int = 0  # consecutive ones without a runner-up
 
     @property

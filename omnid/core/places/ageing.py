@@ -16,7 +16,7 @@ from omnid.core.places.place_map import UNUSED, KeyframeUse, PlaceMap
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-BESIDE_M: Final = 0.3  # A keyframe so near to a frame shows the same view, if nothing has changed.
+BESIDE_M: Final = 0.3  # A keyframe this near to a frame shows the same view, if nothing has changed.
 FOUND_INLIERS: Final = 20  # Inliers with which a keyframe counts as recognised.
 VISIT_M: Final = 3.0  # Length of path between two visits of a place.
 AGED_MISSES: Final = 3  # Consecutive visits at which a keyframe is missed, before the next one drops it.

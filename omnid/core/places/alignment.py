@@ -28,7 +28,7 @@ class Landmark:
     name: str
     id: int
     size_m: float  # edge of its black square
-    xyz_m: tuple[float, float, float]  # of its middle
+    xyz_m: tuple[float, float, float]  # position of its middle
     facing_rad: float | None  # azimuth of the direction that it faces; None: on the floor or the ceiling, or unknown
 
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 LEAST_ODOMETRY: Final = np.diag([2e-4] * 3 + [2e-5] * 3) ** 2  # m, rad: of an edge, so that none is infinitely stiff
 FITS_M, FITS_RAD = 0.01, 0.003  # A loop that the map fits within this needs no optimisation.
 LOOPS_THAT_FIT: Final = 3  # wait for the next optimisation, more of them in a large map; by trial on development seeds
-KEYFRAMES_PER_LOOP: Final = 50  # for each so many keyframes, one loop more waits; by trial on development seeds
+KEYFRAMES_PER_LOOP: Final = 50  # one more loop waits per this number of keyframes; by trial on development seeds
 ACCEPTED: Final = 0.5  # least weight of a loop that counts; the middle is enough, because weights end at 0 or 1
 RECENT: Final = 8  # Loops that show the present drift; a refused one may count later, while it is among them.
 
@@ -41,7 +41,7 @@ class MapCorrection:
         self._anchor: _Anchor | None = None
         self._waiting = 0  # loops since the last optimisation
         self.rejected = 0  # loops that the graph refused
-        self.factor = 1.0  # on odometry's covariance, by the loops
+        self.factor = 1.0  # factor on odometry's covariance that the loops show
         self.optimisations = 0
 
     def forget(self) -> None:

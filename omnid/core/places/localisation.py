@@ -51,9 +51,8 @@ class MapLocaliser:
     def __init__(
         self, model: StereoModel, limits: PlaceLimits, places: PlaceMap | None = None, *, localize_only: bool = False
     ) -> None:
-        """places: a map to be extended; None: a new one, which begins where odom does.
-
-        localize_only: the map stays as it is. The newest keyframes of the run tie odom to it, and are no places.
+        """places: a map to be extended; None: a new one, which begins where odom does. localize_only: the map stays as
+        it is; the newest keyframes of the run tie odom to it, and are no places.
         """
         self._limits = limits
         self.places = places if places is not None else PlaceMap()
@@ -72,7 +71,7 @@ class MapLocaliser:
         self._parts = MapParts(self.places)
         self._schedule = SearchSchedule(limits)
         self._hypotheses = Hypotheses()
-        self._newest: PlaceKeyframe | None = None  # of this part, by odometry
+        self._newest: PlaceKeyframe | None = None  # newest keyframe of this part, placed by odometry
         self._T_map_odom = np.eye(4)
         self._resets = 0
         self._path_m = 0.0

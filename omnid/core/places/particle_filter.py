@@ -50,7 +50,7 @@ class ParticleEstimate:
 
     T_map_rect: Array  # (4, 4) on the floor
     covariance: Array  # (3, 3) of x, y, yaw in the map, m^2 and rad^2
-    share: float  # of the weight in the group
+    share: float  # share of the weight in the group
     fitting: float  # share of the beams that end at obstacles of the map, in the mean of the last scans
     ambiguous: bool  # another pose explains the last scans as well, or several groups are left that do
     converged: bool
@@ -62,7 +62,8 @@ class ParticleFilter:
     def __init__(self, grid: Grid, seed: int = 0, particles: int = PARTICLES) -> None:
         self._model, self._rng, self._count = BeamModel(grid), np.random.default_rng(seed), particles
         self._poses, self._log_weight = np.zeros((0, 3)), np.zeros(0)
-        self._scans: deque[tuple[RangeScan, Array]] = deque(maxlen=SCANS)  # and the pose (3,) of odometry at each
+        # last scans, with the pose (3,) of odometry at each
+        self._scans: deque[tuple[RangeScan, Array]] = deque(maxlen=SCANS)
         self._fitting: deque[float] = deque(maxlen=SCANS)
         self._T_odom_rect = np.eye(4)
         self._poor_updates = 0  # one after the other

@@ -26,7 +26,7 @@ FAR_INLIERS, FAR_SECTORS = 24, 5
 PER_PLACE, SAME_PLACE_M = 3, 1.5
 # Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
 RUNNER_UP: Final = 0.6
-RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses so far apart are different places
+RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses farther apart are different places
 VOTERS: Final = 64  # features of a frame that vote; they are evenly spread, the strongest ones first
 BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
 
@@ -77,7 +77,7 @@ def is_elsewhere(a: Array, b: Array) -> bool:
 
 
 def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
-    """Return the first of ranked places (N,) at positions (N, 3), at most so many, and at most PER_PLACE near another.
+    """Return the first `most` of ranked places (N,) at positions (N, 3), at most PER_PLACE near another.
 
     So a second, similar place is compared as well, although all neighbours of the first are more similar.
     """

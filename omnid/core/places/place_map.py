@@ -96,7 +96,7 @@ class PlaceMap:
         self.keyframes: dict[int, PlaceKeyframe] = {}
         self.poses: dict[int, Array] = {}
         self.links: list[Link] = []
-        self.uses: dict[int, KeyframeUse] = {}  # by id; none: UNUSED
+        self.uses: dict[int, KeyframeUse] = {}  # uses by id; a keyframe without an entry is UNUSED
         self.tags = MapTags()
         self.dropped = 0  # keyframes, because the map was full
 

@@ -21,15 +21,15 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 
 # Set by trial on development seeds, where a line gives no other reason.
-NEAR_M: Final = 1.5  # Keyframes so near to the pose by odometry are searched.
+NEAR_M: Final = 1.5  # Keyframes within this distance of the pose by odometry are searched.
 ENOUGH_INLIERS: Final = 50  # Inliers of a place with which the search ends.
 
 
 class Effort(NamedTuple):
     """Numbers of keyframes in the steps of a search: fewer at each step, as each step costs more."""
 
-    voted: int  # of the most similar signatures: on these the features vote
-    compared: int  # of them, those with most votes
+    voted: int  # number of the most similar signatures, whose features vote
+    compared: int  # number of those with most votes, which are compared
 
 
 NEAR_EFFORT: Final = Effort(16, 3)  # Effort where the pose is known roughly by odometry; by trial on development seeds.
@@ -41,7 +41,7 @@ class Expected:
     """Pose in the map that odometry expects for the frame, and its largest errors relative to each keyframe."""
 
     T_map_rect: Array  # (4, 4)
-    error_m: Mapping[int, float]  # by keyframe; a keyframe that is missing is not looked for
+    error_m: Mapping[int, float]  # error by keyframe; a keyframe without an entry is not searched
     error_rad: Mapping[int, float]
     recognised: bool  # places were recognised lately: one that fits well is enough
 
@@ -55,7 +55,7 @@ class PlaceSearch:
         self.ambiguous = 0  # frames that fit two places equally well
         self.refused = 0  # recognitions that odometry contradicts
         self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
-        self._seen: list[Recognition] = []  # by the last search, whether they count or not
+        self._seen: list[Recognition] = []  # recognitions of the last search, whether they count or not
 
     def near(
         self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected

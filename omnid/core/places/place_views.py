@@ -33,10 +33,10 @@ class PlaceSummary:
     features: int
     loops: int
     dropped: int  # keyframes that were dropped because the map was full
-    parts: int  # of keyframes that no link joins; 1: all is one map
+    parts: int  # number of parts that no link joins; 1: all is one map
     path_m: float  # length of the links of odometry
     extent_m: tuple[float, float]  # along x and y
-    tags: int  # that the map knows
+    tags: int  # number of tags in the map
     tags_seen: int
     first_stamp_ns: int
     last_stamp_ns: int

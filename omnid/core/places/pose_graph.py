@@ -58,7 +58,7 @@ class PoseGraphResult:
     squared: Array  # (M,) squared Mahalanobis distances of the edges from the result
     connected: Flags  # (N,) nodes that odometry and accepted loops join to a fixed node
     covariance: Array  # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite: not connected
-    steps: int  # of Gauss-Newton
+    steps: int  # steps of Gauss-Newton
     converged: bool
 
     @property

@@ -19,7 +19,7 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 RATIO: Final = 0.85  # largest distance of a match, as a share of the second best one's (Lowe 2004)
-# A match's azimuth differs at most so much from that of the turn between both views; by trial on development seeds.
+# Largest difference between a match's azimuth and the yaw between both views; by trial on development seeds.
 YAW_WINDOW_RAD: Final = 1.2
 SIGMA_PX: Final = 0.7  # Standard deviation of corners and their disparities; by trial on development seeds.
 THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set; by trial on development seeds
@@ -39,12 +39,12 @@ SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted; of 45 deg
 class Recognition:
     """Pose of a frame in the frame of a keyframe, with the support for it."""
 
-    id: int  # of the keyframe
+    id: int  # id of the keyframe
     T_place_rect: Array  # (4, 4)
     covariance: Array  # (6, 6) [t; r] in the frame's axes
     inliers: int
     matches: int
-    sectors: int  # of SECTORS that hold inliers
+    sectors: int  # number of SECTORS that hold inliers
     by_tag: bool = False  # an AprilTag gives the place, whose corners are the inliers
 
 

@@ -25,7 +25,7 @@ class Relocaliser:
     """Keep at most max_keyframes keyframes, and find the pose of a frame relative to them."""
 
     def __init__(self, model: StereoModel, max_keyframes: int = MAX_KEYFRAMES) -> None:
-        self._model = replace(model, cylinder=model.cylinder.full_turn)  # which the columns of features are of
+        self._model = replace(model, cylinder=model.cylinder.full_turn)  # Columns of features are those of a full turn.
         self._kept: deque[tuple[StereoFrame, Keyframe]] = deque(maxlen=max_keyframes)
         self._features: dict[int, PlaceFeatures] = {}
 

@@ -54,7 +54,7 @@ class TagFinder:
         self._model, self._sizes_m = replace(model, sigma_px=SIGMA_PX), dict(sizes_m)
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        parameters.minMarkerPerimeterRate = 0.01  # of the panorama's width
+        parameters.minMarkerPerimeterRate = 0.01  # by the panorama's width
         family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
         self._detector: Any = cv2.aruco.ArucoDetector(family, parameters)
         self.refused = 0  # tags whose corners fit no tag of their size
@@ -115,7 +115,7 @@ class TagEstimate:
 
     T: Array  # (4, 4) in the frame of the poses it was made of
     covariance: Array
-    views: int  # that agree
+    views: int  # number of views that agree
     rejected: int
 
 

@@ -63,8 +63,8 @@ class FirstPairs:
         self._contradictions = self._rounds = 0
         self._next_ns: float = -float("inf")
         self._unknown_pairs = 0
-        self.finding: StartFinding | None = None  # of the last round
-        self.state = RigState.UNCHECKED  # as decided
+        self.finding: StartFinding | None = None  # finding of the last round
+        self.state = RigState.UNCHECKED  # state that was decided
 
     @property
     def ended(self) -> bool:

@@ -42,9 +42,9 @@ class RigHealth:
         self._mode, self._hint = mode, hint
         self._first = FirstPairs(cylinder)
         self._views = DrivingViews(cylinder, every_s) if every_s else None
-        self._later = RigState.UNCHECKED  # by the views of the drive
+        self._later = RigState.UNCHECKED  # state by the views of the drive
         self._newest_ns = 0
-        self._found: tuple[RigFinding, int] | None = None  # by the views of the drive, with its stamp
+        self._found: tuple[RigFinding, int] | None = None  # finding by the views of the drive, with its stamp
 
     @property
     def state(self) -> RigState:

@@ -51,8 +51,9 @@ LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
 SATURATED_GREY, SATURATED_SHARE = 250, 0.8
-# Of the energy beside the other camera's, in so many columns side by side, because a poster that only one of them sees
-# is all the texture of a column: 0.15 was left in rendered corridors. A drop leaves less.
+# A column is blurred if its energy by the other camera's is below this share of the usual, in BLURRED_COLUMNS columns,
+# because a poster that only one camera sees is all the texture of a column: 0.15 was left in rendered corridors. A drop
+# leaves less.
 BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
 LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise: with less texture no blur is seen.

@@ -22,7 +22,7 @@ class PaddedPanorama:
     image: Image  # (H, W + 2 pad) uint8
     pad_px: int
     noise_grey: float = 1.0  # standard deviation of the noise, grey levels
-    gain: float = 1.0  # by which the image was multiplied because it was dim
+    gain: float = 1.0  # factor that was applied because the image was dim
     turn_px: int = 0  # columns of a full turn, of which this shows a sector; 0: all of them
     first: int = 0  # column of the full turn that is column 0
 

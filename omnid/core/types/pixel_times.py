@@ -19,7 +19,7 @@ def _no_rows() -> NDArray[np.float32]:
 class PixelTimes:
     """Times of exposure of a pair's panorama pixels, s after the stamp of the pair."""
 
-    skew_s: float = 0.0  # of the upper image's first row
+    skew_s: float = 0.0  # time of the upper image's first row relative to the lower one's
     # (H, W) of each pixel after the first image row; (0, 0): at once
     lower_rows_s: NDArray[np.float32] = field(default_factory=_no_rows)
     upper_rows_s: NDArray[np.float32] = field(default_factory=_no_rows)

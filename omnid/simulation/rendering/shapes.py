@@ -15,7 +15,7 @@ Point = tuple[float, float]
 
 
 def painted(rng: Random, kind: str, size_m: Point, px_per_m: float = PX_PER_M) -> Texture:
-    """Return a texture of that kind (textures.PAINTERS) for a surface of so many metres."""
+    """Return a texture of a kind (textures.PAINTERS) for a surface of the given size [m]."""
     size = (max(8, round(size_m[0] * px_per_m)), max(8, round(size_m[1] * px_per_m)))
     return textures.PAINTERS[kind](rng, size, px_per_m)
 
