@@ -1,7 +1,7 @@
 """SQLite files that may be damaged or hostile: opened read-only, with bounds of values and of work.
 
-A page of such a file may be named by many others, so that a small file has any number of rows; a query over it ends
-only by a bound.
+In such a file many pages may refer to the same one, so that a small file has any number of rows, and a query over it
+ends by a bound only.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def open_bounded(path: Path, most_value_bytes: int, *, unchanging: bool = False)
 
 
 def bound_work(database: sqlite3.Connection, most_instructions: int) -> None:
-    """Let the queries from now on take that many instructions in all, to the next block; then sqlite3.Error."""
+    """Bound the instructions of all later queries together, to a multiple of _BLOCK; beyond it sqlite3.Error."""
     left = most_instructions // _BLOCK + 1
 
     def is_too_long() -> bool:

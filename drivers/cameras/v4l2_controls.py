@@ -30,7 +30,7 @@ EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
 MANUAL_EXPOSURE: Final = 1  # enum v4l2_exposure_auto_type, with the next two
 _APERTURE_PRIORITY, _AUTO = 3, 0
 _POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
-_MENU_VALUE: Final = slice(8, 16)  # of struct v4l2_querymenu: the 64-bit integer in the place of the name
+_MENU_VALUE: Final = slice(8, 16)  # bytes of struct v4l2_querymenu: a 64-bit integer in the place of the name
 _NAMES: Final = {
     GAIN: "gain",
     AUTO_GAIN: "automatic gain",
@@ -125,7 +125,8 @@ def read_control(fd: int, control_id: int) -> int:
 def _automatic_modes(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
     """Yield (control id, value) of the automatic modes; a fixed value switches its automatic mode off."""
     if settings.auto_exposure != "keep" or settings.exposure_us:
-        automatic = settings.auto_exposure == "on" or settings.is_regulated  # until the first request of a run
+        # An exposure that a run regulates is automatic until the run sends its first value.
+        automatic = settings.auto_exposure == "on" or settings.is_regulated
         if AUTO_EXPOSURE in offered or not settings.is_regulated:
             yield AUTO_EXPOSURE, _automatic_exposure(offered) if automatic else MANUAL_EXPOSURE
         if EXPOSURE_MAY_SLOW in offered:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from drivers.logs.mcap_info import LogInfo
     from drivers.logs.mcap_recovery import Recovery
 
-MAX_COLUMN = 60  # characters of a topic or a type
-MAX_LINE = 5000  # characters of a line, which may contain the path of a file
+MAX_COLUMN = 60  # Most characters of a topic or a type, so that a line of the table fits a terminal.
+MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -69,7 +69,7 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def run_recover(args: argparse.Namespace) -> int:
-    """Recover a log; of one that is whole a copy is kept only where it is asked for."""
+    """Recover a log. A whole log is copied only if --output is given."""
     from drivers.logs.mcap_recovery import recover
 
     out = args.output or _default_output(args.log)

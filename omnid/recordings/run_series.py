@@ -34,7 +34,7 @@ class RunSeries:
     """Poses, states and commands of a recorded run."""
 
     path: Path
-    topic: str  # of the poses
+    topic: str  # topic of the poses
     poses: Series  # x y z [m], qx qy qz qw: T_odom_base
     states: Series  # index in STATES and reset counter, a row for each reported change
     drive: Series  # commands to the wheels, m/s and rad/s
@@ -43,7 +43,7 @@ class RunSeries:
 
 
 def read_run_series(path: Path, topic: str | None = None) -> RunSeries:
-    """Read a recorded run; topic: of the poses, see choose_odometry_topic.
+    """Read a recorded run; topic: that of the poses, see choose_odometry_topic.
 
     Raise DriverError where there is no log, OmnidError where it has no poses or more than MAX_ROWS rows.
     """

@@ -54,15 +54,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """State of a drive when a pair of images is due; the truth is for scripts that watch, not for planners."""
+    """State of a drive when a pair of images is due. Scripts that watch use the true pose, planners must not."""
 
     time_s: float  # since the start
     T_world_base: Array  # (4, 4) true
     controller: ControllerState
-    odometry: OdometryUpdate | None  # the newest
-    T_odom_base: Array  # (4, 4) of it; the identity without one
-    navigation: NavigationUpdate | None  # the newest
-    place: PlaceUpdate | None  # the newest
+    odometry: OdometryUpdate | None  # newest pose of odometry
+    T_odom_base: Array  # (4, 4) the same pose as a transform; the identity before the first one
+    navigation: NavigationUpdate | None  # newest update of the navigation
+    place: PlaceUpdate | None  # newest pose in the map
 
 
 # A setpoint of the operator, a request to arm, a stop, the end of the run, or a request to the navigation.
@@ -87,11 +87,11 @@ class Fault:
 class SimulatedRun:
     """The truth and the estimates of a drive; odom is the frame of the base at the first pair."""
 
-    stamps_ns: NDArray[np.int64]  # (N,) of the poses
+    stamps_ns: NDArray[np.int64]  # (N,) stamps of the poses
     T_world_base: Array  # (N, 4, 4) true
     T_odom_base: Array  # (N, 4, 4) estimated
-    states: tuple[str, ...]  # of the poses
-    slipping: NDArray[np.bool_]  # (N,) True where the daemon says that the wheels slip
+    states: tuple[str, ...]  # tracking states of the poses
+    slipping: NDArray[np.bool_]  # (N,) True where the daemon reports that the wheels slip
     ticks: tuple[Tick, ...]
     lines: tuple[tuple[float, str], ...]  # time [s] and text: what the controller reported
     rings: tuple[ObstacleRing, ...]

@@ -1,4 +1,4 @@
-"""The kinds of messages for browsers. Each has a version; a browser is sent the newest one that it has not seen."""
+"""Channels to browsers, one for each kind of message. A browser is sent the newest version that it has not seen."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, Protocol
 from omnid.core.mapping.thinned_path import ThinnedPath
 
 MOST_POINTS: Final = 4000  # Most points of the path.
-_FINEST_M: Final = 0.02
+_FINEST_M: Final = 0.02  # Points of the path are at least this far apart, so that a robot at rest adds none.
 _LARGEST_M: Final = 1e6  # Largest coordinate that is drawn.
 _GAP_M: Final = 1.0  # A larger distance between two poses is drawn as a gap.
 
@@ -65,7 +65,7 @@ class LivePath:
 
     def __init__(self) -> None:
         self.name, self.version = "path", 0
-        self._first = 0  # version of the points before the first one; those who saw less are sent all
+        self._first = 0  # Version before the first point; a browser that has seen an older one is sent all points.
         self._path = ThinnedPath(MOST_POINTS, _FINEST_M, _is_step, _with_gap)
 
     def add(self, x_m: float, y_m: float, gap: bool = False) -> bool:

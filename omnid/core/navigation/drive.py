@@ -29,20 +29,20 @@ class Drive:
 
     task: str  # description in words
     frame: NavigationFrame
-    paths: list[DrivePath]  # one after the other
+    paths: list[DrivePath]  # paths that are driven one after the other
     follower: Follower
     resets: int
     command_ns: int = 0  # stamp of the request
-    paused: str = ""  # the reason; empty: it is not paused
-    waits: dict[NavigationState, float] = field(default_factory=dict)  # s, by what is waited for
-    unlocalised_m: float = 0.0  # way since the pose in the map was known
-    nearest_m: float = math.inf  # way left, at the last progress
+    paused: str = ""  # reason of the pause; empty: it is not paused
+    waits: dict[NavigationState, float] = field(default_factory=dict)  # durations [s] of the waits by their reason
+    unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
+    nearest_m: float = math.inf  # length of the path that was left at the last progress
     heading_rad: float = 0.0  # heading at the last progress
-    stuck_s: float = 0.0  # since then
+    stuck_s: float = 0.0  # time since the last progress
     last_xy: Array | None = None  # last position in odom
     giving_way: GivingWay | None = None  # None unless the base gives way now
-    gave_way: int = 0  # times, at the block before which it was
-    gave_way_m: float = math.inf  # way left there
+    gave_way: int = 0  # number of times that the base gave way at the last block
+    gave_way_m: float = math.inf  # length of the path that was left at that block
 
     def path_ahead(self, now: Situation, way_m: float) -> Array:
         """Return the path (N, 2) ahead, in odom."""
@@ -59,7 +59,7 @@ class Drive:
         return Setpoint(setpoint.velocity_mps, wrap_angle(setpoint.heading_rad - turned_rad))
 
     def stands_since_s(self, pose: Array, left_m: float, dt_s: float) -> float:
-        """Return for how long the base has neither come nearer to the end nor turned, dt_s after the last call."""
+        """Return the time since the last progress, which is a shorter way left or a turn; dt_s: since the last call."""
         turned_rad = abs(wrap_angle(float(pose[2]) - self.heading_rad))
         if left_m < self.nearest_m - PROGRESS_M or turned_rad > PROGRESS_RAD:
             self.nearest_m, self.heading_rad, self.stuck_s = left_m, float(pose[2]), 0.0

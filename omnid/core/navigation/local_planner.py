@@ -62,9 +62,9 @@ CROSSES: Final = "somebody or something crosses the path"
 class Detour(NamedTuple):
     """Answer of the planner."""
 
-    setpoint: Setpoint | None  # None: there is no way
-    avoiding: bool
-    reason: str = ""  # why it does not follow the path at the speed that was wanted
+    setpoint: Setpoint | None  # None: the base waits, because no way is free
+    avoiding: bool  # True while the base is off the path, around an obstacle
+    reason: str = ""  # why the base does not follow the path at the wanted speed
 
 
 class LocalPlanner:
@@ -109,14 +109,16 @@ class LocalPlanner:
         moving: Forecast | None = None,
         speed_mps: float = 0.0,
     ) -> Detour:
-        """Return the motion: that of the path where it is free.
+        """Return the motion: the wanted one where the path is free, else one around the obstacles, or none.
 
         pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2), with those of
-        `moving` among them. wanted: the motion on the path. leg_left_m: way to the next corner: obstacles behind it
-        does not matter yet. speed_mps: of the base, as measured.
+        `moving` among them. wanted: the motion on the path. leg_left_m: distance to the next corner; obstacles beyond
+        it do not matter yet. speed_mps: measured speed of the base.
         """
+        # 1. Without moving obstacles, or without a motion forwards, only obstacles at rest count.
         if moving is None or not (self._avoiding or wanted.velocity_mps > 0):
             return self._around_standing(pose, path, obstacles, wanted, leg_left_m, None)
+        # 2. The share of the speed at which the base gives way to moving obstacles.
         pursuit = self._settings.pursuit
         pace = Pace(
             max(speed_mps, 0.0),
@@ -126,7 +128,7 @@ class LocalPlanner:
             self._standing_room_m,
         )
         share, coming = yielding(path, leg_left_m, moving, pace)
-        # The base goes around those that come to where it would wait.
+        # 3. The base goes around those that would reach it where it waits.
         outlines = moving.outlines(coming, pose[:2], SHARE * pursuit.velocity_mps)
         obstacles = np.vstack([moving.others(obstacles), outlines])
         detour = self._around_standing(pose, path, obstacles, wanted, leg_left_m, moving)
@@ -143,7 +145,7 @@ class LocalPlanner:
         if not len(obstacles) or not (self._avoiding or wanted.velocity_mps > 0):
             self._avoiding = self._avoiding and bool(len(obstacles))
             return Detour(wanted, False)
-        # 1. Where the path, and the way to it, comes too near to an obstacle.
+        # 1. The first point of the path that is too near to an obstacle.
         ways = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
         near = ways <= min(AHEAD_M, leg_left_m + CELL_M)
         room_m = _distances(path, obstacles)
@@ -160,7 +162,7 @@ class LocalPlanner:
             if motion is not None:
                 self._avoiding = True
                 return Detour(motion, True)
-        # 3. No way: up to the obstacle, and wait.
+        # 3. Without a way around it, drive up to the obstacle and wait.
         left_m = first_m - self._front_m - BEFORE_M
         if self._avoiding or left_m <= 0:
             return Detour(None, self._avoiding, STANDS)
@@ -169,7 +171,8 @@ class LocalPlanner:
     def _around(
         self, pose: Array, path: Array, obstacles: Array, goal: Array, moving: Forecast | None
     ) -> Setpoint | None:
-        """Return the best arc; None without one."""
+        """Return the arc of least cost to a goal (2,) on the path; None where none is free."""
+        # 1. Cells that are free: far enough from obstacles, or as far as the base is now, and within the corridor.
         settings = self._settings
         corner = pose[:2] - HALF_CELLS * CELL_M
         room_m = grid_distances(obstacles, corner)
@@ -177,12 +180,13 @@ class LocalPlanner:
         least_m = min(self._half_m + 0.5 * settings.clearance_m, own_m)
         is_free = (room_m > least_m) & (grid_distances(path, corner) <= settings.corridor_m)
         is_free[HALF_CELLS, HALF_CELLS] = True
-        # Ways through narrow places count as longer ones.
+        # 2. The length of the way from each cell to the goal, where narrow places count as longer.
         wide_m = self._half_m + 3 * settings.clearance_m
         narrow = 1.0 + NARROW * np.clip((wide_m - room_m) / wide_m, 0, 1)
         left_m = wave_front(self._edges, is_free, narrow, to_cells(goal[None], corner)[0])
         if left_m is None or left_m[HALF_CELLS, HALF_CELLS] >= FAR_M:
             return None
+        # 3. The arcs that keep clear of obstacles and let moving ones pass.
         c, s = math.cos(pose[2]), math.sin(pose[2])
         places = pose[:2] + np.stack([c * self._arc_x - s * self._arc_y, s * self._arc_x + c * self._arc_y], axis=-1)
         cells = to_cells(places, corner)
@@ -192,7 +196,7 @@ class LocalPlanner:
         is_open = self._keeps_clear(pose, obstacles) & (way_m < FAR_M) & is_free[rows, columns]
         if moving is not None:
             is_open &= self._lets_pass(places, moving)
-        # The heading at the end against the way down the distances.
+        # 4. The cost of an arc: way left at its end, difference of its heading from the way, narrowness, backing up.
         down = descent(left_m, rows, columns)
         off = np.abs(np.remainder(pose[2] + self._turned[:, -1] - down + np.pi, 2 * np.pi) - np.pi)
         cost = way_m + HEADING_M_PER_RAD * off + BACK_WEIGHT_M * (self._v < 0)
@@ -216,7 +220,7 @@ class LocalPlanner:
             & (along > -reach[:, 1, None, None] - MARGIN_M)
             & (aside < self._half_m + MARGIN_M)
         )
-        # What is within that room already: it must not come nearer to the outline.
+        # An obstacle that is within that room already must not come nearer to the outline.
         gap_m = np.hypot(
             np.maximum(np.maximum(along - self._turning[0], -self._turning[1] - along), 0.0),
             np.maximum(aside - self._width_m, 0.0),
@@ -226,7 +230,7 @@ class LocalPlanner:
         return np.asarray(~hits.any(axis=1))
 
     def _lets_pass(self, places: Array, moving: Forecast) -> NDArray[np.bool_]:
-        """Return which arcs, with their places (A, T, 2), meet none of what moves, or lead away from it."""
+        """Return which arcs, with places (A, T, 2) at T times, meet no moving obstacle, or lead away from it."""
         others, radii = moving.at(np.linspace(0.0, ARC_S, ARC_STEPS + 1))
         gap_m = np.linalg.norm(others[:, None] - places, axis=-1) - radii[:, None] - self._standing_room_m
         least_m = np.minimum(0.0, gap_m[..., :1]) - NEARER_M
@@ -234,7 +238,7 @@ class LocalPlanner:
 
 
 def room_ahead(pose: Array, speed_mps: float, obstacles: Array) -> float:
-    """Return the distance from a pose (3,) to the nearest obstacle (N, 2) that is not behind, as the base drives."""
+    """Return the distance from a pose (3,) to the nearest obstacle (N, 2) that is not behind the moving base."""
     if not len(obstacles):
         return math.inf
     sign = -1.0 if speed_mps < 0 else 1.0
@@ -258,13 +262,16 @@ def _distances(points: Array, obstacles: Array) -> Array:
 
 
 def _gets_farther(room_m: Array) -> bool:
-    """True if a path leads away from the obstacle that is too near at its beginning."""
+    """True if the distances (N,) from the obstacles grow along the first points of a path."""
     k = min(len(room_m) - 1, 6)
     return bool((np.diff(room_m[: k + 1]) >= -1e-9).all())
 
 
 def _rejoin(ways: Array, is_blocked: NDArray[np.bool_], first_m: float) -> int | None:
-    """Return the point of the path behind the obstacle at which REJOIN_M are free; None without one."""
+    """Return the index of a point behind the obstacle about which REJOIN_M of the path are free; None without one.
+
+    ways: (N,) distances along the path. first_m: where the obstacle begins.
+    """
     behind = (ways > first_m) & ~is_blocked & (ways < REJOIN_WITHIN_M)
     span = max(1, round(REJOIN_M / CELL_M))
     for k in np.flatnonzero(behind):

@@ -28,11 +28,11 @@ FARTHEST_M: Final = 1e6  # Largest coordinate, so that nonsense is refused: larg
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathLeg:
-    """A smooth piece of a path, driven without a halt."""
+    """A smooth piece of a path, driven without a halt. A position on it is given by the arc length s from its start."""
 
-    xy: Array  # (N, 2) m, N >= 2
-    s: Array  # (N,) m from its start
-    heading: Array  # (N,) rad, along the way, not wrapped
+    xy: Array  # (N, 2) positions [m], N >= 2
+    s: Array  # (N,) arc length from the start [m]
+    heading: Array  # (N,) direction of the path [rad], not wrapped
     curvature: Array  # (N,) 1/m
     speed: Array  # (N,) highest speed, m/s
     backwards: bool = False  # the base drives with its back ahead
@@ -43,7 +43,7 @@ class PathLeg:
         return float(self.s[-1])
 
     def project(self, position: ArrayLike, around_m: float) -> float:
-        """Return the way s of the nearest point of the path to a position (2,), searched around a known way [m].
+        """Return the arc length of the point nearest to a position (2,), searched around a known arc length [m].
 
         Past the end it continues along the last heading, so that it gives the distance past the end.
         """
@@ -58,14 +58,14 @@ class PathLeg:
         return float(self.s[k] + max(-STEP_M, min(limit_m, along_m)))
 
     def at(self, s_m: float) -> Array:
-        """Return x, y, heading (3,) at a way; beyond the ends the path continues straight."""
+        """Return x, y, heading (3,) at an arc length; beyond the ends the path continues straight."""
         inside = min(max(s_m, 0.0), self.length_m)
         x, y, heading = (float(np.interp(inside, self.s, v)) for v in (self.xy[:, 0], self.xy[:, 1], self.heading))
         beyond = s_m - inside
         return np.array([x + beyond * math.cos(heading), y + beyond * math.sin(heading), heading])
 
     def offset_m(self, position: ArrayLike, s_m: float) -> float:
-        """Return how far a position (2,) is to the left of the path at a way, m."""
+        """Return the distance [m] of a position (2,) to the left of the path at an arc length."""
         x, y, heading = self.at(s_m)
         px, py = np.asarray(position, np.float64)[:2]
         return float(math.cos(heading) * (py - y) - math.sin(heading) * (px - x))
@@ -76,7 +76,7 @@ class PathLeg:
         return float(np.abs(self.curvature[within]).max(initial=0.0))
 
     def speed_at(self, s_m: float) -> float:
-        """Return the highest speed at a way, m/s."""
+        """Return the highest speed [m/s] at an arc length."""
         return float(self.speed[min(len(self.s) - 1, int(np.searchsorted(self.s, s_m)))])
 
 
@@ -85,7 +85,7 @@ class DrivePath:
     """Legs in their order, and the heading of the base at the end."""
 
     legs: tuple[PathLeg, ...]
-    final_heading_rad: float | None = None  # None: as it comes
+    final_heading_rad: float | None = None  # None: any heading
 
     @property
     def length_m(self) -> float:
@@ -136,7 +136,7 @@ def straight_leg(start: ArrayLike, goal: ArrayLike, *, backwards: bool = False) 
 
 
 def _spaced(xy: Array, back: NDArray[np.bool_]) -> list[int]:
-    """Return the points that are kept: apart from each other, the last one always, and where the direction changes."""
+    """Return the indices of points at least SHORTEST_M apart; the last point is kept in any case."""
     kept = [0]
     for k in range(1, len(xy)):
         if math.dist(xy[k], xy[kept[-1]]) >= SHORTEST_M:
@@ -157,7 +157,7 @@ def _corners(xy: Array, back: NDArray[np.bool_]) -> list[int]:
 
 
 def _leg(xy: Array, speeds: Array, backwards: bool) -> PathLeg:
-    """Return the leg through points, at equal distances."""
+    """Return the leg through points (N, 2) with highest speeds (N,), sampled at equal distances."""
     lengths = np.hypot(*np.diff(xy, axis=0).T)
     ways = np.concatenate([[0.0], np.cumsum(lengths)])
     count = max(2, math.ceil(ways[-1] / STEP_M) + 1)

@@ -21,8 +21,8 @@ from omnid.core.odometry.sensed_motion import RateHistory, SensedMotion
 
 Array = NDArray[np.float64]
 
-# States: the worth of a wheel's metre and radian, seconds to be added to stamps, and rad/s that the gyro reads at
-# rest. Standard deviations before anything is known, and of their random walks over one second.
+# States: scales of the wheels' distance and turn, offsets [s] that are added to the stamps of wheels and gyro, and bias
+# (3,) [rad/s] of the gyro; their start, its standard deviations, and those of their random walks over one second.
 DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
 START: Final = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 START_SIGMA: Final = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
@@ -31,7 +31,7 @@ LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])  # The same af
 # Errors of a step that are independent of those of other steps, by sigma.
 DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02  # Shares of the wheels' distance and turn: roughness, slack.
 WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # Least errors of the wheels: steps of the encoders.
-SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4  # across, by distance and by turn of wheels that cannot move sideways
+SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4  # Lateral and vertical errors: wheels roll forwards on a plane.
 GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not measured.
 TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
 CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
@@ -64,7 +64,7 @@ class MotionSensors:
         self._zero_ns: int | None = None  # stamp of time 0
         self._outliers = {WheelSample: 0, GyroSample: 0}
         self.slips = self.refused = self.steps = 0
-        self.is_slipping = False
+        self.is_slipping = False  # True if the wheels slipped in the last steps that the cameras saw
         self._disagreements = 0  # consecutive steps in which the turns of wheels and gyro differ
         self._noise_factors = {DISTANCE: 1.0, TURN: 1.0}
 
@@ -103,6 +103,7 @@ class MotionSensors:
         Wheels that slipped in the last two steps that the cameras saw are left out, and so are those whose turn differs
         from that of the gyro twice in a row.
         """
+        # 1. What the sensors measured in this time; the wheels only while they can be trusted.
         start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
         dt_s = end_s - start_s
         trusted = self.wheels_are_sane and not self.is_slipping
@@ -110,13 +111,17 @@ class MotionSensors:
         gyro = self._of_gyro(start_s, end_s)
         if wheels is None and gyro is None:
             return None
+        # 2. At rest the motion is zero.
         if wheels is not None and self._stands(start_s, end_s):
             return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
+        # 3. Wheels whose turn differs from that of the gyro slip.
         disagree = wheels is not None and gyro is not None and self._disagree(wheels[0], gyro[0], dt_s)
         self._disagreements = self._disagreements + 1 if disagree else 0
         if self._disagreements >= SLIPPING:
             wheels = None
             self.slips += 1
+        # 4. The twist (6,) of the base with independent errors (6,) and slopes (6, 7) by the states. The rotation is
+        # that of the gyro where there is one.
         twist, sigma, slopes = np.zeros(6), np.repeat([UNKNOWN_M, UNKNOWN_RAD], 3), np.zeros((6, 7))
         if wheels is not None:
             distance, turn = wheels[0]
@@ -153,14 +158,17 @@ class MotionSensors:
         return bool(difference**2 > OUTLIER_SIGMA**2 * variance)
 
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
-        """Learn from a step of the rectified frame that the cameras measured, with its covariance (6, 6)."""
+        """Estimate the states by a step of the rectified frame that the cameras measured, with covariance (6, 6)."""
+        # 1. The step and its variances in the frame of the base.
         start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
         dt_s = end_s - start_s
         seen = self._to_base @ se3.log(T_prev_curr)
         variance = np.diag(self._to_base @ covariance @ self._to_base.T)
         variance = variance + np.repeat([CAMERA_M**2, CAMERA_RAD**2], 3)
+        # 2. Predict the states: they change by random walks.
         self._filter.predict(F=np.eye(len(START)), Q=np.diag(WALK_SIGMA**2 * dt_s))
         self.steps += 1
+        # 3. Update them by the differences between cameras and sensors.
         wheels, gyro = self._of_wheels(start_s, end_s), self._of_gyro(start_s, end_s)
         if wheels is not None:
             self._learn_wheels(wheels, seen, variance)
@@ -221,7 +229,7 @@ class MotionSensors:
         return True
 
     def _count(self, sensor: type[MotionSample], agrees: bool, states: NDArray[np.int64]) -> None:
-        """Forget what is known of a sensor that has not agreed for long: its settings may be wrong."""
+        """Count the outliers of a sensor; after MOST_OUTLIERS its states start again, as its settings may be wrong."""
         self._outliers[sensor] = 0 if agrees else self._outliers[sensor] + 1
         if self._outliers[sensor] > MOST_OUTLIERS:
             self._outliers[sensor] = 0
@@ -229,15 +237,17 @@ class MotionSensors:
             self._filter.P[states, states] = LOST_SIGMA[states] ** 2
 
     def _of_wheels(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
+        """Return distance and turn of the wheels in a time, and the change of their rates; see RateHistory.integral."""
         offset_s = self.values[WHEEL_OFFSET]
         return self._wheels.integral(start_s - offset_s, end_s - offset_s)
 
     def _of_gyro(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
+        """Return the rotation vector (3,) of the gyro in a time, and the change of its rates (3,)."""
         offset_s = self.values[GYRO_OFFSET]
         return self._gyro.integral(start_s - offset_s, end_s - offset_s)
 
     def _stands(self, start_s: float, end_s: float) -> bool:
-        """True if the wheels read nothing in a step and shortly before, and the gyro, if there is one, too."""
+        """True if wheels, and the gyro if there is one, are at rest in a step and STILL_BEFORE_S before it."""
         wheels = self._wheels.largest(start_s - STILL_BEFORE_S, end_s, np.zeros(2))
         gyro = self._gyro.largest(start_s - STILL_BEFORE_S, end_s, self.values[BIAS])
         if wheels is None or not (wheels < STILL_WHEELS).all():
