@@ -1,4 +1,4 @@
-"""Settings that one command uses and another ignores: a warning, or an error where somebody asked for them."""
+"""Settings that one command uses and another ignores: a warning, or an error where they were asked for."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def gyro_packet(rates_radps: tuple[float, float, float]) -> bytes:
 
 
 class SimulatedWitMotion:
-    """Sends measurements at a rate in real time, whether somebody reads them or not."""
+    """Sends measurements at a rate in real time, whether they are read or not."""
 
     def __init__(self, rates_radps: Callable[[], tuple[float, float, float]], rate_hz: float) -> None:
         """Open the pty; `port` is the path for the driver. rates_radps: called for each measurement."""

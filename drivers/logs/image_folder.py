@@ -200,7 +200,7 @@ def _stamp_lines(folder: Path) -> list[str] | None:
 
 
 def parse_stamp(text: str) -> int | None:
-    """Return a stamp [ns], None where the text is none; exact, because a float holds no nanoseconds since 1970."""
+    """Return a stamp [ns], None for another text; exact, because a float holds no nanoseconds since 1970."""
     if text.isascii() and text.isdigit() and len(text) >= _NS_DIGITS:
         stamp_ns = int(text) if len(text) <= len(str(_MAX_STAMP_NS)) else _MAX_STAMP_NS
     elif match := _SECONDS.fullmatch(text):

@@ -26,7 +26,7 @@ _PART: Final = re.compile(r"(.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?_(\d{1,9}
 
 
 def open_image_log(path: str | os.PathLike[str]) -> ImageLog:
-    """Open a log of images; raise DriverError, which says what is supported, where there is none.
+    """Open a log of images. Raise DriverError, which names the supported kinds, for anything else.
 
     path: an MCAP file, an SQLite bag of ROS 2 (.db3), a bag of ROS 1 (.bag), a folder with one of these or with the
     parts of one, or a folder with a folder of images for each camera (see `ImageFolder`).

@@ -20,7 +20,7 @@ _SCAN_MESSAGES = 2000
 
 
 class McapImageLog:
-    """An ImageLog of one MCAP file; raises DriverError where the path is none."""
+    """An ImageLog of one MCAP file; raises DriverError where the path is not one."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._file = LogFile(path)

@@ -47,7 +47,7 @@ class CameraCoverage:
         return total
 
     def missing(self) -> list[str]:
-        """Return what no board covers yet, in words for the person who holds it."""
+        """Return a text about what no board covers yet, for the person who holds the board."""
         counts = self.counts()
         hours = [int(hour) or HOURS for hour in np.flatnonzero(counts.sum(axis=0) == 0)]
         found = [f"no board at {_listed(sorted(hours))} o'clock"] if hours else []

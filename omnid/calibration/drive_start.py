@@ -53,7 +53,7 @@ def straightened(log: Path, parameters: RigParameters, topics: Topics, config: C
             f"calibrate drive: {finding.summary}; are both cameras the ones of this rig, not exchanged, "
             "and is there enough to see?"
         )
-    # Errors of a centre have the effect of a shifted viewpoint, which is none: only the rotation is a start.
+    # Errors of a centre have the effect of a shifted viewpoint, so only the rotation is a start.
     steps = parameters.transform_steps(apply_drift(rig, replace(finding.drift, shift=np.zeros(2))))
     prior = prior_information(parameters, rig)
     if float(np.median([abs(pair.skew_s) for pair in pairs])) > SYNCHRONOUS_S:

@@ -43,7 +43,7 @@ class HeightCalibration:
         )
 
     def contradiction(self, ruler_m: float) -> str:
-        """Return in words that a height by ruler is another one; empty where they agree."""
+        """Return a warning where a height by ruler differs; empty where both agree."""
         limit_m = AGREED_SIGMAS * math.hypot(self.floor.sigma_m, RULER_SIGMA_M)
         if abs(ruler_m - self.floor.height_m) <= limit_m:
             return ""

@@ -116,7 +116,7 @@ def run_build(args: argparse.Namespace) -> int:
 
 
 def run_info(args: argparse.Namespace) -> int:
-    """Print the content of each map; return 2 if one is none."""
+    """Print the content of each map; return 2 if a file is not a map."""
     from omnid.core.places.place_views import summary
     from omnid.errors import OmnidError
     from omnid.formats.place_file import read_places

@@ -6,7 +6,7 @@ e_i = z_i + h - a x_i - b y_i and its noise sigma_i, a point within a span S of 
     p N(e_i; sigma_i) + (1 - p) ((1 - FALSE) Phi(e_i / sigma_i) + FALSE) / S
 
 A part p lies on the floor, the others above it, evenly over S (walls, furniture), and few are false. So little may
-lie below the floor: a table is none. The prior of a and b is 0 +- 1 degree. h is searched on a grid, with S = h;
+lie below the floor: a table is not a floor. The prior of a and b is 0 +- 1 degree. h is searched on a grid, with S = h;
 then expectation maximisation (Dempster, Laird, Rubin 1977) finds h, a, b, p and the noise's scale, with S = SPAN_M.
 The evidence for a floor is the log of the ratio of the likelihoods with it (p) and without (p = 0). Points of one
 surface share their errors: POINTS_ALIKE of them count as one. The evidence of pairs adds up.

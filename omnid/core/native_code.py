@@ -146,7 +146,7 @@ def _is_wrong(builder: Any, array: Any, argument: Argument, array_type: Any) -> 
     """Return a flag: no array of numpy, or another one than the signature says."""
     dtype = np.dtype(argument.kind)
     flags = ALIGNED | CONTIGUOUS * argument.is_contiguous | WRITABLE * argument.is_written
-    # 1. What is no array has none of the fields below, so it ends here.
+    # 1. Another object has none of the fields below, so it is refused first.
     is_array = builder.icmp_unsigned("==", _field(builder, array, TYPE_AT, ADDRESS), array_type)
     before = builder.basic_block
     with builder.if_then(is_array):

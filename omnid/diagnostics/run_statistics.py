@@ -61,7 +61,7 @@ class RunCounters:
 
     @property
     def no_pose(self) -> bool:
-        """True if not one pose was measured: there is none, or all are predictions."""
+        """True if no pose was measured: there are none, or all are predictions."""
         return self.poses == self.states[TrackingState.LOST]
 
     @classmethod

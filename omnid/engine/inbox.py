@@ -10,7 +10,7 @@ from collections import deque
 from omnid.engine.flow import END, LOSSLESS, NEWEST, Policy
 from omnid.engine.telemetry import StageStats
 
-NOTABLE_S = 1e-3  # shorter work after a result was passed on is none
+NOTABLE_S = 1e-3  # shorter work after a result was passed on is ignored
 LASTING = 0.9  # share of an earlier longest time that still counts after each message
 EARLY = 0.75  # of the time expected for that work: to come late would cost the reader more than an older message does
 

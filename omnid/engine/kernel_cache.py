@@ -20,7 +20,7 @@ _state = {"ready": False}
 
 
 def prepare_kernels(report: Report = log_unlimited) -> None:
-    """Compile all functions, or read them from the disk; report what takes long, and what is not kept.
+    """Compile all functions, or read them from the disk; report compilations that take long, and code that is not kept.
 
     The second call and later ones do nothing. Raises OmnidError where the system allows no code that is made at run
     time.

@@ -1,7 +1,7 @@
 """Commands and environments of the Python programs that omnid starts.
 
 `python -m NAME` and `python -c TEXT` look for modules in the current folder first, where a `numpy.py` may lie that
-somebody else wrote. Each program is therefore started with -P, which leaves that folder out (Python 3.11 and later).
+another user wrote. Each program is therefore started with -P, which leaves that folder out (Python 3.11 and later).
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def thread_times(pid: int = 0) -> dict[int, ThreadTime]:
     """Return the times of the threads of a process (0: this one), by their id; empty without /proc.
 
     The main thread is called MAIN, and threads that have its name LIBRARIES: a new thread has the name of the one that
-    started it, until somebody names it.
+    started it, until the program names it.
     """
     times: dict[int, ThreadTime] = {}
     main = pid or os.getpid()

@@ -15,7 +15,7 @@ from typing import Final
 
 from omnid.errors import OmnidError
 
-# The temporary file is new, and no link that somebody has put there.
+# The temporary file is new, and not a link that another program has made.
 _NEW: Final = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 

@@ -146,7 +146,7 @@ def parts(data: ReportData, clock: Clock) -> list[str]:
 
 
 def rounded(text: str) -> str:
-    """Return a number with fewer digits; "" where the text is none."""
+    """Return a number with fewer digits; "" for a text that is no number."""
     value = status_names.number(text)
     if value is None:
         return ""

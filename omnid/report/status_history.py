@@ -112,7 +112,7 @@ class StatusHistory:
             self._events.add(Event(t_s, t_s, ERROR, "state", "odometry was reset, with an unknown gap"))
 
     def _add_message(self, status: DiagnosticStatus, t_s: float) -> None:
-        """Add an event where the message of a part changes; a change of digits only is none."""
+        """Add an event where the message of a part changes; a change of digits only is not an event."""
         message = without_digits(status.message)
         before, self._messages[status.name] = self._messages.get(status.name), message
         if message and message != before and (before is not None or status.level > 0):

@@ -75,7 +75,7 @@ class RunParts:
     navigation: NavigationParts | None = None
     load: Load = full_load
     map_every_s: float = 0.0  # between two maps; 0: one, at the end
-    map_is_read: Callable[[], bool] = always  # somebody takes the maps now
+    map_is_read: Callable[[], bool] = always  # True while the map has a reader
 
 
 class RequestSource(Protocol):

@@ -1,6 +1,6 @@
 """Files of a system below a folder: no symbolic link is followed there, so nothing is written elsewhere.
 
-This runs as root, and DIR of `--root DIR` may hold a system that somebody else has made.
+This runs as root, and DIR of `--root DIR` may hold a system from another source.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MODE: Final = 0o644
 
 
 def text_below(root: Path, name: str) -> str | None:
-    """Return the text of root/name, None where there is none; raise OmnidError for a link or what is no file."""
+    """Return the text of root/name, None where there is none; raise OmnidError for a link, a folder or a device."""
     folder = root
     for part in PurePosixPath(name).parts:
         folder /= part

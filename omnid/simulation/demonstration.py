@@ -54,7 +54,7 @@ def oval() -> Array:
 
 
 class TeachAndRepeat:
-    """The script: somebody drives an oval while the route is taught; then it is repeated. `show` takes lines."""
+    """The script: an operator drives an oval while the route is taught, then it is repeated. `show` takes lines."""
 
     def __init__(self, show: Callable[[str], None]) -> None:
         self._show = show

@@ -75,7 +75,7 @@ class Walkers:
                 self._started_s[number] = time_s
 
     def _polite(self, number: int, started_s: float, passed_s: float, robot: Point) -> float:
-        """Return when somebody started who waits for the robot: later by the step, while waiting."""
+        """Return the start time of a person: for one who waits for the robot it is delayed by the step."""
         person, walked_s = self._people[number], self.time_s - started_s
         before_m, now_m = (math.dist(person.place(at_s)[:2], robot) for at_s in (walked_s - passed_s, walked_s))
         if now_m >= before_m or now_m >= person.waits_within_m:

@@ -124,7 +124,7 @@ class RealtimeRobot:
         return self._rendered.frame(camera, seq, stamp_ns, T_world_base @ self.rig.T_base_rig, people)
 
     def walkers(self) -> Walkers:
-        """Return the people at the start; each camera has its own, who walk alike."""
+        """Return the people at the start; each camera has its own copies, which walk in the same way."""
         return Walkers(self._world.people)
 
     def _keep(self, stamp_ns: int, pose: Pose, people: Walkers) -> None:

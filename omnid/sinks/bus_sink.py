@@ -52,7 +52,7 @@ def _attachment(odometry: OdometryUpdate) -> PoseAttachment:
 
 
 class PanoramaSink:
-    """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second, while somebody subscribes."""
+    """Publishes the panorama of the lower camera as JPEG, at most rate_hz times a second, while it has a subscriber."""
 
     def __init__(self, bus: Bus, rate_hz: float, offset_ns: int = 0) -> None:
         """offset_ns: the Encoder's."""

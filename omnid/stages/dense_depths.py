@@ -9,7 +9,7 @@ from omnid.core.odometry.exposure_times import Exposure
 from omnid.engine.one_at_a_time import OneAtATime
 from omnid.messages import DensePoints, Panoramas, StereoDepth
 
-# Computes the dense depth of panoramas for a motion during their exposures; None: unknown, or there is none.
+# Computes the dense depth of panoramas for a motion during their exposures; None: unknown, or none is needed.
 Compute = Callable[[Panoramas, Exposure | None], DensePoints]
 
 

@@ -36,7 +36,7 @@ class DenseStereo:
     def compute(self, panoramas: Panoramas, exposure: Exposure | None = None) -> DensePoints:
         """Return disparities and their points in the rig frame, at the stamp of the pair.
 
-        exposure: the motion during the exposures; None: unknown, or there is none. May be called in several threads at
+        exposure: the motion during the exposures; None: unknown, or none is needed. May be called in several threads at
         the same time.
         """
         correction = None if exposure is None else DenseCorrection.of(exposure, panoramas.visible.shape)

@@ -51,7 +51,7 @@ class Mapping:
         is_read: Callable[[], bool] = always,
     ) -> None:
         """dense: computes the depth of a pair that enters the map. every_s: between two maps, by the stamps; 0: one,
-        at the end. is_read: somebody takes the maps now.
+        at the end. is_read: True while the map has a reader.
         """
         self._load, self._is_read = load, is_read
         self._config, self._dense = config, dense

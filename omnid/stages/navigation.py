@@ -207,7 +207,8 @@ class NavigationStage:
             case RouteAction.REPEAT:
                 if routes.teaching:
                     raise OmnidError(f"the route {routes.teaching} is being taught: finish or stop it first")
-                route = routes.found(request, command.refusal)  # first: who asks for another one need not arm it
+                # The route comes first, because a request for a missing one must not ask for arming.
+                route = routes.found(request, command.refusal)
                 self._require_ready(NavigationFrame.MAP)
                 paths = routes.paths(route, request, self._situation())
                 self._start(f"route {request.name}", NavigationFrame.MAP, paths, command)

@@ -130,7 +130,7 @@ class Bus:
             raise OmnidError(f"bus cannot publish {topic}: {reason(error)}; restart") from error
 
     def is_received(self, topic: str) -> bool:
-        """True if somebody subscribes to a topic."""
+        """True if a topic has a subscriber."""
         return self._session is not None and self._publishers[topic].is_received
 
     def serve(self, name: str, text: str) -> None:

@@ -84,7 +84,7 @@ class CommandIntake:
     def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
         """Return the topic of a message; empty where another ring has it, and for a query of several keys.
 
-        Who sends a request means one robot and one thing.
+        A request names one robot and one topic.
         """
         key = str(message.key_expr).removeprefix(ring.prefix)
         if isinstance(message, zenoh.Query):

@@ -4,7 +4,7 @@ twist is a geometry_msgs/msg/TwistStamped in base_link: linear.x m/s, angular.z 
 the time of sending that rmw_zenoh attaches. heading is a
 geometry_msgs/msg/Vector3Stamped: x the speed in m/s, z the heading in odom in rad. Both also exist for each source of
 commands, as cmd/planner/twist. stop may have any payload. arm is a std_msgs/msg/Header with the time it was sent.
-bumper and cliff are std_msgs/msg/Bool with the time of sending attached: whatever is not a fresh False is a contact.
+bumper and cliff are std_msgs/msg/Bool with the time of sending attached: all but a fresh False is a contact.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from typing import Final
 from rosbags.typesys import Stores, get_typestore
 
 RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
-TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message for those who come later, as of /tf_static
+TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message is kept for later subscribers, as of /tf_static
 BRIDGE_RELIABLE_LAST_10: Final = ":1:0:0,10"  # no key, then Cyclone DDS' numbers: reliable, volatile, keep last
 BRIDGE_TRANSIENT_LOCAL: Final = ":1:1:0,1"
 GID_BYTES: Final = 16

@@ -157,7 +157,7 @@ def parsed_time_key(key: str) -> TimeKey | None:
 
 
 def number(text: str) -> float | None:
-    """Return the finite number that a value is; None where it is none."""
+    """Return a value as a finite number; None for any other text."""
     try:
         value = float(text)
     except ValueError:
@@ -166,7 +166,7 @@ def number(text: str) -> float | None:
 
 
 def count(text: str) -> int | None:
-    """Return the count that a value is; None where it is none."""
+    """Return a value as a count; None for any other text."""
     value = number(text)
     return int(value) if value is not None and value >= 0 and value.is_integer() else None
 

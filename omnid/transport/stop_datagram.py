@@ -87,7 +87,7 @@ class StopListener:
 
 
 class StopSender:
-    """The end of who stops a robot: asks at each endpoint at once."""
+    """The client of a stop: it asks all endpoints at the same time."""
 
     def __init__(self, robot: str, endpoints: Sequence[str]) -> None:
         self._nonce = secrets.token_hex(_NONCE_BYTES).encode()

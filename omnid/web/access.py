@@ -140,7 +140,7 @@ class Access:
             del self._ended[next(iter(self._ended))]
 
     def role_of(self, text: str) -> Role | None:
-        """Return the role of a token, None for a text that is none; takes the same time for all texts."""
+        """Return the role of a token, None for any other text; takes the same time for all texts."""
         given = text.strip().encode("utf-8", "replace")
         is_all = hmac.compare_digest(given, self.token.encode())
         is_stop = hmac.compare_digest(given, self.stop_token.encode()) and bool(self.stop_token)

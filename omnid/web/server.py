@@ -51,7 +51,7 @@ class WebSettings:
 
     listen: str = DEFAULT_LISTEN  # HOST:PORT; port 0: any
     token_file: Path | None = None
-    stop_token_file: Path | None = None  # of a second token, which may see and stop, not arm; None: there is none
+    stop_token_file: Path | None = None  # file of a second token, which may see and stop but not arm
     names: tuple[str, ...] = ()  # further names of this machine
     recordings: Path = Path("recordings")
     tls: tuple[Path, Path] | None = None  # certificate and key, PEM

@@ -237,7 +237,7 @@ class CollisionMonitor:
 
     def _before_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
         """Slow down by the time until a moving obstacle, at its predicted place, is where the base would then be, and
-        to slow_mps where a new one may be there, within one sigma: two pairs show roughly where somebody goes.
+        to slow_mps where a new one may be there, within one sigma: two pairs show roughly where it goes.
         """
         settings, stop = self._settings, self._stop_polygon(motion)
         slow = FREE

@@ -234,9 +234,9 @@ class ControlLaw:
         )
 
     def _command_age_s(self, now_ns: int) -> float:
-        """Return the age of the setpoint; inf where there is none, a void one, or one to stand that is old.
+        """Return the age of the setpoint; inf without a valid one, and for an old one of velocity zero.
 
-        Who asks the base to stand and then says nothing has finished: that is no command, rather than a stale one.
+        A sender that asked for velocity zero and is silent has finished: its command ends and is not stale.
         """
         command = self.commands.current
         if command is None or command.arrival_ns <= self._void_ns:

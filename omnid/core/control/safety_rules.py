@@ -82,7 +82,7 @@ def _disagree(reason: str) -> Rule:
 
 # The first rule that holds is reported. A NaN is a reason, and so is an age as far below 0 as it may be above: no pose
 # comes from the future. The end and a stop are no faults: nothing follows the end, and a stop latches in any mode. A
-# heading that jumps is none either: odometry has closed a gap, and only setpoints from before it are void.
+# heading that jumps is no reason: odometry has closed a gap, and only setpoints from before it are void.
 RULES: Final = (
     Rule(ENDS, False, lambda now, _: now.ending),
     Rule(ASKED, False, lambda now, _: now.stop_asked),

@@ -31,7 +31,7 @@ def azimuths() -> Array:
 def fill_gaps(scan: RangeScan) -> RangeScan:
     """Return the scan (SECTORS,) with short gaps filled, where the ranges on both sides are those of one surface.
 
-    Sparse stereo measures edges only, so a plain wall between two edges appears as a gap and is none.
+    Sparse stereo measures edges only, so a plain wall between two edges appears as a gap.
     """
     known = np.flatnonzero(np.isfinite(scan))
     if len(known) < 2:

@@ -52,7 +52,7 @@ class GoalRequest:
     frame: NavigationFrame
     x_m: float
     y_m: float
-    heading_rad: float | None = None  # None: as it comes
+    heading_rad: float | None = None  # None: any heading
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +79,7 @@ class RouteRequest:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaughtRoute:
-    """A route that is to be written; as a request: it was written, or its refusal says why not."""
+    """A route that is to be written. As a request: it was written, or `refusal` says why it was not."""
 
     route: Route
     id: int  # id of the request to finish the recording

@@ -77,7 +77,7 @@ class _Track:
         self.looks += 1
 
     def obstacle(self) -> MovingObstacle | None:
-        """Return the moving obstacle, None where it is none."""
+        """Return the track as a moving obstacle; None where it does not move or is not confirmed."""
         x, y, vx, vy = self._filter.x[:, 0].tolist()
         P = (self._filter.P + self._filter.P.T) / 2
         speed_mps, sigma_mps = math.hypot(vx, vy), math.sqrt(max(P[2, 2], P[3, 3]))
@@ -128,7 +128,7 @@ class MovingTracker:
             along = (middle - T_odom_base[:2, 3]) / np.linalg.norm(middle - T_odom_base[:2, 3])
             across = np.array([-along[1], along[0]])
             along2 = SIGMA_M**2 + float((sigma_m[sectors] ** 2).mean())
-            # Of somebody who steps out of what was hidden before only a part hides floor that was free.
+            # Of a person who comes out of a hidden area only a part hides floor that was free.
             across2 = SIGMA_M**2 + (max(PERSON_M - width_m, 0.0) / 2) ** 2
             covariance = along2 * np.outer(along, along) + across2 * np.outer(across, across)
             found.append(_Cluster(middle, covariance, max(0.15, width_m / 2)))

@@ -136,7 +136,7 @@ class Exposure:
     def upper_pixels(self, pixels: Array, disparity: Array) -> tuple[Array, Array]:
         """Return where the upper panorama shows pixels (N, 2) whose disparities (N,) at the stamp are known: (N, 2).
 
-        Also the spread (N,) of the columns, as `upper_columns`. NaN where the disparity is none.
+        Also the spread (N,) of the columns, as `upper_columns`. NaN where the disparity is unknown.
         """
         known = np.flatnonzero(disparity > 0)
         views = np.column_stack([pixels, pixels[:, 1] + disparity])[known]

@@ -257,7 +257,7 @@ class VisualOdometry:
         )
 
     def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
-        """Start a map where there is none, after the motion that wheels and gyro know of."""
+        """Start a map where there is none, after the motion that wheels and gyro measured."""
         carried = False
         if frame.sensed is not None and dt_s > 0:
             T_predicted = self._T_odom_rect @ self._motion.predict(frame.sensed, dt_s)

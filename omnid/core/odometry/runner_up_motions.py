@@ -163,7 +163,7 @@ def displacements(
     """Return displacements (x, y) [m] of a pose, in its own axes, at which the last panorama's patches are seen too.
 
     At most PEAKS, best first; the pose itself may be among them, as (0, 0). reach_m: the largest one that is searched;
-    one within a step of the grid is none.
+    none if that is less than a step of the grid.
     """
     before, rows = local_map.last_seen(LANDMARKS)
     if before is None or not len(rows):

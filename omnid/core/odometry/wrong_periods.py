@@ -42,7 +42,7 @@ def has_wrong_period(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array,
     for n in np.flatnonzero(differs):
         reach = int(np.ceil(SEARCH_SHARE * around[n]))
         there = pixels[n, 1] + around[n] + np.arange(-reach, reach + 1)
-        if there[-1] > len(pair[1].image) - 1:  # what is not shown cannot be excluded
+        if there[-1] > len(pair[1].image) - 1:  # a motion that the image does not show cannot be excluded
             found[n] = True
             continue
         lower = _patches(pair[0], pixels[n, 0], pixels[n, 1:])
