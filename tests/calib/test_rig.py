@@ -19,8 +19,6 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
-from calib.rig_frame import rig_between
-from calib.transform_file import straight_up
 
 FOCAL_PX = 200.0
 CENTER = (384.0, 380.0)
@@ -166,15 +164,6 @@ def test_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:
     seen = visible(masked, maps, 2.0)
     radius = np.hypot(maps[0] - masked.camera.center[0], maps[1] - masked.camera.center[1])
     np.testing.assert_array_equal(seen, (maps[0] >= 0) & (radius >= 122) & (radius <= 298))
-
-
-def test_rig_between_is_upright_with_x_along_the_image_axis() -> None:
-    lower, upper = parabolic_omni().camera, parabolic_ocam().camera
-    for camera, T_down in ((lower, parabolic_omni().T_cam_rig), (upper, parabolic_ocam().T_cam_rig)):
-        rig = rig_between(camera, camera, straight_up(0.25), ("a", "b"))
-        np.testing.assert_allclose(rig.upper.viewpoint, [0, 0, 0.25], rtol=0, atol=1e-15)
-        # The image's u axis runs to the robot's left here, and the rig's x is that axis.
-        np.testing.assert_allclose(rig.lower.T_cam_rig[:3, 0], T_down[:3, 1], rtol=0, atol=1e-12)
 
 
 def first_images(log: Path, topics: tuple[str, str]) -> list[Any]:

@@ -13,9 +13,7 @@ import pytest
 from calib import se3
 from drivers.logs.mcap_writer import LogWriter
 from omnid.cli import main
-from omnid.recordings import run_series
 from omnid.recordings.comparison import table_differences
-from omnid.recordings.run_series import read_run_series
 from omnid.transport import codec
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY
@@ -261,12 +259,6 @@ def test_compares_the_named_topic(capsys: pytest.CaptureFixture[str], tmp_path: 
     both = [tmp_path / "a.mcap", tmp_path / "b.mcap"]
     assert diff(capsys, *both, "--topic", "/omnid/odom")[0] == 0
     assert diff(capsys, *both, "--topic", "/omnid/wheels")[0] == 1
-
-
-def test_refuses_recordings_that_are_too_long(tmp_path: Path, first: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_series, "MAX_ROWS", COUNT - 1)
-    with pytest.raises(run_series.OmnidError, match="cut it into shorter ones"):
-        read_run_series(first)
 
 
 def test_names_keys_by_their_paths() -> None:

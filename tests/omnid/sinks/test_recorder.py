@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +17,11 @@ from drivers.logs.log_reader import LogReader
 from drivers.motor import VelocityCommand
 from omnid.config import Config
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.engine.graph import NEWEST, Graph
-from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, OdometryUpdate
-from omnid.runs.record import open_recorder, record
+from omnid.runs.record import open_recorder
 from omnid.sinks.encoder import Encoder, MapEncoding, status_report
-from omnid.sinks.recorder import Recorder
-from omnid.transport.codec import ERROR, OK
-from omnid.transport.image_codec import image_cdr, image_topic
 from omnid.transport.records import DiagnosticStatus
-from tests.drivers.logs.mcap_logs import STORE, jpeg
+from tests.drivers.logs.mcap_logs import jpeg
 from tests.omnid.small_pair import small_depth
 
 ROOT = Path(__file__).parents[3]
@@ -71,31 +64,6 @@ def test_recorded_images_are_read_unchanged_and_found_by_name(tmp_path: Path, en
     for read, each in zip(reader.frames(), given, strict=True):
         assert (read.camera, read.stamp_ns, read.encoding) == (each.camera, each.stamp_ns + OFFSET_NS, encoding)
         assert np.array_equal(gray(read), gray(each))
-
-
-@pytest.mark.parametrize("encoding", ["jpeg", *LENGTHS])
-def test_image_messages_have_the_layout_of_ros(encoding: str) -> None:
-    each = frame(7, "upper", encoding)
-    schema, payload = image_cdr(each, START_NS + 5)
-    message: Any = STORE.deserialize_cdr(payload, schema)
-    assert bytes(STORE.serialize_cdr(message, schema)) == payload
-    stamp = message.header.stamp
-    assert (stamp.sec, stamp.nanosec, message.header.frame_id) == (1_700_000_000, 5, "upper")
-    if encoding == "jpeg":
-        assert (message.format, bytes(message.data)) == ("jpeg", each.data)
-        return
-    names = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
-    assert (message.encoding, message.width, message.height) == (names.get(encoding, encoding), WIDTH, HEIGHT)
-    rows = HEIGHT * 3 // 2 if encoding == "nv12" else HEIGHT
-    assert message.step == each.step and bytes(message.data) == bytes(each.data)[: each.step * rows]
-
-
-def test_rows_without_padding_get_their_step() -> None:
-    packed = Frame(0, 0, "lower", "bgr8", bytes(WIDTH * HEIGHT * 3), WIDTH, HEIGHT)
-    message: Any = STORE.deserialize_cdr(image_cdr(packed, 0)[1], "sensor_msgs/msg/Image")
-    assert message.step == WIDTH * 3 and image_topic(packed) == "lower/image_raw"
-    with pytest.raises(OmnidError, match="-1 ns"):
-        image_cdr(packed, -1)
 
 
 def odometry(seq: int, state: str = "tracking") -> OdometryUpdate:
@@ -184,90 +152,3 @@ def test_an_invalid_message_does_not_end_the_run(tmp_path: Path) -> None:
         recorder.process(replace(odometry(0), stamp_ns=stamp_ns))
     recorder.finish()
     assert recorder.invalid == 6 and recorder.state.messages == 7 and recorder.state.lost == 0
-
-
-class Given:
-    """A source of given frames."""
-
-    def __init__(self, frames: list[Frame]) -> None:
-        self._frames = frames
-        self.frames = lambda: iter(self._frames)
-
-    def close(self) -> None:
-        """Nothing to close."""
-
-
-def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
-    late = Late(recorder)
-    graph, seen = Graph(policy=NEWEST, depth=3), Seen()
-    stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
-    graph.sink("record", late, stream)
-    graph.sink("odometry", seen, stream)
-    graph.run()
-    stats = next(stage for stage in graph.telemetry.stages if stage.name == "record")
-    assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
-    assert min(seen.times_s) < late.until_s  # the others went on meanwhile
-
-
-def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
-    config = settings(tmp_path / "log")
-    recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
-    assert (recorder.status().level, recorder.status().message) == (OK, "waiting")
-    recorder.process(frame(0, "lower"))
-    status = recorder.status()
-    assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
-    recorder.close()
-    full = replace(config, record=replace(config.record, free_mb=1_000_000))
-    recorder = open_recorder(full, "", lambda *_: None, offset_ns=OFFSET_NS)
-    recorder.process(frame(0, "lower"))
-    status = recorder.status()
-    assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
-
-
-class Late:
-    """A recorder whose disk is blocked for half a second."""
-
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder, self.until_s = recorder, time.monotonic() + 0.5
-        self.finish = recorder.finish
-
-    def process(self, message: Frame) -> None:
-        """Record the message after the disk is free."""
-        time.sleep(max(0.0, self.until_s - time.monotonic()))
-        self._recorder.process(message)
-
-
-class Seen:
-    """A sink that keeps the times of its messages."""
-
-    def __init__(self) -> None:
-        self.times_s: list[float] = []
-
-    def process(self, message: Frame) -> None:
-        """Keep the time."""
-        self.times_s.append(time.monotonic())
-
-
-def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
-    events: list[tuple[int, str]] = []
-    now_ns = time.monotonic_ns()
-    sources = {
-        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
-        for camera in ("lower", "upper")
-    }
-    before = signal.getsignal(signal.SIGTERM)
-    state = record(
-        sources,
-        settings(tmp_path / "log"),
-        "version = 1",  # type: ignore[arg-type]
-        lambda severity, text: events.append((severity, text)),
-    ).state
-    assert signal.getsignal(signal.SIGTERM) is before
-    assert (state.messages, state.lost, state.status) == (20, 0, "closed")
-    assert "20 messages in 1 files" in events[-1][1]
-    (path,) = recorded(tmp_path / "log")
-    reader = LogReader(path)
-    frames = list(reader.frames())
-    assert len(frames) == 20 and abs(frames[0].stamp_ns - time.time_ns()) < 60 * 10**9
-    assert "rig.toml" in reader.attachments()

@@ -10,9 +10,7 @@ import pytest
 from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.errors import CalibError
-from calib.fit.boards.bundle import Observations
 from calib.fit.boards.camera_fit import fit_camera
-from calib.fit.boards.ocam_linear import solve_linear
 from calib.models.camera import Mask, OmniCamera
 from calib.models.ocam import OcamCamera, View
 from calib.models.unified import UnifiedCamera
@@ -86,13 +84,6 @@ def test_recovers_board_poses_and_selects_mirror_or_lens_by_view() -> None:
     assert isinstance(lens.camera, UnifiedCamera) and lens.camera.focal[0] > 0
     # The images do not distinguish a mirror from a lens.
     assert lens.fit.mean_px == pytest.approx(found.fit.mean_px, abs=1e-4)
-
-
-def test_linear_solution_is_close() -> None:
-    views = seen_by(OCAM, noise_px=0.2)
-    linear = solve_linear(Observations(np.array([view.pixels for view in views]), BOARD.points), SIZE, 4, "mirror")
-    assert linear.center == pytest.approx(OCAM.center_row_column, abs=2.5)
-    assert linear.coefficients[0] == pytest.approx(-131.6, rel=0.02)
 
 
 @pytest.mark.slow

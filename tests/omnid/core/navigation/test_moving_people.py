@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.se2_arrays import relative
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
-from omnid.core.navigation.forecast import Forecast, Pace, forecast, yielding
+from omnid.core.navigation.forecast import Forecast, forecast
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
@@ -139,35 +139,8 @@ def at(x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> Forecast:
     return found
 
 
-def test_the_share_of_the_speed_by_hand() -> None:
-    path = np.column_stack([np.arange(0.0, 4.0, 0.05), np.zeros(80)])
-    pace = Pace(0.4, 0.4, 0.3, 0.4, 0.26)
-
-    def judged(length_m: float, moving: Forecast) -> tuple[float, bool]:
-        share, coming = yielding(path, length_m, moving, pace)
-        return share, bool(coming[0])
-
-    assert judged(4.0, at(3.0, 2.0, 0.0, 0.0)) == (1.0, False)
-    # In 2.5 s the base is at 1 m, and the person, from 2 m aside at 0.8 m/s, there as well.
-    share, coming = judged(4.0, at(1.0, 2.0, 0.0, -0.8))
-    assert 0.0 <= share < 1.0 and not coming
-    assert judged(0.2, at(1.0, 2.0, 0.0, -0.8)) == (1.0, False), "it turns at a corner before"
-    assert judged(4.0, at(1.5, 0.0, -0.5, 0.0)) == (1.0, True), "it comes to where the base would wait"
-    assert judged(4.0, at(-0.8, 0.0, 0.8, 0.0)) == (1.0, False), "it comes from behind"
-    share, coming = judged(4.0, at(0.8, 0.0, 0.2, 0.0))
-    assert share == 0.5 and not coming, "it walks ahead, more slowly"
-
-
 def test_points_of_moving_obstacles_are_left_out() -> None:
     points = np.array([(1.0, 0.1), (1.0, 0.5), (1.0, -0.4), (3.0, 0.0)])
     others = at(1.0, 0.0, 0.0, -1.0).others(points)
     np.testing.assert_array_equal(others, points[[3]])
     np.testing.assert_array_equal(at(1.0, 0.0, 0.0, 0.0).others(points), points[[1, 3]])
-
-
-def test_a_forecast_goes_on_from_the_age_of_the_ring() -> None:
-    one = MovingObstacle(1.0, 0.0, 0.5, 0.0, np.diag([0.01, 0.01, 0.04, 0.04]), 0.2)
-    places, radii = forecast([one], 0.4).at(np.array([0.0, 1.0]))  # type: ignore[union-attr]
-    np.testing.assert_allclose(places[0], [(1.2, 0.0), (1.7, 0.0)])
-    np.testing.assert_allclose(radii[0], 0.2 + np.minimum(np.sqrt([0.01 + 0.04 * 0.16, 0.01 + 0.04 * 1.96]), 0.15))
-    assert forecast([], 0.1) is None

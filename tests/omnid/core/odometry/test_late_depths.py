@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import NO_VELOCITY, AssumedMotion, Exposure, RigVelocity
+from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, RigVelocity
 from omnid.core.odometry.landmarks import LandmarkStore
 from omnid.core.odometry.late_depths import LateDepths
 from omnid.core.odometry.new_landmarks import NewLandmarks
@@ -127,16 +125,3 @@ def test_disparities_of_an_instant_correct_the_map_at_once() -> None:
     at_once = store.table
     late.settle(TRUE)
     assert store.table is at_once
-
-
-def test_the_noise_of_new_views_contains_that_of_the_motion() -> None:
-    exact = views(20)
-    found, exposure = corrected(exact)
-    noise = np.zeros((len(exact), 3, 3))
-    new = NewLandmarks(
-        exact[:, :2], found, np.zeros((len(exact), 2)), noise, AssumedMotion(WRONG, exposure.derivatives(found))
-    )
-    expected = exposure.corrected(exact[:, :2], found[:, 2])[1]
-    np.testing.assert_allclose(new.whole_noise, expected, rtol=0.1, atol=1e-6)
-    final = replace(new, assumed=AssumedMotion(NO_VELOCITY, np.zeros((len(exact), 3, 0))))
-    np.testing.assert_array_equal(final.whole_noise, noise)

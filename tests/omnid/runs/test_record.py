@@ -1,0 +1,119 @@
+"""A run that only records."""
+
+from __future__ import annotations
+
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from drivers.frame import Frame
+from drivers.logs.log_reader import LogReader
+from omnid.config import Config
+from omnid.engine.graph import NEWEST, Graph
+from omnid.runs.record import open_recorder, record
+from omnid.sinks.recorder import Recorder
+from omnid.transport.codec import ERROR, OK
+from tests.omnid.sinks.test_recorder import frame
+
+START_NS = 1_700_000_000 * 10**9
+
+
+OFFSET_NS = START_NS - 5 * 10**9  # boot time of the machine: five seconds before
+
+
+def settings(folder: Path, **more: Any) -> Config:
+    config = Config()
+    return replace(config, record=replace(config.record, folder=str(folder), free_mb=0, file_mb=1, **more))
+
+
+def recorded(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.mcap"))
+
+
+class Given:
+    """A source of given frames."""
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = frames
+        self.frames = lambda: iter(self._frames)
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def test_a_blocked_disk_stops_no_camera(tmp_path: Path) -> None:
+    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, offset_ns=OFFSET_NS)
+    late = Late(recorder)
+    graph, seen = Graph(policy=NEWEST, depth=3), Seen()
+    stream = graph.source("lower", lambda: iter([frame(n, "lower") for n in range(50)]))
+    graph.sink("record", late, stream)
+    graph.sink("odometry", seen, stream)
+    graph.run()
+    stats = next(stage for stage in graph.telemetry.stages if stage.name == "record")
+    assert stats.dropped >= 40 and stats.dropped + recorder.state.messages == 50
+    assert min(seen.times_s) < late.until_s  # the others went on meanwhile
+
+
+def test_reports_the_state_of_the_recording(tmp_path: Path) -> None:
+    config = settings(tmp_path / "log")
+    recorder = open_recorder(config, "", lambda *_: None, offset_ns=OFFSET_NS)
+    assert (recorder.status().level, recorder.status().message) == (OK, "waiting")
+    recorder.process(frame(0, "lower"))
+    status = recorder.status()
+    assert status.message == "recording" and status.values["messages"] == "1" and Path(status.values["file"]).exists()
+    recorder.close()
+    full = replace(config, record=replace(config.record, free_mb=1_000_000))
+    recorder = open_recorder(full, "", lambda *_: None, offset_ns=OFFSET_NS)
+    recorder.process(frame(0, "lower"))
+    status = recorder.status()
+    assert status.level == ERROR and status.values["lost"] == "1" and "1000001 needed" in status.message
+
+
+class Late:
+    """A recorder whose disk is blocked for half a second."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder, self.until_s = recorder, time.monotonic() + 0.5
+        self.finish = recorder.finish
+
+    def process(self, message: Frame) -> None:
+        """Record the message after the disk is free."""
+        time.sleep(max(0.0, self.until_s - time.monotonic()))
+        self._recorder.process(message)
+
+
+class Seen:
+    """A sink that keeps the times of its messages."""
+
+    def __init__(self) -> None:
+        self.times_s: list[float] = []
+
+    def process(self, message: Frame) -> None:
+        """Keep the time."""
+        self.times_s.append(time.monotonic())
+
+
+def test_records_both_cameras_and_reports_the_result(tmp_path: Path) -> None:
+    events: list[tuple[int, str]] = []
+    now_ns = time.monotonic_ns()
+    sources = {
+        camera: Given([replace(frame(n, camera), stamp_ns=now_ns + n) for n in range(10)])
+        for camera in ("lower", "upper")
+    }
+    before = signal.getsignal(signal.SIGTERM)
+    state = record(
+        sources,
+        settings(tmp_path / "log"),
+        "version = 1",  # type: ignore[arg-type]
+        lambda severity, text: events.append((severity, text)),
+    ).state
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert (state.messages, state.lost, state.status) == (20, 0, "closed")
+    assert "20 messages in 1 files" in events[-1][1]
+    (path,) = recorded(tmp_path / "log")
+    reader = LogReader(path)
+    frames = list(reader.frames())
+    assert len(frames) == 20 and abs(frames[0].stamp_ns - time.time_ns()) < 60 * 10**9
+    assert "rig.toml" in reader.attachments()
