@@ -151,7 +151,8 @@ class CollisionMonitor:
         self._motions.append((now_ns, motion))
 
     def _judged(self, now_ns: int, motion: Twist) -> Allowance:
-        """Return the strictest of all rules."""
+        """Return the strictest allowance of all rules."""
+        # 1. Without a recent ring nothing is known: the settings say whether the base stops, drives slowly or drives.
         settings = self._settings
         if not settings.check or (motion.velocity_mps == 0.0 and motion.yaw_rate_radps == 0.0):
             return FREE
@@ -163,10 +164,12 @@ class CollisionMonitor:
             return self._capped(
                 motion, 0.0 if settings.stale == STOP else settings.slow_mps, RING_STALE if is_stale else UNSEEN
             )
+        # 2. The distance within which obstacles matter: the way until the base stops, or of time_s if that is longer.
         moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
         speed_mps = abs(motion.velocity_mps)
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
         reach_m = way_m + self._outline.radius_m + settings.stop_m + settings.slow_m
+        # 3. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
         points = _within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:

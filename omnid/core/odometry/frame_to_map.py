@@ -117,6 +117,7 @@ class FrameToMap:
         along with the aligned lower row. Tracks from the last panorama and patches of the keyframes are two independent
         supports of the pose: the number of inliers is the smaller one of both.
         """
+        # 1. Align the patches of the keyframes in the lower panorama.
         T_odom_curr = se3.inverse(coarse.T_curr_odom)
         landmarks, _ = self._map.visible(T_odom_curr)
         in_view = len(landmarks)
@@ -124,22 +125,25 @@ class FrameToMap:
         shift = exposure.shift(in_curr)
         aligned = self._map.align(frame.lower, T_odom_curr, landmarks, shift.lower)
         landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
+        # 2. The views: aligned pixels, with the disparities of the tracks, corrected to the stamp of the pair.
         disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
         disparity[coarse.landmarks], variance[coarse.landmarks] = coarse.disparity, coarse.variance
         views = np.column_stack([pixels, pixels[:, 1] + disparity[landmarks]])
         noise = view_noise(aligned.covariance[aligned.found], variance[landmarks])
-        # The velocity is estimated along with the pose. Its prior is one measurement, no correlated ones.
         views += np.column_stack([shift.lower, shift.upper[:, 1]])[aligned.found]
+        # 3. Solve for the pose and the velocity. The prior of the velocity is one measurement: unlike the landmarks'
+        # errors it is not correlated with others.
         covariance = exposure.motion.covariance / CORRELATED_LANDMARKS
         by_motion = SharedError(shift.by_motion[aligned.found, :3], covariance)
         solution, kept = self._solve(landmarks, views, coarse.T_curr_odom, self._model, noise, by_motion)
         if solution is None:
             return None
-        # Errors larger than expected enlarge the covariance; smaller ones never reduce it.
+        # 4. The covariance: errors larger than expected enlarge it, smaller ones never reduce it.
         scale = CORRELATED_LANDMARKS * max(1.0, float(solution.squared.mean()) / VIEW_DIMENSIONS)
         variance = variance[landmarks]
-        # The velocity found here agrees with the depths in the map, so it must not correct them: a vertical one has the
-        # effect of another baseline, and the scale would drift. That of the steps is independent.
+        # 5. The motion by which later frames correct depths is the one before this pair. The velocity found here agrees
+        # with the depths in the map, so it must not correct them: a vertical one has the effect of another baseline,
+        # and the scale would drift.
         of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
         assumed = AssumedMotion(exposure.motion, of_depth[kept])
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks

@@ -104,12 +104,12 @@ class LandmarkStore:
     def add_keyframe(
         self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
     ) -> Indices:
-        """Add a keyframe with new landmarks; return their ids (N,), -1 for views that cannot be triangulated.
+        """Add a keyframe with new landmarks, and remove the oldest keyframe beyond the bound.
 
-        They are observed at views (N, 3) [px] with slopes (N, 2) of the disparity.
-        noise: covariance (N, 3, 3) [px^2] of the views in addition to that of the model; None: none. pixels (N, 2) in
-        the keyframe's panorama; None: those of the views, which are the same unless it was exposed at several times.
-        Those views are left out. The oldest keyframe beyond the bound leaves.
+        views (N, 3) [px]: those of the landmarks. slopes (N, 2): those of the disparity. noise: covariance (N, 3, 3)
+        [px^2] of the views in addition to that of the model; None: none. pixels (N, 2): those in the keyframe's
+        panorama, which differ from the views where it was exposed at several times; None: those of the views. Return
+        the ids (N,) of the landmarks; -1 for views that cannot be triangulated, which are left out.
         """
         points = triangulate(views, self._model.cylinder, self._model.baseline_m)
         finite = np.isfinite(points).all(axis=1)
