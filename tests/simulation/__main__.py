@@ -3,6 +3,7 @@
 Cameras that are not synchronised: `--speed 1.4 --skew-ms 15`, or `--skew-ms 5 25` (first and last pair); a rolling
 shutter of 20 ms on 768 rows: `--line-time-us 26`. Real mirrors: `--mirrors`, with nominal.toml instead of rig.toml.
 Real lenses, lamps and electronics: `--real`, or some of `tests/simulation/disturbances.py` by `--disturb flicker dust`.
+Photographs on walls, floor and pictures: `--photographs`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 from omnid.simulation.rendering.sensor import DIM
 from tests.simulation.disturbances import DISTURBANCES
 from tests.simulation.logs import write_log
+from tests.simulation.photographs import with_photographs
 from tests.simulation.readout import Readout
 from tests.simulation.recipes import RECIPES, build
 from tests.simulation.rigs import with_real_mirrors
@@ -67,6 +69,7 @@ def main() -> None:
         "that of the first row",
     )
     parser.add_argument("--dim", action="store_true", help="dim images with much noise, whose brightness changes")
+    parser.add_argument("--photographs", action="store_true", help="on walls, floor and pictures, of scikit-image")
     disturb = parser.add_mutually_exclusive_group()
     disturb.add_argument(
         "--disturb", nargs="+", choices=DISTURBANCES, default=(), metavar="NAME", help=", ".join(DISTURBANCES)
@@ -88,7 +91,7 @@ def main() -> None:
         arguments.out,
         rig,
         run.poses,
-        run.scene,
+        with_photographs(run.scene, arguments.seed) if arguments.photographs else run.scene,
         sensor=sensor,
         seed=arguments.seed,
         supersample=arguments.supersample,
