@@ -56,8 +56,8 @@ REMARKS: Final = (
     "within 0.2 %, error over sigma below 2. Photographs: of bricks, gravel, grass and others on walls, floor, "
     "pictures and boxes.",
     "Gloss: a floor that reflects a quarter of the light like a mirror. Glass: before a third of the pictures. "
-    "Windows: another third of them, saturated, in the floor and the glass too. Shadows: of boxes and robot on the floor. "
-    "Restarts: a tenth of the images has lost rows of blocks with their restart markers; such images are refused, so "
+    "Windows: another third of them, saturated, in the floor and the glass too. Shadows: of boxes and robot on the "
+    "floor. Restarts: a tenth of the images has lost rows of blocks with their restart markers; such images are refused, so "
     "that their pairs have no pose.",
 )
 PART_REMARKS: Final = (
