@@ -4,9 +4,10 @@ A flat checkerboard appears the same either way: its poses are then mirror image
 
 - markers, which a mirror reflects;
 - the rim of a mirror with the dark hub in its middle, where the camera sees itself;
-- an image that shows the world to all four corners and in the middle, which no rim of a mirror bounds.
+- straight lines of the board that stay straight off the axis, which no convex mirror leaves so.
 
-A circle without a hub may be a mirror or a fisheye lens.
+A circle without a hub may be a mirror or a fisheye lens, and so may an image without a rim whose lines are bent: the
+part of a mirror inside its rim looks like that.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Final, Literal
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import MarkerBoard
@@ -29,16 +32,25 @@ ViewChoice = Literal["auto", "mirror", "direct"]
 VIEW_CHOICES: Final[tuple[ViewChoice, ...]] = ("auto", *VIEWS)
 VIEW_HELP: Final = (
     "the world is seen in a mirror or directly through a lens; auto (default): what markers, or rim and hub of a "
-    "mirror, or an image without a rim show; else it must be given, as a checkerboard looks the same"
+    "mirror, or lines that a lens leaves straight show; else it must be given, as a checkerboard looks the same"
 )
 # Share of the views whose markers must agree: a single view may be misread.
 AGREED: Final = 0.8
-# Side of the patches in the corners and in the middle, in parts of the smaller side of the image; their least
-# brightness in parts of the median of the image, to which a lens shades its corners; and the least grey level of that
-# median, below which dark and light are not distinguished.
-PATCH: Final = 1 / 16
-LIT: Final = 0.4
-LIGHT_GREY: Final = 40.0
+# A mirror bends lines by 0.11 to 0.14 of the radius at 40 degrees from the axis (unified model, xi of 0.8 to 1; a
+# parabola, xi = 1, has tan^2(angle / 2)), lenses that are not fisheyes by 0.03: half of the parabola's is between them.
+BENT_PART: Final = 0.5
+MAX_ANGLE_RAD: Final = np.deg2rad(50)  # from the axis; beyond it the one coefficient does not describe a mirror
+# Corners are found to 0.1 to 0.3 px; in a part of a mirror beside its middle the fit fails by 0.5 to 5 px.
+MAX_RMS_PX: Final = 0.5
+MIN_VIEWS, MIN_CORNERS = 3, 8  # for a fit of focal length and bend
+FIXED: Final = (
+    cv2.CALIB_USE_INTRINSIC_GUESS
+    | cv2.CALIB_FIX_PRINCIPAL_POINT
+    | cv2.CALIB_FIX_ASPECT_RATIO
+    | cv2.CALIB_ZERO_TANGENT_DIST
+    | cv2.CALIB_FIX_K2
+    | cv2.CALIB_FIX_K3
+)
 
 
 def view_of_images(
@@ -53,9 +65,11 @@ def view_of_images(
     """
     if choice != "auto":
         return choice
-    shown = {_view_of_markers(views, board) or _view_of_image(_brightest(images)) for images, views in cameras} - {None}
+    shown = {_view_of_camera(_brightest(images), views, board) for images, views in cameras} - {None}
     if len(shown) != 1:
-        found = "a mirror in one and a lens in the other camera" if shown else "no markers, no mirror's rim with a hub"
+        found = "no markers, no mirror's rim with a hub, no lines that are straight as only a lens shows them"
+        if shown:
+            found = "a mirror in one and a lens in the other camera"
         raise OmnidError(
             "calibrate: the images do not show whether the world is seen in a mirror or through a lens (found "
             f"{found}): add --view mirror or --view direct"
@@ -64,6 +78,12 @@ def view_of_images(
     assert view is not None
     progress(f"view: {view}, as the images show")
     return view
+
+
+def _view_of_camera(image: Image, views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:
+    """Return the view of one camera by the maximum of its images and its views of the board; None: undecided."""
+    size = (image.shape[1], image.shape[0])
+    return _view_of_markers(views, board) or _view_of_image(image) or _view_of_lines(size, views, board)
 
 
 def _view_of_markers(views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:
@@ -96,14 +116,34 @@ def _brightest(images: Iterable[Image]) -> Image:
 
 
 def _view_of_image(image: Image) -> View | None:
-    """Return the view that the maximum (H, W) of a camera's images shows; None where it may be either."""
+    """Return "mirror" where the maximum (H, W) of a camera's images has a rim and a hub."""
     height, width = image.shape
     rim = find_rim(image, ((width - 1) / 2, (height - 1) / 2))
-    if rim is not None:
-        return "mirror" if rim.inner_px > 0 else None
-    side = max(4, round(PATCH * min(height, width)))
-    top, left = (height - side) // 2, (width - side) // 2
-    corners = [image[:side, :side], image[:side, -side:], image[-side:, :side], image[-side:, -side:]]
-    darkest = min(float(np.median(patch)) for patch in [*corners, image[top : top + side, left : left + side]])
-    median = float(np.median(image))
-    return "direct" if median >= LIGHT_GREY and darkest >= LIT * median else None
+    return "mirror" if rim is not None and rim.inner_px > 0 else None
+
+
+def _view_of_lines(size: tuple[int, int], views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:
+    """Return "direct" where the board is seen as by a pinhole, bent less than any mirror bends it; size (w, h)."""
+    # 1. Fit a pinhole with one coefficient, r_seen = r (1 + k r^2), about the middle of the image.
+    points, pixels = list[NDArray[np.float32]](), list[NDArray[np.float32]]()
+    for view in views:
+        seen = np.isfinite(view.pixels[:, 0])
+        if seen.sum() >= MIN_CORNERS:
+            points.append(board.points[seen].astype(np.float32))
+            pixels.append(view.pixels[seen].astype(np.float32))
+    if len(pixels) < MIN_VIEWS:
+        return None
+    centre = (np.array(size) - 1) / 2
+    K = np.array([[size[0], 0, centre[0]], [0, size[0], centre[1]], [0, 0, 1.0]])
+    try:
+        rms_px, K, bends, _, _ = cv2.calibrateCamera(points, pixels, size, K, np.zeros(5), flags=FIXED)
+    except cv2.error:
+        return None
+    k = float(np.ravel(bends)[0])
+    if not (rms_px <= MAX_RMS_PX and np.isfinite(k)):
+        return None
+    # 2. Compare its bend, at the corner that is the farthest from the axis, with that of a mirror.
+    farthest = max(float(np.linalg.norm(one - centre, axis=1).max()) for one in pixels) / K[0, 0]
+    r = np.linspace(0, np.tan(MAX_ANGLE_RAD), 1000)
+    r = r[r * (1 + k * r**2) <= farthest][-1]
+    return "direct" if -k * r**2 < BENT_PART * np.tan(np.arctan(r) / 2) ** 2 else None

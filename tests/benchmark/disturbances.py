@@ -57,8 +57,8 @@ REMARKS: Final = (
     "pictures and boxes.",
     "Gloss: a floor that reflects a quarter of the light like a mirror. Glass: before a third of the pictures. "
     "Windows: another third of them, saturated, in the floor and the glass too. Shadows: of boxes and robot on the "
-    "floor. Restarts: a tenth of the images has lost rows of blocks with their restart markers; such images are refused, so "
-    "that their pairs have no pose.",
+    "floor. Restarts: a tenth of the images has lost rows of blocks with their restart markers; such images are "
+    "refused, so that their pairs have no pose.",
 )
 PART_REMARKS: Final = (
     "Places: the share of the poses that are known in the map of the clean drive, and the largest error of those. "

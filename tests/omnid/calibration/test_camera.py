@@ -45,3 +45,23 @@ def test_what_is_saved_is_the_camera(found: CameraResult, tmp_path: Path) -> Non
     read = read_camera(tmp_path / "camera.toml").camera
     assert read == found.calibration.camera
     assert read.center == pytest.approx(CAMERA.center, abs=0.3)
+
+
+@pytest.mark.parametrize(("xi", "focal_px"), [(0.9, 230.0), (0.0, 350.0)])
+def test_an_image_without_a_rim_is_that_of_a_lens_only_where_its_lines_are_straight(
+    xi: float, focal_px: float, tmp_path: Path
+) -> None:
+    """The image of a mirror that is cropped inside its rim, light up to its corners, was taken for that of a lens."""
+    camera = UnifiedCamera(xi, (-focal_px if xi else focal_px, focal_px), (159.5, 119.5), (320, 240))
+    whole = Mask(camera.center, 0.0, 300.0)
+    renderer = BoardRenderer.of(BOARD, camera, whole)
+    inside, away_m = Mask(camera.center, 0.0, 119.0), (0.25, 0.4) if xi else (0.6, 0.9)
+    poses = board_poses_around_camera(camera, BOARD, inside, 6, distance_m=away_m, elevation_deg=(0.0, 20.0))
+    for seed, T in enumerate(poses):
+        cv2.imwrite(str(tmp_path / f"p{seed}.png"), renderer.render_board(T, seed=seed).image)
+    if xi:
+        with pytest.raises(omnid.OmnidError, match="add --view mirror or --view direct"):
+            omnid.calibrate_camera([str(tmp_path)], BOARD, model="omni")
+    else:
+        found = omnid.calibrate_camera([str(tmp_path)], BOARD, model="ocam")
+        assert found.calibration.camera.center == pytest.approx(camera.center, abs=2)

@@ -1,4 +1,4 @@
-"""The view, mirror or lens, by markers, rim and hub, or an image without a rim; asked for where nothing shows it."""
+"""The view, mirror or lens, by markers, rim and hub, or straight lines; asked for where nothing shows it."""
 
 from __future__ import annotations
 
@@ -6,63 +6,88 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
 from calib.boards.marker_finder import find_marker_board
 from omnid.calibration.progress import silent
 from omnid.calibration.view_guess import view_of_images
 from omnid.errors import OmnidError
+from tests.simulation.boards import board_pose
 from tests.simulation.marker_boards import print_of
 
 CHECKERBOARD = Board(6, 5, 0.03)
 Image = NDArray[np.uint8]
+Camera = tuple[list[Image], list[BoardView]]  # its images, and what was found in them
 
 
-def disc(hub_px: float, side: int = 240) -> Image:
-    """Return a light circle with a dark hub in a dark image."""
+def rim(hub_px: float, side: int = 240) -> Camera:
+    """Return a camera that shows a light circle with a dark hub in a dark image, and no board."""
     v, u = np.indices((side, side)) - (side - 1) / 2
     radius = np.hypot(u, v)
-    return np.where((radius < 0.45 * side) & (radius >= hub_px), 150, 8).astype(np.uint8)
+    return [np.where((radius < 0.45 * side) & (radius >= hub_px), 150, 8).astype(np.uint8)], []
 
 
-def shaded(corner: float, side: int = 240) -> Image:
-    """Return an image whose brightness falls to a part of that of its middle in the corners."""
-    v, u = (np.indices((side, side)) - (side - 1) / 2) / ((side - 1) / 2)
-    return np.asarray(160 * (1 - (1 - corner) * (u**2 + v**2) / 2), np.uint8)
+def seen_boards(focal_px: float, xi: float, k: float = 0.0, *, sigma_px: float = 0.15) -> Camera:
+    """Return a camera of 640x480 px without a rim, and its views of boards, as the unified model shows them.
+
+    xi 0: a pinhole lens, whose lines k bends; 0.8 to 1: the part of a mirror inside its rim.
+    """
+    rng, views = np.random.default_rng(4), list[BoardView]()
+    while len(views) < 10:
+        angle, off_axis = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.8)
+        middle = [np.sin(off_axis) * np.cos(angle), np.sin(off_axis) * np.sin(angle), np.cos(off_axis)]
+        T = board_pose(np.array(middle), rng.uniform(0.25, 0.5), rng.uniform(-0.5, 0.5, 3), CHECKERBOARD)
+        rays = se3.apply(T, CHECKERBOARD.points)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        plane = (1 + xi) * rays[:, :2] / (rays[:, 2:] + xi)
+        plane *= 1 + k * (plane**2).sum(axis=1, keepdims=True)
+        pixels = focal_px * plane + [319.5, 239.5] + sigma_px * rng.standard_normal(plane.shape)
+        if ((pixels > 5) & (pixels < [635, 475])).all():
+            views.append(BoardView(str(len(views)), pixels))
+    return [np.full((480, 640), 150, np.uint8)], views
 
 
-def guess(*images: Image) -> str:
-    return view_of_images("auto", [([image], []) for image in images], CHECKERBOARD, silent)
+def guess(*cameras: Camera) -> str:
+    return view_of_images("auto", cameras, CHECKERBOARD, silent)
 
 
 @pytest.mark.parametrize("board", [CharucoBoard(7, 5, 0.06, 0.045, "4X4_50"), AprilGrid(5, 4, 0.08, 0.3)])
 @pytest.mark.parametrize("view", ["mirror", "direct"])
 def test_markers_are_reflected_by_a_mirror(board: MarkerBoard, view: str) -> None:
     sheet = print_of(board)[0]
-    seen: list[tuple[list[Image], list[BoardView]]] = []
+    seen: list[Camera] = []
     for turns in range(2):  # two cameras; the second one sees the board on its side
         turned = np.ascontiguousarray(np.rot90(sheet if view == "direct" else sheet[:, ::-1], turns))
         found = find_marker_board(turned, board)
         assert found is not None
-        seen.append(([disc(0.0)], [found]))
+        seen.append((rim(0.0)[0], [found]))
     assert view_of_images("auto", seen, board, silent) == view
 
 
-def test_a_rim_with_a_hub_is_a_mirror_and_an_image_without_a_rim_a_lens() -> None:
-    assert guess(disc(25.0)) == "mirror" and guess(disc(25.0), disc(0.0)) == "mirror"
-    assert guess(shaded(0.5)) == "direct"
+def test_a_rim_with_a_hub_is_a_mirror() -> None:
+    assert guess(rim(25.0)) == "mirror" and guess(rim(25.0), rim(0.0)) == "mirror"
+
+
+@pytest.mark.parametrize(("focal_px", "k"), [(1200, 0.0), (600, 0.0), (600, -0.05), (600, 0.1), (350, -0.03)])
+def test_lines_that_stay_straight_are_seen_by_a_lens(focal_px: float, k: float) -> None:
+    assert guess(seen_boards(focal_px, 0.0, k)) == "direct"
+    assert guess(rim(0.0), seen_boards(focal_px, 0.0, k)) == "direct"
 
 
 @pytest.mark.parametrize(
-    ("images", "found"),
+    ("cameras", "found"),
     [
-        ([disc(0.0)], "no markers"),  # a mirror without a hub, or a fisheye
-        ([shaded(0.2)], "no markers"),  # neither a rim nor light corners
-        ([shaded(0.5) // 8], "no markers"),  # dark
-        ([disc(25.0), shaded(0.5)], "a mirror in one"),
+        ([rim(0.0)], "no markers"),  # a mirror without a hub, or a fisheye
+        ([seen_boards(1000, 0.8)], "no markers"),  # inside the rim of a mirror: 19 degrees about its axis,
+        ([seen_boards(500, 0.9)], "no markers"),  # 36 degrees,
+        ([seen_boards(300, 1.0)], "no markers"),  # and 55 degrees
+        ([seen_boards(600, 0.0, sigma_px=3.0)], "no markers"),  # uncertain corners
+        ([(seen_boards(600, 0.0)[0], seen_boards(600, 0.0)[1][:2])], "no markers"),  # too few views
+        ([rim(25.0), seen_boards(600, 0.0)], "a mirror in one"),
     ],
 )
-def test_what_the_images_leave_open_is_asked_for(images: list[Image], found: str) -> None:
+def test_what_the_images_leave_open_is_asked_for(cameras: list[Camera], found: str) -> None:
     with pytest.raises(OmnidError, match=rf"\(found {found}.*add --view mirror or --view direct"):
-        guess(*images)
-    assert view_of_images("direct", [(images, [])], CHECKERBOARD, silent) == "direct"
+        guess(*cameras)
+    assert view_of_images("direct", cameras, CHECKERBOARD, silent) == "direct"
