@@ -22,7 +22,7 @@ from omnid.simulation.rendering.textures import PAINTERS
 
 SURFACES: Final = ("brick.png", "gravel.png", "grass.png")  # each of 512x512 px, evenly lit
 SURFACE_M: Final = 1.2  # width of a photograph of a surface
-PICTURES: Final = (
+POSTERS: Final = (
     "astronaut.png",
     "camera.png",
     "chelsea.png",
@@ -46,7 +46,7 @@ def with_photographs(scene: Scene, seed: int) -> Scene:
 
 def _painter(face: Rectangle) -> Callable[[Random, Rectangle], Rectangle]:
     if face.name.startswith(("poster", "box")):
-        return _as_picture
+        return _as_poster
     return _as_surface if face.name == "floor" or face.name in PAINTERS else lambda _, unchanged: unchanged
 
 
@@ -61,9 +61,9 @@ def _as_surface(rng: Random, face: Rectangle) -> Rectangle:
     return replace(face, texture=np.ascontiguousarray(np.tile(shifted, times)[:rows, :columns]))
 
 
-def _as_picture(rng: Random, face: Rectangle) -> Rectangle:
+def _as_poster(rng: Random, face: Rectangle) -> Rectangle:
     """Return a face that shows a part of a photograph."""
-    photograph, shape = photographed(str(rng.choice(PICTURES))), face.texture.shape
+    photograph, shape = photographed(str(rng.choice(POSTERS))), face.texture.shape
     # The largest part of the face's form, then a random share of it at a random place.
     scale = rng.uniform(LEAST_PART, 1) * min(photograph.shape[0] / shape[0], photograph.shape[1] / shape[1])
     height, width = (max(2, int(scale * side)) for side in shape)

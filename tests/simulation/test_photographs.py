@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from tests.simulation import build
-from tests.simulation.photographs import PICTURES, SURFACES, photographed, with_photographs
+from tests.simulation.photographs import POSTERS, SURFACES, photographed, with_photographs
 
 pytestmark = pytest.mark.skipif(find_spec("skimage") is None, reason="needs the files of scikit-image")
 SCENE = build("rooms", 3, 160, 4).scene
 
 
 def test_every_photograph_is_there_in_grey() -> None:
-    for name in (*SURFACES, *PICTURES):
+    for name in (*SURFACES, *POSTERS):
         assert photographed(name).ndim == 2 and photographed(name).std() > 10
 
 
@@ -40,12 +40,12 @@ def test_a_surface_repeats_in_mirror_images_without_seams() -> None:
     assert columns.max() < 2 * np.median(columns) and rows.max() < 2 * np.median(rows)
 
 
-def test_pictures_keep_their_form_and_are_parts_of_photographs() -> None:
+def test_posters_keep_their_form_and_are_parts_of_photographs() -> None:
     faces = zip(SCENE.rectangles, with_photographs(SCENE, 3).rectangles, strict=True)
-    pictures = [(before, now) for before, now in faces if before.name.startswith("poster")]
-    assert all(now.texture.shape == before.texture.shape for before, now in pictures)
-    shown = pictures[0][1].texture
-    assert max(_likeness(photographed(name), shown) for name in PICTURES) > 0.9
+    posters = [(before, now) for before, now in faces if before.name.startswith("poster")]
+    assert all(now.texture.shape == before.texture.shape for before, now in posters)
+    shown = posters[0][1].texture
+    assert max(_likeness(photographed(name), shown) for name in POSTERS) > 0.9
 
 
 def _likeness(photograph: np.ndarray, part: np.ndarray) -> float:
