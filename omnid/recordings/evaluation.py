@@ -58,7 +58,7 @@ class Metrics:
 def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01, alignment: str = "origin") -> Metrics:
     """Compare an estimate with the truth, both T_world_rig of the same rig frame in any two worlds.
 
-    alignment: one of ALIGNMENTS, see `alignment.aligned`.
+    alignment: one of ALIGNMENTS, see `aligned`.
 
     Each estimate is associated with the truth nearest in time within the tolerance; of two estimates with the same
     truth, the nearer one. Raise OmnidError for fewer than two associated poses.
