@@ -8,30 +8,34 @@ from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Iterable, Iterator, Set
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence, Set
+from contextlib import ExitStack, closing
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.bounded_sqlite import bound_work, open_bounded
+from omnid.core.places.code_index import INDEXED, CodeIndex
 from omnid.core.places.map_tags import MAX_VIEWS, TagView
-from omnid.core.places.place_map import UNUSED, Link, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_features import FeatureStore, PlaceFeatures, StoredFeatures
+from omnid.core.places.place_map import UNUSED, Link, PlaceMap, StoredPlaces
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.tags import MAX_TAG
 from omnid.errors import OmnidError
 from omnid.formats import place_rows
-from omnid.formats.place_rows import BadRowError
+from omnid.formats.place_rows import BadRowError, KeyframeRow
+from omnid.formats.stored_features import FeatureFile
 from omnid.formats.whole_file import replacement
 
-VERSION: Final = 4  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+VERSION: Final = 5  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
 # Earlier versions that are read as well. Scans before version 4 had heights above the base, not above the floor, and
 # passed over low obstacles before a wall: they are read as unknown.
 WITHOUT_TAGS: Final = 2
 WITHOUT_FLOOR: Final = 3
+WITHOUT_CODES: Final = 4  # Features are in the rows of the keyframes, which are read whole.
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
 MAX_VALUE_BYTES: Final = 1 << 20  # Limit of one value in the database.
@@ -42,7 +46,7 @@ MAX_INSTRUCTIONS: Final = 50_000_000  # Instructions that SQLite may take to rea
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
     "missed INTEGER, T_map_rect BLOB, "
-    "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, descriptors BLOB, views BLOB, "
+    "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, features INTEGER, codes BLOB, azimuths BLOB, "
     "crc32 INTEGER)",
     "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
     "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, tags INTEGER, tag_views INTEGER, "
@@ -51,12 +55,22 @@ SCHEMA: Final = {
     "tag": "CREATE TABLE tag (id INTEGER PRIMARY KEY, name TEXT, size_m REAL, crc32 INTEGER)",
     "tag_view": "CREATE TABLE tag_view (keyframe INTEGER, tag INTEGER, T_rect_tag BLOB, covariance BLOB, "
     "crc32 INTEGER)",
+    # The last table, so that what is read at the start lies together in the file.
+    "features": "CREATE TABLE features (id INTEGER PRIMARY KEY, descriptors BLOB, views BLOB, crc32 INTEGER)",
+}
+SCHEMA_4: Final = {
+    "keyframe": SCHEMA["keyframe"].replace(
+        "features INTEGER, codes BLOB, azimuths BLOB", "descriptors BLOB, views BLOB"
+    ),
+    **{table: text for table, text in SCHEMA.items() if table not in ("keyframe", "features")},
 }
 SCHEMA_2: Final = {
-    "keyframe": SCHEMA["keyframe"],
+    "keyframe": SCHEMA_4["keyframe"],
     "link": SCHEMA["link"],
     "map": SCHEMA["map"].replace("tags INTEGER, tag_views INTEGER, ", ""),
 }
+IN_MEMORY: Final = 1 << 62  # More bytes than the features of any map have.
+BLOCK: Final = 1000  # Rows of which arrays are made at once: 5 MB of keyframes; by judgement, not measured.
 
 
 def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
@@ -68,22 +82,29 @@ def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
     try:
         with replacement(path) as partial:
             _write(partial, places, rig)
-            read_places(partial)  # no map is replaced by one that would be refused
+            _require_readable(partial)  # no map is replaced by one that would be refused
     except (OSError, ValueError, sqlite3.Error) as error:
         raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
 
 
-def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMap, PlaceRig]:
+def read_places(
+    path: str | Path, into: PlaceMap | None = None, most_feature_bytes: int = IN_MEMORY
+) -> tuple[PlaceMap, PlaceRig]:
     """Return the map of a file and the rig by which it was made.
 
     into: an empty map that is filled, whose bounds hold as soon as a keyframe is added to it.
-    Raises OmnidError, in one line, for any file that is no whole map.
+    most_feature_bytes: features that take more stay in the file until they are needed.
+    Raises OmnidError, in one line, for any file that is no whole map; features that stay are checked later.
     """
-    path = Path(path)
+    path, places = Path(path), PlaceMap() if into is None else into
     version = _version_of(path)
     try:
-        with closing(open_bounded(path, MAX_VALUE_BYTES, unchanging=True)) as database:
-            return _read(_Reader(database, version), PlaceMap() if into is None else into)
+        with ExitStack() as open_file:
+            database = open_file.enter_context(closing(open_bounded(path, MAX_VALUE_BYTES, unchanging=True)))
+            rig = _read(_Reader(database, version), places, most_feature_bytes)
+            if places.stored is not None:
+                open_file.pop_all()  # features are read from it later
+        return places, rig
     except BadRowError as error:
         raise OmnidError(
             f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
@@ -106,7 +127,7 @@ def _version_of(path: Path) -> int:
     if len(header) < 100 or not header.startswith(MAGIC) or int.from_bytes(header[68:72]) != APPLICATION_ID:
         raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
     version = int.from_bytes(header[60:64])
-    if version not in (WITHOUT_TAGS, WITHOUT_FLOOR, VERSION):
+    if version not in (WITHOUT_TAGS, WITHOUT_FLOOR, WITHOUT_CODES, VERSION):
         raise OmnidError(
             f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
             "`omnid map build`, or update omnid"
@@ -132,13 +153,17 @@ def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
             database.execute(text)
         ids = sorted(places.keyframes)
         keyframes = (
-            place_rows.keyframe_row(places.keyframes[id], places.poses[id], places.uses.get(id, UNUSED)) for id in ids
+            place_rows.keyframe_row(
+                places.keyframes[id], places.poses[id], places.uses.get(id, UNUSED), rig.cylinder.width
+            )
+            for id in ids
         )
         _insert(database, "keyframe", keyframes)
         _insert(database, "link", (place_rows.link_row(link) for link in places.links))
         _insert(database, "tag", (place_rows.tag_row(places.tags.known[id]) for id in sorted(places.tags.known)))
         _insert(database, "tag_view", (place_rows.tag_view_row(view) for view in places.tags.views))
         _insert(database, "map", [place_rows.map_row(rig, places)])
+        _insert(database, "features", (place_rows.features_row(places.keyframes[id]) for id in ids))
         database.execute("COMMIT")
 
 
@@ -152,8 +177,8 @@ class _Reader:
     """Rows of a database that may be hostile: bounded work, no code of the file, checked sums."""
 
     def __init__(self, database: sqlite3.Connection, version: int) -> None:
-        self._database, self.version = database, version
-        schema = SCHEMA_2 if version == WITHOUT_TAGS else SCHEMA
+        self.database, self.version = database, version
+        schema = {WITHOUT_TAGS: SCHEMA_2, VERSION: SCHEMA}.get(version, SCHEMA_4)
         bound_work(database, MAX_INSTRUCTIONS)
         found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(schema) + 1))
         if found != schema:
@@ -161,22 +186,29 @@ class _Reader:
 
     def rows(self, table: str, most: int) -> Iterator[place_rows.Row]:
         """Yield the rows of a table without their checksums, at most the given number."""
-        for number, row in enumerate(self._database.execute(f"SELECT * FROM {table} ORDER BY rowid")):
+        for number, row in enumerate(self.database.execute(f"SELECT * FROM {table} ORDER BY rowid")):
             if number >= most:
                 raise BadRowError(f"more than {most} rows of {table}")
             if place_rows.checksum(row[:-1]) != row[-1]:
                 raise BadRowError(f"the checksum of row {number + 1} of {table} is wrong")
             yield row[:-1]
 
+    def blocks(self, table: str, most: int) -> Iterator[list[place_rows.Row]]:
+        """Yield the same rows, BLOCK at a time."""
+        rows = self.rows(table, most)
+        while block := list(islice(rows, BLOCK)):
+            yield block
 
-def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
+
+def _read(reader: _Reader, places: PlaceMap, most_feature_bytes: int) -> PlaceRig:
+    """Fill an empty map; return the rig."""
     heads = list(reader.rows("map", 1))
     if not heads:
         raise BadRowError("the table map is empty")
     has_tags = reader.version != WITHOUT_TAGS
     head = place_rows.read_map_row(heads[0] if has_tags else place_rows.head_of_version_2(heads[0]))
-    keyframes = [place_rows.read_keyframe_row(row, head.rig) for row in reader.rows("keyframe", MAX_KEYFRAMES)]
-    links = [place_rows.read_link_row(row) for row in reader.rows("link", MAX_LINKS)]
+    keyframes, features = _read_keyframes(reader, head.rig, places, most_feature_bytes)
+    links = [link for block in reader.blocks("link", MAX_LINKS) for link in place_rows.read_links(block)]
     tags = [place_rows.read_tag_row(row) for row in reader.rows("tag", MAX_TAG + 1)] if has_tags else []
     views = [place_rows.read_tag_view_row(row) for row in reader.rows("tag_view", MAX_TAG_VIEWS)] if has_tags else []
     for name, found, expected in (
@@ -187,18 +219,65 @@ def _read(reader: _Reader, places: PlaceMap) -> tuple[PlaceMap, PlaceRig]:
     ):
         if found != expected:
             raise BadRowError(f"expected {expected} {name}, found {found}")
-    _check([(keyframe, T_map_rect) for keyframe, T_map_rect, _ in keyframes], links)
-    for keyframe, T_map_rect, use in keyframes:
-        if reader.version != VERSION:
-            keyframe.scan.fill(np.nan)
-        places.keyframes[keyframe.id], places.poses[keyframe.id] = keyframe, T_map_rect
-        if use != UNUSED:
-            places.uses[keyframe.id] = use
+    _check(keyframes, links)
+    for row, of_row in zip(keyframes, features, strict=True):
+        if reader.version <= WITHOUT_FLOOR:
+            row.scan.fill(np.nan)
+        places.keyframes[row.id], places.poses[row.id] = row.keyframe(of_row), row.T_map_rect
+        if row.use != UNUSED:
+            places.uses[row.id] = row.use
     places.links, places.dropped = links, head.dropped
     _check_views(views, {tag.id for tag in tags}, places.keyframes.keys())
     places.tags.known = {tag.id: tag for tag in tags}
     places.tags.views = views
-    return places, head.rig
+    return head.rig
+
+
+def _read_keyframes(
+    reader: _Reader, rig: PlaceRig, places: PlaceMap, most_feature_bytes: int
+) -> tuple[list[KeyframeRow], Sequence[PlaceFeatures | StoredFeatures]]:
+    """Return the keyframes and their features; where these stay in the file, the map gets the index of them."""
+    keyframes: list[KeyframeRow] = []
+    features: list[PlaceFeatures] = []
+    codes: list[place_rows.KeyframeCodes] = []
+    for block in reader.blocks("keyframe", MAX_KEYFRAMES):
+        keyframes += place_rows.read_keyframes(block)
+        if reader.version == VERSION:
+            codes.append(place_rows.read_codes(block))
+        else:
+            features += [place_rows.read_features(row[-2], row[-1], rig) for row in block]
+    if reader.version != VERSION:
+        return keyframes, features
+    counts = [count for block in codes for count in block.counts]
+    if sum(counts) * place_rows.FEATURE_BYTES > most_feature_bytes:
+        store = FeatureStore(FeatureFile(reader.database, rig).read, most_feature_bytes)
+        places.stored = StoredPlaces(_index([row.id for row in keyframes], counts, codes), store)
+        return keyframes, [StoredFeatures(row.id, n, store) for row, n in zip(keyframes, counts, strict=True)]
+    by_id = {
+        id: place_rows.read_features(descriptors, views, rig)
+        for id, descriptors, views in reader.rows("features", MAX_KEYFRAMES)
+    }
+    if [(id, one.count) for id, one in by_id.items()] != list(zip([row.id for row in keyframes], counts, strict=True)):
+        raise BadRowError(f"the features are not those of {len(keyframes)} keyframes")
+    return keyframes, list(by_id.values())
+
+
+def _index(ids: list[int], counts: list[int], codes: list[place_rows.KeyframeCodes]) -> CodeIndex:
+    """Return the index of keyframes, from blocks of their codes."""
+    return CodeIndex(
+        np.array(ids, np.int64),
+        np.minimum(counts, INDEXED),
+        np.concatenate([block.codes for block in codes]),
+        np.concatenate([block.azimuths for block in codes]),
+    )
+
+
+def _require_readable(path: Path) -> None:
+    """Read a map and check all of it, keyframe after keyframe, so that a large one needs little memory."""
+    places, _ = read_places(path, most_feature_bytes=0)
+    for keyframe in places.keyframes.values():
+        if keyframe.features.copied().count != keyframe.features.count:
+            raise BadRowError(f"the features of keyframe {keyframe.id} are outside their range")
 
 
 def _check_views(views: list[TagView], tags: Set[int], keyframes: Set[int]) -> None:
@@ -211,15 +290,14 @@ def _check_views(views: list[TagView], tags: Set[int], keyframes: Set[int]) -> N
     place_rows.require_covariances([view.covariance for view in views], place_rows.LEAST_VARIANCE)
 
 
-def _check(keyframes: list[tuple[PlaceKeyframe, NDArray[np.float64]]], links: list[Link]) -> None:
+def _check(keyframes: list[KeyframeRow], links: list[Link]) -> None:
     """Check poses and covariances, all at once, and that links join keyframes."""
-    ids = {keyframe.id for keyframe, _ in keyframes}
+    ids = {keyframe.id for keyframe in keyframes}
     if any(link.a not in ids or link.b not in ids or link.a == link.b for link in links):
         raise BadRowError("a link joins no two keyframes")
-    of_keyframes: list[Any] = [keyframe for keyframe, _ in keyframes]
-    place_rows.require_rigid(
-        [T for _, T in keyframes] + [k.T_odom_rect for k in of_keyframes] + [link.T_a_b for link in links]
-    )
-    of_odometry: list[Any] = [link for link in links if not link.is_loop]
-    place_rows.require_covariances([one.covariance for one in of_keyframes + of_odometry], 0.0)
+    place_rows.require_rigid([k.T_map_rect for k in keyframes])
+    place_rows.require_rigid([k.T_odom_rect for k in keyframes])
+    place_rows.require_rigid([link.T_a_b for link in links])
+    place_rows.require_covariances([k.covariance for k in keyframes], 0.0)
+    place_rows.require_covariances([link.covariance for link in links if not link.is_loop], 0.0)
     place_rows.require_covariances([link.covariance for link in links if link.is_loop], place_rows.LEAST_VARIANCE)

@@ -12,8 +12,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
+from omnid.core.places.code_index import INDEXED, azimuths_of, codes_of
 from omnid.core.places.map_tags import MapTag, TagView
-from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_features import DESCRIPTOR, PlaceFeatures, StoredFeatures
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.tags import MAX_NAME, MAX_TAG, SIZES_M
 
@@ -22,19 +24,55 @@ Row: TypeAlias = tuple[Any, ...]
 
 MAX_INTEGER: Final = 1 << 62
 MAX_FEATURES: Final = 4096  # Most features of a keyframe.
+FEATURE_BYTES: Final = DESCRIPTOR + 3 * 4  # Size of a descriptor with its view.
 MAX_POSITION_M: Final = 1e5
 MAX_PIXELS: Final = 1 << 15  # Largest width and height of a panorama.
 MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
 LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
 RIGID: Final = 1e-6  # largest difference of R R^T from the identity
 THUMBNAIL: Final = (16, 128)
-DESCRIPTOR: Final = 128
+INDEX_COLUMNS: Final = 10  # Columns of a keyframe up to its scan, the same in all versions.
 MAX_HASH: Final = 128  # characters
 BASELINES_M: Final = (1e-3, 1e2)
 
 
 class BadRowError(ValueError):
     """A row that no omnid has written."""
+
+
+class KeyframeRow(NamedTuple):
+    """A keyframe but for its features."""
+
+    id: int
+    session: int
+    stamp_ns: int
+    use: KeyframeUse
+    T_map_rect: Array
+    T_odom_rect: Array
+    covariance: Array
+    thumbnail: NDArray[np.int8]
+    scan: NDArray[np.float16]
+
+    def keyframe(self, features: PlaceFeatures | StoredFeatures) -> PlaceKeyframe:
+        """Return the keyframe with its features."""
+        return PlaceKeyframe(
+            self.id,
+            self.session,
+            self.stamp_ns,
+            self.T_odom_rect,
+            self.covariance,
+            self.thumbnail,
+            self.scan,
+            features,
+        )
+
+
+class KeyframeCodes(NamedTuple):
+    """Numbers of features of keyframes (K), and the codes and azimuths of the strongest of them."""
+
+    counts: list[int]
+    codes: NDArray[np.uint64]
+    azimuths: NDArray[np.uint8]
 
 
 class Head(NamedTuple):
@@ -56,9 +94,9 @@ def checksum(row: Row) -> int:
     return crc
 
 
-def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse) -> Row:
-    """Return the row of a keyframe."""
-    features = keyframe.features
+def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse, width: int) -> Row:
+    """Return the row of a keyframe; width: columns of the panorama."""
+    features = keyframe.features.copied()
     return (
         keyframe.id,
         keyframe.session,
@@ -70,9 +108,18 @@ def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse) -
         _bytes(keyframe.covariance, "<f8"),
         _bytes(keyframe.thumbnail, "i1"),
         _bytes(keyframe.scan, "<f2"),
-        _bytes(features.descriptors, "u1"),
-        _bytes(features.views, "<f4"),
+        keyframe.features.count,
+        _bytes(codes_of(features), "<u8"),
+        _bytes(azimuths_of(features, width), "u1"),
     )
+
+
+def features_row(keyframe: PlaceKeyframe) -> Row:
+    """Return the row of the features of a keyframe. Raises BadRowError where they cannot be read any more."""
+    features = keyframe.features.copied()
+    if features.count != keyframe.features.count:
+        raise BadRowError(f"the features of keyframe {keyframe.id} in the map that was read are damaged")
+    return keyframe.id, _bytes(features.descriptors, "u1"), _bytes(features.views, "<f4")
 
 
 def link_row(link: Link) -> Row:
@@ -126,15 +173,52 @@ def head_of_version_2(row: Row) -> Row:
     return (*row[:3], 0, 0, *row[3:])
 
 
-def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array, KeyframeUse]:
-    """Return a keyframe, its pose T_map_rect (4, 4) and its use. Raises BadRowError.
+def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
+    """Return keyframes but for their features. Raises BadRowError. Poses and covariances are not checked.
 
-    Poses and covariance are not checked.
+    The arrays of all of them are made at once: one by one takes most of the time in which a large map opens.
     """
-    id, session, stamp_ns, found, missed, T_map_rect, T_odom_rect, covariance, thumbnail, scan, descriptors, views = row
-    ranges = _array(scan, "<f2", (SECTORS,))
+    ids, sessions, stamps, found, missed, T_map_rect, T_odom_rect, covariance, thumbnail, scan = (
+        [row[column] for row in rows] for column in range(INDEX_COLUMNS)
+    )
+    ranges = _arrays(scan, "<f2", (SECTORS,))
     if not (np.isnan(ranges) | ((ranges >= 0) & (ranges <= MAX_RANGE_M))).all():
-        raise BadRowError(f"a range of keyframe {id!r} is outside 0 to {MAX_RANGE_M:g} m")
+        raise BadRowError(f"a range of a keyframe is outside 0 to {MAX_RANGE_M:g} m")
+    return [
+        KeyframeRow(_integer(id), _integer(session), _integer(stamp_ns, -MAX_INTEGER), use, *arrays)
+        for id, session, stamp_ns, use, *arrays in zip(
+            ids,
+            sessions,
+            stamps,
+            (KeyframeUse(_integer(a), _integer(b)) for a, b in zip(found, missed, strict=True)),
+            _transforms(T_map_rect),
+            _transforms(T_odom_rect),
+            _arrays(covariance, "<f8", (6, 6)),
+            _arrays(thumbnail, "i1", THUMBNAIL),
+            ranges,
+            strict=True,
+        )
+    ]
+
+
+def read_codes(rows: Sequence[Row]) -> KeyframeCodes:
+    """Return the numbers of features and their codes, one keyframe's after the other's. Raises BadRowError."""
+    counts = [_integer(row[INDEX_COLUMNS], 0, MAX_FEATURES) for row in rows]
+    for count, row in zip(counts, rows, strict=True):
+        codes, azimuths = row[INDEX_COLUMNS + 1 :]
+        if not isinstance(codes, bytes) or not isinstance(azimuths, bytes):
+            raise BadRowError("the codes of a keyframe are none")
+        if (len(codes), len(azimuths)) != (8 * min(count, INDEXED), min(count, INDEXED)):
+            raise BadRowError(f"the codes of keyframe {row[0]!r} are not those of {count} features")
+    return KeyframeCodes(
+        counts,
+        np.frombuffer(b"".join(row[INDEX_COLUMNS + 1] for row in rows), "<u8").astype(np.uint64),
+        np.frombuffer(b"".join(row[INDEX_COLUMNS + 2] for row in rows), np.uint8),
+    )
+
+
+def read_features(descriptors: object, views: object, rig: PlaceRig) -> PlaceFeatures:
+    """Return the features of a keyframe. Raises BadRowError."""
     features = PlaceFeatures(_array(descriptors, "u1", (-1, DESCRIPTOR)), _array(views, "<f4", (-1, 3)))
     if len(features.descriptors) != len(features.views) or len(features.views) > MAX_FEATURES:
         raise BadRowError(f"{len(features.descriptors)} descriptors and {len(features.views)} views in a keyframe")
@@ -145,23 +229,17 @@ def read_keyframe_row(row: Row, rig: PlaceRig) -> tuple[PlaceKeyframe, Array, Ke
         (np.abs(column) <= 2 * width) & (np.abs(lower) <= 2 * height) & (upper > lower) & (upper <= 3 * height)
     ).all():
         raise BadRowError("a view of a keyframe is outside the panorama")
-    keyframe = PlaceKeyframe(
-        _integer(id),
-        _integer(session),
-        _integer(stamp_ns, -MAX_INTEGER),
-        _transform(T_odom_rect),
-        _array(covariance, "<f8", (6, 6)),
-        _array(thumbnail, "i1", THUMBNAIL),
-        ranges,
-        features,
-    )
-    return keyframe, _transform(T_map_rect), KeyframeUse(_integer(found), _integer(missed))
+    return features
 
 
-def read_link_row(row: Row) -> Link:
-    """Return a link. Raises BadRowError. Its pose and covariance are not checked."""
-    a, b, inliers, T_a_b, covariance = row
-    return Link(_integer(a), _integer(b), _transform(T_a_b), _array(covariance, "<f8", (6, 6)), _integer(inliers))
+def read_links(rows: Sequence[Row]) -> list[Link]:
+    """Return links. Raises BadRowError. Their poses and covariances are not checked."""
+    T_a_b = _transforms([row[3] for row in rows])
+    covariance = _arrays([row[4] for row in rows], "<f8", (6, 6))
+    return [
+        Link(_integer(a), _integer(b), T, P, _integer(inliers))
+        for (a, b, inliers, *_), T, P in zip(rows, T_a_b, covariance, strict=True)
+    ]
 
 
 def read_tag_row(row: Row) -> MapTag:
@@ -217,8 +295,26 @@ def _array(value: object, dtype: DTypeLike, shape: tuple[int, ...]) -> NDArray[A
     return np.frombuffer(value, kind).reshape(shape).astype(kind.newbyteorder("="))
 
 
+def _arrays(values: Sequence[object], dtype: DTypeLike, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Return arrays (N, ...) of a shape, made at once."""
+    kind = np.dtype(dtype)
+    size = kind.itemsize * math.prod(shape)
+    known = [value for value in values if isinstance(value, bytes) and len(value) == size]
+    if len(known) != len(values):
+        raise BadRowError("an array has another size")
+    return (
+        np.frombuffer(bytearray(b"".join(known)), kind).reshape(-1, *shape).astype(kind.newbyteorder("="), copy=False)
+    )
+
+
+def _transforms(values: Sequence[object]) -> Array:
+    """Return transforms (N, 4, 4)."""
+    upper = _arrays(values, "<f8", (3, 4))
+    return np.concatenate([upper, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(upper), 1, 4))], axis=1)
+
+
 def _transform(value: object) -> Array:
-    return np.vstack([_array(value, "<f8", (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    return np.asarray(_transforms([value])[0])
 
 
 def _integer(value: object, low: int = 0, high: int = MAX_INTEGER) -> int:

@@ -115,7 +115,7 @@ def _keyframes(places: PlaceMap, at: Mapping[int, Point]) -> Iterator[str]:
         keyframe = places.keyframes[id]
         yield (
             f"<circle class='keyframe' cx='{coord(x)}' cy='{coord(y)}' r='2.5'><title>keyframe {id}, session "
-            f"{keyframe.session}, {len(keyframe.features.views)} features</title></circle>"
+            f"{keyframe.session}, {keyframe.features.count} features</title></circle>"
         )
 
 

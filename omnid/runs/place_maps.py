@@ -80,7 +80,14 @@ class RunPlaces:
             if not path.exists():
                 self._warn(f"{path}: there is no such map: this run begins a new one")
                 return None
-        return RigPlaces(*read_places(path, new_places(settings)))
+        found = RigPlaces(*read_places(path, new_places(settings), settings.limits.max_bytes))
+        if self._writes and found.places.stored is not None and found.places.is_full:
+            raise OmnidError(
+                f"{path}: a map of {len(found.places)} keyframes is more than places.limits.max_keyframes = "
+                f"{settings.limits.max_keyframes} and max_mb = {settings.limits.max_mb:g} leave room for: "
+                "add --localize-only, or raise them"
+            )
+        return found
 
     def _know(self, tags: Mapping[int, MapTag], places: PlaceMap) -> None:
         """Let the map know the tags of the settings, under their names there."""
@@ -176,7 +183,7 @@ def place_rig(geometry: Geometry) -> PlaceRig:
 
 def new_places(settings: PlacesConfig) -> PlaceMap:
     """Return an empty map with the bounds of the settings."""
-    return PlaceMap(settings.limits.max_keyframes, round(settings.limits.max_mb * 1_000_000))
+    return PlaceMap(settings.limits.max_keyframes, settings.limits.max_bytes)
 
 
 def _unmasked(camera: MountedCamera) -> MountedCamera:

@@ -90,6 +90,21 @@ def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_aga
     assert "calibrated again" in result.err and omap.read_bytes() == before and "written" not in result.out
 
 
+def test_a_map_that_stays_in_its_file_gives_the_same_poses_and_is_not_extended_beyond_its_bounds(
+    omnid: Command, scene: Path, omap: Path, tmp_path: Path
+) -> None:
+    """The features of few keyframes fit in 0.1 MB; the others are read again and again."""
+    arguments = ("--map", omap, "--localize-only", "--map-tum")
+    whole, little = tmp_path / "whole.txt", tmp_path / "little.txt"
+    bound = ("--set", "places.limits.max_mb=0.1")
+    assert omnid.replay(scene / "log.mcap", *arguments, whole, rig=scene / "rig.toml").count("loops") >= 2
+    assert omnid.replay(scene / "log.mcap", *arguments, little, *bound, rig=scene / "rig.toml").count("loops") >= 2
+    assert whole.read_bytes() == little.read_bytes()
+    full = (*bound, "--set", "places.limits.max_keyframes=4")
+    error = omnid.refused("replay", scene / "log.mcap", "--map", omap, *full, "--rig", scene / "rig.toml")
+    assert f"{omap}: a map of {len(read_places(omap)[0])} keyframes is more than" in error
+
+
 def test_what_is_not_recognised_is_left_out_with_a_warning(
     omnid: Command, scene: Path, elsewhere: Path, omap: Path
 ) -> None:

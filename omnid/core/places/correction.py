@@ -61,9 +61,14 @@ class MapCorrection:
             return
         self._waiting = 0
         self.optimisations += 1
-        row = {id: n for n, id in enumerate(part)}
-        links = [link for link in self._places.links if link.a in row]
+        among = set(part)
+        links = [link for link in self._places.links if link.a in among]
         self.factor = self._drift_factor(links)
+        # What joins two keyframes that stay says nothing of those that move.
+        links = [link for link in links if link.a not in fixed or link.b not in fixed]
+        joined = {id for link in links for id in (link.a, link.b)}
+        part = [id for id in part if id not in fixed or id in joined]
+        row = {id: n for n, id in enumerate(part)}
         edges = PoseEdges(
             np.array([(row[link.a], row[link.b]) for link in links]),
             np.array([link.T_a_b for link in links]),

@@ -24,4 +24,14 @@ class PlaceLimits:
         "where no place of a saved map is recognised, localise by the shape of the room: a "
         "particle filter on range scans; another building of the same shape would mislead it",
     )
-    max_mb: float = knob(50.0, "memory of the keyframes, MB; the same", low=0.1, high=10_000)
+    max_mb: float = knob(
+        50.0,
+        "memory of the keyframes, MB; the same, and larger features of a map file are read when they are needed",
+        low=0.1,
+        high=10_000,
+    )
+
+    @property
+    def max_bytes(self) -> int:
+        """Memory of the keyframes."""
+        return round(1e6 * self.max_mb)

@@ -18,13 +18,15 @@ from omnid.core.places.ageing import Ageing
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
 from omnid.core.places.features import describe
+from omnid.core.places.fixed_places import FixedPlaces
 from omnid.core.places.hypotheses import Hypotheses, Hypothesis, length_m
 from omnid.core.places.keyframe_id import NO_KEYFRAME
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.map_parts import MapParts
 from omnid.core.places.map_pose import MapPose, OdometryFrame
-from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
-from omnid.core.places.place_search import Expected, PlaceSearch
+from omnid.core.places.place_features import NOTHING, PlaceFeatures
+from omnid.core.places.place_map import PlaceKeyframe, PlaceMap, by_odometry
+from omnid.core.places.place_search import NEAR_M, Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition
 from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.core.places.search_schedule import SearchSchedule
@@ -56,12 +58,10 @@ class MapLocaliser:
         """
         self._limits = limits
         self.places = places if places is not None else PlaceMap()
-        self._fixed = frozenset(self.places.keyframes) if localize_only else frozenset()
+        self._fixed = FixedPlaces(self.places, sorted(self.places.keyframes) if localize_only else [])
         self._localize_only = localize_only
-        self.places.bound(
-            len(self._fixed) + TIES + 1 if localize_only else limits.max_keyframes,
-            round(1e6 * limits.max_mb) + sum(self.places.keyframes[id].nbytes for id in self._fixed),
-        )
+        bounds = (len(self._fixed.ids) + TIES + 1, None) if localize_only else (limits.max_keyframes, limits.max_bytes)
+        self.places.bound(*bounds)
         # A map has the columns of full turns, whatever sector of them the cameras show.
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
         self._tags = TagRecogniser(model, self.places) if self.places.tags else None
@@ -126,19 +126,9 @@ class MapLocaliser:
             "unjoined": max(0, len(self._parts) - 1),
             "ambiguous": self.search.ambiguous,
             "refused": self.search.refused,
-            **self._counts_of_tags(),
+            **({} if self.places.stored is None else self.places.stored.store.counts),
+            **({} if self._tags is None else self._tags.counts),
             **({} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous}),
-        }
-
-    def _counts_of_tags(self) -> dict[str, int]:
-        if self._tags is None:
-            return {}
-        return {
-            "tags_seen": len({view.tag for view in self.places.tags.views}),
-            "tag_views": len(self.places.tags.views),
-            "tag_views_forgotten": self.places.tags.forgotten,
-            "tags_ambiguous": self._tags.ambiguous,
-            "tags_of_other_size": self._tags.refused,
         }
 
     def map(self) -> PlaceMap:
@@ -159,11 +149,9 @@ class MapLocaliser:
             len(self.places.links),
         )
         if self._scans is None or self._scans[0] != now:
-            ids = sorted(self._parts.ids())
-            ids = [id for id in ids if id in self._fixed] or ids
-            poses = np.array([self.places.poses[id] for id in ids]).reshape(-1, 4, 4)
+            shown = self._fixed if self._is_in_fixed else FixedPlaces(self.places, sorted(self._parts.ids()))
             loops = tuple((link.a, link.b) for link in self.places.links if link.is_loop)
-            self._scans = now, KeyframeScans({id: self.places.keyframes[id].scan for id in ids}, poses, loops)
+            self._scans = now, KeyframeScans(shown.scans, shown.poses, loops)
         return self._scans[1]
 
     def _advance(self, frame: OdometryFrame) -> None:
@@ -183,7 +171,7 @@ class MapLocaliser:
 
     def _search_is_due(self, frame: OdometryFrame) -> bool:
         """True if a recognition is to be checked, or where odom is in the map is not known."""
-        is_unknown = self._recognised_at is None and bool(self._elsewhere())
+        is_unknown = self._recognised_at is None and any(map(self._is_place, self._parts.others()))
         is_pending = len(self._hypotheses) > 0 and self._state() is not MapState.LOCALIZED
         return self._schedule.search_is_due(
             frame.stamp_ns, frame.T_odom_rect, is_unknown=is_unknown, is_pending=is_pending
@@ -195,7 +183,7 @@ class MapLocaliser:
 
     def _is_place(self, id: int) -> bool:
         """True if a keyframe holds what recognises it."""
-        return len(self.places.keyframes[id].features.views) > 0
+        return self.places.keyframes[id].features.count > 0
 
     def _recognise(
         self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]
@@ -236,7 +224,11 @@ class MapLocaliser:
     def _expected(self, frame: OdometryFrame) -> Expected:
         """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""
         T_map_rect = self._T_map_odom @ frame.T_odom_rect
-        ids = [id for id in self._parts.ids() if self._is_place(id)]
+        # A pose by a tag may err by more than odometry since then.
+        P = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
+        sigmas = np.sqrt([np.trace(P[:3, :3]), np.trace(P[3:, 3:])]) if self._by_tag else np.zeros(2)
+        slack_m, slack_rad = (TAG_SIGMAS * sigmas).tolist()
+        ids = [id for id in self._around(T_map_rect[:3, 3], slack_m) if self._is_place(id)]
         drift_m = self._path_m - np.array([self._path_at.get(id, -math.inf) for id in ids])
         left = drift_m >= LOCAL_M
         ids, drift_m = [ids[n] for n in np.flatnonzero(left).tolist()], drift_m[left]
@@ -244,19 +236,31 @@ class MapLocaliser:
             path_m, at = self._recognised_at
             apart_m = np.linalg.norm(self.places.positions(ids) - at, axis=1)
             drift_m = np.minimum(drift_m, self._path_m - path_m + apart_m)
-        # A pose by a tag may err by more than odometry since then.
-        covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
-        sigmas = np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])]) if self._by_tag else np.zeros(2)
-        slack_m, slack_rad = (TAG_SIGMAS * sigmas).tolist()
         error_m = dict(zip(ids, (slack_m + GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
         error_rad = dict(zip(ids, (slack_rad + GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
         return Expected(T_map_rect, error_m, error_rad, self._state() is MapState.LOCALIZED)
 
+    @property
+    def _is_in_fixed(self) -> bool:
+        """True if the current part is that of the keyframes that stay as they are."""
+        return bool(self._fixed.ids) and self._parts.number(self._fixed.ids[0]) == self._parts.current
+
+    def _around(self, position: Array, slack_m: float) -> list[int]:
+        """Return the keyframes of this part; of those that stay as they are the ones that may be near or see tags."""
+        moving = [id for id in self._parts.ids() if id not in self._fixed.known]
+        if not self._is_in_fixed or self._recognised_at is None:
+            return moving
+        # One that is farther than NEAR_M and the largest error, which grows with its distance, is not looked for.
+        path_m, at = self._recognised_at
+        drift_m = self._path_m - path_m + float(np.linalg.norm(position - at))
+        reach_m = (NEAR_M + slack_m + GATE_M + GATE_PER_M * drift_m) / (1 - GATE_PER_M)
+        return self._fixed.within(position, reach_m, {view.keyframe for view in self.places.tags.views}) + moving
+
     def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]) -> None:
         """Add a keyframe to the map, with the tags that it shows."""
         if self._localize_only:
-            features = PlaceFeatures(features.descriptors[:0], features.views[:0])
-            ties = [id for id in self.places.keyframes if id not in self._fixed]
+            features = NOTHING
+            ties = [id for id in self.places.keyframes if id not in self._fixed.known]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)
         keyframe = PlaceKeyframe(
@@ -269,7 +273,7 @@ class MapLocaliser:
             frame.scan().astype(np.float16),
             features,
         )
-        link = None if self._newest is None else _by_odometry(self._newest, keyframe)
+        link = None if self._newest is None else by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._parts.add(keyframe.id)
         self._path_at[keyframe.id] = self._path_m
@@ -305,7 +309,9 @@ class MapLocaliser:
             T_other_odom = hypothesis.T_map_odom(self.places.poses)
             self._parts.join(other, T_other_odom @ se3.inverse(self._T_map_odom))
         links = [one.link() for one in consistent if self._hypotheses.take(one)]
-        self.correction.close([link for link in links if link.a != link.b], sorted(self._parts.ids()), self._fixed)
+        self.correction.close(
+            [link for link in links if link.a != link.b], sorted(self._parts.ids()), self._fixed.known
+        )
         self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
         self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
         self._by_tag = found.by_tag
@@ -322,9 +328,3 @@ class MapLocaliser:
             return MapPose(self._T_map_odom, covariance, state, NO_KEYFRAME, np.eye(4))
         T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
         return MapPose(self._T_map_odom, covariance, state, newest.id, T_keyframe_rect)
-
-
-def _by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
-    """Return the edge between two keyframes as odometry measured it."""
-    T_a_b = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
-    return Link(a.id, b.id, T_a_b, relative_covariance(T_a_b, a.covariance, b.covariance))

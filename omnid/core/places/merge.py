@@ -36,7 +36,7 @@ def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:
     loops, located = list[Link](), list[Array]()
     for id in sorted(renumbered.keyframes):
         keyframe = renumbered.keyframes[id]
-        found = search.far(keyframe.thumbnail, keyframe.features, places, ids)
+        found = search.far(keyframe.thumbnail, keyframe.features.loaded(), places, ids)
         if found is not None:
             loops.append(Link(found.id, id, found.T_place_rect, found.covariance, found.inliers))
             located.append(places.poses[found.id] @ found.T_place_rect @ se3.inverse(renumbered.poses[id]))

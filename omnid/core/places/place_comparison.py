@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.places.hypotheses import angle_rad, length_m
-from omnid.core.places.place_map import PlaceFeatures
+from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.recognition import RATIO, Recognition, distances, recognise
 from omnid.core.types.stereo_model import StereoModel
 
@@ -47,7 +47,7 @@ def compare(
     voted = [votes(here, known[id], model.cylinder.width) for id in ids]
     ranked = np.argsort([-count for count, _ in voted], kind="stable")
     found: dict[int, Recognition | None] = {}
-    for n in _spread(ranked, np.array([poses[id][:3, 3] for id in ids]), most):
+    for n in spread(ranked, np.array([poses[id][:3, 3] for id in ids]), most):
         place = found[ids[n]] = recognise(here, known[ids[n]], ids[n], voted[n][1], model)
         if place is not None and place.inliers >= enough:
             break
@@ -76,7 +76,7 @@ def is_elsewhere(a: Array, b: Array) -> bool:
     return length_m(between) > RUNNER_UP_M or angle_rad(between) > RUNNER_UP_RAD
 
 
-def _spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
+def spread(ranked: NDArray[np.intp], at: Array, most: int) -> list[int]:
     """Return the first `most` of ranked places (N,) at positions (N, 3), at most PER_PLACE near another.
 
     So a second, similar place is compared as well, although all neighbours of the first are more similar.
@@ -99,7 +99,7 @@ def votes(here: PlaceFeatures, there: PlaceFeatures, width: int) -> tuple[int, f
     """
     if len(there.views) < 2 or not len(here.views):
         return 0, 0.0
-    here = PlaceFeatures(here.descriptors[:VOTERS], here.views[:VOTERS])
+    here = here.first(VOTERS)
     squared = distances(here, there)
     best = squared.argmin(axis=1)
     nearest, second = np.partition(squared, 1, axis=1)[:, :2].T

@@ -11,23 +11,15 @@ import scipy
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.places.code_index import CodeIndex
+from omnid.core.places.drift import relative_covariance
 from omnid.core.places.map_tags import MapTags
+from omnid.core.places.place_features import FeatureStore, PlaceFeatures, StoredFeatures
 
 Array = NDArray[np.float64]
 
 MOST_LOOPS = 4  # Most loops that a dropped keyframe leaves to its neighbour: the most certain ones.
 OVERHEAD_BYTES = 1500  # Bytes of a keyframe without its large arrays: poses, covariance, links.
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaceFeatures:
-    """Features of a lower panorama whose depth is known: descriptors (N, 128), views (N, 3) [px].
-
-    A view is column, lower row, upper row.
-    """
-
-    descriptors: NDArray[np.uint8]
-    views: NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,13 +33,12 @@ class PlaceKeyframe:
     covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
     thumbnail: NDArray[np.int8]  # (16, 128) the panorama's contrast, see signature.py
     scan: NDArray[np.float16]  # (360,) m, nearest obstacle by azimuth from -pi on, NaN unknown
-    features: PlaceFeatures
+    features: PlaceFeatures | StoredFeatures
 
     @property
     def nbytes(self) -> int:
         """Memory that the keyframe takes."""
-        arrays = (self.thumbnail, self.scan, self.features.descriptors, self.features.views)
-        return OVERHEAD_BYTES + sum(a.nbytes for a in arrays)
+        return OVERHEAD_BYTES + self.thumbnail.nbytes + self.scan.nbytes + self.features.nbytes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +69,12 @@ class Link:
         return Link(self.a, other.b, self.T_a_b @ other.T_a_b, covariance, weakest)
 
 
+def by_odometry(a: PlaceKeyframe, b: PlaceKeyframe) -> Link:
+    """Return the edge between two keyframes as odometry measured it."""
+    T_a_b = se3.inverse(a.T_odom_rect) @ b.T_odom_rect
+    return Link(a.id, b.id, T_a_b, relative_covariance(T_a_b, a.covariance, b.covariance))
+
+
 class KeyframeUse(NamedTuple):
     """Visits at which a keyframe was recognised, and visits since the last one of them at which it was not."""
 
@@ -88,16 +85,24 @@ class KeyframeUse(NamedTuple):
 UNUSED: Final = KeyframeUse()
 
 
+class StoredPlaces(NamedTuple):
+    """What a map in memory has of keyframes whose features are in a file."""
+
+    codes: CodeIndex
+    store: FeatureStore
+
+
 class PlaceMap:
     """Keyframes by id with their poses T_map_rect, and the links between them; bounded in count and bytes."""
 
-    def __init__(self, max_keyframes: int = 1000, max_bytes: int = 50_000_000) -> None:
+    def __init__(self, max_keyframes: int = 1000, max_bytes: int | None = 50_000_000) -> None:
         self._max_keyframes, self._max_bytes = max_keyframes, max_bytes
         self.keyframes: dict[int, PlaceKeyframe] = {}
         self.poses: dict[int, Array] = {}
         self.links: list[Link] = []
         self.uses: dict[int, KeyframeUse] = {}  # uses by id; a keyframe without an entry is UNUSED
         self.tags = MapTags()
+        self.stored: StoredPlaces | None = None  # None: all features are in memory
         self.dropped = 0  # keyframes, because the map was full
 
     def __len__(self) -> int:
@@ -106,7 +111,8 @@ class PlaceMap:
     @property
     def nbytes(self) -> int:
         """Memory that the keyframes take."""
-        return sum(keyframe.nbytes for keyframe in self.keyframes.values())
+        of_file = 0 if self.stored is None else self.stored.codes.nbytes + self.stored.store.nbytes
+        return of_file + sum(keyframe.nbytes for keyframe in self.keyframes.values())
 
     @property
     def next_id(self) -> int:
@@ -132,9 +138,18 @@ class PlaceMap:
         self.poses[keyframe.id] = T_map_rect
         if link is not None:
             self.links.append(link)
-        while len(self) > max(2, self._max_keyframes) or (len(self) > 2 and self.nbytes > self._max_bytes):
+        while len(self) > 2 and self._is_too_large:
             self.drop(self._least_useful(keyframe.id))
             self.dropped += 1
+
+    @property
+    def is_full(self) -> bool:
+        """True if a keyframe that is added makes another one leave."""
+        return len(self) >= self._max_keyframes or (self._max_bytes is not None and self.nbytes >= self._max_bytes)
+
+    @property
+    def _is_too_large(self) -> bool:
+        return len(self) > self._max_keyframes or (self._max_bytes is not None and self.nbytes > self._max_bytes)
 
     def drop(self, id: int) -> None:
         """Drop a keyframe; what was linked to it is linked to the next one on its path, or to the one before."""
@@ -174,8 +189,8 @@ class PlaceMap:
         use = self.uses.get(id, UNUSED)
         return use.found - use.missed
 
-    def bound(self, max_keyframes: int, max_bytes: int) -> None:
-        """Set other bounds, which hold from the next keyframe on."""
+    def bound(self, max_keyframes: int, max_bytes: int | None) -> None:
+        """Set other bounds, which hold from the next keyframe on; max_bytes: None is no bound."""
         self._max_keyframes, self._max_bytes = max_keyframes, max_bytes
 
     def part(self, ids: Iterable[int]) -> PlaceMap:
@@ -187,6 +202,7 @@ class PlaceMap:
         part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
         part.uses = {id: use for id, use in self.uses.items() if id in part.keyframes}
         part.tags = self.tags.part(chosen)
+        part.stored = self.stored
         return part
 
     def move(self, poses: dict[int, Array]) -> None:

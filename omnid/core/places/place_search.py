@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.places.features import FEATURES
 from omnid.core.places.hypotheses import angle_rad, length_m
-from omnid.core.places.place_comparison import compare, is_elsewhere, supported, unambiguous
-from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_comparison import compare, is_elsewhere, spread, supported, unambiguous
+from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Recognition
 from omnid.core.places.signature import Signature, signature_of, similarities
 from omnid.core.types.stereo_model import StereoModel
@@ -34,6 +35,10 @@ class Effort(NamedTuple):
 
 NEAR_EFFORT: Final = Effort(16, 3)  # Effort where the pose is known roughly by odometry; by trial on development seeds.
 FAR_EFFORT: Final = Effort(200, 8)  # Effort where it is not; by trial on development seeds.
+# More keyframes than MOST_BY_SIGNATURE are searched by codes, where their features are in a file; the features of
+# VOTED_OF_FILE of them are read; by trial on development seeds, as 200 of 20,000 signatures often lack the right one.
+MOST_BY_SIGNATURE, VOTED_OF_FILE = 1000, 24
+MOST_SIGNATURES: Final = 2000  # Most signatures that are kept of a map in a file, so that they have 17 MB.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,14 +121,32 @@ class PlaceSearch:
         self.compared, self._seen = {}, []
         if not ids:
             return []
-        others = np.array([self._signature(places.keyframes[id]) for id in ids])
-        similar = similarities(signature_of(small), others)
-        ids = [ids[n] for n in np.argsort(-similar, kind="stable")[: effort.voted].tolist()]
-        known = {id: places.keyframes[id].features for id in ids}
+        known = {
+            id: places.keyframes[id].features.loaded() for id in self._shortlist(small, features, places, ids, effort)
+        }
         found = compare(features, known, places.poses, effort.compared, enough, self._model)
         self.compared = {id: 0 if place is None else place.inliers for id, place in found.items()}
         self._seen = [place for place in found.values() if place is not None]
         return self._seen
+
+    def _shortlist(
+        self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int], effort: Effort
+    ) -> list[int]:
+        """Return the keyframes that a closer look is for: by signatures, and by codes where they are many in a file."""
+        by_codes: list[int] = []
+        if places.stored is not None and len(ids) > MOST_BY_SIGNATURE:
+            among = np.array(ids)
+            ranked = places.stored.codes.ranked(features, among, self._model.cylinder.width)
+            chosen = spread(np.arange(len(ranked)), places.positions(ranked), VOTED_OF_FILE)
+            by_codes = [ranked[n] for n in chosen]
+            ids = [int(id) for id in among[~places.stored.codes.has(among)]]
+        if not ids:
+            return by_codes
+        others = np.array([self._signature(places.keyframes[id]) for id in ids])
+        if places.stored is not None and len(self._signatures) > MOST_SIGNATURES:
+            self._signatures = {id: self._signatures[id] for id in ids}
+        similar = similarities(signature_of(small), others)
+        return by_codes + [ids[n] for n in np.argsort(-similar, kind="stable")[: effort.voted].tolist()]
 
     def _signature(self, keyframe: PlaceKeyframe) -> Signature:
         if keyframe.id not in self._signatures:

@@ -51,7 +51,7 @@ def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
     return PlaceSummary(
         len(keyframes),
         len({keyframe.session for keyframe in keyframes}),
-        sum(len(keyframe.features.views) for keyframe in keyframes),
+        sum(keyframe.features.count for keyframe in keyframes),
         places.loops,
         places.dropped,
         len(parts(places)),
@@ -136,10 +136,10 @@ def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
 
 def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:
     """Return the landmarks of all keyframes, fused in voxels."""
-    count = sum(len(keyframe.features.views) for keyframe in places.keyframes.values())
+    count = sum(keyframe.features.count for keyframe in places.keyframes.values())
     fused = VoxelMap(VOXEL_M, 1 << max(4, (2 * count).bit_length()))
     for id in sorted(places.keyframes):
-        points = triangulate(places.keyframes[id].features.views.astype(float), rig.cylinder, rig.baseline_m)
+        points = triangulate(places.keyframes[id].features.loaded().views.astype(float), rig.cylinder, rig.baseline_m)
         radius = np.hypot(points[:, 0], points[:, 1])
         sigma_m = SIGMA_PX * radius**2 / (rig.cylinder.focal_px * rig.baseline_m)
         sure = sigma_m < MAX_SIGMA_M

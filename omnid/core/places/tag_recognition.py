@@ -27,9 +27,16 @@ class TagRecogniser:
         self.ambiguous = 0  # tags that hang in several places
 
     @property
-    def refused(self) -> int:
-        """Tags that are not of the size that is known."""
-        return self._finder.refused
+    def counts(self) -> dict[str, int]:
+        """Sizes and counters, for the status."""
+        tags = self._places.tags
+        return {
+            "tags_seen": len({view.tag for view in tags.views}),
+            "tag_views": len(tags.views),
+            "tag_views_forgotten": tags.forgotten,
+            "tags_ambiguous": self.ambiguous,
+            "tags_of_other_size": self._finder.refused,
+        }
 
     def find(self, frame: StereoFrame) -> list[TagPose]:
         """Return the tags that a frame shows."""

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from omnid.core.places.place_map import PlaceMap
+from omnid.core.places.place_map import UNUSED, PlaceMap
 from omnid.errors import OmnidError
-from omnid.formats.place_file import APPLICATION_ID, MAX_VALUE_BYTES, SCHEMA_2, read_places, write_places
-from omnid.formats.place_rows import checksum
+from omnid.formats.place_file import APPLICATION_ID, MAX_VALUE_BYTES, SCHEMA_2, SCHEMA_4, read_places, write_places
+from omnid.formats.place_rows import checksum, features_row, keyframe_row
 from omnid.formats.ply import write_ply
 from tests.faults.mutation import mutated
 from tests.omnid.formats.place_maps import RIG, some_places
@@ -56,7 +56,14 @@ def test_a_map_of_the_version_before_is_read(tmp_path: Path) -> None:
     write_places(path, places, RIG)
     row = head_of(path)
     row = (*row[:3], *row[5:-1])
-    changed(path, "DROP TABLE tag", "DROP TABLE tag_view", "DROP TABLE map", SCHEMA_2["map"], "PRAGMA user_version = 2")
+    changed(
+        as_of_version_4(path, places),
+        "DROP TABLE tag",
+        "DROP TABLE tag_view",
+        "DROP TABLE map",
+        SCHEMA_2["map"],
+        "PRAGMA user_version = 2",
+    )
     with closing(sqlite3.connect(path)) as database:
         database.execute(f"INSERT INTO map VALUES ({', '.join('?' * 11)})", (*row, checksum(row)))
         database.commit()
@@ -70,9 +77,33 @@ def test_scans_of_versions_before_heights_above_the_floor_are_unknown(tmp_path: 
     path, places = tmp_path / "a.omap", some_places(4)
     write_places(path, places, RIG)
     assert np.isfinite(read_places(path)[0].keyframes[2].scan).any()
-    changed(path, "PRAGMA user_version = 3")
+    changed(as_of_version_4(path, places), "PRAGMA user_version = 3")
     read = read_places(path)[0]
     assert len(read) == 4 and all(np.isnan(keyframe.scan).all() for keyframe in read.keyframes.values())
+
+
+def test_version_4_had_the_features_in_the_rows_of_the_keyframes(tmp_path: Path) -> None:
+    """They are read whole, however many there are, and the map is written in the version of today."""
+    path, places = tmp_path / "a.omap", some_places(4)
+    write_places(path, places, RIG)
+    now = path.read_bytes()
+    read, rig = read_places(as_of_version_4(path, places), most_feature_bytes=0)
+    assert read.stored is None and all(same(read.keyframes[id], places.keyframes[id]) for id in places.keyframes)
+    write_places(path, read, rig)
+    assert path.read_bytes() == now
+
+
+def as_of_version_4(path: Path, places: PlaceMap) -> Path:
+    """Change a file to one of version 4."""
+    changed(path, "DROP TABLE features", "DROP TABLE keyframe", SCHEMA_4["keyframe"], "PRAGMA user_version = 4")
+    with closing(sqlite3.connect(path)) as database:
+        for id in sorted(places.keyframes):
+            keyframe, use = places.keyframes[id], places.uses.get(id, UNUSED)
+            row = keyframe_row(keyframe, places.poses[id], use, RIG.cylinder.width)[:10]
+            row = (*row, *features_row(keyframe)[1:])
+            database.execute(f"INSERT INTO keyframe VALUES ({', '.join('?' * 13)})", (*row, checksum(row)))
+        database.commit()
+    return path
 
 
 def head_of(path: Path) -> tuple[object, ...]:
@@ -169,10 +200,12 @@ def changed(path: Path, *statements: str) -> Path:
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
-        ("PRAGMA user_version = 1", "version 1, expected 4"),
+        ("PRAGMA user_version = 1", "version 1, expected 5"),
         ("UPDATE keyframe SET stamp_ns = 5 WHERE id = 2", "the checksum of row 3 of keyframe"),
         ("UPDATE link SET inliers = 5", "the checksum of row 1 of link"),
-        ("DELETE FROM keyframe WHERE id = 3", "expected 4 keyframes, found 3"),
+        ("DELETE FROM keyframe WHERE id = 3", "the features are not those of 3 keyframes"),
+        ("DELETE FROM features WHERE id = 3", "the features are not those of 4 keyframes"),
+        ("UPDATE features SET views = zeroblob(0) WHERE id = 1", "the checksum of row 2 of features"),
         ("DELETE FROM link WHERE rowid = 1", "expected 4 links, found 3"),
         ("DELETE FROM tag WHERE id = 586", "expected 2 tags, found 1"),
         ("DELETE FROM tag_view WHERE rowid = 1", "expected 3 views of tags, found 2"),
@@ -211,7 +244,7 @@ def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
         ({"covariance": -np.eye(6)}, "a covariance is not positive"),
         ({"covariance": np.triu(np.ones((6, 6)))}, "a covariance is not symmetric"),
         ({"covariance": np.full((6, 6), np.inf)}, "a covariance is not finite"),
-        ({"scan": np.full(360, 1000, np.float16)}, "a range of keyframe"),
+        ({"scan": np.full(360, 1000, np.float16)}, "a range of a keyframe"),
         ({"thumbnail": np.zeros((16, 64), np.int8)}, "an array has another size"),
         ({"session": -1}, "outside its range"),
     ],

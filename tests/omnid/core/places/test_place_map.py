@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceKeyframe, PlaceMap
 
 
 def keyframe(number: int, features: int = 10) -> PlaceKeyframe:

@@ -10,7 +10,8 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.localisation import MapLocaliser
 from omnid.core.places.map_pose import MapPose, OdometryFrame
-from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
 from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.tracking_state import MapState
 from tests.omnid.core.mapping.rooms import pose, scan_of
