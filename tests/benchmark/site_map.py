@@ -61,7 +61,7 @@ COVARIANCE: Final = 1e-6 * np.eye(6)
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What a frame shows, and where it is in the map."""
+    """Content of a frame, and its pose in the map."""
 
     T_map_rect: Array
     thumbnail: Thumbnail

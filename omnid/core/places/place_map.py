@@ -86,7 +86,7 @@ UNUSED: Final = KeyframeUse()
 
 
 class StoredPlaces(NamedTuple):
-    """What a map in memory has of keyframes whose features are in a file."""
+    """Codes of the keyframes whose features are in a file, and the store that reads them."""
 
     codes: CodeIndex
     store: FeatureStore
