@@ -48,7 +48,7 @@ from tests.simulation.closed_worlds import ring, two_laps_path, with_other_poste
 
 Array = NDArray[np.float64]
 
-WORLDS, QUERIES = 16, 10  # rendered corridors, and queries in each of them
+WORLDS, QUERIES = 8, 10  # rendered corridors, and queries in each of them
 LAP_M, APART_M = 18.0, 0.3  # of the path that has keyframes, and between two of them
 ROW_M = 20.0  # between two corridors in the map, and between two rows of the other keyframes
 SECTORS: Final = 8  # of a keyframe that is put together, each of another real one
