@@ -48,7 +48,7 @@ def test_a_map_that_was_not_read_whole_is_written_whole(path: Path, tmp_path: Pa
 
 
 def test_damaged_features_recognise_nothing_and_are_not_written(path: Path, tmp_path: Path) -> None:
-    changed(path, "UPDATE features SET views = zeroblob(12) WHERE id = 4", "DELETE FROM features WHERE id = 5")
+    changed(path, "UPDATE features SET descriptors = zeroblob(32768) WHERE id = 4", "DELETE FROM features WHERE id = 5")
     places = stored(path)
     assert places.stored is not None
     assert [places.keyframes[id].features.loaded().count for id in (3, 4, 5)] == [256, 0, 0]
