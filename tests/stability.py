@@ -44,7 +44,7 @@ class Run:
     took_s: float
     processor_s: float
     exit_code: int  # of pytest; -9 after the timeout
-    failures: tuple[str, ...]
+    failures: dict[str, str]  # names of tests and the first lines of what failed
 
     def row(self) -> str:
         """Return the row of the table."""
@@ -83,23 +83,24 @@ def one_run(number: int, busy: int, words: Sequence[str], timeout_s: float, *, b
             process.wait()
             code = -9
         took_s, processor_s = time.monotonic() - begin_s, _children_s() - before_s
-        passed, failures, skipped = outcomes(report.read_text("utf-8")) if report.exists() else (0, (), 0)
+        passed, failures, skipped = outcomes(report.read_text("utf-8")) if report.exists() else (0, {}, 0)
     return Run(number, busy, passed, len(failures), skipped, took_s, processor_s, code, failures)
 
 
-def outcomes(report: str) -> tuple[int, tuple[str, ...], int]:
-    """Return from a JUnit report how many tests passed, the names of those that failed, and how many were skipped."""
+def outcomes(report: str) -> tuple[int, dict[str, str], int]:
+    """Return from a JUnit report how many tests passed, those that failed and why, and how many were skipped."""
     passed, skipped = 0, 0
-    failures: dict[str, None] = {}  # an error at the end of a test is a case of its own
+    failures: dict[str, str] = {}  # an error at the end of a test is a case of its own
     for case in ElementTree.fromstring(report).iter("testcase"):
-        kinds = {child.tag for child in case}
-        if kinds & {"failure", "error"}:
-            failures[f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"] = None
+        kinds = {child.tag: child.get("message", "") for child in case}
+        if kinds.keys() & {"failure", "error"}:
+            name = f"{case.get('classname', '').replace('.', '/')}.py::{case.get('name')}"
+            failures.setdefault(name, kinds.get("failure", kinds.get("error", "")).partition("\n")[0])
         elif "skipped" in kinds:
             skipped += 1
         else:
             passed += 1
-    return passed, tuple(failures), skipped
+    return passed, failures, skipped
 
 
 def _children_s() -> float:
@@ -128,6 +129,8 @@ def main() -> int:
     for number, busy in enumerate([0] * args.idle + [args.processes] * args.busy, 1):
         runs.append(one_run(number, busy, args.words, args.timeout_s, background=args.background))
         print(runs[-1].row(), flush=True)
+        for name, reason in runs[-1].failures.items():
+            print(f"{name}: {reason}", file=sys.stderr, flush=True)
         if args.json:
             args.json.write_text(json.dumps([asdict(run) for run in runs], indent=1) + "\n")
     bad = sum(not run.is_good for run in runs)

@@ -17,7 +17,7 @@ REPORT = """<testsuites><testsuite><testcase classname="tests.a" name="good"/>
 
 def test_reads_the_command_and_the_outcomes() -> None:
     assert readme_command()[:2] == ["-m", "pytest"] and "-n" in readme_command()
-    assert outcomes(REPORT) == (1, ("tests/a.py::bad",), 1)
+    assert outcomes(REPORT) == (1, {"tests/a.py::bad": "no"}, 1)
 
 
 def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path) -> None:
@@ -47,4 +47,5 @@ def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path) -> None:
     assert done.returncode == 1 and "2 runs, 2 with failures" in done.stdout, done.stderr
     rows = json.loads((tmp_path / "rows.json").read_text())
     assert [(row["busy"], row["passed"], row["failed"]) for row in rows] == [(0, 1, 1), (1, 1, 1)]
-    assert rows[0]["failures"][0].endswith("::test_bad")
+    assert [(name.endswith("::test_bad"), why) for name, why in rows[0]["failures"].items()] == [(True, "assert False")]
+    assert "::test_bad: assert False" in done.stderr
