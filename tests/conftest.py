@@ -24,11 +24,6 @@ PAIRS = 24
 COURSE_PAIRS = 22  # before the turn
 
 
-def pytest_xdist_auto_num_workers() -> int:
-    """Return one worker more than there are processors: many tests wait for programs that they have started."""
-    return (os.cpu_count() or 1) + 1
-
-
 @pytest.fixture(scope="session", autouse=True)
 def kernels(request: pytest.FixtureRequest) -> None:
     """Compile the functions of omnid once, or read them from the cache folder, before the first test.

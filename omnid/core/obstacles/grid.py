@@ -37,10 +37,15 @@ FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
-MOST_SURFACE: Final = 1.0
+MOST_SURFACE: Final = np.float32(1.0)
 FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
 TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
-CONTRADICTION: Final = -2.5  # Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
+CLEAR_ODDS: Final = -4.5  # Most log-odds of a surface in a free cell: 1 %. With -5.5 a base stopped in a free corridor.
+# Mean evidence of a surface where there is none, as the best of many runs is never negative: below 0.13 in 95 % of the
+# cells of bare floor. It would add up as the robot moves: two of three false surfaces before plain walls came of it.
+NOISE_SURFACE: Final = np.float32(0.15)
+UNSEEN_SURFACE: Final = np.float32(0.4)  # The same where no floor is in view, as nothing contradicts a surface there.
+CONTRADICTION: Final = -1.5  # Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
 APART_M: Final = 0.05  # Least distance between places from which errors are independent.
 APART_S: Final = 0.2  # Time after which a pair from the same place counts in full.
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
@@ -51,6 +56,9 @@ MOST_FRESH: Final = 1.2  # Most evidence of a pair in the mean: an object that l
 LEAST_FRESH: Final = 0.4  # Mean evidence from which a cell is watched; that of noise is 0.2.
 FLOOD_MPS: Final = 1.6  # Speed at which an object may enter hidden cells.
 NARROW_CELLS: Final = 5  # An object that enters is wider.
+CROSS: Final = np.array(
+    [[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8
+)  # By turns with a square, a step of the flood is nearly a circle.
 GAP: Final = np.ones((3, 3), np.uint8)  # nothing comes through narrower gaps, which noise opens in walls
 ONCE_FREE_S: Final = 30.0  # For this time an object may have come through a cell that was free and is hidden now.
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
@@ -86,9 +94,7 @@ class ObstacleGrid:
         self.clear()
 
     def set_floor(self, T_rect_base: Array, height_m: float) -> None:
-        """Take T_rect_base (4, 4), from the base levelled on the floor to the columns' frame, and the viewpoint's
-        height.
-        """
+        """Take T_rect_base (4, 4), from the base level on the floor to the columns, and the viewpoint's height."""
         self._T_rect_base = T_rect_base
         # What is lower than an obstacle may hide this share of the range.
         self._gap_share = self._low_m / max(height_m - self._low_m, self._low_m)
@@ -132,7 +138,10 @@ class ObstacleGrid:
         )
         in_view = np.isfinite(floor)
         floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
-        surface = np.minimum(surface, np.float32(MOST_SURFACE))
+        noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
+        # An obstacle that is hidden or too near to be seen remains one.
+        noise[(surface <= 0) & ~in_view & (self._odds[SURFACE, rows, columns] > TAKEN_ODDS)] = 0.0
+        surface = np.minimum(surface - noise, MOST_SURFACE)
         # 2. Log-odds.
         odds = self._odds[:, rows, columns]
         is_surface = surface > 0
@@ -165,10 +174,13 @@ class ObstacleGrid:
     def state(self) -> Bytes:
         """Return the cells: 0 unknown, 1 free, 2 taken."""
         taken = self._odds[SURFACE] > TAKEN_ODDS
+        suspect = (self._odds[SURFACE] > CLEAR_ODDS) & ~taken
         level = self._level_odds()
-        free = ((self._odds[FLOOR] > FREE_ODDS) & (level > FREE_ODDS)) | taken
+        free = ((self._odds[FLOOR] > FREE_ODDS) & (level > FREE_ODDS) & ~suspect) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
-        cells = about[patch, cv2.CC_STAT_AREA]
+        # Specks are noise unless something may stand there.
+        sizes = about[:, cv2.CC_STAT_AREA]
+        cells = np.where(np.bincount(patch[suspect], minlength=len(sizes)) > 0, CELLS * CELLS, sizes)[patch]
         free |= (cells <= SPECK_CELLS) | ((cells <= LEVEL_SPECK_CELLS) & (level > FREE_ODDS))
         # Steps are seen by several directions together, of which those at a corner show half floor.
         beside = cv2.dilate(((level < 0) & ~free).astype(np.uint8), GAP) > 0
@@ -203,9 +215,7 @@ class ObstacleGrid:
         return cells
 
     def _weights(self, stamp_ns: int, place_m: Array) -> tuple[np.float32, np.float32]:
-        """Return the weight of a pair, and the part of it that only time gives: pairs from one place have the same
-        errors, and are little more than one.
-        """
+        """Return the weight of a pair, and the part of it by time alone: pairs from one place have the same errors."""
         if self._place_m is None:
             self._place_m = place_m.copy()
             return np.float32(1.0), np.float32(0.0)
@@ -222,10 +232,7 @@ class ObstacleGrid:
         self._fresh[window] += np.float32(1 - kept) * amount
 
     def _assume_free(self, at: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
-        """Take the floor nearer than what is seen for free, in the directions that the panorama shows.
-
-        It ends at a surface where the nearest floor in view is not seen.
-        """
+        """Take the floor nearer than what is in view for free, up to a surface that hides the nearest floor in view."""
         y, x = np.ogrid[:CELLS, :CELLS]
         in_view = np.isfinite(evidence.floor)
         shown = np.asarray(in_view.any(axis=0)) | ~in_view.any()
@@ -320,6 +327,3 @@ class ObstacleGrid:
         self._free_ns[gone] = NEVER
         self._corner = self._corner + shift
         return self._corner
-
-
-CROSS: Final = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)

@@ -146,10 +146,33 @@ def test_weak_evidence_of_one_place_is_no_surface_however_long_the_base_stands(g
         seen[0]._replace(
             surface=np.full_like(seen[0].surface, log_odds), floor=0 * seen[0].floor, level=0 * seen[0].level
         )
-        for log_odds in (0.15, 0.8)
+        for log_odds in (0.4, 0.8)
     )
     assert not np.isfinite(after(grid, [weak], 600).ranges_m).any()
     assert np.isfinite(after(grid, [strong], 30, first=600).ranges_m).mean() > 0.9
+
+
+@pytest.mark.parametrize(("log_odds", "is_found"), [(0.14, False), (0.5, True)])
+def test_noise_is_no_surface_however_far_the_base_drives(
+    grid: ObstacleGrid, seen: Pairs, log_odds: float, is_found: bool
+) -> None:
+    pair = seen[0]._replace(
+        surface=np.full_like(seen[0].surface, log_odds), floor=0 * seen[0].floor, level=0 * seen[0].level
+    )
+    pose = np.eye(4)
+    for n in range(100):
+        pose[0, 3] = n * CELL_M
+        ring = grid.update(n * PERIOD_NS, pose, pair)
+    assert np.isfinite(ring.ranges_m).any() == is_found
+
+
+def test_a_cell_is_not_free_where_something_may_stand(grid: ObstacleGrid) -> None:
+    """A speck without such evidence is noise, and passed."""
+    grid._odds[:SURFACE] = 4.0
+    grid._odds[FLOOR, 100, [100, 120]] = -3.0
+    grid._odds[SURFACE, 100, [100, 140]] = -3.0  # 5 %
+    free = grid.state() == 1
+    assert free[100, [99, 120, 139]].all() and not free[100, [100, 140]].any()
 
 
 @pytest.mark.parametrize(("gap_cells", "comes_in"), [(2, False), (6, True)])
