@@ -40,7 +40,7 @@ LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pa
 MOST_SURFACE: Final = np.float32(1.0)
 FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
 TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
-CLEAR_ODDS: Final = -4.5  # Most log-odds of a surface in a free cell: 1 %. With -5.5 a base stopped in a free corridor.
+CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
 # Mean evidence of a surface where there is none, as the best of many runs is never negative: below 0.13 in 95 % of the
 # cells of bare floor. It would add up as the robot moves: two of three false surfaces before plain walls came of it.
 NOISE_SURFACE: Final = np.float32(0.15)

@@ -34,13 +34,11 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Standard deviation of the velocity while poses are refused, m/s and rad/s. Where one is refused for its speed alone,
-# that speed, as the vehicle may have it: at 10 m/s the position was 11 sigmas off.
+# Sigma of the velocity while poses are refused [m/s, rad/s]; of one refused for its speed, that speed: it may be right.
 UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
 TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
-
 # Share of the landmarks in view, inliers, below which a pose after a break is doubtful. Wrong ones at 10 m/s before a
 # limit of 5 had 0.09, 0.24 and 0.27 (set on seed 3 of `honesty`, too fast).
 AGAIN_SHARE = 1 / 3
@@ -67,8 +65,7 @@ class VisualOdometry:
         self._relocaliser = relocaliser
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
-        self._status = TrackingStatus()
-        self._resets = 0
+        self._status, self._resets = TrackingStatus(), 0
         self._untracked_mps = UNTRACKED_SPEED_SIGMA
         self._doubt: Doubt | None = None  # other motions that may have been made in place of the chosen ones
         self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
@@ -149,9 +146,8 @@ class VisualOdometry:
         estimate = self._search.find(frame, usable, last, T_predicted, dt_s)
         if estimate is None or self._status.refused_frames:
             return estimate  # displacements from an unknown place lead anywhere: relocalisation decides
-        # How far the vehicle may be from where it was predicted, by the velocity's covariance. That takes the errors of
-        # steps for independent, which those of runners-up are not; wheels, which measure each step, are better
-        # evidence.
+        # How far the vehicle may be from where it was predicted, by the velocity's covariance, for which the errors of
+        # steps are independent. Those of runners-up are not: wheels, which measure each step, are better evidence.
         sigma_mps = math.sqrt(float(np.linalg.eigvalsh(self._motion.velocity_covariance[:3, :3])[-1]))
         is_measured = frame.sensed is not None and frame.sensed.is_complete
         doubt = None if is_measured or not self._in_doubt else self._doubt
