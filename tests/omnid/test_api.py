@@ -22,12 +22,12 @@ from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
-from omnid.formats.ply import read_ply
 from omnid.formats.tum import Trajectory, tum_row
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunFailedError
 from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
+from tests.ply import read_ply
 from tests.replay.command import Command
 
 pytestmark = pytest.mark.usefixtures("default_signals")

@@ -12,8 +12,8 @@ import pytest
 from omnid.cli import main
 from omnid.core.places.place_views import base_poses
 from omnid.formats.place_file import read_places, write_places
-from omnid.formats.ply import read_ply
 from tests.omnid.formats.place_maps import RIG, some_places
+from tests.ply import read_ply
 
 
 @pytest.fixture

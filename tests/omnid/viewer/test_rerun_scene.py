@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+pytest.importorskip("rerun", reason="needs the packages of omnid[view]")
 from omnid.viewer.rerun_scene import Thinning
 
 
