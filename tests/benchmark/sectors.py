@@ -61,9 +61,9 @@ REMARKS: Final = (
     "Corners of the images widen the sector of a fisheye; of 270 degrees it is a full turn with a part that is "
     "not seen.",
     "`_wall`: the drive ends 1.2 m before the end wall; in all other rows it is 8 m away. A wall that fills 30 "
-    "degrees tells a turn from a step aside by its perspective only: on seed 1 the pose is lost near the wall, and "
-    "says so. On seed 600 the first step, whose velocity is not known, follows identical bricks by one of them "
-    "too far, and all later ones do: metres of error in poses that say `tracking`, with a sigma of millimetres.",
+    "degrees tells a turn from a step aside by its perspective only: where the pose is lost near the wall, the state "
+    "says so. On seed 600 half of the first landmarks lie one course of bricks too far away; the first steps are "
+    "`degraded`, because two motions are supported by as many landmarks each. That was mended on seed 600.",
 )
 
 
@@ -100,7 +100,7 @@ def measure(case: Case, seed: int, pairs: int, table: ResultTable) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 600])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 600, 608])
     parser.add_argument("--pairs", type=int, default=100)
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES])
     args = parser.parse_args(arguments)

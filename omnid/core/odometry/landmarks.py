@@ -228,6 +228,12 @@ class LandmarkStore:
         if (misses >= self._max_misses).any():
             self._select(misses < self._max_misses)
 
+    def give_up(self, rows: Indices) -> None:
+        """Let landmarks (rows of the table) be removed at the next `update_tracked`, unless they are inliers in it."""
+        misses = self.table.misses.copy()
+        misses[rows] = self._max_misses
+        self.table = replace(self.table, misses=misses)
+
     def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
         """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
         T_odom_anchor, keyframe = self._anchors(rows)

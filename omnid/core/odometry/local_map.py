@@ -37,6 +37,13 @@ class Tracks:
     visible: int  # landmarks that were searched: those predicted within the panorama, or a sample of them
     each_counts: float = 1.0  # landmarks within the panorama, for each that was searched
 
+    def without(self, landmarks: Indices) -> Tracks:
+        """Return the tracks of other landmarks than these (K,)."""
+        others = ~np.isin(self.landmarks, landmarks)
+        return replace(
+            self, landmarks=self.landmarks[others], pixels=self.pixels[others], predicted=self.predicted[others]
+        )
+
 
 class LocalMap:
     """Landmarks in a store, and the last panorama in which they were found."""

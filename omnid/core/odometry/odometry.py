@@ -300,6 +300,7 @@ class VisualOdometry:
         store = self._map.store
         ids = store.table.id[estimate.landmarks]
         self._map.late_depths.seen(ids, estimate)
+        self._map.store.give_up(estimate.contradicting)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
         if not self._keyframes.is_due(len(estimate.landmarks)):
             return None

@@ -98,8 +98,21 @@ class PoseSearch:
             T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
             other = self._estimate(frame, T_guess, exposure, last, dt_s, is_near=True)
             others += [other] if other is not None else []
-        # 2. The likeliest one, and whether another one is nearly as likely.
+        # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong.
+        if estimate.inlier_ratio < self._limits.good_inlier_ratio:
+            other = self._by_outliers(frame, estimate, exposure, last, dt_s)
+            others += [other] if other is not None else []
+        # 3. The likeliest one, and whether another one is nearly as likely.
         return likeliest(estimate, others, T_predicted, reach_m)
+
+    def _by_outliers(
+        self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure, last: LastFrame, dt_s: float
+    ) -> PoseEstimate | None:
+        """Return the pose by the tracks that are outliers of an estimate; None: too few of them agree."""
+        tracks = self._map.track(frame.lower, estimate.T_odom_rect, self.tracked, turn=frame.seq)
+        outliers = tracks.without(estimate.landmarks)
+        coarse = self._frame_to_map.estimate(frame, outliers, estimate.T_odom_rect, exposure)
+        return None if coarse is None else self._exposures.refine(frame, coarse, exposure, last.T_odom_rect, dt_s)
 
     def _estimate(
         self, frame: StereoFrame, T_guess: Array, exposure: Exposure, last: LastFrame, dt_s: float, *, is_near: bool

@@ -8,6 +8,10 @@ panorama B, the likelihood of a displacement d [m] of the pose follows
 On a texture that does not repeat C has one peak; on one that repeats with the period L it has others at multiples of L.
 Displacements are horizontal, as those of a vehicle on a floor, and within the reach that is known of the velocity. The
 peaks are guesses of the pose that the odometry then estimates from and compares as it does those of the yaw.
+
+Along a column a texture that repeats also gives wrong depths: half of a wall one period too far, in the first keyframe,
+where no landmark is known yet. Then two motions are supported by about as many landmarks each, but by others, and their
+steps differ by the ratio of the depths. The second one is estimated from the outliers of the first (pose_search.py).
 """
 
 from __future__ import annotations
@@ -51,6 +55,9 @@ RUNNER_UP_COST = math.log(1e6)
 LEAST_SHARE = 0.5
 # Error of a runner-up pose as a share of its displacement: few millimetres of a period of some decimetres.
 RUNNER_UP_ERROR = 0.02
+# Poses whose landmarks contradict each other: their shares of the landmarks in view differ by less than the chance of
+# which are in view, and fewer than half of the landmarks support both.
+EQUAL_SHARE, COMMON_SHARE = 2 / 3, 0.5
 SAME_M = 0.02  # poses that differ less are one: four sigmas of a pose that few landmarks support
 # Consecutive steps without a runner-up that end a doubt: in one of 29 the noise hid it.
 CLEAR_STEPS = 3
@@ -136,25 +143,46 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     others: from displacements; one that is not within reach_m [m] of the pose T_predicted is no motion of a vehicle,
     and one that explains less than LEAST_SHARE of the landmarks in view no view of the scene. Of estimates of one pose
     the one with most inliers is taken.
+
+    Where half of the landmarks contradict the others, one half has a wrong depth, all of it by the same period of the
+    texture. The costs are sums over landmarks that err independently, so they do not decide; the motion does: the pose
+    nearest to T_predicted is taken, and the other one is its runner-up.
     """
-    within = [
-        each
-        for each in others
-        if np.linalg.norm(each.T_odom_rect[:3, 3] - T_predicted[:3, 3]) < reach_m
-        and len(each.landmarks) >= LEAST_SHARE * each.in_view
-    ]
-    best = min([found, *within], key=lambda estimate: estimate.cost)
-    steps = [(each, se3.log(se3.inverse(best.T_odom_rect) @ each.T_odom_rect)) for each in (found, *within)]
+    # 1. The estimate with the lowest cost, and those that contradict it; of these, the motion decides.
+    near = [each for each in others if _apart_m(each, T_predicted) < reach_m]
+    views = [found, *(each for each in near if len(each.landmarks) >= LEAST_SHARE * each.in_view)]
+    cheapest = min(views, key=lambda each: each.cost)
+    opposed = [each for each in (found, *near) if contradict(each, cheapest)]
+    best = min([cheapest, *opposed], key=lambda each: _apart_m(each, T_predicted))
+    # 2. The others are at the same pose, or runners-up if they contradict the best one or cost little more.
+    candidates = [*views, *(each for each in opposed if all(each is not view for view in views))]
+    steps = [(each, se3.log(se3.inverse(best.T_odom_rect) @ each.T_odom_rect)) for each in candidates]
     same = [each for each, step in steps if np.linalg.norm(step[:3]) <= SAME_M]
     runners_up = [
         step
         for each, step in steps
         if np.linalg.norm(step[:3]) > SAME_M
-        and (each.cost - best.cost) * min(best.in_view, each.in_view) < RUNNER_UP_COST
-        and np.linalg.norm(each.T_odom_rect[:3, 3] - T_predicted[:3, 3]) < reach_m
+        and (contradict(each, best) or (each.cost - best.cost) * min(best.in_view, each.in_view) < RUNNER_UP_COST)
+        and _apart_m(each, T_predicted) < reach_m
     ]
     farthest = max(runners_up, key=lambda step: float(np.linalg.norm(step[:3])), default=None)
-    return replace(max(same, key=lambda estimate: estimate.inliers), runner_up=farthest)
+    wrong = [each.landmarks for each in candidates if contradict(each, best)]
+    chosen = max(same, key=lambda estimate: estimate.inliers)
+    contradicting = np.setdiff1d(np.concatenate(wrong), chosen.landmarks) if wrong else chosen.contradicting
+    return replace(chosen, runner_up=farthest, contradicting=contradicting)
+
+
+def contradict(a: PoseEstimate, b: PoseEstimate) -> bool:
+    """True if about as many landmarks support one pose as the other, and they are not the same landmarks."""
+    shares = [len(each.landmarks) / max(1, each.in_view) for each in (a, b)]
+    common = len(np.intersect1d(a.landmarks, b.landmarks))
+    fewest = min(len(a.landmarks), len(b.landmarks))
+    return min(shares) >= EQUAL_SHARE * max(shares) and common <= COMMON_SHARE * fewest
+
+
+def _apart_m(estimate: PoseEstimate, T_predicted: Array) -> float:
+    """Return the distance [m] of a pose from the predicted one."""
+    return float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
 
 
 def displacements(

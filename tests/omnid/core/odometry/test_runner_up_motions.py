@@ -71,6 +71,19 @@ def pose(x_m: float, cost: float, inliers: int = 100, runner_up: Array | None = 
     )
 
 
+def test_of_poses_whose_landmarks_contradict_each_other_the_nearest_to_the_prediction_is_taken() -> None:
+    near, far = pose(0.05, 20.0, inliers=50), pose(0.32, 10.0)
+    far = replace(far, landmarks=np.arange(50, 105))
+    for one, other in ((near, far), (far, near)):
+        found = likeliest(one, [other], np.eye(4), 0.5)
+        assert found.T_odom_rect[0, 3] == 0.05
+        assert found.runner_up is not None and found.runner_up == pytest.approx([0.27, 0, 0, 0, 0, 0])
+    # Landmarks that support both poses, and a pose that far fewer support, contradict nothing.
+    for landmarks in (np.arange(20, 75), np.arange(50, 130)):
+        found = likeliest(near, [replace(far, landmarks=landmarks)], np.eye(4), 0.5)
+        assert found.T_odom_rect[0, 3] == 0.32 and found.runner_up is None
+
+
 def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
     near, unlikely, far, same = pose(0.3, 0.25), pose(0.3, 0.5), pose(0.9, 0.1), pose(0.01, 0.2, inliers=120)
     best = pose(0.0, 0.2)
