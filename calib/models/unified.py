@@ -35,9 +35,9 @@ class UnifiedCamera:
         values = (self.xi, *self.focal, *self.center, *self.distortion)
         if not np.isfinite(values).all():
             raise CalibError(f"omni camera: every parameter must be a finite number, found {values}")
-        if self.xi < 0 or 0 in self.focal or min(self.size) < 1:
+        if not self.xi > -1 or 0 in self.focal or min(self.size) < 1:
             raise CalibError(
-                f"omni camera: expected xi >= 0, fu and fv not 0 and a size, found xi {self.xi}, "
+                f"omni camera: expected xi > -1, fu and fv not 0 and a size, found xi {self.xi}, "
                 f"focal {self.focal}, size {self.size}"
             )
 

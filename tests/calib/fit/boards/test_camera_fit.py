@@ -21,6 +21,7 @@ MASK = Mask((394.2, 380.9), 60.0, 372.0)
 SIZE = (780, 768)
 OMNI = UnifiedCamera(0.93, (-205.0, 206.2), MASK.center, SIZE)
 BENT = UnifiedCamera(1.1, (-230.0, 231.0), MASK.center, SIZE, (-0.02, 0.004, 1e-3, -2e-3))
+PINHOLE = UnifiedCamera(0.0, (400.0, 401.5), MASK.center, SIZE)
 LENS = UnifiedCamera(1.4, (330.0, 331.5), MASK.center, SIZE)
 OCAM = OcamCamera((-131.6, 0.0, 1.9e-3, 9e-8, -6e-10), (380.9, 394.2), (0.998, 2e-4, 2e-4), SIZE)
 DIRECT = OcamCamera((-190.0, 0.0, 1.2e-3, -2e-7, 4e-10), (380.9, 394.2), (1.001, -3e-4, -3e-4), SIZE, "direct")
@@ -31,9 +32,12 @@ def seen_by(camera: OmniCamera, count: int = 10, noise_px: float = 0.0, seed: in
     elevation = (35.0, 100.0) if axis[2] > 0 else (95.0, 150.0)
     if camera is LENS:
         elevation = (10.0, 75.0)
+    distance_m = (0.12, 0.3)
+    if camera is PINHOLE:
+        elevation, distance_m = (10.0, 25.0), (0.3, 0.5)
     rng = np.random.default_rng(seed)
     poses = board_poses_around_camera(
-        camera, BOARD, MASK, count, seed=seed, distance_m=(0.12, 0.3), elevation_deg=elevation
+        camera, BOARD, MASK, count, seed=seed, distance_m=distance_m, elevation_deg=elevation
     )
     return [
         BoardView(f"view{k}", camera.project(se3.apply(T, BOARD.points)) + noise_px * rng.standard_normal((42, 2)))
@@ -63,7 +67,7 @@ def test_recovers_the_ocam_camera_from_exact_corners(truth: OcamCamera) -> None:
     assert turned_apart_rad(found, truth) < 1e-5
 
 
-@pytest.mark.parametrize(("truth", "view"), [(OMNI, "mirror"), (BENT, "mirror"), (LENS, "direct")])
+@pytest.mark.parametrize(("truth", "view"), [(OMNI, "mirror"), (BENT, "mirror"), (LENS, "direct"), (PINHOLE, "direct")])
 def test_recovers_the_omni_camera_from_exact_corners(truth: UnifiedCamera, view: View) -> None:
     found = fit_camera(seen_by(truth), BOARD, SIZE, "omni", view).camera
     assert isinstance(found, UnifiedCamera)
