@@ -19,7 +19,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any, Final
@@ -40,6 +40,7 @@ class Reached:
 
     tests: dict[str, float]  # names of the tests that passed, with their durations [s]
     calls: dict[str, list[tuple[int, int, list[str]]]]  # of a file: first and last line of a function, its tests
+    starting: list[str] = field(default_factory=list)  # tests that start programs
 
     def calls_all(self, path: str, functions: Iterable[CodeType]) -> bool:
         """True if tests call all these functions: those that only the import calls have done their work by then."""
@@ -57,8 +58,10 @@ class Reached:
         around = [(last - first, names) for first, last, names in functions if first <= mutant.line <= last]
         every = sorted({name for *_, names in functions for name in names})
         chosen = (min(around)[1] if around and in_function else every) or list(self.tests)
-        own = f"test_{Path(mutant.path).name}::"
-        return sorted(chosen, key=lambda name: (own not in name, self.tests[name]))
+        own, starting = f"test_{Path(mutant.path).name}::", set(self.starting) - set(chosen)
+        return sorted(
+            {*chosen, *starting}, key=lambda name: (name in starting, own not in name, self.tests[name], name)
+        )
 
 
 class MutantRunner:
@@ -162,16 +165,22 @@ def replace_functions(changed: dict[CodeType, CodeType]) -> None:
             thing.__code__ = changed[thing.__code__]
 
 
-def _reached(items: dict[str, pytest.Item], files: dict[str, str]) -> tuple[dict[str, float], dict[str, Any]]:
-    """Run all tests; return the durations of those that pass, and the tests that called each function of the files."""
+def _reached(
+    items: dict[str, pytest.Item], files: dict[str, str]
+) -> tuple[dict[str, float], dict[str, Any], list[str]]:
+    """Run all tests; return the durations of those that pass, which called each function of the files, and which
+    started programs."""
     durations: dict[str, float] = {}
     called: dict[CodeType, set[str]] = defaultdict(set)
     current = [""]
+    starting = set[str]()
 
     def trace(frame: FrameType, event: str, argument: object) -> None:
         if frame.f_code.co_filename in files:
             called[frame.f_code].add(current[0])
 
+    # A hook cannot be removed: this process ends with the tests.
+    sys.addaudithook(lambda event, _: starting.add(current[0]) if event == "subprocess.Popen" else None)
     threading.settrace(trace)
     sys.settrace(trace)
     for name, item in items.items():
@@ -183,7 +192,7 @@ def _reached(items: dict[str, pytest.Item], files: dict[str, str]) -> tuple[dict
     for code, names in called.items():
         last = max(line for *_, line in code.co_lines() if line)
         calls[files[code.co_filename]].append((code.co_firstlineno, last, sorted(names & durations.keys())))
-    return durations, calls
+    return durations, calls, sorted(starting & durations.keys())
 
 
 def _tried(items: Iterable[pytest.Item], until_s: float) -> int:

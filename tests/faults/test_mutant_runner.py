@@ -21,12 +21,23 @@ class Gate:
 
 def never(value):
     return value > LIMIT
+
+
+def elsewhere(value):
+    return value == LIMIT
 """
-TESTS = """from small import gate
+TESTS = """import subprocess
+import sys
+
+from small import gate
 
 
 def test_the_gate():
     assert gate.Gate().is_open(2) and not gate.Gate().is_open(3)
+
+
+def test_a_program():
+    subprocess.run([sys.executable, "-c", "from small import gate; assert gate.elsewhere(3)"], check=True)
 """
 
 
@@ -60,6 +71,12 @@ def test_a_function_that_only_the_import_calls_needs_a_new_python() -> None:
     assert reached.calls_all("a.py", [called]) and not reached.calls_all("a.py", [called, imported])
 
 
+def test_tests_that_start_programs_run_after_those_that_call_the_function() -> None:
+    names = {"calls": 3.0, "starts": 1.0, "starts slowly": 2.0, "another": 0.1}
+    reached = Reached(names, {"a.py": [(1, 9, ["calls"])]}, ["starts slowly", "starts"])
+    assert reached.of(Mutant("a.py", 2, 0, 1, "")) == ["calls", "starts", "starts slowly"]
+
+
 def test_the_tests_of_the_own_module_run_first() -> None:
     names = {"tests/test_b.py::fast": 0.1, "tests/test_a.py::slow": 2.0, "tests/test_a.py::quick": 1.0}
     reached = Reached(names, {"a.py": [(1, 9, list(names))]})
@@ -90,6 +107,6 @@ def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_
     )
     outcomes = Results(results).outcomes
     assert outcomes == {
-        after: "survived" if "value < LIMIT" in after and "LIMIT = 3" in after else "noticed" for after in mutants
+        after: "survived" if "value >= LIMIT" in after else "noticed" for after in mutants
     }
     assert (copy / "small" / "gate.py").read_text() == SOURCE, "left as it was"
