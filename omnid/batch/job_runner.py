@@ -10,34 +10,24 @@ import json
 import math
 import os
 import shutil
-import subprocess
 import tempfile
 import time
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
 from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.batch.jobs import Job, file_system, is_url
-from omnid.engine.python_program import python, python_environment
+from omnid.batch.programs import messages, run_omnid
 from omnid.plain_text import one_line
 
 RESULT_FILE: Final = "result.json"
-LOG_FILE: Final = "messages.txt"
 _ATTEMPT: Final = ".attempt-"
 _FETCHED: Final = "fetched"  # name of a log from an address, without its suffix
-_END_S: Final = 10.0  # A program is killed if it has not ended this long after SIGTERM.
-_MAX_MESSAGES: Final = 64 * 1024  # bytes of a program's messages that are kept
-# One thread for each program: as many programs run as there are cores.
-_ENVIRONMENT: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 
-_RUNNING: set[subprocess.Popen[str]] = set()  # programs that run now: at most one for each worker
+MAX_ATTEMPTS: Final = 2  # A job whose program was killed is attempted this often.
 OK, NO_POSE, FAILED, KILLED, TIMED_OUT = "ok", "no pose", "failed", "killed", "timed out"
-
-
-class BatchInterrupted(Exception):  # noqa: N818 - no error of the job
-    """The batch ends before the program of a job has ended."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +54,29 @@ class JobResult:
     end_error_m: float = math.nan
     heading_max_rad: float = math.nan
     key: str = field(default="", repr=False)  # of the job
+
+
+@dataclass(frozen=True, slots=True)
+class JobTask:
+    """A job for a worker."""
+
+    job: Job
+
+    def run(self) -> JobResult:
+        """Run it, again where its program was killed; an error of the machine, such as a full disk, is its result."""
+        result = self.failed("")
+        for attempt in range(1, MAX_ATTEMPTS + 1):
+            try:
+                result = replace(run_job(self.job), attempts=attempt)
+            except OSError as error:
+                result = replace(self.failed(one_line(error)), attempts=attempt)
+            if result.status != KILLED:
+                break
+        return result
+
+    def failed(self, error: str) -> JobResult:
+        """Return the result of a job that could not be run."""
+        return JobResult(self.job.name, self.job.log, FAILED, error)
 
 
 def run_job(job: Job) -> JobResult:
@@ -112,7 +125,7 @@ def _attempt(job: Job, folder: Path) -> dict[str, Any]:
     outputs = ["--tum", "est.txt", "--map-tum", "map_est.txt", "--cloud", "cloud.ply", "--plan", "plan.png"]
     if job.options.record:
         outputs += ["--record", "recording.mcap"]
-    code, text = _omnid(
+    code, text = run_omnid(
         ["replay", str(log), *job.options.arguments, *outputs, "--inline", "--quiet", "--json"],
         folder,
         job.options.timeout_s,
@@ -121,7 +134,7 @@ def _attempt(job: Job, folder: Path) -> dict[str, Any]:
     if code == 0 and (truth := _truth(job, log)) is not None:
         values |= _compared(folder, truth, job.options.timeout_s)
     if code in (0, 1) and job.options.record:
-        _omnid(["report", "recording.mcap", "-o", "report.html"], folder, job.options.timeout_s)
+        run_omnid(["report", "recording.mcap", "-o", "report.html"], folder, job.options.timeout_s)
     if is_url(job.log):
         log.unlink(missing_ok=True)
     return values
@@ -140,48 +153,6 @@ def _local(log: str, folder: Path) -> Path:
     return path
 
 
-def _omnid(words: list[str], folder: Path, timeout_s: float) -> tuple[int | None, str]:
-    """Run omnid in a folder; return its exit code, None after the time, and its output."""
-    with (folder / LOG_FILE).open("ab") as messages:
-        process = subprocess.Popen(
-            python("-m", "omnid", *words),
-            cwd=folder,
-            env=python_environment(**_ENVIRONMENT),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=messages,
-            text=True,
-        )
-        _RUNNING.add(process)
-        try:
-            text, _ = process.communicate(timeout=timeout_s)
-            if process not in _RUNNING:
-                raise BatchInterrupted
-            return process.returncode, text
-        except subprocess.TimeoutExpired:
-            return None, ""
-        finally:
-            _end(process)
-            _RUNNING.discard(process)
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    """End a program that still runs: it is asked first, so that it leaves no wheel turning and no file half written."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-
-def end_programs() -> None:
-    """End the programs of the jobs that run now, so that an interrupted batch leaves none; their results are lost."""
-    while _RUNNING:
-        _RUNNING.pop().terminate()
-
-
 def remove_attempts(out: Path) -> None:
     """Remove what programs that were killed have left in the folder of a batch."""
     for left in out.glob(f"{_ATTEMPT}*"):
@@ -190,7 +161,7 @@ def remove_attempts(out: Path) -> None:
 
 def _failure(code: int | None, folder: Path) -> dict[str, Any]:
     status = {0: OK, 1: NO_POSE, None: TIMED_OUT}.get(code, FAILED if code is None or code > 0 else KILLED)
-    lines = (folder / LOG_FILE).read_bytes()[-_MAX_MESSAGES:].decode("utf-8", "replace").strip().splitlines()
+    lines = messages(folder)
     problem = one_line(lines[-1]).removeprefix("omnid: ") if lines and status not in (OK, NO_POSE) else ""
     if status == KILLED:
         problem = f"the program ended by signal {-(code or 0)}"
@@ -221,7 +192,7 @@ def _truth(job: Job, log: Path) -> Path | None:
 
 def _compared(folder: Path, truth: Path, timeout_s: float) -> dict[str, Any]:
     """Return the errors against the truth; where they cannot be computed, the messages say why."""
-    _, text = _omnid(["eval", "est.txt", str(truth), "--json"], folder, timeout_s)
+    _, text = run_omnid(["eval", "est.txt", str(truth), "--json"], folder, timeout_s)
     with suppress(ValueError, KeyError, TypeError):
         found = json.loads(text)
         return {

@@ -1,32 +1,57 @@
-"""Workers for the jobs: programs on this machine, or an existing scheduler of dask.distributed."""
+"""Workers for tasks: programs on this machine, or an existing scheduler of dask.distributed."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import replace
+from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
-from typing import Any, Final
+from typing import Any, Final, Protocol, TypeVar
 
-from omnid.batch.job_runner import FAILED, KILLED, JobResult, end_programs, run_job
-from omnid.batch.jobs import Job
+from omnid.batch.programs import end_programs
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line
 
-MAX_ATTEMPTS: Final = 2  # A job whose program was killed is attempted this often.
+MAX_JOBS: Final = 256
 _CONNECT_S: Final = 10.0
 
-Workers = Callable[[Sequence[Job]], Iterator[JobResult]]
+Result = TypeVar("Result")
+ResultOf = TypeVar("ResultOf", covariant=True)
 
 
-def local_workers(count: int) -> Workers:
-    """Return workers that run `count` jobs at a time; a job whose program was killed is run once more."""
+class Task(Protocol[ResultOf]):
+    """Work for a worker; it can be pickled."""
 
-    def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
+    def run(self) -> ResultOf:
+        """Run a program and return its result; raise BatchInterrupted where there is none."""
+
+    def failed(self, error: str) -> ResultOf:
+        """Return the result for a worker that was lost."""
+
+
+class Workers(Protocol):
+    """Runs tasks, and yields their results as they come."""
+
+    def __call__(self, tasks: Sequence[Task[Result]], /) -> Iterator[Result]:
+        """Yield the results, in any order."""
+
+
+def workers_of(jobs: int, dask: str | None) -> AbstractContextManager[Workers]:
+    """Return workers on this machine, `jobs` at a time, or those of the dask scheduler at an address."""
+    if not 1 <= jobs <= MAX_JOBS:
+        raise OmnidError(f"--jobs {jobs}: expected 1 to {MAX_JOBS}")
+    return dask_workers(dask) if dask else local_workers(jobs)
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[Workers]:
+    """Give workers that run `count` programs at a time."""
+
+    def run(tasks: Sequence[Task[Result]]) -> Iterator[Result]:
         # Threads only wait here: the work is done in programs of their own.
         with ThreadPoolExecutor(count) as pool:
-            futures = [pool.submit(run_repeatedly, job) for job in jobs]
+            futures = [pool.submit(task.run) for task in tasks]
             try:
                 for future in as_completed(futures):
                     yield future.result()
@@ -34,49 +59,40 @@ def local_workers(count: int) -> Workers:
                 pool.shutdown(wait=False, cancel_futures=True)
                 end_programs()
 
-    return run
+    yield run
 
 
-def run_repeatedly(job: Job) -> JobResult:
-    """Run a job, again where its program was killed; an error of the machine, such as a full disk, is its result."""
-    result = JobResult(job.name, job.log)
-    for attempt in range(1, MAX_ATTEMPTS + 1):
-        try:
-            result = replace(run_job(job), attempts=attempt)
-        except OSError as error:
-            result = JobResult(job.name, job.log, FAILED, one_line(error), attempts=attempt)
-        if result.status != KILLED:
-            break
-    return result
+@contextmanager
+def dask_workers(address: str) -> Iterator[Workers]:
+    """Give the workers of a dask scheduler; raise OmnidError where none answers.
 
-
-def dask_workers(address: str) -> Workers:
-    """Return the workers of a dask scheduler; raise OmnidError where none answers.
-
-    They need omnid and the folders of logs and results at the same paths. Jobs of a worker that dies go to another.
+    They need omnid and the folders of logs and results at the same paths. Tasks of a worker that dies go to another.
     """
     try:
         distributed: Any = import_module("distributed")
     except ImportError as error:
         raise OmnidError(
-            f"batch --dask needs dask.distributed: install the extra `fleet` of omnid into {sys.prefix}"
+            f"--dask needs dask.distributed: install the extra `fleet` of omnid into {sys.prefix}"
         ) from error
     try:
         client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise OmnidError(
-            f"batch: no dask scheduler answers at {address!r}: {one_line(error)}; start one with "
+            f"no dask scheduler answers at {address!r}: {one_line(error)}; start one with "
             "`dask scheduler`, and give its address such as tcp://HOST:8786"
         ) from error
 
-    def run(jobs: Sequence[Job]) -> Iterator[JobResult]:
-        with client:
-            of_future = {client.submit(run_repeatedly, job, pure=False): job for job in jobs}
-            for future in distributed.as_completed(of_future, loop=client.loop, raise_errors=False):
-                if future.status == "finished":
-                    yield future.result()
-                else:
-                    job = of_future[future]
-                    yield JobResult(job.name, job.log, FAILED, one_line(future.exception()))
+    def run(tasks: Sequence[Task[Result]]) -> Iterator[Result]:
+        of_future = {client.submit(_run, task, pure=False): task for task in tasks}
+        for future in distributed.as_completed(of_future, loop=client.loop, raise_errors=False):
+            if future.status == "finished":
+                yield future.result()
+            else:
+                yield of_future[future].failed(one_line(future.exception()))
 
-    return run
+    with client:
+        yield run
+
+
+def _run(task: Task[Result]) -> Result:
+    return task.run()

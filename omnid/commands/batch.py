@@ -5,21 +5,19 @@ from __future__ import annotations
 import argparse
 import fcntl
 import os
-import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
+
+from omnid.commands.worker_options import add_workers, end_by_sigterm
 
 if TYPE_CHECKING:
     from omnid.batch.jobs import BatchOptions
-    from omnid.batch.workers import Workers
 
-MAX_JOBS = 256
 LOCK_FILE = ".lock"
 TABLES_S = 5.0  # shortest time from one writing of the tables to the next, before the end
 
@@ -59,46 +57,31 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="trajectory beside each log, which is compared where it exists; default %(default)s",
     )
     parser.add_argument("--record", action="store_true", help="keep a recording and a report of each log")
-    parser.add_argument(
-        "--jobs",
-        type=int,
-        default=os.cpu_count() or 1,
-        metavar="N",
-        help="logs at a time on this machine; default: the number of cores, %(default)s",
-    )
-    parser.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        help="run on the workers of this dask scheduler, such as "
-        "tcp://HOST:8786; they need the same paths (extra `fleet`)",
-    )
+    add_workers(parser, "logs at a time on this machine", os.cpu_count() or 1)
     parser.add_argument("--timeout-s", type=float, default=3600.0, metavar="S", help="for one log; default %(default)g")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the jobs that have no result yet; return 1 where a log failed."""
-    from omnid.batch.job_runner import OK, remove_attempts, stored_result
+    from omnid.batch.job_runner import OK, JobTask, remove_attempts, stored_result
     from omnid.batch.jobs import find_logs, jobs
     from omnid.batch.tables import write_tables
+    from omnid.batch.workers import workers_of
     from omnid.errors import OmnidError
     from omnid.plain_text import plain
 
-    if not 1 <= args.jobs <= MAX_JOBS or not args.timeout_s > 0:
-        raise OmnidError(
-            f"batch: --jobs {args.jobs} --timeout-s {args.timeout_s:g}: expected 1 to {MAX_JOBS} jobs and "
-            "a time above 0"
-        )
+    if not args.timeout_s > 0:
+        raise OmnidError(f"batch: --timeout-s {args.timeout_s:g}: expected a time above 0")
     all_jobs = jobs(find_logs(args.logs), args.out.absolute(), _options(args))
-    workers = _workers(args)
-    signal.signal(signal.SIGTERM, _interrupt)
-    with _locked(args.out):
+    end_by_sigterm()
+    with workers_of(args.jobs, args.dask) as workers, _locked(args.out):
         remove_attempts(args.out)
         stored = {job.name: result for job in all_jobs if (result := stored_result(job)) is not None}
         if stored:
             print(f"{len(stored)} of {len(all_jobs)} logs have their results already", file=sys.stderr)
         results, next_s = dict(stored), 0.0
-        for result in workers([job for job in all_jobs if job.name not in stored]):
+        for result in workers([JobTask(job) for job in all_jobs if job.name not in stored]):
             results[result.name] = result
             outcome = result.error if result.status != OK else f"{result.length_m:.3f} m"
             print(
@@ -129,17 +112,6 @@ def _options(args: argparse.Namespace) -> BatchOptions:
     for override in args.overrides:
         arguments += ["--set", override]
     return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s)
-
-
-def _workers(args: argparse.Namespace) -> Workers:
-    from omnid.batch.workers import dask_workers, local_workers
-
-    return dask_workers(args.dask) if args.dask else local_workers(args.jobs)
-
-
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    """End as after Ctrl-C: the programs of the jobs end, too."""
-    raise KeyboardInterrupt
 
 
 @contextmanager

@@ -98,6 +98,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "map build": (
             "map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
             "map build wednesday.mcap -o place.omap --extend",
+            "map build logs/*.mcap -o site.omap --jobs 4",
         ),
         "map info": ("map info place.omap",),
         "map show": ("map show place.omap -o place.html",),

@@ -106,7 +106,5 @@ def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_
         env={"PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
     )
     outcomes = Results(results).outcomes
-    assert outcomes == {
-        after: "survived" if "value >= LIMIT" in after else "noticed" for after in mutants
-    }
+    assert outcomes == {after: "survived" if "value >= LIMIT" in after else "noticed" for after in mutants}
     assert (copy / "small" / "gate.py").read_text() == SOURCE, "left as it was"

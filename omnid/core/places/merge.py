@@ -23,6 +23,7 @@ SAME_M: Final = 0.5
 SAME_RAD: Final = math.radians(5)  # The same of their headings; by trial on development seeds.
 MIN_CONSISTENT: Final = 3  # keyframes that must agree
 MIN_SHARE: Final = 0.6  # Share of the recognised keyframes that must agree.
+NO_COMMON_PLACE: Final = "shares no place"  # words of the error, by which programs that join many maps know it
 
 
 def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.batch.job_runner import KILLED, OK, run_job, stored_result
+from omnid.batch.job_runner import KILLED, OK, JobTask, run_job, stored_result
 from omnid.batch.jobs import BatchOptions, find_logs, jobs
 from omnid.batch.workers import dask_workers
 from omnid.errors import OmnidError
@@ -238,10 +238,12 @@ def test_a_dask_worker_that_is_killed_costs_nothing_but_repetition(tmp_path: Pat
             for _ in range(2)
         ]
         results = []
-        for result in dask_workers(address)(jobs([str(log) for log in logs], tmp_path / "out", BatchOptions())):
-            results.append(result)
-            if len(results) == 1:
-                workers[0].kill()
+        tasks = [JobTask(job) for job in jobs([str(log) for log in logs], tmp_path / "out", BatchOptions())]
+        with dask_workers(address) as run:
+            for result in run(tasks):
+                results.append(result)
+                if len(results) == 1:
+                    workers[0].kill()
         assert sorted(result.name for result in results) == sorted(log.stem for log in logs)
         assert {result.status for result in results} == {OK} and KILLED not in results
     finally:
