@@ -211,6 +211,11 @@ class Results:
             file.write(json.dumps({"mutant": mutant, "outcome": outcome}) + "\n")
 
 
+def tests_of(folder: str) -> tuple[str, ...]:
+    """Return the tests of a folder, or of the one that it is part of."""
+    return next(tests for whole, tests in TESTS.items() if folder == whole or folder.startswith(f"{whole}/"))
+
+
 def try_mutants(folder: str, mutants: Mapping[str, Mutant], limit_s: float, results: Path) -> None:
     """Try mutants of one folder in a copy of the repository; their outcomes are added to the results."""
     copy = results.with_suffix(".copy")
@@ -219,7 +224,7 @@ def try_mutants(folder: str, mutants: Mapping[str, Mutant], limit_s: float, resu
     try:
         for entry in COPIED:
             (shutil.copytree if (ROOT / entry).is_dir() else shutil.copy2)(ROOT / entry, copy / entry)
-        asked = {"mutants": mutants, "tests": TESTS[folder], "limit_s": limit_s, "results": str(results)}
+        asked = {"mutants": mutants, "tests": tests_of(folder), "limit_s": limit_s, "results": str(results)}
         subprocess.run(
             [sys.executable, "-m", "tests.faults.mutant_runner"],
             cwd=copy,
@@ -234,7 +239,7 @@ def try_mutants(folder: str, mutants: Mapping[str, Mutant], limit_s: float, resu
 def main() -> int:
     """Print the survivors of a sample of mutants of each folder, and how many there are."""
     parser = argparse.ArgumentParser(prog="python -m tests.faults.mutants", description=__doc__)
-    parser.add_argument("folders", nargs="*", default=list(TESTS), help=f"default: {' '.join(TESTS)}")
+    parser.add_argument("folders", nargs="*", default=list(TESTS), help=f"or files in them; default: {' '.join(TESTS)}")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=0, help="mutants of each folder to try; default: all")
     parser.add_argument("--limit-s", type=float, default=30.0, help="of the tests of one mutant; default: %(default)s")
