@@ -55,7 +55,7 @@ def test_a_motor_does_not_talk_to_the_terminal_of_another_program(linked: bool, 
     link.symlink_to(simulated.port)
     path = simulated.port
     command = VelocityCommand(0, 0.2, 0.0, 0.0)
-    with contextlib.closing(SerialMotor(str(link) if linked else path)) as motor:
+    with contextlib.closing(SerialMotor(str(link) if linked else path, timeout_s=PATIENCE_S)) as motor:
         motor.send(command)
         time.sleep(KERNEL_TICK_S)
         simulated.close()

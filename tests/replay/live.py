@@ -224,6 +224,22 @@ def command_line(scene: Path, port: int, motor: Path | None, *words: object, mod
     return [sys.executable, "-m", module, *map(str, [*run, *log, *wheels, *sets, *words])]
 
 
+def patient(*settings: str) -> tuple[str, ...]:
+    """Return the words of these settings, and of those with which a robot on a busy machine, late with all, drives on.
+
+    Otherwise each late pose, tick or answer would be a fault, and faults disarm.
+    """
+    late = (
+        "controller.deadlines.pose_s=8",
+        "controller.deadlines.tick_s=8",
+        "motor.watchdog_ms=8000",
+        "controller.trust.velocity_sigma_mps=0",
+        "controller.trust.yaw_rate_sigma_radps=0",
+        "controller.trust.odometry_reset=ignore",
+    )
+    return tuple(word for setting in (*settings, *late) for word in ("--set", setting))
+
+
 @contextmanager
 def started(command: list[str], port: int) -> Iterator[Daemon]:
     """Yield a daemon that is killed at the end of the block."""

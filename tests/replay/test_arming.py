@@ -15,21 +15,9 @@ import pytest
 from omnid.client import Robot
 from omnid.core.control.command_sources import LOWER_PRIORITY, OPERATOR, OTHER_SENDER, PLANNER
 from omnid.core.control.safety_rules import FAILED
-from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, robot, wait_until
+from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, patient, robot, wait_until
 
-# A busy machine is late with everything: each fault would disarm, and another sender would take over.
-PATIENT = (
-    "controller.arming=manual",
-    "controller.deadlines.pose_s=8",
-    "controller.deadlines.command_s=8",
-    "controller.deadlines.tick_s=8",
-    "motor.watchdog_ms=8000",
-    "controller.trust.velocity_sigma_mps=0",
-    "controller.trust.yaw_rate_sigma_radps=0",
-    "controller.trust.odometry_reset=ignore",
-    "controller.sources.hold_s=8",
-)
-MANUAL = tuple(word for setting in PATIENT for word in ("--set", setting))
+MANUAL = patient("controller.arming=manual", "controller.deadlines.command_s=8", "controller.sources.hold_s=8")
 WATCH_S = 0.5  # during which nothing may move
 HUNG_S = 4.0  # until the queues of subscribers that do not read are full; after 10 s zenoh drops them
 TIMEOUT_STOP_S = float(re.findall(r"^TimeoutStopSec=(\d+)$", (ROOT / "systemd/omnid.service").read_text(), re.M)[0])

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tests.replay.live import PATIENCE_S, ROOT, robot, wait_until
+from tests.replay.live import PATIENCE_S, ROOT, patient, robot, wait_until
 
 UP = b"\x1b[A"
-MANUAL = ("--set", "controller.arming=manual")
+MANUAL = patient("controller.arming=manual")
 
 
 @contextmanager

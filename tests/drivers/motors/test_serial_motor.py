@@ -257,7 +257,7 @@ class ExpiredForever(SimulatedLine):
 def test_a_watchdog_that_stays_expired_is_an_error() -> None:
     controller = ExpiredForever()
     with contextlib.closing(SimulatedMotor(controller)) as simulated, pytest.raises(DriverError, match="stays stopped"):
-        SerialMotor(simulated.port, connect_s=0.1)
+        SerialMotor(simulated.port, timeout_s=REPLY_S, connect_s=0.1)
 
 
 class Echo(SimulatedLine):

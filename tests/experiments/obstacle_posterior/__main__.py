@@ -3,6 +3,7 @@
 A base drives straight into a small room at its true poses (no odometry, no wheels), a pair each 5 cm. Directions of one
 degree whose nearest obstacle or edge lies within 4 m count as found (the ring has it, or something before it), unknown,
 or missed: the way is said to be free beyond it and a tolerance. A false obstacle lies before the nearest true one.
+What is missed of the thing itself is given for ranges below 0.8, to 1.25, to 2 m, beyond, and for all of them.
 Free ahead: what is said of the fan of 28 degrees ahead in the last rings, against the truth. The table of evidence
 (--reliability) has the share of cells that are free, by what the grid says of them.
 """
@@ -42,6 +43,7 @@ FARTHEST_M: Final = 4.0
 AHEAD_RAD: Final = 0.25
 NEIGHBOURS: Final = 2  # directions on either side that an edge may be off
 OPEN_M: Final = (1.0, 1.5, 2.0, 3.0)
+RANGES_M: Final = (0.8, 1.25, 2.0)  # of the thing itself, between which what is missed is counted
 OPEN_MARGIN_M: Final = 0.3  # of the nearest obstacle beyond the place that is to be told as free
 ODDS_BINS: Final = (-6.0, -3.0, -1.5, 0.0, 1.5, 3.0, 6.01)
 
@@ -56,7 +58,7 @@ class Scores:
     false: int = 0
     of_target: int = 0  # directions whose nearest is the thing itself
     target_found: int = 0
-    target_missed: int = 0
+    target_missed: Array = field(default_factory=lambda: np.zeros((len(RANGES_M) + 1, 2)))  # by range: missed, all
     excess_m: list[float] = field(default_factory=list)  # free ahead, more than true, within 1.5 m of it
     open: Array = field(default_factory=lambda: np.zeros((len(OPEN_M), 2)))  # directions free so far: told, true
     milliseconds: list[float] = field(default_factory=list)
@@ -65,10 +67,9 @@ class Scores:
     def row(self, case: str) -> str:
         """Return a row of the table."""
         share = [f"{100 * n / max(self.directions, 1):.2f} %" for n in (self.found, self.missed, self.false)]
-        target = [
-            f"{100 * n / self.of_target:.1f} %" if self.of_target else "-"
-            for n in (self.target_found, self.target_missed)
-        ]
+        target = [f"{100 * self.target_found / self.of_target:.1f} %" if self.of_target else "-"]
+        each = [*self.target_missed, self.target_missed.sum(axis=0)] if self.of_target else []
+        target += [" / ".join(f"{100 * missed / n:.1f}" if n else "-" for missed, n in each) or "-"]
         free = " / ".join(f"{100 * n / max(true, 1):.0f}" for n, true in self.open) + " %"
         excess = f"{100 * max(self.excess_m):.0f} cm" if self.excess_m else "-"
         cells = " | ".join([case, *share, *target, free, excess, f"{np.median(self.milliseconds):.1f}"])
@@ -148,7 +149,9 @@ def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) ->
         target = counted & scene.is_target(x_m, 0.0, azimuths())
         scores.of_target += int(target.sum())
         scores.target_found += int((found & target).sum())
-        scores.target_missed += int((missed & target).sum())
+        at_range = np.digitize(truth[target], RANGES_M)
+        np.add.at(scores.target_missed, (at_range, 0), missed[target])
+        np.add.at(scores.target_missed, (at_range, 1), 1)
     for number, open_m in enumerate(OPEN_M):
         is_open = truth > open_m + OPEN_MARGIN_M
         scores.open[number] += ((is_open & (ring.free_m >= open_m)).sum(), is_open.sum())
@@ -183,7 +186,7 @@ def main() -> None:
     robot = make_robot(arguments.size)
     robot = replace(robot, rig=with_masks(robot.rig))
     print(
-        "| case | found | missed | false | thing found | thing missed | told free to "
+        "| case | found | missed | false | thing found | thing missed, % | told free to "
         f"{' / '.join(f'{m:g}' for m in OPEN_M)} m | most free beyond, ahead | ms a pair |"
     )
     print("|---|---|---|---|---|---|---|---|---|")
