@@ -25,6 +25,7 @@ import sys
 import tempfile
 import time
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -52,6 +53,7 @@ def cache_folder() -> Path:
     return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "omnid"
 
 
+@cache
 def kernel_files() -> dict[str, Path]:
     """Return the files with compiled functions by the names of their modules."""
     root = Path(omnid.core.__path__[0]).parent
@@ -74,19 +76,24 @@ def is_ready(name: str) -> bool:
 
 def folder_of_state(name: str, path: Path) -> Path:
     """Return the folder for the code of this file and those that it imports, of these versions and this processor."""
-    import llvmlite.binding as llvm
-
-    digest = hashlib.sha256()
-    processor = platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    environment = sorted((key, value) for key, value in os.environ.items() if key.startswith("NUMBA_"))
-    versions = [version(package) for package in ("numba", "llvmlite", "numpy")]  # numba itself is not loaded
-    digest.update(repr((sys.version, versions, processor, environment)).encode())
+    settings = sorted((key, value) for key, value in os.environ.items() if key.startswith("NUMBA_"))
+    digest = hashlib.sha256(repr((_versions_and_processor(), settings)).encode())
     core = Path(omnid.core.__path__[0])
     makers = (("", core / "compiled.py"), ("", core / "native_code.py"))
     for module, source in (*makers, (name, path), *sorted(imported_files(path).items())):
         # The code contains the names of the modules.
         digest.update(repr((module, source.read_bytes())).encode())
     return cache_folder() / f"kernels-{path.stem.removesuffix('_kernels')}-{digest.hexdigest()[:20]}"
+
+
+@cache
+def _versions_and_processor() -> tuple[object, ...]:
+    """Return what decides about the code and stays the same while a program runs; numba itself is not loaded."""
+    import llvmlite.binding as llvm
+
+    versions = [version(package) for package in ("numba", "llvmlite", "numpy")]
+    features = llvm.get_host_cpu_features().flatten()
+    return sys.version, versions, platform.machine(), llvm.get_host_cpu_name(), features
 
 
 def imported_files(path: Path) -> dict[str, Path]:

@@ -8,16 +8,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache, lru_cache
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
-from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
+from omnid.transport import ros_types as ros
 from omnid.transport.records import DiagnosticStatus, FrameTransform, HeadingRecord, OdometryRecord, TwistRecord
 
 ODOMETRY_SCHEMA = "nav_msgs/msg/Odometry"
@@ -57,7 +58,9 @@ MAX_SECONDS = 2**31 - 1  # builtin_interfaces/msg/Time counts seconds in an int3
 
 Array = NDArray[np.float64]
 Frames = tuple[str, str]
-Cartesian = ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ros.geometry_msgs__msg__Quaternion
+Cartesian: TypeAlias = (
+    "ros.geometry_msgs__msg__Vector3 | ros.geometry_msgs__msg__Point | ros.geometry_msgs__msg__Quaternion"
+)
 
 
 OK, WARN, ERROR, STALE = range(4)  # levels of diagnostic_msgs/msg/DiagnosticStatus

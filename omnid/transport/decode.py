@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec, map_codec, status_names
+from omnid.transport import ros_types as ros
 from omnid.transport.codec import NS_PER_S
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec
+from omnid.transport import ros_types as ros
 
 CLOUD_FIELDS = ("x", "y", "z", "confidence")
 CLOUD_BLOCK = 4096  # points transformed at once: temporary arrays of a whole map would fragment the memory

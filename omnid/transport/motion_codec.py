@@ -6,13 +6,13 @@ import math
 from typing import Final
 
 import numpy as np
-from rosbags.typesys.stores import ros2_humble as ros
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
 from drivers.logs.ros_motion import IMU, ODOMETRY, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
+from omnid.transport import ros_types as ros
 from omnid.transport.codec import header_message, message_cdr, odometry_cdr
 
 WHEEL_SCHEMA: Final = ODOMETRY

@@ -8,11 +8,11 @@ from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from rosbags.typesys.stores import ros2_humble as ros
 
 from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec
+from omnid.transport import ros_types as ros
 
 PATH_SCHEMA: Final = "nav_msgs/msg/Path"
 STRING_SCHEMA: Final = "std_msgs/msg/String"

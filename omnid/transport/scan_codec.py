@@ -12,9 +12,9 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys.stores import ros2_humble as ros
 
 from omnid.errors import OmnidError
+from omnid.transport import ros_types as ros
 from omnid.transport.codec import MAX_SECONDS, NS_PER_S, message_from_cdr
 
 SCAN_SCHEMA: Final = "sensor_msgs/msg/LaserScan"

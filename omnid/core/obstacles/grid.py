@@ -19,6 +19,7 @@ from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.usual_floor import MOST_RATIO, Arrivals, UsualFloor
+from omnid.core.obstacles.watch import FRESH_NS, Watch
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -29,7 +30,6 @@ CELL_M: Final = 0.05  # Side of a cell. By judgement; not measured.
 CELLS: Final = 256  # Cells of a side: twice the largest range, and the way until the square is moved.
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
-NEVER: Final = np.iinfo(np.int64).min
 
 # Layers: floor against upright surfaces, against planes just above it, and just below it; surface.
 FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
@@ -46,27 +46,25 @@ CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With
 NOISE_SURFACE: Final = np.float32(0.15)
 UNSEEN_SURFACE: Final = np.float32(0.4)  # The same where no floor is in view, as nothing contradicts a surface there.
 CONTRADICTION: Final = -1.5  # Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
-APART_M: Final = 0.05  # Least distance between places from which errors are independent.
-APART_S: Final = 0.2  # Time after which a pair from the same place counts in full.
+# A thin thing shows a surface in half of the pairs, and floor in the others, which contradict it: its log-odds stay at
+# the prior. So a cell is free only where the mean surface of single pairs is low. Set on development seeds 1 and 2.
+SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean
+SHOWN_CELLS: Final = 5  # side of the patch of the mean, as errors of the range move what a pair shows by some cells
+MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair: with 3.0 free corridors were unknown within 0.6 m
+FREE_SHOWN: Final = 0.1  # largest mean in a free cell
+
+APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.
+APART_S: Final = 0.2  # A pair from the same place counts in full after it, so that a base that stands sees what comes.
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
 # below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
 PLACE_PAIRS: Final = 18.0
-FRESH_NS: Final = 500_000_000  # time constant of the mean evidence by which a cell is watched
-MOST_FRESH: Final = 1.2  # Most evidence of a pair in the mean: an object that leaves is noticed in half a second.
-LEAST_FRESH: Final = 0.4  # Mean evidence from which a cell is watched; that of noise is 0.2.
-FLOOD_MPS: Final = 1.6  # Speed at which an object may enter hidden cells.
-NARROW_CELLS: Final = 5  # An object that enters is wider.
-CROSS: Final = np.array(
-    [[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8
-)  # By turns with a square, a step of the flood is nearly a circle.
-GAP: Final = np.ones((3, 3), np.uint8)  # nothing comes through narrower gaps, which noise opens in walls
-ONCE_FREE_S: Final = 30.0  # For this time an object may have come through a cell that was free and is hidden now.
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
 WIDE_CELLS: Final = 3  # Side of the mean that shows a low object or an edge, because single cells are noisy.
 # The same where no step is seen either, because what hides so little floor is no higher than one.
 LEVEL_SPECK_CELLS: Final = 9
 THIN_M: Final = 0.03  # width of the thinnest obstacle
+GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 END_M: Final = 0.1  # Distance before the end of the free floor, for the same reason.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
@@ -103,15 +101,13 @@ class ObstacleGrid:
         """Forget everything: the pose has lost its relation to the past."""
         self._odds = np.empty((len(PRIOR), CELLS, CELLS), np.float32)
         self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
-        self._fresh = np.zeros((CELLS, CELLS), np.float32)  # mean evidence of the last FRESH_NS
-        self._free_ns = np.full((CELLS, CELLS), NEVER, np.int64)  # when a cell was free last
-        self._usual = UsualFloor(CELLS)
-        self._flooded = np.zeros((CELLS, CELLS), np.uint8)  # 1 where something may have come unseen
+        self._shown = np.zeros((CELLS, CELLS), np.float32)  # mean surface of single pairs
+        self._watch, self._usual = Watch(CELLS, CELL_M), UsualFloor(CELLS)
         self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
         self._start_ns: int | None = None
         self._nearest_m = 0.0  # range of the floor in view at the start
         self._place_m: Array | None = None  # of the last pair
-        self._last_ns, self._carry = NEVER, 0.0
+        self._last_ns: int | None = None
 
     def update(self, stamp_ns: int, T_odom_base: Array, evidence: ColumnEvidence) -> GridRing:
         """Add the evidence of a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
@@ -124,13 +120,15 @@ class ObstacleGrid:
             self._start_ns = stamp_ns
             self._nearest_m = evidence.nearest_floor_m
             self._assume_free(at, T_odom_base, evidence)
+        passed_ns = FRESH_NS if self._last_ns is None else max(stamp_ns - self._last_ns, 0)
+        self._last_ns = stamp_ns
         # 1. Evidence of each cell.
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
-        weight, at_rest = self._weights(stamp_ns, T_odom_base[:2, 3])
+        weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
         arrivals = self._usual.arrivals(
             self._usual.compare((rows, columns), floor, weight),
-            self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9),
+            self._watch.was_free(stamp_ns),
             self._odds[SURFACE] > TAKEN_ODDS,
             np.array([*(place - corner), CELL_M, self._max_range_m, self._at_1m]),
             self._azimuths + float(se3.yaw(T_odom_base)),
@@ -141,6 +139,7 @@ class ObstacleGrid:
         noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
         # An obstacle that is hidden or too near to be seen remains one.
         noise[(surface <= 0) & ~in_view & (self._odds[SURFACE, rows, columns] > TAKEN_ODDS)] = 0.0
+        self._keep_shown(surface, in_view, weight, (rows, columns))
         surface = np.minimum(surface - noise, MOST_SURFACE)
         # 2. Log-odds.
         odds = self._odds[:, rows, columns]
@@ -153,12 +152,17 @@ class ObstacleGrid:
         odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
         np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
         np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
-        self._keep_fresh(stamp_ns, (rows, columns), np.maximum(floor, surface).clip(0, MOST_FRESH))
         # 3. What is not watched, and may have changed.
-        self._flood(stamp_ns, in_view, rows, columns)
+        self._watch.take(passed_ns, (rows, columns), np.maximum(floor, surface))
+        if stamp_ns - self._start_ns >= FRESH_NS:
+            visible = np.zeros((CELLS, CELLS), bool)
+            visible[rows, columns] = in_view
+            lost = self._watch.spread(stamp_ns, passed_ns, self._odds[FLOOR] > FREE_ODDS, visible)
+            self._odds[FLOOR][lost] = PRIOR[FLOOR]
         self._clear_seen_past(place - corner, evidence.nearest_floor_m)
         i, j = int(at[1]), int(at[0])
-        self._odds[FLOORS, i - 3 : i + 4, j - 3 : j + 4] = LIMIT
+        own = slice(i - 3, i + 4), slice(j - 3, j + 4)
+        self._odds[FLOORS, *own], self._shown[own] = LIMIT, 0.0
         return self._ring(T_odom_base, place - corner, arrivals)
 
     @property
@@ -174,7 +178,7 @@ class ObstacleGrid:
     def state(self) -> Bytes:
         """Return the cells: 0 unknown, 1 free, 2 taken."""
         taken = self._odds[SURFACE] > TAKEN_ODDS
-        suspect = (self._odds[SURFACE] > CLEAR_ODDS) & ~taken
+        suspect = ((self._odds[SURFACE] > CLEAR_ODDS) | (self._shown > FREE_SHOWN)) & ~taken
         level = self._level_odds()
         free = ((self._odds[FLOOR] > FREE_ODDS) & (level > FREE_ODDS) & ~suspect) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
@@ -214,22 +218,25 @@ class ObstacleGrid:
         )
         return cells
 
-    def _weights(self, stamp_ns: int, place_m: Array) -> tuple[np.float32, np.float32]:
+    def _weights(self, passed_ns: int, place_m: Array) -> tuple[np.float32, np.float32]:
         """Return the weight of a pair, and the part of it by time alone: pairs from one place have the same errors."""
         if self._place_m is None:
             self._place_m = place_m.copy()
             return np.float32(1.0), np.float32(0.0)
         by_way = min(math.dist(place_m, self._place_m) / APART_M, 1.0)
         self._place_m = place_m.copy()
-        weight = min(max(by_way, (stamp_ns - self._last_ns) * 1e-9 / APART_S), 1.0)
+        weight = min(max(by_way, passed_ns * 1e-9 / APART_S), 1.0)
         return np.float32(weight), np.float32(weight - by_way)
 
-    def _keep_fresh(self, stamp_ns: int, window: tuple[slice, slice], amount: Floats) -> None:
-        """Take the amount of evidence of a pair into the mean of the last FRESH_NS."""
-        passed_ns = FRESH_NS if self._last_ns == NEVER else max(stamp_ns - self._last_ns, 0)
-        kept = math.exp(-passed_ns / FRESH_NS)
-        self._fresh *= np.float32(kept)
-        self._fresh[window] += np.float32(1 - kept) * amount
+    def _keep_shown(self, surface: Floats, in_view: Flags, weight: np.float32, window: tuple[slice, slice]) -> None:
+        """Take the surface that a pair shows into the mean of single pairs, of cells that it shows at all."""
+        taken = (self._odds[SURFACE][window] > TAKEN_ODDS).astype(np.uint8)
+        # What a pair shows around a surface that is known is that surface.
+        known = cv2.dilate(taken, np.ones((SHOWN_CELLS, SHOWN_CELLS), np.uint8)) > 0
+        amount = np.where(known, np.float32(0), np.clip(surface, 0, MOST_SHOWN))
+        amount = cv2.blur(amount, (SHOWN_CELLS, SHOWN_CELLS))
+        changed = in_view | (amount > 0)
+        self._shown[window] += np.where(changed, weight * SHOWN_RATE * (amount - self._shown[window]), np.float32(0))
 
     def _assume_free(self, at: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
         """Take the floor nearer than what is in view for free, up to a surface that hides the nearest floor in view."""
@@ -246,51 +253,26 @@ class ObstacleGrid:
         reach_there = reach[np.floor(turned * len(reach)).astype(np.intp) % len(reach)]
         self._odds[FLOORS, (x - at[0]) ** 2 + (y - at[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
 
-    def _flood(self, stamp_ns: int, in_view: Flags, rows: slice, columns: slice) -> None:
-        """Forget the floor that something may have come to that was not seen, from cells that are not watched."""
-        passed_s = 0.0 if self._last_ns == NEVER else min((stamp_ns - self._last_ns) * 1e-9, 1.0)
-        self._last_ns = stamp_ns
-        assert self._start_ns is not None, "the first pair sets it"
-        if stamp_ns - self._start_ns < FRESH_NS:
-            return
-        self._carry += max(passed_s, 0.0) * FLOOD_MPS / CELL_M
-        steps, self._carry = int(self._carry), self._carry % 1.0
-        watched = (self._fresh > LEAST_FRESH).astype(np.uint8)
-        box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
-        free = (self._odds[FLOOR] > FREE_ODDS).astype(np.uint8)
-        visible = np.zeros((CELLS, CELLS), np.uint8)
-        visible[rows, columns] = in_view
-        self._free_ns[free > 0] = stamp_ns
-        was_free = (self._free_ns > stamp_ns - round(ONCE_FREE_S * 1e9)).astype(np.uint8)
-        lost = np.asarray((1 - watched) & (visible | (1 - free)) & was_free, np.uint8)
-        passable = np.asarray(cv2.morphologyEx((free & (1 - watched)) | lost, cv2.MORPH_OPEN, GAP), np.uint8)
-        reached = np.asarray(cv2.morphologyEx(lost, cv2.MORPH_OPEN, box), np.uint8) | (self._flooded & lost)
-        for step in range(steps):
-            kernel = np.ones((3, 3), np.uint8) if step % 2 else CROSS
-            reached = np.asarray(cv2.dilate(reached, kernel), np.uint8) & passable
-        self._flooded = reached
-        self._odds[FLOOR][(reached & free) > 0] = PRIOR[FLOOR]
-
     def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
         """End the flood too near to be seen where what is behind it is watched: a person would hide that.
 
         Behind it is the nearest floor in view, or a nearer surface, such as the walls of a corridor.
         """
-        if not nearest_m or not self._flooded.any():
+        if not nearest_m or not self._watch.flooded.any():
             return
         steps = int(nearest_m / CELL_M) + 2
         direction = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
         ways = np.arange(1, steps + 1)[None, :, None] * direction[:, None]
         columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
-        watched = self._fresh[rows, columns] > LEAST_FRESH
+        watched = self._watch.watched[rows, columns]
         before_surface = ~np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
         past = (watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS))[:, -2:].all(axis=1) | ~before_surface[:, -1]
         past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
         chosen = past[:, None] & before_surface
         cells = rows[chosen], columns[chosen]
-        flooded = self._flooded[cells] > 0
+        flooded = self._watch.flooded[cells] > 0
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
-        self._flooded[cells] = 0
+        self._watch.flooded[cells] = 0
 
     def _ring(self, T_odom_base: Array, place: Array, arrivals: Arrivals) -> GridRing:
         """Return the ring about a place (2,) [cells] of the square."""
@@ -319,11 +301,9 @@ class ObstacleGrid:
         gone = np.ones((CELLS, CELLS), bool)
         x, y = np.clip(shift, -CELLS, CELLS).tolist()
         gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
-        self._odds[:] = np.roll(self._odds, (-y, -x), axis=(1, 2))
-        for layer in (self._fresh, self._free_ns, self._flooded, self._usual.mean):
+        layers = *zip(self._odds, PRIOR, strict=True), (self._shown, 0), (self._usual.mean, 0), *self._watch.layers
+        for layer, unknown in layers:
             layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
-        self._odds[:, gone] = np.array(PRIOR, np.float32)[:, None]
-        self._fresh[gone], self._flooded[gone], self._usual.mean[gone] = 0.0, 0, 0.0
-        self._free_ns[gone] = NEVER
+            layer[gone] = unknown
         self._corner = self._corner + shift
         return self._corner

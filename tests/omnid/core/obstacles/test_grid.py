@@ -6,21 +6,19 @@ import numpy as np
 import pytest
 
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
+from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.grid import (
     ABOVE,
     CELL_M,
-    FLOOD_MPS,
     FLOOR,
     FREE_ODDS,
-    FRESH_NS,
-    NEVER,
     PRIOR,
     SURFACE,
     GridRing,
     ObstacleGrid,
 )
 from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
@@ -175,16 +173,26 @@ def test_a_cell_is_not_free_where_something_may_stand(grid: ObstacleGrid) -> Non
     assert free[100, [99, 120, 139]].all() and not free[100, [100, 140]].any()
 
 
+def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pairs) -> None:
+    """As a bar under which the floor is seen: the pairs between them contradict it, so that it is never taken."""
+    shown = seen[0].surface.copy()
+    near = round(COLUMNS.at_1m / 1.3)
+    shown[near - 1 : near + 2, DIRECTIONS // 2 - 3 : DIRECTIONS // 2 + 3] = 1.5
+    ring = after(grid, [seen[0], seen[1]._replace(surface=shown)], 60)
+    assert 1.0 < ring.free_m[AHEAD].min() < 1.35
+    assert ring.free_m[SECTORS // 2 + 10 : SECTORS // 2 + 30].min() > 1.5
+
+
 @pytest.mark.parametrize(("gap_cells", "comes_in"), [(2, False), (6, True)])
 def test_nothing_comes_in_through_a_narrow_gap(grid: ObstacleGrid, seen: Pairs, gap_cells: int, comes_in: bool) -> None:
     """A ring about the base that was never free, with a gap; in the dark something may have come to all other floor."""
     after(grid, seen, 20)
     middle = np.floor(-grid.corner_m / CELL_M).astype(int)
-    y, x = np.ogrid[: grid._fresh.shape[0], : grid._fresh.shape[1]]
+    y, x = np.ogrid[: grid._odds.shape[1], : grid._odds.shape[2]]
     x, y = x - middle[0], y - middle[1]
     away = np.hypot(x, y)
     ring = (away > 8) & (away < 12) & ~((x > 0) & (y >= 0) & (y < gap_cells))
-    grid._odds[FLOOR][ring], grid._free_ns[ring] = PRIOR[FLOOR], NEVER
+    grid._odds[FLOOR][ring], grid._watch.free_ns[ring] = PRIOR[FLOOR], NEVER
     dark = seen[0]._replace(
         surface=np.zeros_like(seen[0].surface), floor=0 * seen[0].floor, level=np.zeros_like(seen[0].level)
     )
@@ -219,7 +227,7 @@ def test_floor_before_a_wall_too_near_for_floor_is_kept_where_the_wall_is_seen(
     found = evidence(stains, wall, wall_m=near_m)
     assert found[0].nearest_floor_m > near_m
     after(grid, found, 20)
-    grid._flooded[:] = 1  # something may have come from all sides
+    grid._watch.flooded[:] = 1  # something may have come from all sides
     grid._odds[FLOOR] = PRIOR[FLOOR]
     ring = after(grid, found, 3, first=20)
     assert (np.median(ring.free_m) > near_m - 0.25) == is_known
