@@ -227,11 +227,12 @@ def command_line(scene: Path, port: int, motor: Path | None, *words: object, mod
 def patient(*settings: str) -> tuple[str, ...]:
     """Return the words of these settings, and of those with which a robot on a busy machine, late with all, drives on.
 
-    Otherwise each late pose, tick or answer would be a fault, and faults disarm.
+    Otherwise each late pose, tick or answer would be a fault, and faults disarm; each late ring of obstacles a stop.
     """
     late = (
         "controller.deadlines.pose_s=8",
         "controller.deadlines.tick_s=8",
+        "controller.collision.stale_s=8",
         "motor.watchdog_ms=8000",
         "controller.trust.velocity_sigma_mps=0",
         "controller.trust.yaw_rate_sigma_radps=0",

@@ -18,7 +18,18 @@ import pytest
 from omnid.formats.tum import read_tum
 from tests.replay.command import Command
 from tests.replay.edited import images, save
-from tests.replay.live import PATIENCE_S, ROOT, Base, answers, command_line, free_port, robot, started, wait_until
+from tests.replay.live import (
+    PATIENCE_S,
+    ROOT,
+    Base,
+    answers,
+    command_line,
+    free_port,
+    patient,
+    robot,
+    started,
+    wait_until,
+)
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
@@ -26,7 +37,7 @@ SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
 
 def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, course: Path) -> None:
-    with robot(course, tmp_path) as (daemon, operator, base):
+    with robot(course, tmp_path, *patient("controller.deadlines.command_s=2")) as (daemon, operator, base):
         time.sleep(0.5)
         assert not base.line.moved_since(0.0), "no command yet"
         operator.drive(0.3)
