@@ -4,27 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.replay.live import Base, Operator, answers, command_line, free_port, started, wait_until
+from tests.replay.live import Base, Operator, answers, command_line, free_port, patient, started, wait_until
 
 
 def recorded_run(scene: Path, folder: Path, poses: int) -> Path:
     """Return a recording of at least so many poses, at half speed so that an idle machine drops no image."""
     port, base, kept = free_port(), Base(folder), folder / "kept"
-    more = (
-        "--pace",
-        "0.5",
-        "--set",
-        "record.enabled=true",
-        "--set",
-        f"record.folder={kept}",
-        "--set",
-        "record.free_mb=0",
-    )
+    more = ("--pace", "0.5", *patient("record.enabled=true", f"record.folder={kept}", "record.free_mb=0"))
     with started(command_line(scene, port, base.port, *more), port) as daemon:
         wait_until(lambda: answers(port) or not daemon.alive, "the bus")
         operator = Operator(port)
         operator.drive(0.3)
-        wait_until(lambda: len(operator.poses) > poses and base.drives, "poses and motion")
+        wait_until(lambda: len(operator.poses) > poses and base.line.base.velocity_mps > 0.2, "poses and motion")
         operator.close()
         code, err = daemon.end()
     base.close()
