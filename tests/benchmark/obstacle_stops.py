@@ -14,9 +14,11 @@ import itertools
 import math
 import random
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -259,6 +261,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, default=(1, 3), metavar=("FIRST", "LAST"))
     parser.add_argument("--sizes", type=int, nargs="+", default=(512,), help="of the images, px")
     parser.add_argument("--speeds", type=float, nargs="+", default=(SPEED_MPS,), help="m/s; below 0: backwards")
+    parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
     table = ResultTable(
@@ -282,25 +285,35 @@ def main() -> None:
         continued=True,
     )
     seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
-    for case, speed_mps, size_px in itertools.product(arguments.cases, arguments.speeds, arguments.sizes):
-        drives = []
-        for seed in seeds:
-            drives.append(run(case, seed, size_px, arguments.overrides, speed_mps))
-            print(f"{case} {seed}: {drives[-1]}", flush=True)
-            table.seeds += [("obstacle stops", seed)] * (("obstacle stops", seed) not in table.seeds)
-        at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
-        table.add(
-            case + at,
-            len(drives),
-            sum(drive.contacts for drive in drives),
-            sum(drive.own for drive in drives),
-            min(drive.clearance_m for drive in drives),
-            sum(drive.stops for drive in drives),
-            sum(drive.false_stops for drive in drives),
-            sum(drive.driven_m for drive in drives),
-            max(drive.near_mps for drive in drives),
-            *(sum(drive.unknown[k] for drive in drives) for k in (0, 1)),
-        )
+    table.seeds = [("obstacle stops", seed) for seed in seeds]
+    parts = list(itertools.product(arguments.cases, arguments.speeds, arguments.sizes))
+    with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
+        runs = [
+            [pool.submit(run, case, seed, size_px, arguments.overrides, speed_mps) for seed in seeds]
+            for case, speed_mps, size_px in parts
+        ]
+        for part, futures in zip(parts, runs, strict=True):
+            drives = []
+            for seed, future in zip(seeds, futures, strict=True):
+                drives.append(future.result())
+                print(f"{part[0]} {seed}: {drives[-1]}", flush=True)
+            _add(table, *part, drives)
+
+
+def _add(table: ResultTable, case: str, speed_mps: float, size_px: int, drives: Sequence[Drive]) -> None:
+    at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
+    table.add(
+        case + at,
+        len(drives),
+        sum(drive.contacts for drive in drives),
+        sum(drive.own for drive in drives),
+        min(drive.clearance_m for drive in drives),
+        sum(drive.stops for drive in drives),
+        sum(drive.false_stops for drive in drives),
+        sum(drive.driven_m for drive in drives),
+        max(drive.near_mps for drive in drives),
+        *(sum(drive.unknown[k] for drive in drives) for k in (0, 1)),
+    )
 
 
 if __name__ == "__main__":
