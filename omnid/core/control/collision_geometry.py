@@ -41,8 +41,8 @@ class Outline(NamedTuple):
         along_m = (self.front_m if c > 0 else self.rear_m) / max(abs(c), TINY)
         return min(along_m, self.half_width_m / max(s, TINY))
 
-    def is_approached(self, x_m: float, y_m: float, motion: Twist) -> bool:
-        """True if the motion takes the outline nearer to a point, or a point inside it deeper."""
+    def approach_mps(self, x_m: float, y_m: float, motion: Twist) -> float:
+        """Return the speed at which a motion takes the outline nearer to a point, or a point inside it deeper."""
         vx, vy = motion.yaw_rate_radps * y_m - motion.velocity_mps, -motion.yaw_rate_radps * x_m
         dx = max(x_m - self.front_m, 0.0) - max(-self.rear_m - x_m, 0.0)
         dy = math.copysign(max(abs(y_m) - self.half_width_m, 0.0), y_m)
@@ -55,7 +55,11 @@ class Outline(NamedTuple):
             )
             _, dx, dy = min(edges)
         # A speed, not its product with the distance: a point at the edge is approached as any other.
-        return dx * vx + dy * vy < -TINY * math.hypot(dx, dy)
+        return -(dx * vx + dy * vy) / math.hypot(dx, dy)
+
+    def is_approached(self, x_m: float, y_m: float, motion: Twist) -> bool:
+        """True if the motion takes the outline nearer to a point, or a point inside it deeper."""
+        return self.approach_mps(x_m, y_m, motion) > TINY
 
 
 def contact_s(outline: Outline, motion: Twist, x_m: float, y_m: float) -> float:

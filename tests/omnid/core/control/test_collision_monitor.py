@@ -174,6 +174,17 @@ def test_a_few_unknown_sectors_between_free_ones_mean_nothing() -> None:
     assert after(with_unknown(-3, 3))[1] == monitor_module.UNKNOWN
 
 
+@pytest.mark.parametrize(("yaw_rate_radps", "goes_on"), [(0.0, True), (0.05, True), (-0.05, True), (0.2, False)])
+def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, goes_on: bool) -> None:
+    """A corrected heading takes a corner nearer by a little; a turn into it is another thing, and so is an obstacle."""
+    motion = Twist(0.5, yaw_rate_radps)
+    for way in (1, -1):
+        beside, turned = with_unknown(45, 135), Twist(way * 0.5, motion.yaw_rate_radps)
+        assert (after(beside, turned) == (turned, "")) == goes_on
+    near, slow = with_points((0.1, 0.24), (-0.1, 0.24)), Twist(0.15, 0.3 * yaw_rate_radps)
+    assert (after(near, slow) == (slow, "")) == (yaw_rate_radps == 0.0)
+
+
 @pytest.mark.parametrize("policy", ["stop", "slow", "ignore"])
 @pytest.mark.parametrize("unknown", ["stop", "ignore"])
 def test_towards_dead_and_blind_parts_of_the_images_counts_as_without_a_fresh_ring(policy: str, unknown: str) -> None:
