@@ -167,11 +167,12 @@ class MotionAgreement:
     def _compare(self, now_s: float) -> Witness:
         """Return the account that differs, and whether it is a fault."""
         starts_s, ends_s, seen_m, seen_rad = np.array(self._steps).T
-        distance = self._finding((starts_s, ends_s), seen_m, self._wheels_m, (STEP_M, LEAST_M, "m"))
-        of_wheels = self._finding((starts_s, ends_s), seen_rad, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
-        of_gyro = self._finding((starts_s, ends_s), seen_rad, self._gyro_rad, (STEP_RAD, TURN_RAD, "rad"))
+        spans = starts_s, ends_s, seen_m
+        distance = self._finding(spans, seen_m, self._wheels_m, (STEP_M, LEAST_M, "m"))
+        of_wheels = self._finding(spans, seen_rad, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
+        of_gyro = self._finding(spans, seen_rad, self._gyro_rad, (STEP_RAD, TURN_RAD, "rad"))
         by_gyro = self._gyro_rad.between(starts_s, ends_s)
-        between = self._finding((starts_s, ends_s), by_gyro, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
+        between = self._finding(spans, by_gyro, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
         # The larger one of distance and turn of the wheels; a lag counts as a fault.
         wheels = max((distance, of_wheels), key=lambda found: (found.differs, found.excess, abs(found.lag_s)))
         if not wheels.differs and not of_gyro.differs:
@@ -192,9 +193,13 @@ class MotionAgreement:
         return Witness(reason, found.text, bool(is_long or found.excess >= 1.0))
 
     def _finding(
-        self, span_s: tuple[Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
+        self, spans: tuple[Array, Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
     ) -> _Finding:
-        """Compare the motion seen (N,) in steps with that of a sensor. limits: noise of a step, least sum, unit."""
+        """Compare the motion seen (N,) in steps with that of a sensor.
+
+        spans: begins and ends [s] of the steps, and their ways [m]; limits: noise of a step, least sum, unit.
+        """
+        span_s, ways_m = spans[:2], spans[2]
         noise, least, unit = limits
         by_lag = travel.between(span_s[0] - self._lags_s[:, None], span_s[1] - self._lags_s[:, None])
         near = int(np.argmin(np.abs(self._lags_s)))
@@ -211,7 +216,7 @@ class MotionAgreement:
             return _UNKNOWN
         moved, seen = by_lag[near, known][::-1], seen[known][::-1]  # the newest first
         path = np.cumsum(np.abs(moved))
-        count = int(np.searchsorted(path, WINDOW_M)) + 1 if unit == "m" else len(path)
+        count = int(np.searchsorted(path if unit == "m" else np.cumsum(np.abs(ways_m[known][::-1])), WINDOW_M)) + 1
         length = float(path[min(count, len(path)) - 1])
         difference = abs(float((moved[:count] - seen[:count]).sum()))
         is_whole = count <= len(path) or span_s[1][-1] - span_s[0][0] >= WINDOW_S - LEAST_STEPS * EVERY_S

@@ -35,6 +35,7 @@ class Errors:
     images_scale: float = 1.0
     wheels_scale: float = 1.0
     wheels_turn: float = 1.0
+    wheels_curve: float = 0.0  # rad/m, of wheels with different diameters
     gyro_scale: float = 1.0
     has_gyro: bool = True
 
@@ -63,6 +64,7 @@ def driven(
         for t_s in np.arange(end_s - PAIR_S, end_s - 1e-9, WHEEL_S):
             shown = errors.wheels_scale * at(t_s - errors.wheels_late_s, speed) + rng.normal(0, 0.004)
             turn = errors.wheels_turn * at(t_s - errors.wheels_late_s, rate) + rng.normal(0, 0.01)
+            turn += errors.wheels_curve * at(t_s - errors.wheels_late_s, speed)
             agreement.add([WheelSample(ns(t_s), float(shown), float(turn))], 0.0)
         for t_s in np.arange(end_s - PAIR_S, end_s - 1e-9, GYRO_S):
             if errors.has_gyro:
@@ -97,6 +99,7 @@ def first(found: list[tuple[float, Witness]], *, is_fault: bool) -> tuple[float,
         Errors(images_late_s=0.15),
         Errors(images_late_s=-0.1),
         Errors(wheels_scale=1.04, wheels_turn=0.95),
+        Errors(wheels_curve=np.radians(5.0) / 3.0),
         Errors(gyro_scale=1.02),
         Errors(images_scale=0.97),
         Errors(wheels_late_s=0.1, has_gyro=False),
