@@ -28,7 +28,7 @@ ALONG_SLOPE: Final = 0.05
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
-# Consecutive ones without a range that make a direction unknown; by trial on development seeds.
+# Consecutive unknown ones that make a direction unknown; by trial on development seeds.
 UNKNOWN_SECTORS: Final = 5
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
 MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
@@ -66,7 +66,7 @@ class ControllerRing(NamedTuple):
 
     stamp_ns: int  # time of the capture
     ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
-    free_m: tuple[float, ...] = ()  # (N,) up to which an unknown direction was seen to be free; empty: 0
+    free_m: tuple[float, ...] = ()  # (N,) up to which a direction was seen to be free; empty: the range, 0 if unknown
     moving: tuple[MovingPoint, ...] = ()
     unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
 
@@ -120,11 +120,19 @@ class CollisionMonitor:
             for k, r in enumerate(ring.ranges_m)
             if math.isfinite(r)
         ]
-        free = ring.free_m if len(ring.free_m) == count else (0.0,) * count
+        free = ring.free_m
+        if len(free) != count:
+            free = tuple(r if math.isfinite(r) else 0.0 for r in ring.ranges_m)
+        # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer. What
+        # stands nearer than stop_m before the surface is kept clear by that.
+        unknown = [
+            math.isnan(r) or (math.isfinite(r) and r - f > self._settings.stop_m)
+            for r, f in zip(ring.ranges_m, free, strict=True)
+        ]
         self._unknown, self._unwatched = [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
-        for k in _unknown_sectors(ring.ranges_m):
+        for k in _in_long_runs(unknown):
             azimuth = (k + 0.5) * step - math.pi
             begins_m = self._around.edge_m(azimuth) if unwatched[k] else max(free[k], self._outline.edge_m(azimuth))
             ends = self._unwatched if unwatched[k] else self._unknown
@@ -293,10 +301,9 @@ class CollisionMonitor:
         return pose
 
 
-def _unknown_sectors(ranges_m: tuple[float, ...]) -> list[int]:
-    """Return the sectors without a range in runs of at least UNKNOWN_SECTORS, around the full turn."""
-    count = len(ranges_m)
-    unknown = [math.isnan(r) for r in ranges_m]
+def _in_long_runs(unknown: list[bool]) -> list[int]:
+    """Return the unknown sectors in runs of at least UNKNOWN_SECTORS, around the full turn."""
+    count = len(unknown)
     if all(unknown):
         return list(range(count))
     start = unknown.index(False)

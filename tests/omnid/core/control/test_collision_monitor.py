@@ -169,6 +169,13 @@ def test_an_unknown_way_that_was_seen_to_be_free_is_driven_up_to_there() -> None
         assert after(wall, free=(0.4,) * 360, settings=settings) == (slowest, monitor_module.UNKNOWN)
 
 
+def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
+    """As behind a plain pole; beside a wall the floor is often seen to be free not quite as far as it."""
+    for sectors, free_m, is_unknown in ((8, 0.4, True), (4, 0.4, False), (8, 2.9, False)):
+        free = tuple(free_m if abs(k - 179.5) < sectors / 2 else 3.0 for k in range(360))
+        assert (after((3.0,) * 360, free=free)[1] == monitor_module.UNKNOWN) == is_unknown
+
+
 def test_a_few_unknown_sectors_between_free_ones_mean_nothing() -> None:
     assert after(with_unknown(-2, 2)) == (AHEAD, "")
     assert after(with_unknown(-3, 3))[1] == monitor_module.UNKNOWN
