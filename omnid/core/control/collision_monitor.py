@@ -100,6 +100,7 @@ class CollisionMonitor:
         self._stamp_ns: int | None = None
         self._points: list[Point] = []  # obstacles in the frame of the ring
         self._unknown: list[Point] = []  # ends of the way that was seen to be free: nothing is known beyond
+        self._gaps: list[Point] = []  # the same where a surface is seen beyond
         self._unwatched: list[Point] = []  # around the outline, where the images show nothing
         self._is_blind = False  # they show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
@@ -125,17 +126,15 @@ class CollisionMonitor:
             free = tuple(r if math.isfinite(r) else 0.0 for r in ring.ranges_m)
         # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer. What
         # stands nearer than stop_m before the surface is kept clear by that.
-        unknown = [
-            math.isnan(r) or (math.isfinite(r) and r - f > self._settings.stop_m)
-            for r, f in zip(ring.ranges_m, free, strict=True)
-        ]
-        self._unknown, self._unwatched = [], []
+        has_gap = [math.isfinite(r) and r - f > self._settings.stop_m for r, f in zip(ring.ranges_m, free, strict=True)]
+        unknown = [math.isnan(r) or gap for r, gap in zip(ring.ranges_m, has_gap, strict=True)]
+        self._unknown, self._gaps, self._unwatched = [], [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
         for k in _in_long_runs(unknown):
             azimuth = (k + 0.5) * step - math.pi
             begins_m = self._around.edge_m(azimuth) if unwatched[k] else max(free[k], self._outline.edge_m(azimuth))
-            ends = self._unwatched if unwatched[k] else self._unknown
+            ends = self._unwatched if unwatched[k] else self._gaps if has_gap[k] else self._unknown
             ends.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
 
     def step(self, now_ns: int, motion: Twist) -> Twist:
@@ -184,7 +183,9 @@ class CollisionMonitor:
         points = _within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
-            ends = _within_reach(self._unknown, moved, reach_m)
+            # Who stood beside or behind the base would hide the surface there; a thin thing was passed by the front.
+            gaps = self._ahead(_within_reach(self._gaps, moved, reach_m), motion)
+            ends = _within_reach(self._unknown, moved, reach_m) + gaps
             allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
         if settings.stale != IGNORE and self._unwatched:
             ends = _within_reach(self._unwatched, moved, reach_m)
@@ -236,6 +237,12 @@ class CollisionMonitor:
         far_m = (outline.front_m if side > 0 else outline.rear_m) + settings.slow_m
         is_near = any(0.0 <= side * x <= far_m and abs(y) <= wide_m for x, y in points)
         return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
+
+    def _ahead(self, points: list[Point], motion: Twist) -> list[Point]:
+        """Return the points beyond the edge that leads."""
+        if motion.velocity_mps > 0.0:
+            return [(x, y) for x, y in points if x > self._outline.front_m]
+        return [(x, y) for x, y in points if x < -self._outline.rear_m]
 
     def _into_unknown(self, unknown: list[Point], motion: Twist, policy: str, reason: str) -> Allowance:
         """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all.

@@ -174,6 +174,15 @@ def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
     for sectors, free_m, is_unknown in ((8, 0.4, True), (4, 0.4, False), (8, 2.9, False)):
         free = tuple(free_m if abs(k - 179.5) < sectors / 2 else 3.0 for k in range(360))
         assert (after((3.0,) * 360, free=free)[1] == monitor_module.UNKNOWN) == is_unknown
+        assert (after((3.0,) * 360, Twist(-0.5), free=(*free[180:], *free[:180]))[0] == Twist(-0.5)) != is_unknown
+
+
+def test_a_place_beside_before_which_a_wall_is_seen_does_not_keep_a_base_from_turning() -> None:
+    """Who stood there would hide the wall."""
+    free = tuple(0.0 if -150 < k - 179.5 < -100 else 3.0 for k in range(360))
+    swings = Twist(0.3, 0.6)
+    assert after((3.0,) * 360, swings, free=free) == (swings, "")
+    assert after(with_unknown(-150, -100), swings, free=free) == (Twist(), monitor_module.UNKNOWN)
 
 
 def test_a_few_unknown_sectors_between_free_ones_mean_nothing() -> None:
