@@ -178,7 +178,7 @@ def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
 
 
 def test_a_place_beside_before_which_a_wall_is_seen_does_not_keep_a_base_from_turning() -> None:
-    """Who stood there would hide the wall."""
+    """A person there would hide the wall."""
     free = tuple(0.0 if -150 < k - 179.5 < -100 else 3.0 for k in range(360))
     swings = Twist(0.3, 0.6)
     assert after((3.0,) * 360, swings, free=free) == (swings, "")
