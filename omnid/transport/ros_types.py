@@ -1,4 +1,4 @@
-"""Types of ROS 2 (Humble) messages, by rosbags. They are loaded at first use: they take 60 ms of a start."""
+"""Types of ROS 2 (Humble) messages, by rosbags, loaded at first use: they are many, and most commands need none."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ CONTRADICTION: Final = -1.5  # Log-odds of a surface where floor is seen and no 
 # the prior. So a cell is free only where the mean surface of single pairs is low. Set on development seeds 1 and 2.
 SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean
 SHOWN_CELLS: Final = 5  # side of the patch of the mean, as errors of the range move what a pair shows by some cells
-MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair: with 3.0 free corridors were unknown within 0.6 m
+MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair; by trial, too
 FREE_SHOWN: Final = 0.1  # largest mean in a free cell
 
 APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.

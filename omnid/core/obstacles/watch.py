@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 
 NEVER: Final = np.iinfo(np.int64).min
 FRESH_NS: Final = 500_000_000  # time constant of the mean by which a cell is watched: no motion on older evidence
@@ -26,9 +25,8 @@ CROSS: Final = np.array(
     [[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8
 )  # By turns with a square, a step of the flood is nearly a circle.
 GAP: Final = np.ones((3, 3), np.uint8)  # Nothing comes through narrower gaps, because noise opens such in walls.
-ONCE_FREE_NS: Final = (
-    30_000_000_000  # An object may have come for so long through a hidden cell that was free: a door was opened.
-)
+# An object may have come for so long through a hidden cell that was free, because a door may have been opened.
+ONCE_FREE_NS: Final = 30_000_000_000
 
 
 class Watch:
@@ -37,7 +35,7 @@ class Watch:
     def __init__(self, cells: int, cell_m: float) -> None:
         """cells: side of the square; cell_m: side of a cell."""
         self._steps_per_s = FLOOD_MPS / cell_m
-        self._passed_ns, self._carry = 0, 0.0
+        self._carry = 0.0  # part of a step that is left from the pair before
         self.evidence = np.zeros((cells, cells), np.float32)  # mean of the last FRESH_NS
         self.free_ns = np.full((cells, cells), NEVER, np.int64)  # stamp of the pair at which a cell was free last
         self.flooded = np.zeros((cells, cells), np.uint8)  # 1 where something may have come unseen
