@@ -60,9 +60,7 @@ APART_S: Final = 0.2  # A pair from the same place counts in full after it, so t
 PLACE_PAIRS: Final = 18.0
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
-WIDE_CELLS: Final = 3  # Side of the mean that shows a low object or an edge, because single cells are noisy.
-# The same where no step is seen either, because what hides so little floor is no higher than one.
-LEVEL_SPECK_CELLS: Final = 9
+WIDE_CELLS: Final = 3  # Side of the mean that shows floor, a low object or an edge, because single cells are noisy.
 THIN_M: Final = 0.03  # width of the thinnest obstacle
 GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
@@ -179,13 +177,15 @@ class ObstacleGrid:
         """Return the cells: 0 unknown, 1 free, 2 taken."""
         taken = self._odds[SURFACE] > TAKEN_ODDS
         suspect = ((self._odds[SURFACE] > CLEAR_ODDS) | (self._shown > FREE_SHOWN)) & ~taken
-        level = self._level_odds()
-        free = ((self._odds[FLOOR] > FREE_ODDS) & (level > FREE_ODDS) & ~suspect) | taken
+        floor, level = self._odds[FLOOR], self._level_odds()
+        # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
+        is_floor = (floor > FREE_ODDS) | ((floor > 0) & (_wide_mean(floor) > FREE_ODDS))
+        free = (is_floor & (level > FREE_ODDS) & ~suspect) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
         # Specks are noise unless something may stand there.
         sizes = about[:, cv2.CC_STAT_AREA]
         cells = np.where(np.bincount(patch[suspect], minlength=len(sizes)) > 0, CELLS * CELLS, sizes)[patch]
-        free |= (cells <= SPECK_CELLS) | ((cells <= LEVEL_SPECK_CELLS) & (level > FREE_ODDS))
+        free |= cells <= SPECK_CELLS
         # Steps are seen by several directions together, of which those at a corner show half floor.
         beside = cv2.dilate(((level < 0) & ~free).astype(np.uint8), GAP) > 0
         free = taken | (free & ~beside)
@@ -193,8 +193,7 @@ class ObstacleGrid:
 
     def _level_odds(self) -> Floats:
         """Return the least log-odds (CELLS, CELLS) against steps up and down, which are wider than a cell."""
-        above, below = (cv2.blur(self._odds[layer], (WIDE_CELLS, WIDE_CELLS)) for layer in (ABOVE, BELOW))
-        return np.asarray(cv2.min(above, below), np.float32)
+        return np.minimum(_wide_mean(self._odds[ABOVE]), _wide_mean(self._odds[BELOW]))
 
     def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
         """Return the evidence (4, N, N) of the cells of the view, the first of which has its middle at first_m."""
@@ -307,3 +306,8 @@ class ObstacleGrid:
             layer[gone] = unknown
         self._corner = self._corner + shift
         return self._corner
+
+
+def _wide_mean(odds: Floats) -> Floats:
+    """Return the mean (CELLS, CELLS) of log-odds over WIDE_CELLS."""
+    return np.asarray(cv2.blur(odds, (WIDE_CELLS, WIDE_CELLS)), np.float32)

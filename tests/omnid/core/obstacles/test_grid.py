@@ -173,6 +173,18 @@ def test_a_cell_is_not_free_where_something_may_stand(grid: ObstacleGrid) -> Non
     assert free[100, [99, 120, 139]].all() and not free[100, [100, 140]].any()
 
 
+@pytest.mark.parametrize(
+    ("odds", "rows", "is_free"), [(0.5, 1, True), (0.5, 2, True), (0.5, 4, False), (-0.5, 1, False)]
+)
+def test_a_cell_is_floor_by_its_neighbours_only_where_floor_is_more_likely_than_not(
+    grid: ObstacleGrid, odds: float, rows: int, is_free: bool
+) -> None:
+    """Patches of more cells than a speck, with sure floor around; of a wide one the middle stays unknown."""
+    grid._odds[:SURFACE] = 4.0
+    grid._odds[FLOOR, 100 : 100 + rows, 100:116] = odds
+    assert (grid.state()[100 : 100 + rows, 105:110] == 1).all() == is_free
+
+
 def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pairs) -> None:
     """As a bar under which the floor is seen: the pairs between them contradict it, so that it is never taken."""
     shown = seen[0].surface.copy()
