@@ -39,22 +39,26 @@ def available() -> bool:
     return shutil.which("povray") is not None
 
 
-def write_world(folder: Path, scene: Scene) -> None:
-    """Write world.inc and its textures: every rectangle in world coordinates, then moved by the transform `View`."""
+def write_world(folder: Path, scene: Scene, gloss: float = 0.0) -> None:
+    """Write world.inc and its textures: every rectangle in world coordinates, then moved by the transform `View`.
+
+    gloss: share of the light that rectangles of the name "floor" mirror.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for number, rectangle in enumerate(scene.rectangles):
-        cv2.imwrite(str(folder / f"{number}.pgm"), rectangle.texture)
-    (folder / "world.inc").write_text("\n".join(_rectangle(n, r) for n, r in enumerate(scene.rectangles)) + "\n")
+        cv2.imwrite(str(folder / f"{number}.png"), rectangle.texture)
+    parts = [_rectangle(n, r, gloss if r.name == "floor" else 0.0) for n, r in enumerate(scene.rectangles)]
+    (folder / "world.inc").write_text("\n".join(parts) + "\n")
 
 
-def _rectangle(number: int, r: Rectangle) -> str:
+def _rectangle(number: int, r: Rectangle, gloss: float) -> str:
     """Return a unit square with its texture; POV-Ray counts the rows of an image from below."""
     axes = (r.edge_u, -r.edge_v, r.normal, r.origin + r.edge_v)
     matrix = ", ".join(f"{x:.12g}" for axis in axes for x in axis)
     return (
-        f'polygon {{ 5, <0,0>, <1,0>, <1,1>, <0,1>, <0,0> pigment {{ image_map {{ pgm "{number}.pgm" gamma 1.0 '
-        f"interpolate 2 }} }} finish {{ ambient {r.brightness:.6f} diffuse 0 }} matrix <{matrix}> "
-        "transform { View } }"
+        f'polygon {{ 5, <0,0>, <1,0>, <1,1>, <0,1>, <0,0> pigment {{ image_map {{ png "{number}.png" gamma 1.0 '
+        f"interpolate 2 }} }} finish {{ ambient {r.brightness * (1 - gloss):.6f} diffuse 0 reflection {gloss:.6f} }} "
+        f"matrix <{matrix}> transform {{ View }} }}"
     )
 
 
@@ -98,7 +102,7 @@ def view_text(mounted: MountedCamera, T_world_rig: Array) -> str:
     return "\n".join(
         [
             "#version 3.7;",
-            "global_settings { assumed_gamma 1.0 max_trace_level 2 }",
+            "global_settings { assumed_gamma 1.0 max_trace_level 3 }",
             _camera(camera),
             _mirror(camera, mounted.visible.outer_px),
             f"#declare View = transform {{ matrix <{columns}> }}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,9 +13,13 @@ from calib import se3
 from calib.rig_file import read_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
+from omnid.simulation.lockstep import with_masks
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.rigs import make_rig
+from omnid.simulation.robot import make_robot
 from tests.experiments.building import building
+from tests.experiments.obstacle_posterior.scenes import base_pose, obstacle_scene, render_pair
+from tests.experiments.obstacle_posterior.traced import TracedScene
 from tests.experiments.povray import INSTALL, PovrayError, available, shoot, view_text, write_world
 from tests.experiments.rendering import cast_log, render_log
 from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
@@ -129,3 +134,17 @@ def test_rendering_continues_an_interrupted_run_and_writes_a_log_with_its_truth(
     before = (tmp_path / "log.mcap").stat().st_mtime_ns
     render_log(tmp_path, experiment.run, 3)
     assert (tmp_path / "log.mcap").stat().st_mtime_ns == before
+
+
+@needs_povray
+def test_a_floor_mirrors_the_same_in_both_renderers(tmp_path: Path) -> None:
+    scene = obstacle_scene("glossy", 1)
+    robot = make_robot(192)
+    robot = replace(robot, rig=with_masks(robot.rig))
+    cast_glossy = render_pair(scene, robot, base_pose(0.0, 0.0, 0.0), 3)
+    cast_matt = render_pair(replace(scene, gloss=0.0), robot, base_pose(0.0, 0.0, 0.0), 3)
+    traced = TracedScene(tmp_path, scene, robot).pair(base_pose(0.0, 0.0, 0.0))
+    for glossy, matt, image in zip(cast_glossy, cast_matt, traced, strict=True):
+        on_floor = np.abs(glossy - matt) > 8
+        error, without = (np.median(np.abs(image - other)[on_floor]) for other in (glossy, matt))
+        assert on_floor.sum() > 1000 and error < without / 4

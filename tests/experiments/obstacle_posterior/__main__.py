@@ -11,9 +11,12 @@ Free ahead: what is said of the fan of 28 degrees ahead in the last rings, again
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -33,8 +36,11 @@ from omnid.simulation.robot import SimulatedRobot, make_robot
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
 from tests.experiments.obstacle_posterior.scenes import CASES, ObstacleScene, base_pose, obstacle_scene, render_pair
+from tests.experiments.obstacle_posterior.traced import TracedScene
 
 Array = NDArray[np.float64]
+# Ideal images of both cameras, from T_world_base (4, 4)
+Shoot = Callable[[Array], tuple[NDArray[np.float32], NDArray[np.float32]]]
 STEP_M: Final = 0.05
 START_M: Final = -1.2
 PERIOD_NS: Final = 100_000_000
@@ -77,7 +83,7 @@ class Scores:
 
 
 def pairs(
-    scene: ObstacleScene, robot: SimulatedRobot, dewarp: Dewarp, steps: int, seed: int
+    shoot: Shoot, robot: SimulatedRobot, dewarp: Dewarp, steps: int, seed: int
 ) -> Iterator[tuple[float, Panoramas]]:
     """Yield the way and the panoramas of a drive."""
     rng = np.random.default_rng([seed, 61])
@@ -88,28 +94,30 @@ def pairs(
     number = 0
     for step in range(steps):
         x_m = START_M + STEP_M * step
-        ideal = render_pair(scene, robot, base_pose(x_m, 0.0, 0.0))
+        ideal = shoot(base_pose(x_m, 0.0, 0.0))
         for _ in range(STANDING if step == 0 else 1):
             lower, upper = (sensor.expose(image, rng) for sensor, image in zip(sensors, ideal, strict=True))
             yield x_m, dewarp.process(FramePair(number, number * PERIOD_NS, lower, upper))
             number += 1
 
 
-def drive(case: str, seed: int, robot: SimulatedRobot, steps: int, scores: Scores) -> None:
-    """Drive into the room of a case and add to its scores."""
+def drive(case: str, seed: int, robot: SimulatedRobot, steps: int, scores: Scores, *, traced: bool = False) -> None:
+    """Drive into the room of a case and add to its scores; traced: by POV-Ray."""
     config = Config()
     shape: Geometry = geometry(robot.rig, config.panorama)
     grid = ObstacleGrid(FOCAL_PX * shape.rig.baseline_m, RingSettings())
     columns: Columns | None = None
     scene = obstacle_scene(case, seed)
-    for x_m, panoramas in pairs(scene, robot, Dewarp(shape, config.panorama), steps, seed):
-        if columns is None:
-            columns = columns_of(shape, panoramas, grid)
-        begin = time.thread_time()
-        evidence = columns.evidence(panoramas.lower, panoramas.upper)
-        ring = grid.update(panoramas.stamp_ns, base_pose(x_m, 0.0, 0.0), evidence)
-        scores.milliseconds.append(1e3 * (time.thread_time() - begin))
-        compare(ring, scene, x_m, scores)
+    with tempfile.TemporaryDirectory() as folder:
+        shoot = TracedScene(Path(folder), scene, robot).pair if traced else partial(render_pair, scene, robot)
+        for x_m, panoramas in pairs(shoot, robot, Dewarp(shape, config.panorama), steps, seed):
+            if columns is None:
+                columns = columns_of(shape, panoramas, grid)
+            begin = time.thread_time()
+            evidence = columns.evidence(panoramas.lower, panoramas.upper)
+            ring = grid.update(panoramas.stamp_ns, base_pose(x_m, 0.0, 0.0), evidence)
+            scores.milliseconds.append(1e3 * (time.thread_time() - begin))
+            compare(ring, scene, x_m, scores)
     add_cells(grid, scene, x_m, scores)
 
 
@@ -180,6 +188,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, default=(1, 1), metavar=("FIRST", "LAST"))
     parser.add_argument("--size", type=int, default=512, help="of the images, px")
     parser.add_argument("--steps", type=int, default=40, help="of 5 cm")
+    parser.add_argument("--povray", action="store_true", help="trace the images with POV-Ray; minutes a drive")
     parser.add_argument("--reliability", action="store_true", help="print the table of evidence too")
     arguments = parser.parse_args()
     prepare_kernels()
@@ -194,7 +203,7 @@ def main() -> None:
     for case in arguments.cases:
         scores = Scores()
         for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
-            drive(case, seed, robot, arguments.steps, scores)
+            drive(case, seed, robot, arguments.steps, scores, traced=arguments.povray)
         total += scores.cells
         print(scores.row(case), flush=True)
     if arguments.reliability:
