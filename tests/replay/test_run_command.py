@@ -104,7 +104,8 @@ def test_poses_are_those_of_the_scene(tmp_path: Path, course: Path) -> None:
 
 
 def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
-    with robot(course, tmp_path, module="tests.replay.faulty") as (daemon, operator, base):
+    words = (*patient(), "--set", "controller.deadlines.pose_s=2")
+    with robot(course, tmp_path, *words, module="tests.replay.faulty") as (daemon, operator, base):
         operator.drive()
         wait_until(lambda: base.drives, "motion")
         daemon.write_line("upper mute")
