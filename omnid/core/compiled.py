@@ -6,7 +6,8 @@ noticed. There is no second version in Python. Results are the same bytes in eve
 (fastmath), no threads inside. The global lock of Python is released meanwhile.
 
 numba makes the code (native_code.py); it is imported only where code is missing. What is kept runs without numba: LLVM
-loads it, and ctypes calls it. A function writes its results to arrays and returns nothing.
+loads it, and ctypes calls it. A function writes its results to arrays and returns nothing. It does not assign an array
+to an array (`a[:] = b`): the check of their shapes calls numba's run time, which is not there. Indices are not checked.
 """
 
 from __future__ import annotations

@@ -16,16 +16,17 @@ The last three are blind. A direction is unknown where one tile of either camera
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
+from omnid.core.stereo.tile_kernels import column_energies, tile_sums
 
 Image = NDArray[np.uint8]
-Floats = NDArray[np.float32]
+Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Side = Literal["lower", "upper"]
 SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
@@ -34,6 +35,8 @@ SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 # narrowest part that matters.
 TILE_COLUMNS: Final = 60
 TILE_ROWS: Final = 4  # 63 rows at scale 1
+SPACING_PX: Final = 2  # of the pixels that are judged, because a quarter of them is enough in a quarter of the time ...
+LEAST_SAMPLES: Final = 100  # ... where a tile has so many: a few may keep their greys by chance, as at 160 px
 JUDGED_SHARE: Final = 0.5  # Share of a tile that must show the world; tiles that show less are not judged.
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts; one may be a glitch of a driver
 # Share of the judged tiles that must change before others are dead: else the whole image is still.
@@ -50,7 +53,7 @@ TEXTURE_GREY: Final = 4.0  # standard deviation, more than what such a camera le
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
-SATURATED_GREY, SATURATED_SHARE = 250, 0.8
+SATURATED_GREY, SATURATED_SHARE = np.uint8(250), 0.8
 # A column is blurred if its energy by the other camera's is below this share of the usual, in BLURRED_COLUMNS columns,
 # because a poster that only one camera sees is all the texture of a column: 0.15 was left in rendered corridors. A drop
 # leaves less.
@@ -98,26 +101,38 @@ class TileMonitor:
     def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
         """visible (H, W): pixels that show the world; columns of tiles in W."""
         self._columns = columns
-        self._visible = _sample(visible).astype(np.float32)
-        self._share = _means(self._visible, columns)
-        self._judged = self._share >= JUDGED_SHARE
-        half = (visible.shape[1] // 2, visible.shape[0] // 2)
+        tile_pixels = visible.size / (TILE_ROWS * columns)
+        self._spacing_px = SPACING_PX if tile_pixels >= LEAST_SAMPLES * SPACING_PX**2 else 1
+        self._visible = self._sample(visible.view(np.uint8))
+        self._tiles = _borders(self._visible.shape[0], TILE_ROWS), _borders(self._visible.shape[1], columns)
+        ones = np.ones_like(self._visible)
+        self._counts = np.maximum(self._sums(ones, ones)[0], 1)  # visible pixels of each tile
+        areas = np.diff(self._tiles[0])[:, None] * np.diff(self._tiles[1])
+        self._judged = np.asarray(self._sums(ones, ones)[0] >= JUDGED_SHARE * areas)
         # Pixels at half resolution, all of which show the world, and so do their neighbours.
-        shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))
-        self._half = (cv2.resize(shown.astype(np.float32), half, interpolation=cv2.INTER_AREA) >= 1).astype(np.float32)
-        self._half_share = cv2.resize(self._half, (columns, 1), interpolation=cv2.INTER_AREA)[0]
+        height, width = visible.shape[0] // 2, visible.shape[1] // 2
+        shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))[: 2 * height, : 2 * width]
+        self._half = np.ascontiguousarray(shown.reshape(height, 2, width, 2).min(axis=(1, 3)))
+        self._half_columns = _borders(width, columns)
+        shown_columns = np.add.reduceat(self._half.sum(axis=0, dtype=np.int64), self._half_columns[:-1])
+        self._half_counts = np.maximum(shown_columns, 1)
         self._before: dict[Side, Image] = {}
         self._since_ns = dict.fromkeys(SIDES, 0)
-        self._lively = {side: np.zeros(self._judged.shape, np.float32) for side in SIDES}  # share of pairs that changed
+        self._lively = {side: np.zeros(self._judged.shape) for side in SIDES}  # share of pairs that changed
         self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
         self._faint = {side: np.zeros(columns, np.intp) for side in SIDES}  # pairs in a row with little energy
 
     def update(self, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
         """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey."""
         # 1. What each camera shows by itself.
-        samples = {side: np.ascontiguousarray(_sample(images[side])) for side in SIDES}
-        blind = {side: self._dark_or_glaring(samples[side], noise_grey[side]) for side in SIDES}
-        dead = {side: self._dead(side, samples[side], blind[side], noise_grey[side]) for side in SIDES}
+        blind, dead = {}, {}
+        for side in SIDES:
+            sample = self._sample(images[side])
+            before, self._before[side] = self._before.get(side, sample), sample
+            grey, square, saturated, change = self._sums(sample, before) / self._counts
+            contrast = np.sqrt(np.maximum(square - grey**2, 0.0))
+            blind[side] = self._dark_or_glaring(grey, contrast, saturated, noise_grey[side])
+            dead[side] = self._dead(side, change, contrast, blind[side], noise_grey[side], is_first=before is sample)
         # 2. What one camera does not show that the other one does.
         energy = {side: self._energy(images[side]) for side in SIDES}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -131,49 +146,40 @@ class TileMonitor:
             return ALL_LIVE
         return TileStates(dead, blind, columns, dict(self._since_ns))
 
-    def _dead(self, side: Side, image: Image, blind: Flags, noise_grey: float) -> Flags:
-        """Return the tiles of a camera that do not change. blind: dark and saturated ones, which have no noise."""
-        before, self._before[side] = self._before.get(side), image
-        if before is None or before.shape != image.shape:
+    def _dead(
+        self, side: Side, change: Array, contrast: Array, blind: Flags, noise_grey: float, *, is_first: bool
+    ) -> Flags:
+        """Return the tiles of a camera that do not change, by the mean change and the contrast (TILE_ROWS, C).
+
+        blind: dark and saturated ones, which have no noise; is_first: there is no image before.
+        """
+        if is_first:
             return np.zeros_like(self._judged)
-        change = self._mean(cv2.absdiff(image, before).astype(np.float32))
         least = NOISE_SHARE * NOISE_CHANGE * noise_grey if noise_grey >= MEASURED_NOISE_GREY else 0.0
         shows = self._judged & ~blind
         is_still = shows & (change <= least)
         lively = self._lively[side]
-        may_be_dead = is_still & ((self._contrast(image) > TEXTURE_GREY) | (lively > LIVELY_SHARE))
+        may_be_dead = is_still & ((contrast > TEXTURE_GREY) | (lively > LIVELY_SHARE))
         enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
         self._still[side] = np.where(may_be_dead & enough, self._still[side] + 1, 0)
         # While it is dead, a tile counts as what it was before.
         self._lively[side] = np.where(self._still[side] > 0, lively, lively + LIVELY_GAIN * (~is_still - lively))
         return np.asarray(self._still[side] >= IN_A_ROW)
 
-    def _dark_or_glaring(self, image: Image, noise_grey: float) -> Flags:
-        is_dark = self._mean(image.astype(np.float32)) < BLACK_GREY
-        if is_dark.any():
-            is_dark &= self._contrast(image) < DARK_CONTRAST * max(noise_grey, MEASURED_NOISE_GREY)
-        saturated = self._mean((image >= SATURATED_GREY).astype(np.float32))
+    def _dark_or_glaring(self, grey: Array, contrast: Array, saturated: Array, noise_grey: float) -> Flags:
+        is_dark = (grey < BLACK_GREY) & (contrast < DARK_CONTRAST * max(noise_grey, MEASURED_NOISE_GREY))
         return np.asarray(self._judged & (is_dark | (saturated > SATURATED_SHARE)))
 
-    def _contrast(self, image: Image) -> Floats:
-        """Return the standard deviations (TILE_ROWS, C) within tiles."""
-        grey = image.astype(np.float32)
-        return np.asarray(np.sqrt(np.maximum(self._mean(grey * grey) - self._mean(grey) ** 2, 0.0)), np.float32)
-
-    def _energy(self, image: Image) -> Floats:
+    def _energy(self, image: Image) -> Array:
         """Return the gradient energy (C,) of columns of tiles at half resolution, grey levels squared.
 
         There the noise is halved, and the texture that dirt takes away is not.
         """
-        half = cv2.resize(image, (self._half.shape[1], self._half.shape[0]), interpolation=cv2.INTER_AREA)
-        grey = half.astype(np.float32)
-        squared = np.zeros_like(grey)
-        squared[:, 1:] += (grey[:, 1:] - grey[:, :-1]) ** 2
-        squared[1:] += (grey[1:] - grey[:-1]) ** 2
-        column = cv2.resize(squared * self._half, (self._columns, 1), interpolation=cv2.INTER_AREA)[0]
-        return np.asarray(column / np.maximum(self._half_share, 1e-6), np.float32)
+        sums = np.empty(self._columns)
+        column_energies(np.ascontiguousarray(image), self._half, self._half_columns, sums)
+        return sums / self._half_counts
 
-    def _blurred(self, side: Side, energy: Floats, other: Floats, noise_grey: float) -> Flags:
+    def _blurred(self, side: Side, energy: Array, other: Array, noise_grey: float) -> Flags:
         """Return the columns (C,) in which a camera shows far less than the other one does."""
         textured = other > LEAST_ENERGY * max(noise_grey, MEASURED_NOISE_GREY) ** 2
         if textured.sum() < COMPARED_COLUMNS:
@@ -192,9 +198,14 @@ class TileMonitor:
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
         return np.asarray(self._faint[side] >= IN_A_ROW)
 
-    def _mean(self, values: Floats) -> Floats:
-        """Return the means (TILE_ROWS, C) of values (H, W) over the pixels that show the world."""
-        return np.asarray(_means(values * self._visible, self._columns) / np.maximum(self._share, 1e-6), np.float32)
+    def _sample(self, image: Image) -> Image:
+        return np.ascontiguousarray(image[:: self._spacing_px, :: self._spacing_px])
+
+    def _sums(self, image: Image, before: Image) -> NDArray[np.int32]:
+        """Return the sums (4, TILE_ROWS, C) of `tile_sums` of samples of an image and the one before."""
+        sums = np.empty((4, TILE_ROWS, self._columns), np.int32)
+        tile_sums(image, before, self._visible, *self._tiles, SATURATED_GREY, sums)
+        return sums
 
 
 def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
@@ -202,15 +213,9 @@ def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
     return np.asarray(cv2.resize(tiles.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
 
 
-def _sample(image: NDArray[Any]) -> NDArray[Any]:
-    """Return every second pixel of each second row: some 240 pixels of a tile at scale 1 are enough, in a quarter of
-    the time.
-    """
-    return image[::2, ::2]
-
-
-def _means(values: Floats, columns: int) -> Floats:
-    return np.asarray(cv2.resize(values, (columns, TILE_ROWS), interpolation=cv2.INTER_AREA), np.float32)
+def _borders(pixels: int, tiles: int) -> NDArray[np.int32]:
+    """Return the first pixel of each tile along a side, and the end (tiles + 1,)."""
+    return np.rint(np.arange(tiles + 1) * pixels / tiles).astype(np.int32)
 
 
 def tile_columns(cylinder: Cylinder) -> int:

@@ -208,3 +208,13 @@ def test_pixels_of_tiles() -> None:
     tiles[1, 20] = True
     found = of_pixels(tiles, SHAPE)
     assert found[64:128, 300:315].all() and found.sum() == 64 * 15
+
+
+def test_a_small_panorama_of_little_noise_is_live() -> None:
+    """In tiles of a few pixels all keep their greys now and then."""
+    rng, shape, noise_grey = np.random.default_rng(3), (80, 272), 0.3
+    scene, monitor = np.full(shape, 100.0), TileMonitor(np.ones(shape, bool))
+    scene[:, ::9] = 180
+    for number in range(100):
+        images = {side: np.rint(scene + noise_grey * rng.standard_normal(shape)).astype(np.uint8) for side in SIDES}
+        assert monitor.update(100_000_000 * number, images, dict.fromkeys(SIDES, noise_grey)) is ALL_LIVE
