@@ -42,6 +42,7 @@ Array = NDArray[np.float64]
 
 SPEED_MPS: Final = 0.5
 SIZE_PX: Final = 512
+RATE_HZ: Final = 10.0
 # Rays of a pixel, per axis: with two, joints of tiles come and go from pixel to pixel, as no lens shows them.
 SAMPLES: Final = 3
 REMARKS: Final = (
@@ -166,7 +167,14 @@ def ahead(moment: Moment, speed_mps: float = SPEED_MPS) -> Iterator[Request]:
     yield Setpoint(speed_mps, heading_rad=0.0)
 
 
-def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: float = SPEED_MPS) -> Drive:
+def run(
+    case: str,
+    seed: int,
+    size_px: int,
+    overrides: list[str],
+    speed_mps: float = SPEED_MPS,
+    rate_hz: float = RATE_HZ,
+) -> Drive:
     """Drive one seed of a case along x, backwards at a negative speed."""
     limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
@@ -183,7 +191,7 @@ def run(case: str, seed: int, size_px: int, overrides: list[str], speed_mps: flo
         world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,
-            replace(make_robot(size_px), samples=SAMPLES),
+            replace(make_robot(size_px), samples=SAMPLES, rate_hz=rate_hz),
             partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,
@@ -263,6 +271,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, default=(1, 3), metavar=("FIRST", "LAST"))
     parser.add_argument("--sizes", type=int, nargs="+", default=(512,), help="of the images, px")
     parser.add_argument("--speeds", type=float, nargs="+", default=(SPEED_MPS,), help="m/s; below 0: backwards")
+    parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="of the cameras")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
@@ -291,7 +300,7 @@ def main() -> None:
     parts = list(itertools.product(arguments.cases, arguments.speeds, arguments.sizes))
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
         runs = [
-            [pool.submit(run, case, seed, size_px, arguments.overrides, speed_mps) for seed in seeds]
+            [pool.submit(run, case, seed, size_px, arguments.overrides, speed_mps, arguments.rate) for seed in seeds]
             for case, speed_mps, size_px in parts
         ]
         for part, futures in zip(parts, runs, strict=True):
@@ -299,11 +308,14 @@ def main() -> None:
             for seed, future in zip(seeds, futures, strict=True):
                 drives.append(future.result())
                 print(f"{part[0]} {seed}: {drives[-1]}", flush=True)
-            _add(table, *part, drives)
+            _add(table, *part, arguments.rate, drives)
 
 
-def _add(table: ResultTable, case: str, speed_mps: float, size_px: int, drives: Sequence[Drive]) -> None:
+def _add(
+    table: ResultTable, case: str, speed_mps: float, size_px: int, rate_hz: float, drives: Sequence[Drive]
+) -> None:
     at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
+    at += f", {rate_hz:g} Hz" * (rate_hz != RATE_HZ)
     table.add(
         case + at,
         len(drives),
