@@ -141,7 +141,7 @@ class WiringTest:
     def _move(self, motor: SerialMotor, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
         """Drive for this time, then stop; return the time for which it drove, s."""
         period_s = 1 / self._config.rate_hz
-        motor.send(stop_command(0))  # after a pause the driver sends one in place of the first command
+        _stop(motor)  # after a pause the driver sends one in place of the first command
         begin_s = next_s = time.monotonic()
         sent = 0
         # A busy computer may have paused this program already: the wheels move nevertheless, if only for a moment.
@@ -151,10 +151,23 @@ class WiringTest:
                 motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
             next_s += period_s
             time.sleep(max(0.0, min(next_s, begin_s + duration_s) - time.monotonic()))
-        motor.send(stop_command(0))
-        moved_s = time.monotonic() - begin_s
+        moved_s = time.monotonic() - begin_s  # the answer to the stop may come late, the stop does not
+        _stop(motor)
         time.sleep(self._rest_s)
         return moved_s
+
+
+def _stop(motor: SerialMotor) -> None:
+    """Stop the wheels; DriverError where the controller gives no answer.
+
+    A late one is the fault of a busy computer: the stop is sent again, until the controller's watchdog is due.
+    """
+    while True:
+        try:
+            motor.send(stop_command(0))
+        except LateReplyError:
+            continue
+        return
 
 
 def wiring(first: Seen, second: Seen) -> dict[str, bool]:

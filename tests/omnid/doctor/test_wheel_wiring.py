@@ -6,6 +6,7 @@ import contextlib
 import math
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from tests.replay.live import wait_until
 
 ROOT = Path(__file__).parents[3]
 RADIUS_M = 0.02
+LATE_S = 0.25  # more than an answer may take
 
 
 class WatchedController:
@@ -32,10 +34,15 @@ class WatchedController:
     def __init__(self, controller: SimulatedController) -> None:
         self._controller, self.base = controller, controller.base
         self.notes: list[tuple[float, float]] = []
+        self.late_stops = 0  # stops of wheels that turn whose answers are still to come late
 
     def feed(self, data: bytes) -> bytes:
         """Return the answers of the controller."""
+        did_turn = any(self.base.commanded_mps)
         answer = self._controller.feed(data)
+        if self.late_stops and did_turn and not any(self.base.commanded_mps):
+            self.late_stops -= 1
+            time.sleep(LATE_S)
         self.notes.append((self.base.commanded_mps[0], self.base.commanded_mps[1]))
         return answer
 
@@ -44,7 +51,7 @@ class Person:
     """Looks at the wheels, and answers the questions."""
 
     def __init__(self, base: WatchedController) -> None:
-        self._base = base
+        self.base = base
         self._travel_m = 0.0
         self.questions: list[str] = []
 
@@ -52,8 +59,8 @@ class Person:
         """Return the answer to a question."""
         self.questions.append(question)
         if "wheel that moved" in question:
-            moved = next(note for note in self._base.notes if any(note))
-            self._first, self._base.notes[:] = moved, []
+            moved = next(note for note in self.base.notes if any(note))
+            self._first, self.base.notes[:] = moved, []
             left, right = (abs(speed) > 1e-6 for speed in moved)
             return "b" if left and right else "l" if left else "r"
         if "forwards first" in question:
@@ -61,14 +68,14 @@ class Person:
         if "How many" in question:
             wait_until(
                 lambda: (
-                    not any(self._base.base.commanded_mps)
-                    and self._base.base.velocity_mps == 0
-                    and self._base.base.yaw_rate_radps == 0
+                    not any(self.base.base.commanded_mps)
+                    and self.base.base.velocity_mps == 0
+                    and self.base.base.yaw_rate_radps == 0
                 ),
                 "wheels that stand",
             )
-            return f"{(self._base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
-        self._travel_m = self._base.base.travel_m[0]
+            return f"{(self.base.base.travel_m[0] - self._travel_m) / (math.tau * RADIUS_M):.3f}"
+        self._travel_m = self.base.base.travel_m[0]
         return "yes"
 
 
@@ -98,7 +105,7 @@ def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, 
 )
 def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[str, object]) -> None:
     with simulated(protocol, **true) as (config, person, motor):
-        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=1.5, move_s=0.1, rest_s=0.05).run()
+        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=4, move_s=0.1, rest_s=0.05).run()
         assert not any(motor.base.commanded_mps)
     expected = {"swapped": False, "reverse_left": False, "reverse_right": False, **true}
     for name, value in expected.items():
@@ -124,6 +131,14 @@ def test_answers_without_a_result(answers: list[str], message: str) -> None:
         with pytest.raises(OmnidError, match=message):
             WiringTest(config, lambda _: next(given), speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0).run()
         assert not any(motor.base.commanded_mps) and not list(given)
+
+
+def test_a_late_answer_to_a_stop_is_no_fault() -> None:
+    """A busy computer answers later than the 0.16 s of the driver now and then."""
+    with simulated("roboteq", swapped=True) as (config, person, motor):
+        person.base.late_stops = 3
+        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0).run()
+        assert drive.swapped and person.base.late_stops == 0 and not any(motor.base.commanded_mps)
 
 
 @pytest.mark.parametrize("swapped", [False, True])
