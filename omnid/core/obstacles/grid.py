@@ -60,7 +60,10 @@ APART_S: Final = 0.2  # A pair from the same place counts in full after it, so t
 PLACE_PAIRS: Final = 18.0
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
-WIDE_CELLS: Final = 3  # Side of the mean that shows floor, a low object or an edge, because single cells are noisy.
+WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
+# The same of an edge, because a hole into which a base falls is wide; with 3, by trial, bases stood before joints of
+# tiles.
+EDGE_CELLS: Final = 5
 THIN_M: Final = 0.03  # width of the thinnest obstacle
 GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
@@ -179,7 +182,7 @@ class ObstacleGrid:
         suspect = ((self._odds[SURFACE] > CLEAR_ODDS) | (self._shown > FREE_SHOWN)) & ~taken
         floor, level = self._odds[FLOOR], self._level_odds()
         # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
-        is_floor = (floor > FREE_ODDS) | ((floor > 0) & (_wide_mean(floor) > FREE_ODDS))
+        is_floor = (floor > FREE_ODDS) | ((floor > 0) & (_mean(floor, WIDE_CELLS) > FREE_ODDS))
         free = (is_floor & (level > FREE_ODDS) & ~suspect) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
         # Specks are noise unless something may stand there.
@@ -193,7 +196,7 @@ class ObstacleGrid:
 
     def _level_odds(self) -> Floats:
         """Return the least log-odds (CELLS, CELLS) against steps up and down, which are wider than a cell."""
-        return np.minimum(_wide_mean(self._odds[ABOVE]), _wide_mean(self._odds[BELOW]))
+        return np.minimum(_mean(self._odds[ABOVE], WIDE_CELLS), _mean(self._odds[BELOW], EDGE_CELLS))
 
     def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
         """Return the evidence (4, N, N) of the cells of the view, the first of which has its middle at first_m."""
@@ -308,6 +311,6 @@ class ObstacleGrid:
         return self._corner
 
 
-def _wide_mean(odds: Floats) -> Floats:
-    """Return the mean (CELLS, CELLS) of log-odds over WIDE_CELLS."""
-    return np.asarray(cv2.blur(odds, (WIDE_CELLS, WIDE_CELLS)), np.float32)
+def _mean(odds: Floats, cells: int) -> Floats:
+    """Return the mean (CELLS, CELLS) of log-odds over a patch with a side of so many cells."""
+    return np.asarray(cv2.blur(odds, (cells, cells)), np.float32)

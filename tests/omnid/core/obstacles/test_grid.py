@@ -9,6 +9,7 @@ from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.grid import (
     ABOVE,
+    BELOW,
     CELL_M,
     FLOOR,
     FREE_ODDS,
@@ -183,6 +184,16 @@ def test_a_cell_is_floor_by_its_neighbours_only_where_floor_is_more_likely_than_
     grid._odds[:SURFACE] = 4.0
     grid._odds[FLOOR, 100 : 100 + rows, 100:116] = odds
     assert (grid.state()[100 : 100 + rows, 105:110] == 1).all() == is_free
+
+
+@pytest.mark.parametrize(("layer", "cells", "is_free"), [(BELOW, 3, True), (BELOW, 7, False), (ABOVE, 3, False)])
+def test_an_edge_is_wide_and_a_low_thing_may_be_narrow(
+    grid: ObstacleGrid, layer: int, cells: int, is_free: bool
+) -> None:
+    """A joint of tiles looks like an edge now and then, in a few cells."""
+    grid._odds[:SURFACE] = 4.0
+    grid._odds[layer, 100 : 100 + cells, 100 : 100 + cells] = -2.0
+    assert (grid.state()[100 + cells // 2, 100 + cells // 2] == 1) == is_free
 
 
 def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pairs) -> None:
