@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.patch_fit import WINDOW_PX, PatchFit, fit_patches
+from omnid.core.odometry.patch_kernels import cut
 from omnid.core.odometry.plane_patches import plane_templates
 from omnid.core.stereo.triangulation import triangulate
 from omnid.core.types.panorama import PaddedPanorama
@@ -87,9 +88,6 @@ def view_noise(covariance: Array, row_variance: Array) -> Array:
 
 def _cut(panorama: PaddedPanorama, centres: Array, side_px: int) -> Image:
     """Return cells (N, side, side) around whole pixels (N, 2), also across the seam; the border is repeated."""
-    image, side = panorama.image, np.arange(side_px) - side_px // 2
-    columns = panorama.padded(centres[:, 0])[:, None].astype(np.intp) + side
-    rows = centres[:, 1:].astype(np.intp) + side
-    columns = columns.clip(0, image.shape[1] - 1)
-    rows = rows.clip(0, image.shape[0] - 1) * image.shape[1]
-    return np.asarray(np.take(image.reshape(-1), rows[:, :, None] + columns[:, None]))
+    cells = np.empty((len(centres), side_px, side_px), np.uint8)
+    cut(panorama.image, np.column_stack([panorama.padded(centres[:, 0]), centres[:, 1]]), cells)
+    return cells

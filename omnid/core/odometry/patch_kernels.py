@@ -33,6 +33,7 @@ SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)  # Weights o
 # Columns of a row of a window in memory: a multiple of what the processor adds at once. Those beyond the window hold
 # zeros in the design. Sums are kept by column until the last row, so that their order is fixed.
 LANES = 16
+FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 
 
 @compiled(
@@ -73,6 +74,25 @@ def fit(
         residual = solve(designs[n], cell, lanes, reach, sums[n], normal, inverse, prior * gain[n], shift[n], solution)
         fits[n] = max(abs(shift[n, 0]), abs(shift[n, 1])) < reach and LEAST_GAIN < solution[2] < LARGEST_GAIN
         write_covariance(inverse, residual, min(max(solution[2], LEAST_GAIN), LARGEST_GAIN), covariance[n])
+
+
+@compiled("(u1[:, ::1], f8[:, ::1], u1[:, :, ::1])", writes=("cells",))
+def cut(image: Image, centres: Array, cells: Image) -> None:
+    """Write cells (N, S, S) around whole pixels (N, 2) of an image (H, W), whose border is repeated."""
+    (height, width), side = image.shape, cells.shape[1]
+    for n in range(len(centres)):
+        left, top = -side, -side  # a place that is NaN or absurd: the first pixel
+        if abs(centres[n, 0]) < FARTHEST_PX and abs(centres[n, 1]) < FARTHEST_PX:
+            left, top = int(centres[n, 0]) - side // 2, int(centres[n, 1]) - side // 2
+        inside = left >= 0 and left + side <= width
+        for row in range(side):
+            line = image[min(max(top + row, 0), height - 1)]
+            if inside:
+                for column in range(side):
+                    cells[n, row, column] = line[left + column]
+            else:
+                for column in range(side):
+                    cells[n, row, column] = line[min(max(left + column, 0), width - 1)]
 
 
 @inner

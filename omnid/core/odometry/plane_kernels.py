@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
-from omnid.core.odometry.patch_kernels import LANES, WINDOW_PX, clear
+from omnid.core.odometry.patch_kernels import FARTHEST_PX, LANES, WINDOW_PX, clear
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -20,7 +20,6 @@ TEMPLATE_PX = WINDOW_PX + 2  # the window and the gradient's border: a pixel on 
 MAX_REACH_PX = 2.0 * TEMPLATE_PX  # twice as large as it should be: what reaches farther is no patch of this plane
 MAX_SLOPE = 0.7  # Largest slope of a disparity: a steeper plane is seen so obliquely that it has no patch.
 AROUND_PX = int(2 * MAX_REACH_PX) + 8  # side of a template's source: the reach, and the support of the cubic kernel
-FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 FIRST, SECOND, THIRD = np.uint64(1), np.uint64(2), np.uint64(3)
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 LARGEST_GREY = np.float32(255.0)  # because images have 8 bits
