@@ -75,8 +75,10 @@ def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> No
         command = [*command_line(tmp_path, free_port(), base.port), "--set", "obstacles.ring.floor_m=-1.2"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert not base.line.moved_since(0.0)
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1, done.stderr
-    assert "the images match better the other way round" in done.stderr
+    # On a busy computer the motor may answer late meanwhile, which is a warning.
+    said = [line for line in done.stderr.splitlines() if "gave no answer" not in line]
+    assert done.returncode == 2 and done.stdout == "" and len(said) == 1, done.stderr
+    assert "the images match better the other way round" in said[0]
 
 
 def test_every_part_has_a_status(tmp_path: Path, course: Path) -> None:
