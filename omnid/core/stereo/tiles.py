@@ -100,15 +100,17 @@ class TileMonitor:
 
     def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
         """visible (H, W): pixels that show the world; columns of tiles in W."""
+        self._shape = visible.shape
         self._columns = columns
         tile_pixels = visible.size / (TILE_ROWS * columns)
         self._spacing_px = SPACING_PX if tile_pixels >= LEAST_SAMPLES * SPACING_PX**2 else 1
         self._visible = self._sample(visible.view(np.uint8))
         self._tiles = _borders(self._visible.shape[0], TILE_ROWS), _borders(self._visible.shape[1], columns)
         ones = np.ones_like(self._visible)
-        self._counts = np.maximum(self._sums(ones, ones)[0], 1)  # visible pixels of each tile
+        visible_pixels = self._sums(ones, ones)[0]
+        self._counts = np.maximum(visible_pixels, 1)
         areas = np.diff(self._tiles[0])[:, None] * np.diff(self._tiles[1])
-        self._judged = np.asarray(self._sums(ones, ones)[0] >= JUDGED_SHARE * areas)
+        self._judged = np.asarray(visible_pixels >= JUDGED_SHARE * areas)
         # Pixels at half resolution, all of which show the world, and so do their neighbours.
         height, width = visible.shape[0] // 2, visible.shape[1] // 2
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))[: 2 * height, : 2 * width]
@@ -123,7 +125,13 @@ class TileMonitor:
         self._faint = {side: np.zeros(columns, np.intp) for side in SIDES}  # pairs in a row with little energy
 
     def update(self, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
-        """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey."""
+        """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey.
+
+        Raises ValueError if a panorama has another shape: the compiled loops do not check their bounds.
+        """
+        for side in SIDES:
+            if images[side].shape != self._shape:
+                raise ValueError(f"the {side} panorama is {images[side].shape}, not {self._shape}")
         # 1. What each camera shows by itself.
         blind, dead = {}, {}
         for side in SIDES:

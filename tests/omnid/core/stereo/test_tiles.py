@@ -218,3 +218,11 @@ def test_a_small_panorama_of_little_noise_is_live() -> None:
     for number in range(100):
         images = {side: np.rint(scene + noise_grey * rng.standard_normal(shape)).astype(np.uint8) for side in SIDES}
         assert monitor.update(100_000_000 * number, images, dict.fromkeys(SIDES, noise_grey)) is ALL_LIVE
+
+
+def test_a_panorama_of_another_shape_is_refused() -> None:
+    cameras = Cameras()
+    images = cameras.images()
+    images["upper"] = images["upper"][:-1]
+    with pytest.raises(ValueError, match="upper panorama"):
+        cameras.update(images)
