@@ -14,35 +14,18 @@ from __future__ import annotations
 
 import ctypes
 import inspect
-import operator
-import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache
 from typing import Any, Final, Generic, ParamSpec, TypeVar
 
 import numpy as np
+
+from omnid.core.kernel_arguments import Argument, arguments_of, c_type
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 KERNEL_FILES: Final = "*_kernels.py"
-# An argument of a signature: "f8[:, ::1]", "f8", "UniTuple(f8, 5)".
-_ARGUMENT: Final = re.compile(r"UniTuple\((?P<of>\w+), (?P<count>\d+)\)|(?P<kind>[a-z]\d)(?:\[(?P<axes>[^]]*)\])?")
-
 _declared: list[Kernel[Any, Any]] = []
-
-
-@dataclass(frozen=True, slots=True)
-class Argument:
-    """Type of an argument: an array, a number, or a tuple of numbers."""
-
-    name: str
-    kind: str  # type of the numbers, as numpy names it: f8
-    dimensions: int = 0  # number of axes of an array; 0: no array
-    is_contiguous: bool = False
-    is_written: bool = False
-    count: int = 0  # length of a tuple; 0: no tuple
 
 
 class Kernel(Generic[P, R]):
@@ -85,7 +68,7 @@ class Kernel(Generic[P, R]):
 
     def load(self, code: bytes) -> None:
         """Take code, which was compiled here or read from the disk."""
-        types = [ctypes.c_void_p, *map(_c_type, self.arguments)]
+        types = [ctypes.c_void_p, *map(c_type, self.arguments)]
         self._engine = _loaded(code)
         self._compiled = ctypes.CFUNCTYPE(ctypes.c_int32, *types)(self._engine.get_function_address(self.symbol))
 
@@ -96,16 +79,6 @@ class Kernel(Generic[P, R]):
         wrong = self.arguments[-1 - status]
         layout = ", contiguous" * wrong.is_contiguous + ", writable" * wrong.is_written
         raise TypeError(f"{self.symbol}: {wrong.name} is no array of {wrong.dimensions} axes of {wrong.kind}{layout}")
-
-
-def _arguments(function: Callable[..., object], signature: str, writes: tuple[str, ...]) -> Iterator[Argument]:
-    names = function.__code__.co_varnames
-    for found, name in zip(_ARGUMENT.finditer(signature), names, strict=False):
-        axes = found["axes"]
-        if axes is None:
-            yield Argument(name, found["of"] or found["kind"], count=int(found["count"] or 0))
-        else:
-            yield Argument(name, found["kind"], axes.count(",") + 1, axes.endswith("1"), name in writes)
 
 
 def _loaded(code: bytes) -> Any:
@@ -119,32 +92,6 @@ def _loaded(code: bytes) -> Any:
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return engine
-
-
-@cache
-def _number(kind: str) -> Any:
-    """Return the type of ctypes of a number, which takes those of numpy, too."""
-    base = np.ctypeslib.as_ctypes_type(np.dtype(kind))
-    read: Callable[[Any], Any] = float if kind[0] == "f" else operator.index
-    return type(kind, (base,), {"from_param": classmethod(lambda _, value: base(read(value)))})
-
-
-def _c_type(argument: Argument) -> Any:
-    """Return the type by which ctypes passes an argument; the code itself checks arrays."""
-    if argument.dimensions:
-        return ctypes.py_object
-    number = _number(argument.kind)
-    if not argument.count:
-        return number
-    numbers = number.__base__ * argument.count
-    name, count = f"{argument.kind}x{argument.count}", argument.count
-
-    def from_param(_: Any, values: Any) -> Any:
-        if len(values) != count:
-            raise TypeError(f"expected {count} numbers, found {len(values)}")
-        return numbers(*values)
-
-    return type(name, (ctypes.c_void_p,), {"from_param": classmethod(from_param)})
 
 
 class Inner(Generic[P, R]):
@@ -177,7 +124,7 @@ def compiled(signature: str, writes: tuple[str, ...] = ()) -> Callable[[Callable
     """
 
     def decorate(function: Callable[P, R]) -> Kernel[P, R]:
-        kernel = Kernel(function, tuple(_arguments(function, signature, writes)))
+        kernel = Kernel(function, tuple(arguments_of(function, signature, writes)))
         _declared.append(kernel)
         return kernel
 

@@ -24,7 +24,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
 from numba.np.arrayobj import populate_array
 
-from omnid.core.compiled import Argument
+from omnid.core.kernel_arguments import Argument
 
 # error_model: a division by zero gives inf or NaN as in numpy.
 OPTIONS: Final = {"nogil": True, "error_model": "numpy", "fastmath": False, "parallel": False}

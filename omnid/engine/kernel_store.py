@@ -79,7 +79,7 @@ def folder_of_state(name: str, path: Path) -> Path:
     settings = sorted((key, value) for key, value in os.environ.items() if key.startswith("NUMBA_"))
     digest = hashlib.sha256(repr((_versions_and_processor(), settings)).encode())
     core = Path(omnid.core.__path__[0])
-    makers = (("", core / "compiled.py"), ("", core / "native_code.py"))
+    makers = (("", core / f"{maker}.py") for maker in ("compiled", "kernel_arguments", "native_code"))
     for module, source in (*makers, (name, path), *sorted(imported_files(path).items())):
         # The code contains the names of the modules.
         digest.update(repr((module, source.read_bytes())).encode())

@@ -28,8 +28,7 @@ ALONG_SLOPE: Final = 0.05
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
-# Consecutive unknown ones that make a direction unknown; by trial on development seeds.
-UNKNOWN_SECTORS: Final = 5
+UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
 MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it

@@ -56,13 +56,12 @@ class VisualOdometry:
         features: Callable[[], float] = lambda: 1.0,
     ) -> None:
         """features: called for each keyframe, the share of limits.features that it is to have."""
-        self._limits, self._model = limits, model
+        self._limits, self._model, self._relocaliser = limits, model, relocaliser
         self._map = LocalMap(model, klt, limits.keyframes)
         self._keyframes = Keyframes(self._map, model, replace(klt, levels=1), limits, relocaliser, features)
         self._frame_to_map = FrameToMap(self._map, model, klt)
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
-        self._relocaliser = relocaliser
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status, self._resets = TrackingStatus(), 0
