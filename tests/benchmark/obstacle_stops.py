@@ -43,8 +43,9 @@ Array = NDArray[np.float64]
 SPEED_MPS: Final = 0.5
 SIZE_PX: Final = 512
 RATE_HZ: Final = 10.0
-# Rays of a pixel, per axis: with two, joints of tiles come and go from pixel to pixel, as no lens shows them.
-SAMPLES: Final = 3
+# Least number of rays along a side of an image: with two a pixel and axis at 512 px, joints of tiles come and go from
+# pixel to pixel, as no lens shows them; with three they do not.
+SIDE_RAYS: Final = 3 * SIZE_PX
 REMARKS: Final = (
     "A simulated robot at 0.5 m/s by the stick, straight on, 512 px at 10 Hz where a row says nothing else; only the "
     "collision monitor keeps it from what it meets. A stop is false where the truth has nothing within 1 m ahead, or "
@@ -191,7 +192,7 @@ def run(
         world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,
-            replace(make_robot(size_px), samples=SAMPLES, rate_hz=rate_hz),
+            replace(make_robot(size_px), samples=math.ceil(SIDE_RAYS / size_px), rate_hz=rate_hz),
             partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,

@@ -22,5 +22,6 @@ def test_projects_the_axis_to_the_centre_and_invalid_points_to_nan(camera: OmniC
     nothing = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], -3 * axis[0]])
     if isinstance(camera, EquirectangularCamera):  # it sees what is behind it
         nothing = nothing[:3]
-    assert np.isnan(camera.project(nothing)).any(axis=1).all()
-    assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
+    with np.errstate(invalid="ignore"):  # numpy's own warnings of infinite points
+        assert np.isnan(camera.project(nothing)).any(axis=1).all()
+        assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
