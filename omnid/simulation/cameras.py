@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from calib.rig import Rig
 from drivers.frame import CAMERAS, Camera, Frame
 from omnid.simulation.people import Walkers
+from omnid.simulation.rendering.polished_floor import PolishedFloor
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
@@ -27,6 +28,7 @@ class SimulatedCameras:
             name: MountedSensor.of(sensor, mounted.visible, mounted.camera.size)
             for name, mounted in self._mounted.items()
         }
+        self._floors = {name: PolishedFloor(mounted) for name, mounted in self._mounted.items() if world.is_polished}
 
     def frame(
         self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers, *, brightness: float = 1.0
@@ -35,7 +37,9 @@ class SimulatedCameras:
         mounted, sensor = self._mounted[camera], self._sensors[camera]
         scene = Scene((*self._world.standing, *people.faces()))
         light = np.float32(brightness * self._world.brightness)
-        ideal = render_grey(scene, mounted, T_world_rig, self._samples) * light
+        ideal = render_grey(scene, mounted, T_world_rig, self._samples)
+        if camera in self._floors:
+            ideal = self._floors[camera].reflected(ideal, scene, T_world_rig, self._samples)
         rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
         width, height = mounted.camera.size
-        return Frame(seq, stamp_ns, camera, "mono8", sensor.expose(ideal, rng), width, height)
+        return Frame(seq, stamp_ns, camera, "mono8", sensor.expose(ideal * light, rng), width, height)

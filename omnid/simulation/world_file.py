@@ -118,9 +118,8 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     if options.other_posters:
         standing = _exchanged(standing, options)
     brightness = options.brightness * (_positive(top, "light", 0.05, 3.0) if top.has("light") else 1.0)
-    return World(
-        name, tuple(standing), people if options.people else (), (x_m, y_m, math.radians(heading_deg)), brightness
-    )
+    start = x_m, y_m, math.radians(heading_deg)
+    return World(name, tuple(standing), people if options.people else (), start, brightness, space.is_polished)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +130,11 @@ class _Space:
     high: Point
     ceiling_m: float
     kinds: tuple[str, str]
+    is_polished: bool
 
     @staticmethod
     def of(table: ValidatedTable) -> _Space:
-        table.allow_only(("low", "high", "ceiling_m", "floor", "ceiling"))
+        table.allow_only(("low", "high", "ceiling_m", "floor", "ceiling", "finish"))
         (x0, y0), (x1, y1) = table.numbers("low", 2), table.numbers("high", 2)
         if not (0.5 <= x1 - x0 <= LARGEST_M and 0.5 <= y1 - y0 <= LARGEST_M):
             table.fail("high", f"a corner 0.5 to {LARGEST_M:g} m beyond low")
@@ -142,7 +142,8 @@ class _Space:
         floor, ceiling = (
             table.choice(key, textures.PAINTERS) if table.has(key) else "tiles" for key in ("floor", "ceiling")
         )
-        return _Space((x0, y0), (x1, y1), ceiling_m, (floor, ceiling))
+        is_polished = table.has("finish") and table.choice("finish", ("matt", "polished")) == "polished"
+        return _Space((x0, y0), (x1, y1), ceiling_m, (floor, ceiling), is_polished)
 
     @property
     def area_m2(self) -> float:

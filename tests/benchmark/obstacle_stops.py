@@ -75,6 +75,10 @@ CASES: Final = {
     "edge 50 cm": 10.0,
     "ramp": 10.0,
 } | dict.fromkeys(KINDS, 12.0)
+UNEVEN: Final = ("edge", "ramp")  # Cases whose floor has two heights.
+# The same worlds with a floor that mirrors what stands on it, which is one plane.
+POLISHED: Final = "polished "
+CASES |= {POLISHED + case: seconds for case, seconds in CASES.items() if not case.startswith(UNEVEN)}
 
 
 class Drive(NamedTuple):
@@ -93,6 +97,8 @@ class Drive(NamedTuple):
 
 def world_text(case: str, rng: random.Random) -> str:
     """Return a corridor along x with what the case says in it, as a world file."""
+    finish = "polished" if case.startswith(POLISHED) else "matt"
+    case = case.removeprefix(POLISHED)
     left, right, length = rng.uniform(0.9, 1.5), -rng.uniform(0.9, 1.5), 12.0
     if case.startswith("person crosses"):
         left, right = rng.uniform(2.0, 2.6), -rng.uniform(2.0, 2.6)
@@ -106,6 +112,7 @@ def world_text(case: str, rng: random.Random) -> str:
         "[space]",
         f"low = [-2.0, {right}]",
         f"high = [{end_m}, {left}]",
+        f'finish = "{finish}"',
     ]
     corners = [[-2.0, left], [end_m, left], [end_m, right], [-2.0, right]]
     for first, last, texture, per_m in (
@@ -187,8 +194,8 @@ def run(
             world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
         if case == "ramp":
             world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
-        if case in KINDS:
-            world = with_floating(world, case, random.Random(seed))
+        if case.removeprefix(POLISHED) in KINDS:
+            world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
         world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from calib.models.camera import Array
+from omnid.simulation.rendering.polished_floor import BLACK, WHITE
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import LIGHT, Rectangle, Scene, Texture
 from tests.simulation.disturbances import Disturbance
@@ -30,8 +31,6 @@ PENUMBRA_M: Final = 0.03  # sigma of a shadow's edge
 ROBOT_RADIUS_M, ROBOT_HEIGHT_M = 0.2, 0.6  # a cylinder: its shadow does not depend on its yaw
 CIRCLE: Final = 24  # corners of its outline
 SHIFT: Final = 4  # binary digits of a corner's fraction of a pixel
-WHITE: Final[Texture] = np.full((8, 8), 255, np.uint8)
-BLACK: Final[Texture] = np.zeros((8, 8), np.uint8)
 
 Rendered = Callable[[Scene], Floats]  # returns the image (H, W) of a scene
 

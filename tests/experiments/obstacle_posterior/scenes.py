@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.simulation.rendering.polished_floor import BLACK, WHITE, below_floor
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.shapes import box, painted, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
@@ -350,12 +351,6 @@ def _shaded(rng: Random, part: Rectangle) -> Rectangle:
     return replace(part, texture=np.clip(np.rint(part.texture * light), 0, 255).astype(np.uint8))
 
 
-def mirrored(rectangle: Rectangle) -> Rectangle:
-    """Return the mirror image of a rectangle in the floor."""
-    by = np.array([1.0, 1.0, -1.0])
-    return replace(rectangle, origin=rectangle.origin * by, edge_u=rectangle.edge_u * by, edge_v=rectangle.edge_v * by)
-
-
 def render_pair(
     scene: ObstacleScene, robot: SimulatedRobot, T_world_base: Array, samples: int = 2
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -365,9 +360,8 @@ def render_pair(
     for camera in (robot.rig.lower, robot.rig.upper):
         image = render_grey(Scene(scene.rectangles), camera, T, samples)
         if scene.gloss:
-            black, full = np.zeros((8, 8), np.uint8), np.full((8, 8), 255, np.uint8)
-            flags = Scene(tuple(replace(r, texture=full if r.name == "floor" else black) for r in scene.rectangles))
-            rest = Scene(tuple(mirrored(r) for r in scene.rectangles if r.name != "floor"))
+            flags = Scene(tuple(replace(r, texture=WHITE if r.name == "floor" else BLACK) for r in scene.rectangles))
+            rest = Scene(tuple(below_floor(r) for r in scene.rectangles if r.name != "floor"))
             on_floor = np.clip(render_grey(flags, camera, T, samples) / 220.0, 0, 1) * scene.gloss
             image = image * (1 - on_floor) + on_floor * render_grey(rest, camera, T, samples)
         images.append(np.asarray(image * np.float32(scene.brightness), np.float32))
