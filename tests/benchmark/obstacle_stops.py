@@ -34,6 +34,7 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
+from tests.benchmark.cluttered_room import Wanderer, furnished, room_text
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
@@ -75,6 +76,9 @@ CASES: Final = {
     "edge 50 cm": 10.0,
     "ramp": 10.0,
 } | dict.fromkeys(KINDS, 12.0)
+# Cases of a room with many things, in which the operator drives at random.
+CLUTTER: Final = "clutter"
+CASES[CLUTTER] = 40.0
 UNEVEN: Final = ("edge", "ramp")  # Cases whose floor has two heights.
 # The same worlds with a floor that mirrors what stands on it, which is one plane.
 POLISHED: Final = "polished "
@@ -187,7 +191,8 @@ def run(
     limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
-        path.write_text(world_text(case, random.Random(seed)))
+        is_cluttered = case.endswith(CLUTTER)
+        path.write_text((room_text if is_cluttered else world_text)(case, random.Random(seed)))
         world = load_world(str(path), seed)
         edges = np.zeros((0, 2, 2))
         if case.startswith("edge"):
@@ -196,20 +201,28 @@ def run(
             world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
         if case.removeprefix(POLISHED) in KINDS:
             world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
-        world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
+        if is_cluttered:
+            world = furnished(world, random.Random(seed))
+        else:
+            world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,
             replace(make_robot(size_px), samples=math.ceil(SIDE_RAYS / size_px), rate_hz=rate_hz),
-            partial(ahead, speed_mps=speed_mps),
+            Wanderer(seed) if is_cluttered else partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,
             config=load_config(None, ["places.enabled=false", *limits, *overrides]),
         )
-    return judged(done, world, edges, backwards=speed_mps < 0)
+    return judged(done, world, edges, backwards=speed_mps < 0, everywhere=is_cluttered)
 
 
-def judged(done: SimulatedRun, world: World, edges: Array, *, backwards: bool = False) -> Drive:
-    """Return the result of a run, from the truth at its ticks; edges (N, 2, 2): where the floor falls."""
+def judged(
+    done: SimulatedRun, world: World, edges: Array, *, backwards: bool = False, everywhere: bool = False
+) -> Drive:
+    """Return the result of a run, from the truth at its ticks; edges (N, 2, 2): where the floor falls.
+
+    everywhere: what stands in any direction may be the reason of a stop, and not only what stands ahead.
+    """
     turn_rad = math.pi if backwards else 0.0
     robot = make_robot()
     standing, people = np.concatenate([footprints(world.standing, robot.height_m), edges]), Walkers(world.people)
@@ -227,12 +240,17 @@ def judged(done: SimulatedRun, world: World, edges: Array, *, backwards: bool = 
         )
         segments = np.concatenate([standing, footprints(people.faces(), robot.height_m)])
         x_m, y_m, heading_rad = tick.pose
-        ahead_m.append(room_ahead_m(segments, (x_m, y_m, heading_rad + turn_rad), robot.radius_m))
+        ahead_m.append(
+            clearance_m(segments, (x_m, y_m), robot.radius_m)
+            if everywhere
+            else room_ahead_m(segments, (x_m, y_m, heading_rad + turn_rad), robot.radius_m)
+        )
     lines = [(at_s, text) for at_s, text in done.lines if "obstacle" in text or "way ahead" in text]
     times = np.array([tick.time_s for tick in done.ticks])
     begun = [int(np.argmin(np.abs(times - at_s))) for at_s, _ in lines]
     false = sum(ahead_m[tick] > FALSE_M and not walks[tick] for tick in begun)
-    speeds = np.linalg.norm(np.diff([tick.pose[:2] for tick in done.ticks], axis=0), axis=1) / np.diff(times)
+    steps_m = np.linalg.norm(np.diff([tick.pose[:2] for tick in done.ticks], axis=0), axis=1)
+    speeds = steps_m / np.diff(times)
     near_mps = speeds[np.array(ahead_m)[1:] <= FALSE_M].max(initial=0.0)
     rings = [
         ring
@@ -243,7 +261,6 @@ def judged(done: SimulatedRun, world: World, edges: Array, *, backwards: bool = 
         bool(np.isnan(np.roll(ring.ranges_m, len(ring.ranges_m) // 2 * backwards)[AHEAD]).mean() > 0.5)
         for ring in rings
     )
-    driven_m = math.dist(done.ticks[0].pose[:2], done.ticks[-1].pose[:2])
     reasons = "; ".join(
         f"{at_s:.1f} s {text.removeprefix('the wheels stop: ').partition(';')[0]}" for at_s, text in lines
     )
@@ -254,7 +271,7 @@ def judged(done: SimulatedRun, world: World, edges: Array, *, backwards: bool = 
         min(done.clearance_m, *to_edge_m),
         len(lines),
         false,
-        driven_m,
+        float(steps_m.sum()),
         float(near_mps),
         (unknown, len(rings)),
         reasons,
