@@ -31,13 +31,17 @@ CELLS: Final = 256  # Cells of a side: twice the largest range, and the way unti
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
 
-# Layers: floor against upright surfaces, against planes just above it, and just below it; surface.
-FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
-FLOORS: Final = slice(FLOOR, SURFACE)  # a cell is free by all of them
-PRIOR: Final = (-1.0, 0.0, 0.0, -6.0)  # log-odds where nothing was seen
+# Layers: floor against upright surfaces, against planes just above it, and just below it; surface; floor in sight
+# against something plain that hides it. A cell is free by all of them.
+FLOOR, ABOVE, BELOW, SURFACE, SIGHT = 0, 1, 2, 3, 4
+FLOORS: Final = slice(FLOOR, SURFACE)
+PRIOR: Final = (-1.0, 0.0, 0.0, -6.0, 3.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = np.float32(1.0)
+# Least log-odds of sight: floor that comes out from behind something is free again after two or three pairs.
+LEAST_SIGHT: Final = -1.0
+SIGHT_ODDS: Final = 0.0  # Log-odds of sight from which a cell is free: two pairs without its usual evidence end it.
 FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
 TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
 CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
@@ -82,7 +86,7 @@ class GridRing(NamedTuple):
 
 
 class ObstacleGrid:
-    """Layers of log-odds (4, CELLS, CELLS), and how well they are watched."""
+    """Layers of log-odds (5, CELLS, CELLS), and how well they are watched."""
 
     def __init__(self, at_1m: float, settings: RingSettings) -> None:
         """at_1m: disparity at 1 m; `set_floor` comes before the first pair."""
@@ -127,8 +131,9 @@ class ObstacleGrid:
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
+        hidden = self._usual.compare((rows, columns), floor, weight)
         arrivals = self._usual.arrivals(
-            self._usual.compare((rows, columns), floor, weight),
+            hidden,
             self._watch.was_free(stamp_ns),
             self._odds[SURFACE] > TAKEN_ODDS,
             np.array([*(place - corner), CELL_M, self._max_range_m, self._at_1m]),
@@ -151,7 +156,9 @@ class ObstacleGrid:
         surplus = np.where(is_surface, (odds[SURFACE] - np.float32(PRIOR[SURFACE])) / np.float32(PLACE_PAIRS), 0)
         odds[SURFACE] += weight * np.where(passes, np.float32(CONTRADICTION), surface) - at_rest * surplus
         odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
+        odds[SIGHT] -= weight * hidden[rows, columns]
         np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
+        np.clip(odds[SIGHT], LEAST_SIGHT, PRIOR[SIGHT], out=odds[SIGHT])
         np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), np.maximum(floor, surface))
@@ -163,7 +170,7 @@ class ObstacleGrid:
         self._clear_seen_past(place - corner, evidence.nearest_floor_m)
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
-        self._odds[FLOORS, *own], self._shown[own] = LIMIT, 0.0
+        self._odds[FLOORS, *own], self._odds[SIGHT, *own], self._shown[own] = LIMIT, PRIOR[SIGHT], 0.0
         return self._ring(T_odom_base, place - corner, arrivals)
 
     @property
@@ -174,7 +181,7 @@ class ObstacleGrid:
     @property
     def floor_odds(self) -> Floats:
         """Log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
-        return np.asarray(np.minimum(self._odds[FLOOR], self._level_odds()))
+        return np.asarray(np.minimum(np.minimum(self._odds[FLOOR], self._odds[SIGHT]), self._level_odds()))
 
     def state(self) -> Bytes:
         """Return the cells: 0 unknown, 1 free, 2 taken."""
@@ -183,7 +190,8 @@ class ObstacleGrid:
         floor, level = self._odds[FLOOR], self._level_odds()
         # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
         is_floor = (floor > FREE_ODDS) | ((floor > 0) & (_mean(floor, WIDE_CELLS) > FREE_ODDS))
-        free = (is_floor & (level > FREE_ODDS) & ~suspect) | taken
+        is_floor &= (level > FREE_ODDS) & (self._odds[SIGHT] > SIGHT_ODDS)
+        free = (is_floor & ~suspect) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
         # Specks are noise unless something may stand there.
         sizes = about[:, cv2.CC_STAT_AREA]
@@ -204,7 +212,7 @@ class ObstacleGrid:
         x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
         c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
         norm = math.hypot(c, s)
-        cells = np.empty((len(PRIOR), 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
+        cells = np.empty((SURFACE + 1, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
         floor, level = np.full_like(evidence.floor, np.nan), np.zeros_like(evidence.level)
         floor[END_BINS:], level[:, END_BINS:] = evidence.floor[:-END_BINS], evidence.level[:, :-END_BINS]
         kernels.gather(

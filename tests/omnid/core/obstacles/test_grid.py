@@ -100,6 +100,15 @@ def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: fl
     assert ring.free_m[beside].min() > 2.0
 
 
+@pytest.mark.parametrize("grey", [120.0, 190.0])
+def test_floor_that_was_free_is_not_while_a_thin_plain_pole_hides_it(grid: ObstacleGrid, grey: float) -> None:
+    """As the base drives around a pole it hides floor that was seen from elsewhere, and shows what it hid."""
+    bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(1.3, 0.05, grey)))
+    assert after(grid, bare, 30).free_m[AHEAD].min() > 2.0
+    assert after(grid, hidden, 8, first=30).free_m[AHEAD].min() < 1.6
+    assert after(grid, bare, 8, first=38).free_m[AHEAD].min() > 2.0
+
+
 @pytest.mark.parametrize("drop_m", [0.3, 0.08, -0.08])
 def test_floor_at_another_height_is_unknown(grid: ObstacleGrid, drop_m: float) -> None:
     ring = after(grid, evidence(stains, striped, drop_m), 40)
