@@ -11,7 +11,7 @@ import random
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from omnid.core.control.heading_controller import Setpoint
+from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.simulation.lockstep import Moment, Request
 from omnid.simulation.world import World
 from tests.benchmark.floating_boxes import with_floating
@@ -23,7 +23,8 @@ APART_M: Final = 0.9  # between the middles of things: some gaps are too narrow 
 WALL_TEXTURES: Final = ("brick", "granite", "plaster")
 FLOORS: Final = ("tiles", "granite", "brick")
 SPEEDS_MPS: Final = (0.3, 0.5, 0.8, -0.4)
-STANDS_MPS, STANDS_S = 0.03, 1.5  # slower than this for so long: the operator looks for another way
+# A base that moved and turned by less than this in the time stands: the operator looks for another way.
+STANDS_M, STANDS_RAD, STANDS_S = 0.05, 0.1, 1.5
 LEG_S: Final = (2.0, 5.0)  # time for which the stick is held
 TURN_RAD: Final = math.radians(70.0)  # largest change of the heading from leg to leg
 
@@ -78,7 +79,7 @@ class Wanderer:
     def __init__(self, seed: int, speeds_mps: Sequence[float] = SPEEDS_MPS) -> None:
         self._rng, self._speeds_mps = random.Random(seed), speeds_mps
         self._until_s, self._setpoint = 0.0, Setpoint(0.5, heading_rad=0.0)
-        self._moved_s, self._at = 0.0, (0.0, 0.0)
+        self._moved_s, self._at, self._heading_rad = 0.0, (0.0, 0.0), 0.0
 
     def __call__(self, moment: Moment) -> Iterator[Request]:
         """Yield the operator's requests at a moment."""
@@ -86,13 +87,14 @@ class Wanderer:
             yield "arm"
         T = moment.T_odom_base
         at, heading_rad = (float(T[0, 3]), float(T[1, 3])), math.atan2(T[1, 0], T[0, 0])
-        if math.dist(at, self._at) > STANDS_MPS * STANDS_S:
-            self._at, self._moved_s = at, moment.time_s
+        turned_rad = abs(wrap_angle(heading_rad - self._heading_rad))
+        if math.dist(at, self._at) > STANDS_M or turned_rad > STANDS_RAD:
+            self._at, self._heading_rad, self._moved_s = at, heading_rad, moment.time_s
         stands = moment.time_s - self._moved_s > STANDS_S
         if moment.time_s >= self._until_s or stands:
             # Where the base stands the way is closed: any direction may be free.
             most_rad = math.pi if stands else TURN_RAD
-            turned_rad = heading_rad + self._rng.uniform(-most_rad, most_rad)
-            self._setpoint = Setpoint(self._rng.choice(self._speeds_mps), heading_rad=turned_rad)
+            heading_rad += self._rng.uniform(-most_rad, most_rad)
+            self._setpoint = Setpoint(self._rng.choice(self._speeds_mps), heading_rad=heading_rad)
             self._until_s, self._moved_s = moment.time_s + self._rng.uniform(*LEG_S), moment.time_s
         yield self._setpoint

@@ -39,9 +39,9 @@ PRIOR: Final = (-1.0, 0.0, 0.0, -6.0, 3.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = np.float32(1.0)
-# Least log-odds of sight: floor that comes out from behind something is free again after two or three pairs.
-LEAST_SIGHT: Final = -1.0
-SIGHT_ODDS: Final = 0.0  # Log-odds of sight from which a cell is free: two pairs without its usual evidence end it.
+MOST_SIGHT: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
+LEAST_SIGHT: Final = -1.0  # One or two pairs with the usual evidence make it free again.
+SIGHT_ODDS: Final = 0.0  # Log-odds of sight above which a cell is free.
 FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
 TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
 CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
@@ -132,7 +132,7 @@ class ObstacleGrid:
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
         hidden = self._usual.compare((rows, columns), floor, weight)
-        arrivals = self._usual.arrivals(
+        arrivals, behind = self._usual.arrivals(
             hidden,
             self._watch.was_free(stamp_ns),
             self._odds[SURFACE] > TAKEN_ODDS,
@@ -156,7 +156,9 @@ class ObstacleGrid:
         surplus = np.where(is_surface, (odds[SURFACE] - np.float32(PRIOR[SURFACE])) / np.float32(PLACE_PAIRS), 0)
         odds[SURFACE] += weight * np.where(passes, np.float32(CONTRADICTION), surface) - at_rest * surplus
         odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
-        odds[SIGHT] -= weight * hidden[rows, columns]
+        # All floor behind something is hidden; a cell that is so by itself is noise.
+        lost = np.where(behind, hidden, np.minimum(hidden, 0))[rows, columns]
+        odds[SIGHT] -= weight * np.clip(lost, -MOST_SIGHT, MOST_SIGHT)
         np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
         np.clip(odds[SIGHT], LEAST_SIGHT, PRIOR[SIGHT], out=odds[SIGHT])
         np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
@@ -171,7 +173,7 @@ class ObstacleGrid:
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
         self._odds[FLOORS, *own], self._odds[SIGHT, *own], self._shown[own] = LIMIT, PRIOR[SIGHT], 0.0
-        return self._ring(T_odom_base, place - corner, arrivals)
+        return self._ring(T_odom_base, place - corner, evidence.nearest_floor_m, arrivals)
 
     @property
     def corner_m(self) -> Array:
@@ -284,12 +286,17 @@ class ObstacleGrid:
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._watch.flooded[cells] = 0
 
-    def _ring(self, T_odom_base: Array, place: Array, arrivals: Arrivals) -> GridRing:
-        """Return the ring about a place (2,) [cells] of the square."""
+    def _ring(self, T_odom_base: Array, place: Array, nearest_m: float, arrivals: Arrivals) -> GridRing:
+        """Return the ring about a place (2,) [cells] of the square; nearest_m: of the floor in view."""
         hit, free = np.empty(SECTORS), np.empty(SECTORS)
+        angles = self._azimuths + float(se3.yaw(T_odom_base))
         gap_m = CELL_M + self._gap_share * self._nearest_m
         origin = np.array([*place, CELL_M / 2, self._max_range_m, CELL_M, self._gap_share, gap_m])
-        kernels.march(self.state(), origin, self._azimuths + float(se3.yaw(T_odom_base)), hit, free)
+        kernels.march(self.state(), origin, angles, hit, free)
+        # What hides the nearest floor in view may be anywhere before it.
+        ways = nearest_m / CELL_M + np.array([[1.0], [2.0]])
+        rows, columns = (place[1] + ways * np.sin(angles)).astype(int), (place[0] + ways * np.cos(angles)).astype(int)
+        free[(self._odds[SIGHT, rows, columns] <= SIGHT_ODDS).all(axis=0)] = 0.0
         # A direction between cells may belong to either side.
         free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
         is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)

@@ -114,7 +114,9 @@ def march(state: Bytes, origin: Doubles, azimuths: Doubles, hit: Doubles, free: 
             r += step
 
 
-@compiled("(f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("found",))
+@compiled(
+    "(f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], u1[:, ::1])", writes=("found", "behind")
+)
 def hidden_from(
     hidden: Floats,
     was_free: Bytes,
@@ -123,8 +125,10 @@ def hidden_from(
     azimuths: Doubles,
     bounds: Doubles,
     found: Doubles,
+    behind: Bytes,
 ) -> None:
-    """Write, along directions (N,), the range from which on all floor that was free is hidden, NaN where none is.
+    """Write, along directions (N,), the range from which on all floor that was free is hidden, NaN where none is; and 1
+    for the cells (H, W) from there on.
 
     The sum of log-odds from a range to the end of the way is that of all less that of what is nearer: it is largest
     from where the latter is least. Each disparity counts once, however many cells it has.
@@ -151,4 +155,10 @@ def hidden_from(
                 elif math.isnan(begin):
                     begin = r
             r += step
-        found[n] = begin if total - least >= bounds[0] else math.nan
+        found[n] = math.nan
+        if total - least < bounds[0]:
+            continue
+        found[n] = r = begin
+        while r <= last:
+            behind[math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)] = 1
+            r += step

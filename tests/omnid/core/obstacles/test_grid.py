@@ -109,6 +109,16 @@ def test_floor_that_was_free_is_not_while_a_thin_plain_pole_hides_it(grid: Obsta
     assert after(grid, bare, 8, first=38).free_m[AHEAD].min() > 2.0
 
 
+def test_nothing_is_free_before_hidden_floor_that_is_the_nearest_in_view(grid: ObstacleGrid) -> None:
+    """A thin plain pole is nearer than all floor in view: it may be anywhere before what it hides."""
+    near_m = 0.5 * COLUMNS.nearest_floor_m
+    bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.04)))
+    after(grid, bare, 30)
+    ring = after(grid, hidden, 8, first=30)
+    assert np.median(ring.free_m[AHEAD]) == 0.0 and np.median(ring.free_m) > 2.0
+    assert after(grid, bare, 8, first=38).free_m[AHEAD].min() > 2.0
+
+
 @pytest.mark.parametrize("drop_m", [0.3, 0.08, -0.08])
 def test_floor_at_another_height_is_unknown(grid: ObstacleGrid, drop_m: float) -> None:
     ring = after(grid, evidence(stains, striped, drop_m), 40)
