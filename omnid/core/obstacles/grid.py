@@ -31,17 +31,17 @@ CELLS: Final = 256  # Cells of a side: twice the largest range, and the way unti
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
 
-# Layers: floor against upright surfaces, against planes just above it, and just below it; surface; floor in sight
-# against something plain that hides it. A cell is free by all of them.
-FLOOR, ABOVE, BELOW, SURFACE, SIGHT = 0, 1, 2, 3, 4
+# Layers: floor against upright surfaces, against planes just above and below it; surface; visible floor against floor
+# that something plain hides.
+FLOOR, ABOVE, BELOW, SURFACE, VISIBLE = 0, 1, 2, 3, 4
 FLOORS: Final = slice(FLOOR, SURFACE)
 PRIOR: Final = (-1.0, 0.0, 0.0, -6.0, 3.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = np.float32(1.0)
-MOST_SIGHT: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
-LEAST_SIGHT: Final = -1.0  # One or two pairs with the usual evidence make it free again.
-SIGHT_ODDS: Final = 0.0  # Log-odds of sight above which a cell is free.
+MOST_VISIBLE: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
+LEAST_VISIBLE: Final = -1.0  # One or two pairs with the usual evidence make it free again.
+VISIBLE_ODDS: Final = 0.0  # Log-odds of visible floor above which a cell is free.
 FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
 TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
 CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
@@ -65,8 +65,7 @@ PLACE_PAIRS: Final = 18.0
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 6
 WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
-# The same of an edge, because a hole into which a base falls is wide; with 3, by trial, bases stood before joints of
-# tiles.
+# The same of an edge: a hole into which a base falls is wide. With 3, by trial, bases stood before joints of tiles.
 EDGE_CELLS: Final = 5
 THIN_M: Final = 0.03  # width of the thinnest obstacle
 GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
@@ -158,9 +157,9 @@ class ObstacleGrid:
         odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
         # All floor behind something is hidden; a cell that is so by itself is noise.
         lost = np.where(behind, hidden, np.minimum(hidden, 0))[rows, columns]
-        odds[SIGHT] -= weight * np.clip(lost, -MOST_SIGHT, MOST_SIGHT)
+        odds[VISIBLE] -= weight * np.clip(lost, -MOST_VISIBLE, MOST_VISIBLE)
         np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
-        np.clip(odds[SIGHT], LEAST_SIGHT, PRIOR[SIGHT], out=odds[SIGHT])
+        np.clip(odds[VISIBLE], LEAST_VISIBLE, PRIOR[VISIBLE], out=odds[VISIBLE])
         np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), np.maximum(floor, surface))
@@ -172,7 +171,7 @@ class ObstacleGrid:
         self._clear_seen_past(place - corner, evidence.nearest_floor_m)
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
-        self._odds[FLOORS, *own], self._odds[SIGHT, *own], self._shown[own] = LIMIT, PRIOR[SIGHT], 0.0
+        self._odds[FLOORS, *own], self._odds[VISIBLE, *own], self._shown[own] = LIMIT, PRIOR[VISIBLE], 0.0
         return self._ring(T_odom_base, place - corner, evidence.nearest_floor_m, arrivals)
 
     @property
@@ -183,16 +182,16 @@ class ObstacleGrid:
     @property
     def floor_odds(self) -> Floats:
         """Log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
-        return np.asarray(np.minimum(np.minimum(self._odds[FLOOR], self._odds[SIGHT]), self._level_odds()))
+        return np.asarray(np.minimum(np.minimum(self._odds[FLOOR], self._odds[VISIBLE]), self._level_odds()))
 
     def state(self) -> Bytes:
-        """Return the cells: 0 unknown, 1 free, 2 taken."""
+        """Return the cells: 0 unknown, 1 free (by all layers), 2 taken."""
         taken = self._odds[SURFACE] > TAKEN_ODDS
         suspect = ((self._odds[SURFACE] > CLEAR_ODDS) | (self._shown > FREE_SHOWN)) & ~taken
         floor, level = self._odds[FLOOR], self._level_odds()
         # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
         is_floor = (floor > FREE_ODDS) | ((floor > 0) & (_mean(floor, WIDE_CELLS) > FREE_ODDS))
-        is_floor &= (level > FREE_ODDS) & (self._odds[SIGHT] > SIGHT_ODDS)
+        is_floor &= (level > FREE_ODDS) & (self._odds[VISIBLE] > VISIBLE_ODDS)
         free = (is_floor & ~suspect) | taken
         _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
         # Specks are noise unless something may stand there.
@@ -296,7 +295,7 @@ class ObstacleGrid:
         # What hides the nearest floor in view may be anywhere before it.
         ways = nearest_m / CELL_M + np.array([[1.0], [2.0]])
         rows, columns = (place[1] + ways * np.sin(angles)).astype(int), (place[0] + ways * np.cos(angles)).astype(int)
-        free[(self._odds[SIGHT, rows, columns] <= SIGHT_ODDS).all(axis=0)] = 0.0
+        free[(self._odds[VISIBLE, rows, columns] <= VISIBLE_ODDS).all(axis=0)] = 0.0
         # A direction between cells may belong to either side.
         free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
         is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)
