@@ -87,11 +87,18 @@ def expect_the_operator_drives(daemon: Daemon, operator: Operator, base: Base) -
 
 
 def test_without_a_robot_the_error_says_what_to_do(course: Path) -> None:
-    for command in ("arm", "stop"):
-        line = [sys.executable, "-m", "omnid", command, "--connect", f"tcp/127.0.0.1:{free_port()}"]
-        done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT, check=False)
-        assert done.returncode == 2 and done.stdout == ""
-        assert done.stderr.startswith("omnid: bus cannot reach ") and done.stderr.count("\n") == 1
+    with ExitStack() as ends:
+        line = [sys.executable, "-m", "omnid", "--connect", f"tcp/127.0.0.1:{free_port()}"]
+        pipe = subprocess.PIPE
+        for process in [
+            ends.enter_context(
+                subprocess.Popen([*line[:3], command, *line[3:]], stdout=pipe, stderr=pipe, text=True, cwd=ROOT)
+            )
+            for command in ("arm", "stop")
+        ]:
+            out, err = process.communicate(timeout=PATIENCE_S)
+            assert process.returncode == 2 and out == ""
+            assert err.startswith("omnid: bus cannot reach ") and err.count("\n") == 1
 
 
 @pytest.mark.slow

@@ -356,7 +356,7 @@ class Stalling(SimulatedLine):
 def test_a_full_output_buffer_is_an_error_and_close_returns() -> None:
     controller = Stalling()
     with contextlib.closing(SimulatedMotor(controller)) as simulated:
-        motor = SerialMotor(simulated.port, timeout_s=REPLY_S, watchdog_ms=10_000)
+        motor = SerialMotor(simulated.port, timeout_s=REPLY_S / 4, watchdog_ms=10_000)  # waited for four times
         controller.reading.clear()
         fill(simulated.port)
         with pytest.raises(DriverError, match="gave no answer"):

@@ -24,7 +24,7 @@ from tests.replay.live import Daemon, free_port, started, wait_until
 
 STOPPED_S, RUNNING_S = 0.6, 0.3  # longer than the deadlines of poses and commands; share of a computer that is left
 NEAR_M = 0.05
-GOAL = ("0.5", "0.1")
+GOAL = ("0.3", "0.05")
 
 
 @contextmanager
