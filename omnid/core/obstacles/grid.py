@@ -7,18 +7,19 @@ it, and taken where a surface is more likely than not. README.md has the equatio
 from __future__ import annotations
 
 import math
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence
+from omnid.core.obstacles.grid_ring import GridRing, RingView, ring_of
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.usual_floor import MOST_RATIO, Arrivals, UsualFloor
+from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor
 from omnid.core.obstacles.watch import FRESH_NS, Watch
 
 Array = NDArray[np.float64]
@@ -70,18 +71,7 @@ EDGE_CELLS: Final = 5
 THIN_M: Final = 0.03  # width of the thinnest obstacle
 GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
-END_M: Final = 0.1  # Distance before the end of the free floor, for the same reason.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
-OPEN_SHARE: Final = 0.9  # Share of the longest range up to which an open direction is free.
-
-
-class GridRing(NamedTuple):
-    """Nearest obstacles and free floor around the base, by the grid."""
-
-    ranges_m: Floats  # (SECTORS,) nearest surface; inf: floor up to the longest range; NaN: unknown
-    sigma_m: Floats  # (SECTORS,) of the ranges, NaN without one
-    free_m: Floats  # (SECTORS,) up to which the way is free
-    arrivals: Arrivals  # of this pair
 
 
 class ObstacleGrid:
@@ -131,12 +121,13 @@ class ObstacleGrid:
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
         hidden = self._usual.compare((rows, columns), floor, weight)
+        angles = self._azimuths + float(se3.yaw(T_odom_base))
         arrivals, behind = self._usual.arrivals(
             hidden,
             self._watch.was_free(stamp_ns),
             self._odds[SURFACE] > TAKEN_ODDS,
             np.array([*(place - corner), CELL_M, self._max_range_m, self._at_1m]),
-            self._azimuths + float(se3.yaw(T_odom_base)),
+            angles,
             evidence.nearest_floor_m,
         )
         in_view = np.isfinite(floor)
@@ -172,7 +163,11 @@ class ObstacleGrid:
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
         self._odds[FLOORS, *own], self._odds[VISIBLE, *own], self._shown[own] = LIMIT, PRIOR[VISIBLE], 0.0
-        return self._ring(T_odom_base, place - corner, evidence.nearest_floor_m, arrivals)
+        # 4. The ring.
+        gap_m = CELL_M + self._gap_share * self._nearest_m
+        in_view_m = evidence.nearest_floor_m
+        view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, self._gap_share, gap_m)
+        return ring_of(self.state(), self._odds[VISIBLE] <= VISIBLE_ODDS, view, arrivals)
 
     @property
     def corner_m(self) -> Array:
@@ -284,25 +279,6 @@ class ObstacleGrid:
         flooded = self._watch.flooded[cells] > 0
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._watch.flooded[cells] = 0
-
-    def _ring(self, T_odom_base: Array, place: Array, nearest_m: float, arrivals: Arrivals) -> GridRing:
-        """Return the ring about a place (2,) [cells] of the square; nearest_m: of the floor in view."""
-        hit, free = np.empty(SECTORS), np.empty(SECTORS)
-        angles = self._azimuths + float(se3.yaw(T_odom_base))
-        gap_m = CELL_M + self._gap_share * self._nearest_m
-        origin = np.array([*place, CELL_M / 2, self._max_range_m, CELL_M, self._gap_share, gap_m])
-        kernels.march(self.state(), origin, angles, hit, free)
-        # What hides the nearest floor in view may be anywhere before it.
-        ways = nearest_m / CELL_M + np.array([[1.0], [2.0]])
-        rows, columns = (place[1] + ways * np.sin(angles)).astype(int), (place[0] + ways * np.cos(angles)).astype(int)
-        free[(self._odds[VISIBLE, rows, columns] <= VISIBLE_ODDS).all(axis=0)] = 0.0
-        # A direction between cells may belong to either side.
-        free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
-        is_open = np.isinf(hit) & (free >= OPEN_SHARE * self._max_range_m)
-        ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
-        sigma = np.where(np.isfinite(ranges), CELL_M / 2, np.nan)
-        free = np.where(free < hit, np.maximum(free - END_M, 0.0), hit)
-        return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)
 
     def _follow(self, place: Array) -> NDArray[np.int64]:
         """Move the square where the robot comes near its border; return its corner, in cells of odom."""

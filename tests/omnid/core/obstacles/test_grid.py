@@ -15,9 +15,9 @@ from omnid.core.obstacles.grid import (
     FREE_ODDS,
     PRIOR,
     SURFACE,
-    GridRing,
     ObstacleGrid,
 )
+from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
 from tests.omnid.core.obstacles.drawn_floor import (

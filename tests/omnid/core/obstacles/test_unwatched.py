@@ -7,7 +7,7 @@ import numpy as np
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.grid import GridRing
+from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.core.stereo.tiles import TILE_COLUMNS

@@ -1,0 +1,62 @@
+"""Ring around the base by the cells of the grid: along each direction the nearest obstacle, and the free floor."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.core.obstacles import grid_kernels as kernels
+from omnid.core.obstacles.usual_floor import Arrivals
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Flags = NDArray[np.bool_]
+Bytes = NDArray[np.uint8]
+
+END_M: Final = 0.1  # Distance kept before the end of the free floor: at the foot of an object patches show both.
+OPEN_SHARE: Final = 0.9  # Share of the longest range up to which an open direction is free.
+
+
+class GridRing(NamedTuple):
+    """Nearest obstacles and free floor around the base, by the grid."""
+
+    ranges_m: Floats  # (SECTORS,) nearest surface; inf: floor up to the longest range; NaN: unknown
+    sigma_m: Floats  # (SECTORS,) of the ranges, NaN without one
+    free_m: Floats  # (SECTORS,) up to which the way is free
+    arrivals: Arrivals  # of this pair
+
+
+class RingView(NamedTuple):
+    """Directions from a place in the grid, and the gaps in the floor that are passed."""
+
+    place: Array  # (2,) in cells
+    angles: Array  # (N,) of the directions, in the axes of the grid
+    cell_m: float
+    max_range_m: float
+    nearest_m: float  # of the floor in view
+    gap_share: float  # of the range, that what is lower than an obstacle may hide: such gaps are passed
+    gap_m: float  # least gap that is passed
+
+
+def ring_of(cells: Bytes, hidden: Flags, view: RingView, arrivals: Arrivals) -> GridRing:
+    """Return the ring by the cells (H, W): 0 unknown, 1 free, 2 taken; hidden (H, W): floor that something hides."""
+    hit, free = np.empty(len(view.angles)), np.empty(len(view.angles))
+    # 1. Up to the first taken cell, and to the end of the free floor.
+    origin = np.array(
+        [*view.place, view.cell_m / 2, view.max_range_m, view.cell_m, view.gap_share, view.gap_m], np.float64
+    )
+    kernels.march(cells, origin, view.angles, hit, free)
+    # 2. What hides the nearest floor in view may be anywhere before it.
+    ways = view.nearest_m / view.cell_m + np.array([[1.0], [2.0]])
+    rows = (view.place[1] + ways * np.sin(view.angles)).astype(int)
+    columns = (view.place[0] + ways * np.cos(view.angles)).astype(int)
+    free[hidden[rows, columns].all(axis=0)] = 0.0
+    # 3. A direction between cells may belong to either side.
+    free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
+    is_open = np.isinf(hit) & (free >= OPEN_SHARE * view.max_range_m)
+    ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
+    sigma = np.where(np.isfinite(ranges), view.cell_m / 2, np.nan)
+    free = np.where(free < hit, np.maximum(free - END_M, 0.0), hit)
+    return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)

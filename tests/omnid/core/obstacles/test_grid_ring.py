@@ -1,0 +1,63 @@
+"""The ring by drawn cells: ranges, the end of the free floor, and what hides the nearest floor in view."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.obstacles.grid_ring import END_M, GridRing, RingView, ring_of
+from omnid.core.obstacles.usual_floor import Arrivals
+
+CELLS, CELL_M, MAX_RANGE_M = 120, 0.05, 2.5
+MIDDLE = CELLS // 2
+VIEW = RingView(np.full(2, MIDDLE + 0.5), azimuths(), CELL_M, MAX_RANGE_M, nearest_m=0.8, gap_share=0.07, gap_m=0.1)
+ARRIVALS = Arrivals(np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.nan, np.float32))
+AHEAD, LEFT, BEHIND = SECTORS // 2, 3 * SECTORS // 4, 0
+
+
+def ring(cells: np.ndarray, hidden: np.ndarray | None = None) -> GridRing:
+    return ring_of(cells, np.zeros(cells.shape, bool) if hidden is None else hidden, VIEW, ARRIVALS)
+
+
+@pytest.fixture
+def free() -> np.ndarray:
+    return np.ones((CELLS, CELLS), np.uint8)
+
+
+def ahead(from_m: float, to_m: float) -> tuple[slice, slice]:
+    """Return the cells ahead, half a metre wide, from a distance to another one."""
+    first, last = (MIDDLE + round(way_m / CELL_M) for way_m in (from_m, to_m))
+    return slice(MIDDLE - 5, MIDDLE + 6), slice(first, last)
+
+
+def test_open_floor_is_open_in_all_directions(free: np.ndarray) -> None:
+    found = ring(free)
+    assert np.isposinf(found.ranges_m).all() and np.isnan(found.sigma_m).all()
+    assert found.free_m.min() == pytest.approx(MAX_RANGE_M - END_M, abs=CELL_M)
+
+
+def test_the_range_is_that_of_the_first_taken_cell(free: np.ndarray) -> None:
+    free[ahead(1.0, 1.2)] = 2
+    found = ring(free)
+    assert found.ranges_m[AHEAD] == found.free_m[AHEAD] == pytest.approx(1.0, abs=CELL_M)
+    assert np.isposinf(found.ranges_m[[LEFT, BEHIND]]).all()
+
+
+def test_the_free_floor_ends_at_what_is_unknown_unless_it_is_a_gap(free: np.ndarray) -> None:
+    free[ahead(1.0, 1.1)] = 0
+    assert ring(free).free_m[AHEAD] > 2.0
+    free[ahead(1.0, 1.3)] = 0
+    found = ring(free)
+    assert np.isnan(found.ranges_m[AHEAD]) and found.free_m[AHEAD] == pytest.approx(1.0 - END_M, abs=CELL_M)
+
+
+def test_nothing_is_free_before_what_hides_the_nearest_floor_in_view(free: np.ndarray) -> None:
+    hidden = np.zeros(free.shape, bool)
+    hidden[ahead(0.7, 1.3)] = True
+    found = ring(free, hidden)
+    assert found.free_m[AHEAD] == 0.0 and found.free_m[[LEFT, BEHIND]].min() > 2.0
+    # Farther away the cells themselves end the free floor.
+    hidden[:] = False
+    hidden[ahead(1.3, 1.6)] = True
+    assert ring(free, hidden).free_m[AHEAD] > 2.0
