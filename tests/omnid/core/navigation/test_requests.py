@@ -5,12 +5,18 @@ from __future__ import annotations
 import contextlib
 import random
 
+import numpy as np
 import pytest
 
 from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationFrame,
+    NavigationRequest,
     NavigationVerb,
+    PathRequest,
     RouteAction,
     RouteRequest,
+    is_halt,
     navigation_verb,
     route_name,
     route_request,
@@ -77,6 +83,21 @@ def test_verbs(verb: NavigationVerb) -> None:
     assert navigation_verb(f" {verb}\n") is verb
     with pytest.raises(OmnidError):
         navigation_verb(verb.upper())
+
+
+@pytest.mark.parametrize(
+    ("request_", "halts"),
+    [
+        (NavigationVerb.CANCEL, True),
+        (NavigationVerb.PAUSE, True),
+        (NavigationVerb.RESUME, False),
+        (GoalRequest(NavigationFrame.ODOM, 1.0, 0.0), False),
+        (PathRequest(NavigationFrame.ODOM, np.zeros((2, 2))), False),
+        *((RouteRequest(action, "hall"), action is RouteAction.STOP) for action in RouteAction),
+    ],
+)
+def test_only_cancel_pause_and_the_stop_of_a_route_halt(request_: NavigationRequest, halts: bool) -> None:
+    assert is_halt(request_) == halts
 
 
 def test_no_text_raises_another_error() -> None:

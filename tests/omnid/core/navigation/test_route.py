@@ -121,6 +121,16 @@ def test_a_keyframe_of_another_map_does_not_count() -> None:
     assert route.fits(some), "an aged map is still the same"
 
 
+@pytest.mark.parametrize(("known", "fits"), [(2, False), (3, False), (4, True), (12, True)])
+def test_a_map_that_holds_only_a_few_of_the_noted_keyframes_is_another_one(known: int, fits: bool) -> None:
+    poses = way()
+    places = Map(poses)
+    route = taught(poses, places)
+    assert len(route.stamps_ns) == 12
+    places.poses = {k: pose for k, pose in places.poses.items() if k < known}
+    assert route.fits(places) == fits
+
+
 def test_reversed_faces_the_other_way_and_comes_back() -> None:
     poses = way()
     places = Map(poses)
@@ -233,3 +243,25 @@ def test_a_piece_that_was_driven_backwards_is_repeated_so() -> None:
     route = recorder.route(places, places.stamps, 0, "m")
     (path,) = repeated_paths(route, places, np.zeros(3), loops=1, reverse=False)
     assert [leg.backwards for leg in path.legs] == [False, True]
+
+
+def test_a_base_that_stands_and_is_moved_on_keeps_the_direction_in_which_it_was_driven() -> None:
+    recorder = RouteRecorder("dock")
+    for x_m, speed_mps in [*((-0.1 * k, -0.2) for k in range(20)), (-2.0, 0.0), (-2.1, 0.01)]:
+        recorder.add(np.array([x_m, 0.0, 0.0]), speed_mps, 1, np.zeros(3))
+    places = Map(np.zeros((1, 3)))
+    route = recorder.route(places, places.stamps, 0, "m")
+    assert (route.speeds < 0).all()
+    (path,) = repeated_paths(route, places, np.zeros(3), loops=1, reverse=False)
+    assert [leg.backwards for leg in path.legs] == [True]
+
+
+def test_a_robot_that_joins_a_route_from_beside_it_changes_direction_where_the_route_does() -> None:
+    ahead = np.column_stack([np.arange(0, 2.125, 0.125), np.zeros(17), np.zeros(17)])
+    recorder, places = RouteRecorder("dock"), Map(ahead)
+    for pose, speed in [*((pose, 0.3) for pose in ahead), *((pose, -0.2) for pose in ahead[-2:2:-1])]:
+        recorder.add(pose, speed, 0, places.poses[0])
+    route = recorder.route(places, places.stamps, 0, "m")
+    (path,) = repeated_paths(route, places, np.array([1.2, 0.3, 0.0]), loops=1, reverse=False)
+    assert [leg.backwards for leg in path.legs] == [False, True]
+    np.testing.assert_allclose(path.legs[0].xy[[0, -1]], [(1.2, 0.3), (2.0, 0.0)], atol=1e-6)
