@@ -8,14 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib.se2_arrays import composed, predicted, relative
 from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.navigation.local_planner import room_ahead
+from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.forecast import forecast
+from omnid.core.navigation.local_planner import ARC_S, ARC_STEPS, MARGIN_M, NEARER_M, LocalPlanner, room_ahead
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
-from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.navigation.settings import NavigationSettings, PursuitSettings
 from omnid.core.navigation.situation import Situation
+from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
@@ -163,3 +167,92 @@ def test_the_room_ahead_ends_at_the_nearest_obstacle_that_is_not_behind(speed_mp
     obstacles = np.array([[2.0, -2.0], [2.0, -5.0], [2.5, 0.0]])
     assert room_ahead(pose, speed_mps, obstacles) == pytest.approx(distance_m)
     assert room_ahead(pose, speed_mps, np.zeros((0, 2))) == math.inf
+
+
+@pytest.mark.parametrize("away_m", [0.5, 3.0])
+@pytest.mark.parametrize("speed_mps", [0.3, -0.3])
+def test_what_is_within_100_degrees_of_the_motion_is_not_behind(speed_mps: float, away_m: float) -> None:
+    pose = np.array([2.0, -3.0, 0.4])
+    for angle_deg, counts in ((97.0, True), (-97.0, True), (103.0, False), (-103.0, False)):
+        direction = 0.4 + math.radians(angle_deg) + (math.pi if speed_mps < 0 else 0.0)
+        place = pose[:2] + away_m * np.array([math.cos(direction), math.sin(direction)])
+        assert room_ahead(pose, speed_mps, place[None]) == pytest.approx(away_m if counts else math.inf)
+
+
+def arcs(planner: LocalPlanner) -> tuple[Array, Array]:
+    """Return the speeds and yaw rates (A, 2) of the arcs and places (A, T, 3) on them, of a base at the origin."""
+    motions = np.column_stack([planner._v, planner._w])
+    times = np.linspace(0.0, ARC_S, ARC_STEPS + 1)
+    return motions, np.array([[predicted(np.zeros(3), v, w, t) for t in times] for v, w in motions])
+
+
+def touches(motion: Array, places: Array, obstacle: Array) -> bool:
+    """True if an obstacle (2,) comes into the room that the collision monitor demands at places (T, 3) of an arc."""
+    front_m = OUTLINE.front_m + (OUTLINE.stop_m if motion[0] > 0 else 0.0) + MARGIN_M
+    rear_m = OUTLINE.rear_m + (OUTLINE.stop_m if motion[0] < 0 else 0.0) + MARGIN_M
+    x, y = np.array([relative(place, np.array([*obstacle, 0.0]))[:2] for place in places]).T
+    return bool(((-rear_m < x) & (x < front_m) & (abs(y) < OUTLINE.half_width_m + OUTLINE.side_m + MARGIN_M)).any())
+
+
+@pytest.mark.parametrize(("velocity_mps", "heading"), [(0.4, 0.0), (0.4, 2.2), (1.0, math.pi / 2)])
+def test_arcs_keep_the_room_that_the_collision_monitor_demands(velocity_mps: float, heading: float) -> None:
+    planner = LocalPlanner(NavigationSettings(pursuit=PursuitSettings(velocity_mps=velocity_mps)), OUTLINE)
+    motions, places = arcs(planner)
+    pose = np.array([3.0, -1.0, heading])
+    for obstacle in ((0.43, 0.1), (-0.3, 0.1), (-0.43, -0.2), (0.2, 0.4), (0.6, 0.5), (1.45, 0.0)):
+        seen = composed(pose[None], np.array([*obstacle, 0.0]))[:, :2]
+        expected = [not touches(motion, arc, np.array(obstacle)) for motion, arc in zip(motions, places, strict=True)]
+        np.testing.assert_array_equal(planner._keeps_clear(pose, seen), expected)
+
+
+@pytest.mark.parametrize(("x_m", "sign"), [(0.26, 1.0), (-0.26, -1.0)])
+def test_an_obstacle_at_the_outline_may_be_left_but_not_approached(x_m: float, sign: float) -> None:
+    planner = LocalPlanner(SETTINGS, OUTLINE)
+    may = planner._keeps_clear(np.zeros(3), np.array([[x_m, 0.0]]))
+    straight = planner._w == 0
+    towards = sign * planner._v > 0
+    assert not may[straight & towards].any()
+    assert may[straight & (sign * planner._v < 0)].all()
+
+
+def test_arcs_keep_clear_of_somebody_who_walks_at_each_moment() -> None:
+    planner = LocalPlanner(SETTINGS, OUTLINE)
+    _, places = arcs(planner)
+    P = np.diag([1e-4, 1e-4, 1e-4, 1e-4])
+    moving = forecast([MovingObstacle(0.7, 0.9, 0.0, -0.4, P, 0.2), MovingObstacle(-0.6, 0.1, 0.1, 0.0, P, 0.2)], 0.0)
+    assert moving is not None
+    others, radii = moving.at(np.linspace(0.0, ARC_S, ARC_STEPS + 1))
+    away_m = np.hypot(*np.moveaxis(places[None, :, :, :2] - others[:, None], -1, 0))
+    room_m = radii[:, None] + OUTLINE.half_width_m + OUTLINE.side_m - NEARER_M
+    expected = (away_m >= room_m).all(axis=(0, 2))
+    assert 0.1 < expected.mean() < 0.9
+    np.testing.assert_array_equal(planner._lets_pass(places[..., :2], moving), expected)
+
+
+def back_to_the_path(pose: tuple[float, float, float]) -> Setpoint:
+    """Return the motion at a pose of a base that has gone around something beside a straight path along x."""
+    planner = LocalPlanner(SETTINGS, OUTLINE)
+    path = np.column_stack([np.arange(0.0, 4.0, 0.05), np.zeros(80)])
+    box = np.column_stack([np.full(5, 1.1), np.linspace(-0.1, 0.1, 5)])
+    assert planner.plan(np.zeros(3), path, box, Setpoint(0.3)).avoiding
+    motion = planner.plan(np.array(pose), path, np.array([(5.0, 5.0)]), Setpoint(0.3)).setpoint
+    assert motion is not None and motion.heading_rad is None
+    return motion
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.2, -0.42), (0.0, -0.2, 0.42), (0.0, 0.5, -0.84)])
+def test_a_base_beside_its_path_comes_back_to_it_half_a_metre_ahead(pose: tuple[float, float, float]) -> None:
+    motion = back_to_the_path(pose)
+    assert motion.velocity_mps == pytest.approx(0.28) and abs(motion.yaw_rate_radps) < 0.11, "it looks there already"
+
+
+@pytest.mark.parametrize("heading", [-0.4, -1.4])
+def test_an_arc_back_to_the_path_ends_in_the_direction_of_the_way(heading: float) -> None:
+    motion = back_to_the_path((0.0, 0.5, heading))
+    assert heading + ARC_S * motion.yaw_rate_radps == pytest.approx(math.atan2(-0.5, 0.45), abs=0.45)
+
+
+@pytest.mark.parametrize("heading", [math.pi, 2.3, -2.5])
+def test_a_base_that_looks_away_from_the_way_turns_standing_where_there_is_room(heading: float) -> None:
+    motion = back_to_the_path((0.0, 0.5, heading))
+    assert motion.velocity_mps == 0.0 and abs(motion.yaw_rate_radps) == pytest.approx(0.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,11 @@ import pytest
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.navigation.navigator import GIVES_WAY, STOPS, WAITS, Navigation, Navigator
+from omnid.core.navigation.navigator import AROUND, GIVES_WAY, STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.navigation.situation import WheelState
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
@@ -21,9 +23,11 @@ from tests.omnid.core.navigation.driven_base import DrivenBase
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
 
 
-def driving(frame: NavigationFrame = NavigationFrame.ODOM, seed: int = 1) -> DrivenBase:
+def driving(
+    frame: NavigationFrame = NavigationFrame.ODOM, seed: int = 1, settings: NavigationSettings = SETTINGS
+) -> DrivenBase:
     """Return a base that is on its way to a goal 5 m ahead."""
-    base = DrivenBase(Navigator(SETTINGS), seed)
+    base = DrivenBase(Navigator(settings), seed)
     path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
     base.navigator.start("goal", frame, [path], base.seen(), command_ns=7)
     base.run(20, lambda answer: answer.left_m < 4.0, rest_s=0)
@@ -139,6 +143,37 @@ def test_says_that_it_stood_before_an_obstacle(monkeypatch: pytest.MonkeyPatch) 
     answer = base.run(20)
     assert any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)
     assert answer.reason == f"no progress for 3 s: {GIVES_WAY}: look at the robot", "it tried that, too"
+
+
+def test_gives_up_before_an_obstacle_where_it_may_not_drive_back() -> None:
+    base = driving(settings=replace(SETTINGS, give_way_m=0.0))
+    now = base.seen()
+    box = now.pose[:2] + np.column_stack([np.full(9, 1.1), np.linspace(-0.15, 0.15, 9)])
+    for tick in range(100):
+        later = now._replace(stamp_ns=now.stamp_ns + tick * 10**8, obstacles=box)
+        answer = base.navigator.step(later)
+        if answer.state.is_end:
+            break
+    assert answer.state is NavigationState.FAILED
+    assert answer.reason == f"no progress for 3 s: {AROUND}: look at the robot"
+    assert tick == pytest.approx(30, abs=3)
+
+
+def test_a_fault_that_ends_by_itself_does_not_pause_the_drive() -> None:
+    base = driving()
+    base.navigator.step(base.seen()._replace(wheels=WheelState(False, False, "the pose is lost")))
+    answer = base.navigator.step(base.seen())
+    assert answer.state is NavigationState.DRIVING
+    assert answer.setpoint is not None and answer.setpoint.velocity_mps > 0
+
+
+def test_a_new_goal_ends_the_stops_of_the_one_before() -> None:
+    base = driving()
+    base.navigator.cancel("cancelled by a request")
+    assert base.navigator.stopping
+    path = DrivePath((straight_leg(base.pose, (5.0, 0.0)),), 0.0)
+    base.navigator.start("goal", NavigationFrame.ODOM, [path], base.seen())
+    assert not base.navigator.stopping and base.navigator.state is NavigationState.DRIVING
 
 
 def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
