@@ -16,7 +16,8 @@ Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
 END_M: Final = 0.1  # Distance kept before the end of the free floor: at the foot of an object patches show both.
-OPEN_SHARE: Final = 0.9  # Share of the longest range up to which an open direction is free.
+# Share of the longest range from which on a direction is open, because few pairs show the last cells.
+OPEN_SHARE: Final = 0.9
 
 
 class GridRing(NamedTuple):
