@@ -76,6 +76,7 @@ TOPICS = {
     "/omnid/cmd/joint_states": "sensor_msgs/msg/JointState",
 }
 COMMANDS = command_topics(("planner",))
+PACE_S = 0.01  # between messages, so that a reader which is slow for a moment has them all
 
 
 @contextlib.contextmanager
@@ -118,9 +119,11 @@ def test_tokens_are_those_of_rmw_zenoh() -> None:
 def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
     endpoint, gids, numbers = free_endpoint(), set(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus, client(endpoint) as session:
-        samples = session.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.FifoChannel(100))
+        # A full FIFO that nobody reads would block the session, and its close with it.
+        samples = session.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.RingChannel(100))
         while len(numbers) < 3:
             bus.publish("odom", odometry(1), b'{"seq":1}')
+            time.sleep(PACE_S)
             sample = samples.try_recv()
             if sample is not None:
                 number, sent_ns, length = struct.unpack_from("<qqB", sample.attachment.to_bytes())
