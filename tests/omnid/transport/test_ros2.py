@@ -119,7 +119,7 @@ def test_tokens_are_those_of_rmw_zenoh() -> None:
 def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
     endpoint, gids, numbers = free_endpoint(), set(), []
     with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus, client(endpoint) as session:
-        # A full FIFO that nobody reads would block the session, and its close with it.
+        # A full FIFO that is not read any longer blocks the session, and its close with it.
         samples = session.declare_subscriber(ODOMETRY_KEY, zenoh.handlers.RingChannel(100))
         while len(numbers) < 3:
             bus.publish("odom", odometry(1), b'{"seq":1}')
