@@ -74,6 +74,7 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
 }
 # A query without an answer ends after this time, which a slow network must not exceed.
 _QUERY_TIMEOUT_S: Final = 1.0
+_BETWEEN_QUERIES_S: Final = 0.002  # twice the least time between two queries that `transport/session.py` lets through
 # The channel of a subscription has no wait with a timeout, so Subscription.wait polls: this is the delay that it adds.
 _POLL_S: Final = 0.002
 
@@ -144,11 +145,16 @@ def _attachment(sample: zenoh.Sample) -> bytes:
 
 
 def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
-    """Return the answer to a query for a key, if there is any."""
-    for reply in session.get(key, timeout=_QUERY_TIMEOUT_S):
-        if reply.ok is not None:
-            return reply.ok
-    return None
+    """Return the answer to a query for a key, if there is any.
+
+    A robot refuses a query that comes too soon after another for the same key: no reply at all, at once. Then it is
+    asked again.
+    """
+    replies = list(session.get(key, timeout=_QUERY_TIMEOUT_S))
+    if not replies:
+        time.sleep(_BETWEEN_QUERIES_S)
+        replies = list(session.get(key, timeout=_QUERY_TIMEOUT_S))
+    return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
 class Robot:

@@ -25,9 +25,18 @@ def test_queries_for_several_keys_at_once_are_all_answered() -> None:
         for key in keys:
             stack.enter_context(daemon.declare_queryable(key, lambda query: query.reply(query.key_expr, b"")))
         wait_until(lambda: any(reply.ok for reply in program._session.get(keys[-1], timeout=5.0)))
+        time.sleep(0.01)  # a second query for a key within 1 ms is refused
         for key in keys:
             program._session.get(key, lambda reply: answered.append(str(reply.ok.key_expr)), timeout=5.0)
         wait_until(lambda: sorted(answered) == sorted(keys))
+
+
+def test_a_program_that_asks_in_a_loop_has_every_answer() -> None:
+    endpoint = free_endpoint()
+    with open_session(BusConfig(listen=(endpoint,))) as daemon, Robot(connect=(endpoint,)) as program:
+        with daemon.declare_queryable("omnid/config", lambda query: query.reply(query.key_expr, b"here")):
+            wait_until(lambda: program.query("config") == "here")
+            assert [program.query("config") for _ in range(50)] == ["here"] * 50
 
 
 def test_queries_of_a_link_are_bounded_before_they_reach_a_ring() -> None:
