@@ -34,7 +34,7 @@ from omnid.simulation.robot import make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
-from tests.benchmark.cluttered_room import Wanderer, furnished, room_text
+from tests.benchmark.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, lowered, room_text
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
@@ -76,10 +76,8 @@ CASES: Final = {
     "edge 50 cm": 10.0,
     "ramp": 10.0,
 } | dict.fromkeys(KINDS, 12.0)
-# Cases of a room with many things, in which the operator drives at random.
-CLUTTER: Final = "clutter"
-CASES[CLUTTER] = 40.0
-UNEVEN: Final = ("edge", "ramp")  # Cases whose floor has two heights.
+CASES |= dict.fromkeys(ROOMS, 40.0)  # The operator drives at random.
+UNEVEN: Final = ("edge", "ramp", AT_EDGE)  # Cases whose floor has two heights.
 # The same worlds with a floor that mirrors what stands on it, which is one plane.
 POLISHED: Final = "polished "
 CASES |= {POLISHED + case: seconds for case, seconds in CASES.items() if not case.startswith(UNEVEN)}
@@ -191,7 +189,7 @@ def run(
     limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
-        is_cluttered = case.endswith(CLUTTER)
+        is_cluttered = case.removeprefix(POLISHED) in ROOMS
         path.write_text((room_text if is_cluttered else world_text)(case, random.Random(seed)))
         world = load_world(str(path), seed)
         edges = np.zeros((0, 2, 2))
@@ -201,6 +199,8 @@ def run(
             world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
         if case.removeprefix(POLISHED) in KINDS:
             world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
+        if case == AT_EDGE:
+            world, edges = lowered(world, random.Random(seed))
         if is_cluttered:
             world = furnished(world, random.Random(seed))
         else:

@@ -116,11 +116,10 @@ class ObstacleGrid:
             self._assume_free(at, T_odom_base, evidence)
         passed_ns = FRESH_NS if self._last_ns is None else max(stamp_ns - self._last_ns, 0)
         self._last_ns = stamp_ns
-        # 1. Evidence of each cell.
-        cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
-        floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
-        hidden = self._usual.compare((rows, columns), floor, weight)
+        # 1. Evidence of each cell, and what has come onto floor that was free.
+        cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
+        hidden = self._usual.compare((rows, columns), cells[FLOOR], weight)
         angles = self._azimuths + float(se3.yaw(T_odom_base))
         arrivals, behind = self._usual.arrivals(
             hidden,
@@ -130,35 +129,17 @@ class ObstacleGrid:
             angles,
             evidence.nearest_floor_m,
         )
-        in_view = np.isfinite(floor)
-        floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
-        noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
-        # An obstacle that is hidden or too near to be seen remains one.
-        noise[(surface <= 0) & ~in_view & (self._odds[SURFACE, rows, columns] > TAKEN_ODDS)] = 0.0
-        self._keep_shown(surface, in_view, weight, (rows, columns))
-        surface = np.minimum(surface - noise, MOST_SURFACE)
-        # 2. Log-odds.
-        odds = self._odds[:, rows, columns]
-        is_surface = surface > 0
-        odds[FLOOR] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
-        passes = (floor > 0) & ~is_surface
-        # The sum over pairs from one place tends to their mean, PLACE_PAIRS times: what is no surface stays none.
-        surplus = np.where(is_surface, (odds[SURFACE] - np.float32(PRIOR[SURFACE])) / np.float32(PLACE_PAIRS), 0)
-        odds[SURFACE] += weight * np.where(passes, np.float32(CONTRADICTION), surface) - at_rest * surplus
-        odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
-        # All floor behind something is hidden; a cell that is so by itself is noise.
+        # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
+        in_view = np.isfinite(cells[FLOOR])
         lost = np.where(behind, hidden, np.minimum(hidden, 0))[rows, columns]
-        odds[VISIBLE] -= weight * np.clip(lost, -MOST_VISIBLE, MOST_VISIBLE)
-        np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
-        np.clip(odds[VISIBLE], LEAST_VISIBLE, PRIOR[VISIBLE], out=odds[VISIBLE])
-        np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
+        amount = self._add((rows, columns), cells, lost, weight, at_rest)
         # 3. What is not watched, and may have changed.
-        self._watch.take(passed_ns, (rows, columns), np.maximum(floor, surface))
+        self._watch.take(passed_ns, (rows, columns), amount)
         if stamp_ns - self._start_ns >= FRESH_NS:
             visible = np.zeros((CELLS, CELLS), bool)
             visible[rows, columns] = in_view
-            lost = self._watch.spread(stamp_ns, passed_ns, self._odds[FLOOR] > FREE_ODDS, visible)
-            self._odds[FLOOR][lost] = PRIOR[FLOOR]
+            flooded = self._watch.spread(stamp_ns, passed_ns, self._odds[FLOOR] > FREE_ODDS, visible)
+            self._odds[FLOOR][flooded] = PRIOR[FLOOR]
         self._clear_seen_past(place - corner, evidence.nearest_floor_m)
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
@@ -168,6 +149,36 @@ class ObstacleGrid:
         in_view_m = evidence.nearest_floor_m
         view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, self._gap_share, gap_m)
         return ring_of(self.state(), self._odds[VISIBLE] <= VISIBLE_ODDS, view, arrivals)
+
+    def _add(
+        self, window: tuple[slice, slice], cells: Floats, lost: Floats, weight: np.float32, at_rest: np.float32
+    ) -> Floats:
+        """Add the evidence of a pair to the log-odds of a window; return the most of each cell, of floor or surface.
+
+        cells (4, N, N): evidence of the cells; lost (N, N): log-odds that visible floor loses; weight, at_rest: of the
+        pair, and the part of it by time alone.
+        """
+        floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
+        odds = self._odds[:, *window]
+        in_view = np.isfinite(floor)
+        floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
+        noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
+        # An obstacle that is hidden or too near to be seen remains one.
+        noise[(surface <= 0) & ~in_view & (odds[SURFACE] > TAKEN_ODDS)] = 0.0
+        self._keep_shown(surface, in_view, weight, window)
+        surface = np.minimum(surface - noise, MOST_SURFACE)
+        is_surface = surface > 0
+        odds[FLOOR] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
+        passes = (floor > 0) & ~is_surface
+        # The sum over pairs from one place tends to their mean, PLACE_PAIRS times: what is no surface stays none.
+        surplus = np.where(is_surface, (odds[SURFACE] - np.float32(PRIOR[SURFACE])) / np.float32(PLACE_PAIRS), 0)
+        odds[SURFACE] += weight * np.where(passes, np.float32(CONTRADICTION), surface) - at_rest * surplus
+        odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
+        odds[VISIBLE] -= weight * np.clip(lost, -MOST_VISIBLE, MOST_VISIBLE)
+        np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
+        np.clip(odds[VISIBLE], LEAST_VISIBLE, PRIOR[VISIBLE], out=odds[VISIBLE])
+        np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
+        return np.asarray(np.maximum(floor, surface))
 
     @property
     def corner_m(self) -> Array:
