@@ -80,7 +80,7 @@ def _sizes(rng: random.Random, kind: str) -> list[str]:
 
 
 def _person(rng: random.Random, places: Sequence[Point], limits: Point) -> list[str]:
-    """Return a person who walks to and fro between two places, apart from things; nobody where no try found a way."""
+    """Return a person who walks to and fro between two places, apart from things; no lines where no try found a way."""
     for _ in range(200):
         path = [[rng.uniform(-limit, limit) for limit in limits] for _ in range(2)]
         if math.dist(*path) > WALK_M and all(_apart_m(place, *path) > WALKS_APART_M for place in places):
