@@ -33,10 +33,13 @@ def test_queries_for_several_keys_at_once_are_all_answered() -> None:
 
 def test_a_program_that_asks_in_a_loop_has_every_answer() -> None:
     endpoint = free_endpoint()
-    with open_session(BusConfig(listen=(endpoint,))) as daemon, Robot(connect=(endpoint,)) as program:
-        with daemon.declare_queryable("omnid/config", lambda query: query.reply(query.key_expr, b"here")):
-            wait_until(lambda: program.query("config") == "here")
-            assert [program.query("config") for _ in range(50)] == ["here"] * 50
+    with (
+        open_session(BusConfig(listen=(endpoint,))) as daemon,
+        Robot(connect=(endpoint,)) as program,
+        daemon.declare_queryable("omnid/config", lambda query: query.reply(query.key_expr, b"here")),
+    ):
+        wait_until(lambda: program.query("config") == "here")
+        assert [program.query("config") for _ in range(50)] == ["here"] * 50
 
 
 def test_queries_of_a_link_are_bounded_before_they_reach_a_ring() -> None:
