@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
+from calib.se2 import Point, Pose2, seen_from
 from omnid.core.control.heading_controller import Twist
 
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
@@ -97,3 +98,9 @@ def _crossings(outline: Outline, radius_m: float, rho2: float) -> list[tuple[flo
             reach = math.sqrt(across2)
             found += [(x, y) for x in (reach, -reach) if -outline.rear_m <= x <= outline.front_m]
     return found
+
+
+def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point]:
+    """Return the points within reach of a pose, in its axes."""
+    reach2 = reach_m * reach_m
+    return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])

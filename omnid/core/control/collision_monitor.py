@@ -13,7 +13,7 @@ from collections import deque
 from typing import Final, NamedTuple
 
 from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
-from omnid.core.control.collision_geometry import TINY, Outline, contact_s
+from omnid.core.control.collision_geometry import TINY, Outline, contact_s, within_reach
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.nanoseconds import S_PER_NS
@@ -120,9 +120,8 @@ class CollisionMonitor:
             for k, r in enumerate(ring.ranges_m)
             if math.isfinite(r)
         ]
-        free = ring.free_m
-        if len(free) != count:
-            free = tuple(r if math.isfinite(r) else 0.0 for r in ring.ranges_m)
+        ends_m = tuple(r if math.isfinite(r) else 0.0 for r in ring.ranges_m)
+        free = ring.free_m if len(ring.free_m) == count else ends_m
         # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer. What
         # stands nearer than stop_m before the surface is kept clear by that.
         has_gap = [math.isfinite(r) and r - f > self._settings.stop_m for r, f in zip(ring.ranges_m, free, strict=True)]
@@ -136,16 +135,23 @@ class CollisionMonitor:
             ends = self._unwatched if unwatched[k] else self._gaps if has_gap[k] else self._unknown
             ends.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
 
-    def step(self, now_ns: int, motion: Twist) -> Twist:
-        """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc."""
+    def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
+        """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc.
+
+        to_heading: the yaw rate leads to a heading, to which the base turns on the spot where it may not drive.
+        Otherwise it would stand for good where the arc to a free direction is closed.
+        """
         # 1. Judge the motion by the obstacles; a base that was stopped stays so while it could only creep on.
         allowance = self._held(self._judged(now_ns, motion), motion)
         self.share, self.reason = allowance
-        # 2. Scale both speeds alike.
         self._stopped_mps = motion.velocity_mps if allowance.share == 0.0 else 0.0
-        if allowance.share >= 1.0:
-            return motion
-        return Twist(allowance.share * motion.velocity_mps, allowance.share * motion.yaw_rate_radps)
+        # 2. Where it may not drive, it may turn.
+        share = allowance.share
+        if share == 0.0 and to_heading:
+            motion = Twist(0.0, motion.yaw_rate_radps)
+            share = self._judged(now_ns, motion).share
+        # 3. Scale both speeds alike.
+        return motion if share >= 1.0 else Twist(share * motion.velocity_mps, share * motion.yaw_rate_radps)
 
     def _held(self, allowance: Allowance, motion: Twist) -> Allowance:
         """Return the allowance, none as long as a base that was stopped could only creep on."""
@@ -179,15 +185,15 @@ class CollisionMonitor:
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
         reach_m = way_m + self._outline.radius_m + settings.stop_m + settings.slow_m
         # 3. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
-        points = _within_reach(self._points, moved, reach_m)
+        points = within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
             # Who stood beside or behind the base would hide the surface there; a thin thing was passed by the front.
-            gaps = self._ahead(_within_reach(self._gaps, moved, reach_m), motion)
-            ends = _within_reach(self._unknown, moved, reach_m) + gaps
+            gaps = self._ahead(within_reach(self._gaps, moved, reach_m), motion)
+            ends = within_reach(self._unknown, moved, reach_m) + gaps
             allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
         if settings.stale != IGNORE and self._unwatched:
-            ends = _within_reach(self._unwatched, moved, reach_m)
+            ends = within_reach(self._unwatched, moved, reach_m)
             allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
         if self._moving:
             allowances.append(self._before_moving(moved, age_s, motion))
@@ -221,10 +227,10 @@ class CollisionMonitor:
 
     def _stop_polygon(self, motion: Twist) -> Outline:
         """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
-        settings, outline = self._settings, self._outline
+        (front_m, rear_m, half_width_m), settings = self._outline, self._settings
         ahead_m = settings.stop_m if motion.velocity_mps > TURN_MPS else 0.0
         behind_m = settings.stop_m if motion.velocity_mps < -TURN_MPS else 0.0
-        return Outline(outline.front_m + ahead_m, outline.rear_m + behind_m, outline.half_width_m + settings.side_m)
+        return Outline(front_m + ahead_m, rear_m + behind_m, half_width_m + settings.side_m)
 
     def _near(self, points: list[Point], motion: Twist) -> Allowance:
         """Drive slowly while something is in the slow polygon, on the side to which the base moves."""
@@ -322,9 +328,3 @@ def _in_long_runs(unknown: list[bool]) -> list[int]:
         found += run if len(run) >= UNKNOWN_SECTORS else []
         run = []
     return found
-
-
-def _within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point]:
-    """Return the points within reach of a pose, in its axes."""
-    reach2 = reach_m * reach_m
-    return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])

@@ -215,7 +215,8 @@ class ControlLaw:
         limits = self._settings.limits
         motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
         # Last of all, the part of this motion that obstacles allow, reached with the deceleration of the limits.
-        self.motion = limits.step(self.collision.step(now_ns, motion), self.motion, dt_s)
+        allowed = self.collision.step(now_ns, motion, to_heading=setpoint.heading_rad is not None)
+        self.motion = limits.step(allowed, self.motion, dt_s)
         turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
         error_rad = None if setpoint.heading_rad is None else wrap_angle(setpoint.heading_rad - heading_rad)
         return self._goal.towards(turn_rad, error_rad)

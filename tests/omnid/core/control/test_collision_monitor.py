@@ -149,6 +149,18 @@ def test_turns_on_the_spot_unless_a_corner_would_touch() -> None:
     assert after(with_points((0.27, 0.2)), turn)[0].yaw_rate_radps > -0.3
 
 
+def test_where_a_base_may_not_drive_it_may_turn_to_a_heading() -> None:
+    monitor, arc = CollisionMonitor(SETTINGS, 1.5), Twist(0.3, -0.5)
+    monitor.set_ring(ControllerRing(10 * S, with_points((0.38, 0.0))))
+    assert monitor.step(10 * S, arc) == Twist()
+    assert monitor.step(10 * S, arc, to_heading=True) == Twist(0.0, -0.5)
+    assert (monitor.share, monitor.reason) == (0.0, monitor_module.BLOCKED)
+    # A corner that would touch something keeps it from turning, as ever, and so does a ring that is stale.
+    monitor.set_ring(ControllerRing(11 * S, with_points((0.38, 0.0), (0.27, 0.2))))
+    assert abs(monitor.step(11 * S, arc, to_heading=True).yaw_rate_radps) < 0.3
+    assert monitor.step(15 * S, arc, to_heading=True) == Twist()
+
+
 def test_an_unknown_way_is_approached_slowly_or_not_at_all() -> None:
     wall = with_unknown(-20, 20)
     assert after(wall) == (Twist(), monitor_module.UNKNOWN)
