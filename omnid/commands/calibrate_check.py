@@ -18,6 +18,7 @@ from omnid.calibration.rig_check import RigCheckResult, check_rig, moving_rig_fi
 from omnid.config import Config
 from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.core.rig.rig_state import RigState
+from omnid.engine.kernel_cache import prepare_kernels
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.runs.log_rig import attached_rig
@@ -69,6 +70,7 @@ def run(args: argparse.Namespace) -> int:
             f"calibrate check: --refine would take motion for a drift: {skewed}; `omnid calibrate drive` "
             "calibrates such a rig"
         )
+    prepare_kernels()
     found = check_rig(pairs, rig, Config().panorama)
     if skewed:
         # The motion between the exposures would be taken for a drift.

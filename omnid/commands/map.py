@@ -118,6 +118,7 @@ def run_merge(args: argparse.Namespace) -> int:
     from omnid.core.places.place_rig import seen_by
     from omnid.core.places.place_views import summary
     from omnid.core.types.stereo_model import StereoModel
+    from omnid.engine.kernel_cache import prepare_kernels
     from omnid.errors import OmnidError
     from omnid.formats.place_file import read_places, write_places
     from omnid.sinks.files import check_outputs
@@ -131,6 +132,7 @@ def run_merge(args: argparse.Namespace) -> int:
         if difference := other_rig.difference(rig):
             raise OmnidError(f"{path}: this map was made with {difference}: build one with the rig of {args.maps[0]}")
         seen_by(other, other_rig, rig)
+        prepare_kernels()
         if not merge(places, other, StereoModel(rig.cylinder, rig.baseline_m)):
             raise OmnidError(
                 f"{path}: it {NO_COMMON_PLACE} with the maps before that is recognised: drive where both "

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -230,3 +232,16 @@ def test_a_map_that_cannot_be_saved_is_an_error_in_the_status(scene: Path, omap:
         assert int(operator.values("map file")["failed"]) >= 1 and daemon.alive
         code, err = daemon.end()
         assert code == 2 and "cannot write the map" in err and "Traceback" not in err, err
+
+
+@pytest.mark.parametrize("command", ["merge", "check"])
+def test_commands_read_the_compiled_functions_instead_of_compiling_them_again(
+    scene: Path, omap: Path, tmp_path: Path, command: str
+) -> None:
+    words = {
+        "merge": ["map", "merge", omap, omap, "-o", tmp_path / "both.omap"],
+        "check": ["calibrate", "check", scene / "log.mcap", "--rig", scene / "rig.toml"],
+    }[command]
+    program = "import sys; sys.modules['numba'] = None; from omnid.cli import main; sys.exit(main(sys.argv[1:]))"
+    done = subprocess.run([sys.executable, "-c", program, *map(str, words)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
