@@ -35,6 +35,7 @@ SPEEDS_MPS: Final = (0.3, 0.5, 0.8, -0.4)
 STANDS_M, STANDS_RAD, STANDS_S = 0.05, 0.1, 1.5
 LEG_S: Final = (2.0, 5.0)  # time for which the stick is held
 TURN_RAD: Final = math.radians(70.0)  # largest change of the heading from leg to leg
+ABOUT_RAD: Final = math.radians(50.0)  # about a heading towards which the operator often drives
 PEOPLE: Final = 2
 WALKS_MPS: Final = (0.8, 1.6)
 WALK_M: Final = 2.0  # least length of a person's way
@@ -123,8 +124,9 @@ def furnished(world: World, rng: random.Random) -> World:
 class Wanderer:
     """Holds the stick in one direction for some seconds, then in another one; turns away where the base stands."""
 
-    def __init__(self, seed: int, speeds_mps: Sequence[float] = SPEEDS_MPS) -> None:
-        self._rng, self._speeds_mps = random.Random(seed), speeds_mps
+    def __init__(self, seed: int, towards_rad: float | None = None) -> None:
+        """towards_rad: heading in odom about which half of the directions are chosen."""
+        self._rng, self._towards_rad = random.Random(seed), towards_rad
         self._until_s, self._setpoint = 0.0, Setpoint(0.5, heading_rad=0.0)
         self._moved_s, self._at, self._heading_rad = 0.0, (0.0, 0.0), 0.0
 
@@ -142,6 +144,8 @@ class Wanderer:
             # Where the base stands the way is closed: any direction may be free.
             most_rad = math.pi if stands else TURN_RAD
             heading_rad += self._rng.uniform(-most_rad, most_rad)
-            self._setpoint = Setpoint(self._rng.choice(self._speeds_mps), heading_rad=heading_rad)
+            if self._towards_rad is not None and self._rng.random() < 0.5:
+                heading_rad = self._towards_rad + self._rng.uniform(-ABOUT_RAD, ABOUT_RAD)
+            self._setpoint = Setpoint(self._rng.choice(SPEEDS_MPS), heading_rad=heading_rad)
             self._until_s, self._moved_s = moment.time_s + self._rng.uniform(*LEG_S), moment.time_s
         yield self._setpoint

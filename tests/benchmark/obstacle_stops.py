@@ -199,8 +199,10 @@ def run(
             world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
         if case.removeprefix(POLISHED) in KINDS:
             world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
+        towards_rad = None
         if case == AT_EDGE:
             world, edges = lowered(world, random.Random(seed))
+            towards_rad = -world.start[2]  # The edge is along x; odom begins with the heading of the start.
         if is_cluttered:
             world = furnished(world, random.Random(seed))
         else:
@@ -208,7 +210,7 @@ def run(
         done = simulate(
             world,
             replace(make_robot(size_px), samples=math.ceil(SIDE_RAYS / size_px), rate_hz=rate_hz),
-            Wanderer(seed) if is_cluttered else partial(ahead, speed_mps=speed_mps),
+            Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,
             config=load_config(None, ["places.enabled=false", *limits, *overrides]),
