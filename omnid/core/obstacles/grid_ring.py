@@ -59,7 +59,7 @@ def ring_of(cells: Bytes, hidden: Flags, view: RingView, arrivals: Arrivals) -> 
     is_open = np.isinf(hit) & (free >= OPEN_SHARE * view.max_range_m)
     ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
     sigma = np.where(np.isfinite(ranges), view.cell_m / 2, np.nan)
-    # 4. The foot of what stands there, where the end is in view; a nearer end was found from farther away.
-    in_view = free > view.nearest_m
-    free = np.where(free < hit, np.where(in_view, np.maximum(free - END_M, view.nearest_m), free), hit)
+    # 4. What stands at an end may be nearer: in view, by its foot; an end nearer than that, found before, by a cell.
+    end_m = np.where(free > view.nearest_m, np.minimum(END_M, free - view.nearest_m + view.cell_m), view.cell_m)
+    free = np.where(free < hit, np.maximum(free - end_m, 0.0), hit)
     return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)

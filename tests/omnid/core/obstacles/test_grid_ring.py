@@ -52,13 +52,13 @@ def test_the_free_floor_ends_at_what_is_unknown_unless_it_is_a_gap(free: np.ndar
     assert np.isnan(found.ranges_m[AHEAD]) and found.free_m[AHEAD] == pytest.approx(1.0 - END_M, abs=CELL_M)
 
 
-def test_an_end_nearer_than_the_floor_in_view_is_where_it_was_seen_from_farther_away(free: np.ndarray) -> None:
+def test_an_end_nearer_than_the_floor_in_view_was_found_before_to_a_cell(free: np.ndarray) -> None:
     free[ahead(0.4, 0.7)] = 0
-    assert ring(free).free_m[AHEAD] == pytest.approx(0.4, abs=CELL_M)
-    # An end just beyond the nearest floor in view is never told nearer than that.
+    assert ring(free).free_m[AHEAD] == pytest.approx(0.4 - CELL_M, abs=0.5 * CELL_M)
+    # An end just beyond the nearest floor in view is never told nearer than one at that floor.
     free[:] = 1
     free[ahead(0.85, 1.2)] = 0
-    assert ring(free).free_m[AHEAD] == pytest.approx(VIEW.nearest_m, abs=0.01)
+    assert ring(free).free_m[AHEAD] == pytest.approx(VIEW.nearest_m - CELL_M, abs=0.01)
 
 
 def test_nothing_is_free_before_what_hides_the_nearest_floor_in_view(free: np.ndarray) -> None:
