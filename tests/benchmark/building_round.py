@@ -23,8 +23,8 @@ from omnid.core.control.heading_controller import Setpoint, wrap_angle
 from omnid.core.navigation.requests import NavigationFrame, PathRequest
 from omnid.simulation.demonstration import cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
-from omnid.simulation.robot import make_robot
 from omnid.simulation.world_file import load_world
+from tests.benchmark.fine_robot import fine_robot
 from tests.benchmark.route_series import (
     ASIDE_M,
     ASIDE_RAD,
@@ -92,7 +92,7 @@ def round_by_path(line: Array, path: Array) -> AskedOnceLocalised:
 
 def building_round(seed: int, size_px: int) -> RoundEnd:
     """Make the map and drive the round in it."""
-    line, robot, rng = lap(WHOLE_M), make_robot(size_px), random.Random(seed)
+    line, robot, rng = lap(WHOLE_M), fine_robot(size_px), random.Random(seed)
     path = np.vstack([line, START]) - START  # the map begins at the first pose, which has the heading 0
     start = (
         START[0] + rng.uniform(-ASIDE_M, ASIDE_M),

@@ -35,6 +35,7 @@ from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, lowered, room_text
+from tests.benchmark.fine_robot import fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
@@ -44,9 +45,6 @@ Array = NDArray[np.float64]
 SPEED_MPS: Final = 0.5
 SIZE_PX: Final = 512
 RATE_HZ: Final = 10.0
-# Least number of rays along a side of an image: with two a pixel and axis at 512 px, joints of tiles come and go from
-# pixel to pixel, as no lens shows them; with three they do not.
-SIDE_RAYS: Final = 3 * SIZE_PX
 REMARKS: Final = (
     "A simulated robot at 0.5 m/s by the stick, straight on, 512 px at 10 Hz where a row says nothing else; only the "
     "collision monitor keeps it from what it meets. A stop is false where the truth has nothing within 1 m ahead, or "
@@ -209,7 +207,7 @@ def run(
             world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,
-            replace(make_robot(size_px), samples=math.ceil(SIDE_RAYS / size_px), rate_hz=rate_hz),
+            replace(fine_robot(size_px), rate_hz=rate_hz),
             Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,

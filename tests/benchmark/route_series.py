@@ -28,11 +28,12 @@ from omnid.core.navigation.requests import RouteAction, RouteRequest
 from omnid.navigation_state import NavigationState
 from omnid.simulation.demonstration import ANSWER_S, cross_track_m
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
-from omnid.simulation.robot import SimulatedRobot, make_robot
+from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import WorldOptions, load_world
 from omnid.tracking_state import MapState
+from tests.benchmark.fine_robot import fine_robot
 from tests.benchmark.results import Cell, Column, ResultTable
 
 Array = NDArray[np.float64]
@@ -252,7 +253,9 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=33.0, help="of the route, m")
     parser.add_argument("--repeats", type=int, default=len(STARTS), choices=range(len(STARTS) + 1))
     parser.add_argument("--size", type=int, default=512, help="of the images, px")
-    parser.add_argument("--samples", type=int, default=2, help="rays of a pixel, per axis")
+    parser.add_argument(
+        "--samples", type=int, help="rays of a pixel, per axis; default: enough for a lens (fine_robot.py)"
+    )
     parser.add_argument("--no-people", action="store_true")
     arguments = parser.parse_args()
     columns = (
@@ -272,7 +275,9 @@ def main() -> None:
         Column("processor time", "s", 0),
     )
     table = ResultTable("route_series", "driving", f"Repeated route of {arguments.length:g} m", columns)
-    robot = replace(make_robot(arguments.size), samples=arguments.samples)
+    robot = fine_robot(arguments.size)
+    if arguments.samples:
+        robot = replace(robot, samples=arguments.samples)
     for seed in arguments.seeds:
         for cells in series(seed, arguments.length, arguments.repeats, robot, not arguments.no_people):
             table.add(*cells, seed=("route", seed))
