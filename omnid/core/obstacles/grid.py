@@ -72,6 +72,9 @@ THIN_M: Final = 0.03  # width of the thinnest obstacle
 GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
+# Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
+# neither. What stands 0.5 m away and is higher than 0.6 m hides all of them.
+BEHIND_CELLS: Final = 7
 
 
 class ObstacleGrid:
@@ -271,22 +274,24 @@ class ObstacleGrid:
         self._odds[FLOORS, (x - at[0]) ** 2 + (y - at[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
 
     def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
-        """End the flood too near to be seen where what is behind it is watched: a person would hide that.
+        """End the flood too near to be seen where something behind it is watched: a person would hide that.
 
-        Behind it is the nearest floor in view, or a nearer surface, such as the walls of a corridor.
+        Behind it is the floor in view nearest to it, or a surface, such as the walls of a corridor.
         """
         if not nearest_m or not self._watch.flooded.any():
             return
-        steps = int(nearest_m / CELL_M) + 2
+        nearest = int(nearest_m / CELL_M)
+        steps = nearest + 2
         direction = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
-        ways = np.arange(1, steps + 1)[None, :, None] * direction[:, None]
+        ways = np.arange(1, nearest + BEHIND_CELLS + 1)[None, :, None] * direction[:, None]
         columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
         watched = self._watch.watched[rows, columns]
-        before_surface = ~np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
-        past = (watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS))[:, -2:].all(axis=1) | ~before_surface[:, -1]
+        surface = np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
+        floor = watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS)
+        past = floor[:, nearest - 1 :].any(axis=1) | surface[:, -1]
         past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
-        chosen = past[:, None] & before_surface
-        cells = rows[chosen], columns[chosen]
+        chosen = past[:, None] & ~surface[:, :steps]
+        cells = rows[:, :steps][chosen], columns[:, :steps][chosen]
         flooded = self._watch.flooded[cells] > 0
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._watch.flooded[cells] = 0
