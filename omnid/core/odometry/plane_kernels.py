@@ -243,7 +243,7 @@ def bounds_of(offsets: Floats) -> tuple[int, int]:
     """Return the least of offsets (T LANES,) or zero, and the largest or zero, as whole numbers that are not above."""
     least, largest = 0, 0
     for lane in range(ALL_LANES):
-        whole = np.int32(np.floor(offsets[lane]))
+        whole = int(np.floor(offsets[lane]))
         least, largest = min(least, whole), max(largest, whole)
     return least, largest
 
