@@ -52,6 +52,7 @@ class Sinks:
     """The consumers of a run; a map that no sink takes is not computed, nor are places."""
 
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
+    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # of poses, in the thread of the odometry
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
     rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
@@ -150,6 +151,8 @@ def wire(
     # 4. What is made leaves the run.
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
+    for name, counter in sinks.counters.items():
+        graph.sink(name, counter, odometry, direct=True)
     named = {
         "bus": odometry,
         "bus-drive": commands,
