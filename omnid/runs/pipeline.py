@@ -52,12 +52,12 @@ class Sinks:
     """The consumers of a run; a map that no sink takes is not computed, nor are places."""
 
     poses: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)
-    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # of poses, in the thread of the odometry
     maps: dict[str, Sink[MapUpdate]] = field(default_factory=dict)
     places: dict[str, Sink[PlaceUpdate]] = field(default_factory=dict)
     rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
     bus: Sink[Outgoing] | None = None
     recording: RecordingSink | None = None
+    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # of poses, in the thread of the odometry
 
     @property
     def take_all(self) -> bool:
