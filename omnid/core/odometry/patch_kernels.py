@@ -33,7 +33,9 @@ SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)  # Weights o
 # Columns of a row of a window in memory: a multiple of what the processor adds at once. Those beyond the window hold
 # zeros in the design. Sums are kept by column until the last row, so that their order is fixed.
 LANES = 16
-PART, LINE = WINDOW_PX * LANES, LANES + 2  # of a design: gradients along column and row, greys; of a template
+# A design has three parts, gradients along column and row and greys; a line of a template has a border on each side.
+PART, LINE = WINDOW_PX * LANES, LANES + 2
+
 ZERO = np.float32(0.0)
 FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 

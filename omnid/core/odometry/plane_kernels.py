@@ -21,8 +21,11 @@ TEMPLATE_PX = WINDOW_PX + 2  # the window and the gradient's border: a pixel on 
 MAX_REACH_PX = 2.0 * TEMPLATE_PX  # twice as large as it should be: what reaches farther is no patch of this plane
 MAX_SLOPE = 0.7  # Largest slope of a disparity: a steeper plane is seen so obliquely that it has no patch.
 AROUND_PX = int(2 * MAX_REACH_PX) + 8  # side of a template's source: the reach, and the support of the cubic kernel
-BYTE, FIRST, SECOND, THIRD = np.int32(255), np.int32(8), np.int32(16), np.int32(24)  # bits of four greys
+# Bits of the second to the fourth grey, because a number of 32 bits holds four of 8.
+BYTE, FIRST, SECOND, THIRD = np.int32(255), np.int32(8), np.int32(16), np.int32(24)
+
 ALL_LANES = TEMPLATE_PX * LANES
+# Pixels to the right of one, and below it: without a sign, because the compiler then need not look for negative places.
 NEXT = (np.uint64(1), np.uint64(2), np.uint64(3))
 LINES = (np.uint64(AROUND_PX), np.uint64(2 * AROUND_PX), np.uint64(3 * AROUND_PX))
 ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
