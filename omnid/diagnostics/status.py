@@ -267,7 +267,7 @@ def _times(name: str, histogram: Histogram) -> dict[str, str]:
     """Return median, 99th percentile and maximum in ms; nothing before the first measurement."""
     if not histogram.count:
         return {}
-    found = (("p50", histogram.p(0.5)), ("p99", histogram.p(0.99)), ("max", histogram.max_s))
+    found = zip(("p50", "p99", "max"), (*histogram.quantiles(0.5, 0.99), histogram.max_s), strict=True)
     return {time_key(name, statistic): f"{1e3 * value_s:.2f}" for statistic, value_s in found}
 
 

@@ -92,11 +92,7 @@ class Graph:
         direct: it has no inbox and no thread, and runs in that of the stage before it, which is its only input.
         """
         node = Node(self._add(StageStats(name)), stage)
-        if not direct:
-            return self._node(node, inputs, self._policy, self._depth)
-        (before,) = inputs
-        before.readers.append(Direct(node, 1, self._succeeds, self._finish))
-        return node.stream
+        return self._direct(node, *inputs) if direct else self._node(node, inputs, self._policy, self._depth)
 
     def bound(self, head: str, tail: str) -> None:
         """Let the stage `head` take a message only when `tail`, a stage after it, will soon be able to take the result.
@@ -108,10 +104,22 @@ class Graph:
             self._inboxes[head].prepare_for(self._inboxes[tail])
 
     def sink(
-        self, name: str, sink: Sink[In], *inputs: Stream[In], policy: Policy | None = None, depth: int | None = None
+        self,
+        name: str,
+        sink: Sink[In],
+        *inputs: Stream[In],
+        policy: Policy | None = None,
+        depth: int | None = None,
+        direct: bool = False,
     ) -> None:
-        """Add a sink, with its own policy or depth if given."""
+        """Add a sink, with its own policy or depth if given.
+
+        direct: see `stage`; for work of microseconds, since to wake a thread takes longer.
+        """
         node = Node(self._add(StageStats(name)), sink)
+        if direct:
+            self._direct(node, *inputs)
+            return
         own = None if self._sinks_wait else policy
         self._node(node, inputs, own or self._policy, self._depth if depth is None else depth)
 
@@ -173,6 +181,10 @@ class Graph:
     def _add(self, stats: StageStats) -> StageStats:
         self._require_fresh()
         return self.telemetry.add(stats)
+
+    def _direct(self, node: Node, before: Stream[Any]) -> Stream[Any]:
+        before.readers.append(Direct(node, 1, self._succeeds, self._finish))
+        return node.stream
 
     def _node(self, node: Node, inputs: tuple[Stream[Any], ...], policy: Policy, depth: int) -> Stream[Any]:
         if not inputs or depth < 1:

@@ -49,9 +49,17 @@ class Histogram:
 
     def p(self, q: float) -> float:
         """Return the quantile q (0 to 1) of the durations, s; NaN before the first."""
+        return self.quantiles(q)[0]
+
+    def quantiles(self, *shares: float) -> list[float]:
+        """Return several quantiles as `p`, of one state."""
+        ranks = list(accumulate(self._bins[:]))
+        return [self._quantile(ranks, share) for share in shares]
+
+    def _quantile(self, ranks: list[int], q: float) -> float:
+        """Return a quantile by the numbers of durations up to each bin."""
         if not 0.0 <= q <= 1.0:
             raise ValueError(f"a quantile is a fraction from 0 to 1, found {q}: for the 99th percentile ask p(0.99)")
-        ranks = list(accumulate(self._bins[:]))
         if ranks[-1] == 0:
             return math.nan
         rank = max(1, math.ceil(q * ranks[-1]))
@@ -171,5 +179,5 @@ class Telemetry:
 
 
 def _row(stats: StageStats) -> SummaryRow:
-    p50_ms, p99_ms, max_ms = (1e3 * value_s for value_s in (stats.wall.p(0.5), stats.wall.p(0.99), stats.wall.max_s))
+    p50_ms, p99_ms, max_ms = (1e3 * value_s for value_s in (*stats.wall.quantiles(0.5, 0.99), stats.wall.max_s))
     return SummaryRow(stats.name, stats.processed, stats.dropped, p50_ms, p99_ms, max_ms)

@@ -145,11 +145,12 @@ class LiveWiring:
     def _sinks(self, live_rig: LiveRig, bus: Bus, *, own_time: bool) -> Sinks:
         """Return the sinks of a run that neither drives nor records; own_time: ticks of its wheels give the time."""
         session, config = self._session, self._session.config
-        poses: dict[str, Sink[OdometryUpdate]] = {"statistics": session.statistics, "latency": self._latency}
+        poses: dict[str, Sink[OdometryUpdate]] = {}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
         return Sinks(
             poses={**poses, **live_rig.pose_sinks},
+            counters={"statistics": session.statistics, "latency": self._latency},
             bus=BusSink(
                 bus,
                 session.encoder(self._geometry.rig, config.live.cloud_points),

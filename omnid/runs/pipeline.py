@@ -57,6 +57,7 @@ class Sinks:
     rings: dict[str, Sink[ObstacleRing]] = field(default_factory=dict)
     bus: Sink[Outgoing] | None = None
     recording: RecordingSink | None = None
+    counters: dict[str, Sink[OdometryUpdate]] = field(default_factory=dict)  # of poses, in the thread of the odometry
 
     @property
     def take_all(self) -> bool:
@@ -150,6 +151,8 @@ def wire(
     # 4. What is made leaves the run.
     for name, pose_sink in sinks.poses.items():
         graph.sink(name, pose_sink, odometry)
+    for name, counter in sinks.counters.items():
+        graph.sink(name, counter, odometry, direct=True)
     named = {
         "bus": odometry,
         "bus-drive": commands,

@@ -223,7 +223,7 @@ class _Replay:
         if options.record:
             recorder = self._recorder(session, geometry, options.record)
         sinks = Sinks(
-            poses={"statistics": session.statistics},
+            counters={"statistics": session.statistics},
             bus=self._bus(session, geometry) if options.publish else None,
             recording=None if recorder is None else RecordingSink(recorder),
         )

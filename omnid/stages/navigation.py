@@ -73,6 +73,7 @@ class NavigationStage:
         self._in_map: MapPosition | None = None
         self._tie: KeyframeTie | None = None
         self._ring: ObstacleRing | None = None
+        self._ring_points: Array = np.zeros((0, 2))  # (N, 2) positions in odom of what the ring shows
         self._seq = 0
         self._halted = 0  # id of the newest request to halt: those from before it that come later begin nothing
         self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
@@ -89,7 +90,7 @@ class NavigationStage:
                 self._place(message)
                 return None
             case ObstacleRing():
-                self._ring = message
+                self._ring, self._ring_points = message, _positions(message)
                 return None
             case NavigationCommand():
                 return self._request(message)
@@ -127,12 +128,7 @@ class NavigationStage:
         ring = self._ring
         if ring is None or not 0 <= stamp_ns - ring.stamp_ns <= RING_NS:
             return None
-        seen = np.isfinite(ring.ranges_m)
-        ranges_m, directions = ring.ranges_m[seen].astype(np.float64), azimuths()[seen]
-        points = np.column_stack(
-            [ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))]
-        )
-        return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
+        return self._ring_points
 
     def _moving(self, stamp_ns: int) -> Forecast | None:
         """Return where moving obstacles will be, from a time on; None without any."""
@@ -276,6 +272,14 @@ class NavigationStage:
             answers,
             plan,
         )
+
+
+def _positions(ring: ObstacleRing) -> Array:
+    """Return the positions (N, 2) in odom of what a ring shows."""
+    seen = np.isfinite(ring.ranges_m)
+    ranges_m, directions = ring.ranges_m[seen].astype(np.float64), azimuths()[seen]
+    points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))])
+    return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
 
 
 def _word(request: NavigationRequest) -> str:

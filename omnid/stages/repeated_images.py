@@ -23,7 +23,7 @@ class RepeatedImages:
     """
 
     def __init__(self) -> None:
-        self._earlier: deque[Image] = deque(maxlen=KEPT)  # the newest first
+        self._earlier: deque[tuple[bytes, Image]] = deque(maxlen=KEPT)  # with samples of them, the newest first
         self._equal = [0] * KEPT  # consecutive images that equal the one 1, 2 ... KEPT images earlier
         self.count = 0  # repeated images in all
         self.longest = 0  # most of them in a row
@@ -36,18 +36,13 @@ class RepeatedImages:
 
     def add(self, image: Image) -> bool:
         """Take the next image (H, W); return True if it repeats earlier ones."""
-        for index, earlier in enumerate(self._earlier):
-            self._equal[index] = self._equal[index] + 1 if _equal(image, earlier) else 0
-        self._earlier.appendleft(image)
+        sample = image[::SAMPLED_PX, ::SAMPLED_PX].tobytes()  # decides at once for images that are not equal
+        for index, (earlier_sample, earlier) in enumerate(self._earlier):
+            is_equal = sample == earlier_sample and np.array_equal(image, earlier)
+            self._equal[index] = self._equal[index] + 1 if is_equal else 0
+        self._earlier.appendleft((sample, image))
         repeated = any(count > index for index, count in enumerate(self._equal))
         self.count += repeated
         self._in_a_row = self._in_a_row + 1 if repeated else 0
         self.longest = max(self.longest, self._in_a_row)
         return repeated
-
-
-def _equal(image: Image, other: Image) -> bool:
-    """True if all pixels are equal; a sample of them decides at once for images that are not."""
-    if not np.array_equal(image[::SAMPLED_PX, ::SAMPLED_PX], other[::SAMPLED_PX, ::SAMPLED_PX]):
-        return False
-    return np.array_equal(image, other)

@@ -56,8 +56,11 @@ class Skew:
         if len(recent) < MIN_FITTED:
             median = float(np.median(recent))
             return median if abs(median) > LEAST_AT_START_NS else 0.0
-        index = np.arange(len(recent), dtype=float)
-        slope, start = np.polyfit(index, np.array(recent, float), 1)
-        line = start + slope * index
-        scatter = math.sqrt(float(((np.array(recent) - line) ** 2).sum()) / (len(recent) - 2))
-        return float(line[-1]) if abs(line[-1]) > max(SCATTERS * scatter, LEAST_NS) else 0.0
+        # Least squares in closed form: sums of whole numbers are exact.
+        count, total, moment = len(recent), sum(recent), sum(index * each for index, each in enumerate(recent))
+        indices, squares = count * (count - 1) // 2, count * (count - 1) * (2 * count - 1) // 6
+        slope = (count * moment - indices * total) / (count * squares - indices**2)
+        start = (total - slope * indices) / count
+        newest = start + slope * (count - 1)
+        squared = sum((each - start - slope * index) ** 2 for index, each in enumerate(recent))
+        return newest if abs(newest) > max(SCATTERS * math.sqrt(squared / (count - 2)), LEAST_NS) else 0.0

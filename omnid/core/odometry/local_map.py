@@ -145,9 +145,10 @@ class LocalMap:
 
     def covariance_of(self, estimate: PoseEstimate) -> Array:
         """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to a pose."""
-        total = np.zeros((6, 6))
-        for seq, share in self.store.anchor_shares(estimate.landmarks).items():
-            keyframe = self.store.keyframes[seq]
-            A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ keyframe.T_odom_rect)
-            total = total + share * A @ keyframe.covariance @ A.T
-        return total
+        shares = self.store.anchor_shares(estimate.landmarks)
+        keyframes = [self.store.keyframes[seq] for seq in shares]
+        poses = np.array([keyframe.T_odom_rect for keyframe in keyframes])
+        covariance = np.array([keyframe.covariance for keyframe in keyframes])
+        A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ poses)
+        weighted = np.array(list(shares.values()))[:, None, None] * A
+        return np.asarray((weighted @ covariance @ np.swapaxes(A, 1, 2)).sum(axis=0))

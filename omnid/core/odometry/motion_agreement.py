@@ -111,6 +111,11 @@ class _Travel:
         self._totals.append(total + (rate + self._rate) / 2 * (time_s - before_s))
         self._rate = rate
 
+    @property
+    def is_unknown(self) -> bool:
+        """True while there are too few samples for any motion."""
+        return len(self._times) < 2
+
     def clear(self) -> None:
         """Forget everything."""
         self._times.clear()
@@ -118,7 +123,7 @@ class _Travel:
 
     def between(self, starts_s: Array, ends_s: Array) -> Array:
         """Return the motion from starts to ends, arrays of one shape; NaN where no samples cover it."""
-        if len(self._times) < 2:
+        if self.is_unknown:
             return np.full(starts_s.shape, np.nan)
         times, totals = np.array(self._times), np.array(self._totals)
         at = (np.interp(when, times, totals, np.nan, np.nan) for when in (starts_s, ends_s))
@@ -199,6 +204,8 @@ class MotionAgreement:
 
         spans: begins and ends [s] of the steps, and their ways [m]; limits: noise of a step, least sum, unit.
         """
+        if travel.is_unknown:
+            return _UNKNOWN
         span_s, ways_m = spans[:2], spans[2]
         noise, least, unit = limits
         by_lag = travel.between(span_s[0] - self._lags_s[:, None], span_s[1] - self._lags_s[:, None])

@@ -33,6 +33,10 @@ SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)  # Weights o
 # Columns of a row of a window in memory: a multiple of what the processor adds at once. Those beyond the window hold
 # zeros in the design. Sums are kept by column until the last row, so that their order is fixed.
 LANES = 16
+# A design has three parts, gradients along column and row and greys; a line of a template has a border on each side.
+PART, LINE = WINDOW_PX * LANES, LANES + 2
+
+ZERO = np.float32(0.0)
 FARTHEST_PX = 1e6  # more than the columns and rows of any panorama
 
 
@@ -45,11 +49,14 @@ def fit(
 ) -> None:
     """Write shift (N, 2), covariance (N, 2, 2) and fits (N,) of `patch_fit.fit_patches`."""
     count, reach = len(templates), (cells.shape[1] - WINDOW_PX) // 2
-    designs = np.empty((count, 3, WINDOW_PX, LANES), np.float32)
-    template = np.empty((WINDOW_PX + 2, LANES + 2), np.float32)
-    cell = np.empty((cells.shape[1], cells.shape[1] + LANES + 1), np.float32)
-    lanes = np.empty((9, LANES), np.float32)
-    clear(template)
+    # Arrays of one axis, because within them the compiler knows what does not overlap.
+    designs, lanes = np.empty((count, 3 * PART), np.float32), np.empty(9 * LANES, np.float32)
+    template, cell = (
+        np.empty((WINDOW_PX + 2) * LINE, np.float32),
+        np.empty((cells.shape[1], cells.shape[1] + LANES + 1), np.float32),
+    )
+    for k in range(len(template)):
+        template[k] = ZERO
     clear(cell)
     sums, normals, ratio = np.empty((count, 3)), np.empty((count, 3, 3)), np.empty(count)
     for n in range(count):
@@ -105,57 +112,60 @@ def clear(values: Floats) -> None:
 
 @inner
 def write_design(image: Image, template: Floats, design: Floats) -> None:
-    """Write minus the gradients along column and row (Scharr's 3x3 operator), and the window, into (3, WINDOW, LANES).
+    """Write minus the gradients along column and row (Scharr's 3x3 operator), and the window, into (3 PART,).
 
-    The window is the middle of the image (T, T). template (WINDOW + 2, LANES + 2): room for it and its border.
+    The window is the middle of the image (T, T). template ((WINDOW + 2) LINE,): room for it and its border.
     """
     first = image.shape[0] // 2 - WINDOW_PX // 2 - 1
     for row in range(WINDOW_PX + 2):
         for column in range(WINDOW_PX + 2):
-            template[row, column] = np.float32(image[first + row, first + column]) - MIDDLE_GREY
+            template[row * LINE + column] = np.float32(image[first + row, first + column]) - MIDDLE_GREY
     for row in range(WINDOW_PX):
-        above, here, below = template[row], template[row + 1], template[row + 2]
+        of_row, around = design[row * LANES :], template[row * LINE :]
         for lane in range(LANES):
-            nw, n, ne = above[lane], above[lane + 1], above[lane + 2]
-            sw, s, se = below[lane], below[lane + 1], below[lane + 2]
-            design[0, row, lane] = SIDE_WEIGHT * ((nw - ne) + (sw - se)) + INNER_WEIGHT * (here[lane] - here[lane + 2])
-            design[1, row, lane] = SIDE_WEIGHT * ((nw - sw) + (ne - se)) + INNER_WEIGHT * (n - s)
-            design[2, row, lane] = here[lane + 1]
+            nw, n, ne = around[lane], around[lane + 1], around[lane + 2]
+            w, here, e = around[lane + LINE], around[lane + (LINE + 1)], around[lane + (LINE + 2)]
+            sw, s, se = around[lane + 2 * LINE], around[lane + (2 * LINE + 1)], around[lane + (2 * LINE + 2)]
+            of_row[lane] = SIDE_WEIGHT * ((nw - ne) + (sw - se)) + INNER_WEIGHT * (w - e)
+            of_row[lane + PART] = SIDE_WEIGHT * ((nw - sw) + (ne - se)) + INNER_WEIGHT * (n - s)
+            of_row[lane + 2 * PART] = here
         for lane in range(WINDOW_PX, LANES):
-            design[0, row, lane] = design[1, row, lane] = design[2, row, lane] = 0.0
+            of_row[lane] = of_row[lane + PART] = of_row[lane + 2 * PART] = ZERO
 
 
 @inner
 def write_products(design: Floats, lanes: Floats, sums: Array, normal: Array) -> None:
-    """Write the sums (3,) of the design's rows, and their products (3, 3) about the means; lanes (9, LANES): room."""
-    clear(lanes)
+    """Write the sums (3,) of the design's parts, and their products (3, 3) about the means; lanes (9 LANES,): room."""
+    for k in range(9 * LANES):
+        lanes[k] = ZERO
     for row in range(WINDOW_PX):
+        of_row = design[row * LANES :]
         for lane in range(LANES):
-            across, down, grey = design[0, row, lane], design[1, row, lane], design[2, row, lane]
-            lanes[0, lane] += across
-            lanes[1, lane] += down
-            lanes[2, lane] += grey
-            lanes[3, lane] += across * across
-            lanes[4, lane] += across * down
-            lanes[5, lane] += down * down
-            lanes[6, lane] += across * grey
-            lanes[7, lane] += down * grey
-            lanes[8, lane] += grey * grey
+            across, down, grey = of_row[lane], of_row[lane + PART], of_row[lane + 2 * PART]
+            lanes[lane] += across
+            lanes[lane + LANES] += down
+            lanes[lane + 2 * LANES] += grey
+            lanes[lane + 3 * LANES] += across * across
+            lanes[lane + 4 * LANES] += across * down
+            lanes[lane + 5 * LANES] += down * down
+            lanes[lane + 6 * LANES] += across * grey
+            lanes[lane + 7 * LANES] += down * grey
+            lanes[lane + 8 * LANES] += grey * grey
     for a in range(3):
-        sums[a] = total_of(lanes[a])
+        sums[a] = total_of(lanes, a)
     product = 3
     for b in range(3):
         for a in range(b + 1):
-            normal[a, b] = normal[b, a] = total_of(lanes[product]) - sums[a] * sums[b] / PIXELS
+            normal[a, b] = normal[b, a] = total_of(lanes, product) - sums[a] * sums[b] / PIXELS
             product += 1
 
 
 @inner
-def total_of(lanes: Floats) -> float:
-    """Return the sum of all lanes."""
-    total = 0.0
+def total_of(lanes: Floats, product: int) -> float:
+    """Return the sum of all lanes of a product."""
+    of_product, total = lanes[product * LANES :], 0.0
     for lane in range(LANES):
-        total += lanes[lane]
+        total += of_product[lane]
     return total
 
 
@@ -236,7 +246,7 @@ def solve(
 ) -> float:
     """Iterate shift (2,) and solution (3,) until they converge or leave the reach; return the mean squared residual.
 
-    lanes (9, LANES): room for sums.
+    lanes (9 LANES,): room for sums.
     """
     dx, dy, p0, p1, p2, energy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for _ in range(ITERATIONS):
@@ -246,27 +256,26 @@ def solve(
         fx, fy = x - left, y - top
         nw, ne = np.float32((1 - fy) * (1 - fx)), np.float32((1 - fy) * fx)
         sw, se = np.float32(fy * (1 - fx)), np.float32(fy * fx)
-        for product in range(5):
-            for lane in range(LANES):
-                lanes[product, lane] = 0.0
+        for k in range(5 * LANES):
+            lanes[k] = ZERO
         for row in range(WINDOW_PX):
-            above = cell[reach + top + row, reach + left :]
+            of_row, above = design[row * LANES :], cell[reach + top + row, reach + left :]
             below = cell[reach + top + row + 1, reach + left :]
             for lane in range(LANES):
                 grey = nw * above[lane] + ne * above[lane + 1] + sw * below[lane] + se * below[lane + 1]
-                lanes[0, lane] += design[0, row, lane] * grey
-                lanes[1, lane] += design[1, row, lane] * grey
-                lanes[2, lane] += design[2, row, lane] * grey
-                lanes[3, lane] += grey
-                lanes[4, lane] += grey * grey
+                lanes[lane] += of_row[lane] * grey
+                lanes[lane + LANES] += of_row[lane + PART] * grey
+                lanes[lane + 2 * LANES] += of_row[lane + 2 * PART] * grey
+                lanes[lane + 3 * LANES] += grey
+                lanes[lane + 4 * LANES] += grey * grey
         total, energy = 0.0, 0.0
         for lane in range(WINDOW_PX):
-            total += lanes[3, lane]
-            energy += lanes[4, lane]
+            total += lanes[lane + 3 * LANES]
+            energy += lanes[lane + 4 * LANES]
         mean = total / PIXELS
         energy -= total * mean
-        p0, p1 = total_of(lanes[0]) - sums[0] * mean, total_of(lanes[1]) - sums[1] * mean
-        p2 = total_of(lanes[2]) - sums[2] * mean
+        p0, p1 = total_of(lanes, 0) - sums[0] * mean, total_of(lanes, 1) - sums[1] * mean
+        p2 = total_of(lanes, 2) - sums[2] * mean
         # 2. The step.
         for a in range(3):
             solution[a] = inverse[a, 0] * p0 + inverse[a, 1] * p1 + inverse[a, 2] * (p2 + of_gain)

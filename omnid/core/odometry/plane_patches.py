@@ -57,11 +57,13 @@ def plane_templates(
     points, slopes = (np.ascontiguousarray(part) for part in surfaces)
     T_curr_ref, shift = np.ascontiguousarray(T_curr_ref), np.ascontiguousarray(np.rint(predicted) - predicted)
     height_m = model.baseline_m if upper else 0.0
+    # All panoramas of a run have the same columns.
+    centres = _padded(next(iter(images.values())), pixels) if images else pixels
     for key in np.unique(anchors).tolist():
         plane_kernels.sample(
             images[key].image,
             np.flatnonzero(anchors == key),
-            _padded(images[key], pixels),
+            centres,
             points,
             slopes,
             T_curr_ref,

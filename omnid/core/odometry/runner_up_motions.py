@@ -148,6 +148,8 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     texture. The costs are sums over landmarks that err independently, so they do not decide; the motion does: the pose
     nearest to T_predicted is taken, and the other one is its runner-up.
     """
+    if not others:
+        return found
     # 1. The estimate with the lowest cost, and those that contradict it; of these, the motion decides.
     near = [each for each in others if _apart_m(each, T_predicted) < reach_m]
     views = [found, *(each for each in near if len(each.landmarks) >= LEAST_SHARE * each.in_view)]
@@ -175,7 +177,7 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
 def contradict(a: PoseEstimate, b: PoseEstimate) -> bool:
     """True if about as many landmarks support one pose as the other, and they are not the same landmarks."""
     shares = [len(each.landmarks) / max(1, each.in_view) for each in (a, b)]
-    common = len(np.intersect1d(a.landmarks, b.landmarks))
+    common = len(np.intersect1d(a.landmarks, b.landmarks, assume_unique=True))
     fewest = min(len(a.landmarks), len(b.landmarks))
     return min(shares) >= EQUAL_SHARE * max(shares) and common <= COMMON_SHARE * fewest
 

@@ -196,6 +196,9 @@ class TileMonitor:
         ratio = energy / np.maximum(other, 1e-6)
         usual = float(np.median(ratio[textured]))
         is_faint = textured & (ratio < BLURRED_SHARE * usual)
+        if not is_faint.any():
+            self._faint[side][:] = 0
+            return is_faint
         # The ends of a sector are no neighbours.
         ends = BLURRED_COLUMNS + 1 if self._columns < TILE_COLUMNS else 0
         is_faint = np.pad(is_faint, ends)

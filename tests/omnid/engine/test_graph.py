@@ -699,7 +699,7 @@ def test_a_bound_head_ends_with_a_tail_that_fails() -> None:
         graph.run()
 
 
-def test_a_direct_stage_runs_in_the_thread_of_the_one_before() -> None:
+def test_direct_stages_and_sinks_run_in_the_thread_of_the_one_before() -> None:
     names: list[str] = []
 
     class Named:
@@ -710,6 +710,7 @@ def test_a_direct_stage_runs_in_the_thread_of_the_one_before() -> None:
     graph, out = Graph(), Collect()
     first = graph.stage("first", Named(), graph.source("numbers", lambda: iter(range(3))))
     graph.sink("out", out, graph.stage("second", Named(), first, direct=True))
+    graph.sink("third", Named(), first, direct=True)
     graph.run()
     assert set(names) == {"first"} and out.got == [0, 1, 2]
-    assert [stats.processed for stats in graph.telemetry.stages if stats.name == "second"] == [3]
+    assert [stats.processed for stats in graph.telemetry.stages if stats.name in ("second", "third")] == [3, 3]
