@@ -146,6 +146,8 @@ class LocalMap:
     def covariance_of(self, estimate: PoseEstimate) -> Array:
         """Return the covariance (6, 6) that the keyframes in which the inliers are anchored pass on to a pose."""
         shares = self.store.anchor_shares(estimate.landmarks)
+        if not shares:
+            return np.zeros((6, 6))
         keyframes = [self.store.keyframes[seq] for seq in shares]
         poses = np.array([keyframe.T_odom_rect for keyframe in keyframes])
         covariance = np.array([keyframe.covariance for keyframe in keyframes])
