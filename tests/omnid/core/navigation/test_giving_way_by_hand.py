@@ -1,0 +1,185 @@
+"""Single steps of giving way: the way back, its directions, the waits at its end, and where it ends."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from omnid.core.navigation.giving_way import (
+    PASS_M,
+    RETRY_S,
+    GivingWay,
+    Phase,
+    Trail,
+    closed,
+    give_way,
+    is_free,
+)
+from omnid.core.navigation.settings import NavigationSettings
+
+Array = NDArray[np.float64]
+SETTINGS = NavigationSettings()
+NOTHING = np.zeros((0, 2))
+WALLS = np.array([(x, side) for x in np.arange(-1.0, 6.0, 0.05) for side in (-0.6, 0.6)])
+
+
+def pose(x_m: float, y_m: float = 0.0) -> Array:
+    return np.array([x_m, y_m, 0.0])
+
+
+def driven(*pieces: tuple[float, float], length_m: float = 3.0) -> Trail:
+    """Return the trail of a drive along x in pieces from, to; backwards where x falls."""
+    trail = Trail(length_m)
+    for start, end in pieces:
+        for x_m in np.linspace(start, end, round(abs(end - start) / 0.02) + 1):
+            trail.add(pose(float(x_m)), math.copysign(0.3, end - start))
+    return trail
+
+
+def way_back(
+    trail: Trail | None = None, *, at_m: float = 4.0, stamp_s: float = 0.0, obstacles: Array = NOTHING
+) -> GivingWay:
+    found = give_way(trail or driven((0.0, at_m)), SETTINGS, pose(at_m), round(stamp_s * 1e9), obstacles, 0.3)
+    assert found is not None
+    return found
+
+
+def test_a_trail_keeps_places_10_cm_apart_and_no_more_than_its_length() -> None:
+    xy, backwards = driven((0.0, 5.0)).back(pose(5.0))
+    np.testing.assert_allclose(xy[0], (5.0, 0.0))
+    steps = -np.diff(xy[1:, 0])
+    assert (steps > 0.099).all() and (steps < 0.125).all()
+    assert 2.9 < xy[1, 0] - xy[-1, 0] < 3.9
+    assert backwards.all(), "it came there forwards"
+
+
+def test_what_was_driven_backwards_is_driven_forwards_on_the_way_back() -> None:
+    trail = driven((0.0, 2.0), (2.0, 1.0))
+    xy, backwards = trail.back(pose(0.95))
+    turn = int(xy[:, 0].argmax())
+    assert xy[turn, 0] == pytest.approx(2.0, abs=0.11)
+    assert not backwards[: turn - 1].any() and backwards[turn + 2 :].all()
+    trail.restart()
+    np.testing.assert_allclose(trail.back(pose(1.0))[0], [(1.0, 0.0)])
+
+
+def test_the_way_back_and_the_return_are_driven_in_opposite_directions() -> None:
+    giving = way_back(driven((0.0, 4.0)), obstacles=WALLS)
+    assert [leg.backwards for leg in giving.follower.path.legs] == [True]
+    giving.rest()
+    while giving.move_on(pose(1.0), 1.0, True) and giving.phase is Phase.REST:
+        pass
+    (leg,) = giving.follower.path.legs
+    assert not leg.backwards and leg.xy[0, 0] == pytest.approx(1.0, abs=0.06) and leg.xy[-1, 0] == pytest.approx(4.0)
+    assert leg.speed_at(1.0) == pytest.approx(0.2)
+
+
+def test_a_way_back_with_a_change_of_direction_is_returned_with_it() -> None:
+    trail = driven((0.0, 2.0), (2.0, 1.0))
+    giving = give_way(trail, SETTINGS, pose(0.95), 0, WALLS, 0.3)
+    assert giving is not None
+    assert [leg.backwards for leg in giving.follower.path.legs] == [False, True]
+    end_m = float(giving.follower.path.goal[0])
+    giving.rest()
+    while giving.move_on(pose(end_m), 1.0, True) and giving.phase is Phase.REST:
+        pass
+    there, back = giving.follower.path.legs
+    assert (there.backwards, back.backwards) == (False, True)
+    assert there.xy[-1, 0] == pytest.approx(2.0, abs=0.11) and back.xy[-1, 0] == pytest.approx(0.95)
+
+
+@pytest.mark.parametrize(("left_m", "ends"), [(0.11, False), (0.09, True)])
+def test_the_way_back_ends_10_cm_before_its_last_place(left_m: float, ends: bool) -> None:
+    giving = way_back()
+    end_m = float(giving.follower.path.goal[0])
+    giving.drive(0, pose(3.5), 0.0, 0.0)
+    assert (giving.drive(10**8, pose(end_m + left_m), 0.0, 0.0) is None) == ends
+
+
+def test_one_metre_of_the_way_back_must_be_free() -> None:
+    giving = way_back(obstacles=WALLS)
+    giving.drive(0, pose(3.5), 0.0, 0.0)
+    back = giving.look_back()
+    assert back[0, 0] == pytest.approx(3.5, abs=0.03) and back[-1, 0] == pytest.approx(2.5, abs=0.06)
+
+
+@pytest.mark.parametrize(("stamp_s", "rest_s"), [(0.9, 3.0), (1.0, 4.0), (6.5, 5.0), (3.0, 6.0), (4.0, 3.0)])
+def test_two_robots_that_met_rest_for_different_times(stamp_s: float, rest_s: float) -> None:
+    giving, waited_s = way_back(stamp_s=stamp_s), 0.0
+    giving.rest()
+    while giving.phase is Phase.REST:
+        assert giving.move_on(pose(3.0), 0.25, True)
+        waited_s += 0.25
+    assert waited_s == rest_s
+
+
+def test_the_way_must_be_free_for_a_whole_second() -> None:
+    giving, waited_s = way_back(), 0.0
+    giving.rest()
+    while giving.phase is Phase.REST:
+        waited_s += 0.25
+        is_open = waited_s % 1.0 < 0.6 if waited_s < 6.0 else True
+        assert giving.move_on(pose(3.0), 0.25, is_open)
+    assert waited_s == 6.75, "from 6 s on, at each step"
+    assert waited_s < RETRY_S
+
+
+def test_at_the_place_of_the_block_there_is_no_way_to_return() -> None:
+    giving = way_back()
+    giving.rest()
+    answers = [giving.move_on(pose(4.0), 1.0, True) for _ in range(3)]
+    assert answers == [True, True, False]
+
+
+def test_blocked_at_the_far_end_of_its_return_it_stays_there() -> None:
+    giving = way_back()
+    giving.rest()
+    while giving.phase is Phase.REST:
+        giving.move_on(pose(3.0), 1.0, True)
+    giving.rest()
+    end = giving._xy[-1]
+    answers = [giving.move_on(pose(float(end[0])), 1.0, False) for _ in range(int(RETRY_S) + 1)]
+    assert all(answers) and giving.phase is Phase.REST, "there is nothing to drive back"
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "end_m"),
+    [
+        ([(6.0, 0.0)], 2.98),  # the first place after a metre is wide
+        ([*WALLS, (9.0, 9.0)], 1.0),
+        ([(x, 0.3 + PASS_M - 0.1) for x in np.arange(2.5, 6.0, 0.05)], 2.0),
+    ],
+)
+def test_the_way_back_ends_where_others_can_pass_or_after_three_metres(
+    obstacles: list[tuple[float, float]], end_m: float
+) -> None:
+    giving = way_back(obstacles=np.array(obstacles))
+    assert giving.follower.path.goal[0] == pytest.approx(end_m, abs=0.12)
+
+
+@pytest.mark.parametrize(("came_m", "gives"), [(0.2, False), (0.25, False), (0.45, True)])
+def test_a_way_back_of_less_than_30_cm_makes_no_room(came_m: float, gives: bool) -> None:
+    found = give_way(driven((4.0 - came_m, 4.0)), SETTINGS, pose(4.0), 0, WALLS, 0.3)
+    assert (found is not None) == gives
+
+
+def test_a_robot_that_has_not_moved_has_no_way_back() -> None:
+    assert give_way(Trail(3.0), SETTINGS, pose(4.0), 0, NOTHING, 0.3) is None
+
+
+def test_a_place_is_closed_where_the_way_back_is_too_narrow_and_gets_narrower() -> None:
+    path = np.array([(x, 0.0) for x in (0.0, -0.1, -0.2, -0.3, -0.4)])
+    np.testing.assert_array_equal(closed(path, np.array([(0.2, 0.0)]), 0.3), [False] * 5)
+    np.testing.assert_array_equal(closed(path, np.array([(-0.45, 0.0)]), 0.3), [False, False, True, True, True])
+    np.testing.assert_array_equal(closed(path, NOTHING, 0.3), [False] * 5)
+    beside = np.array([(x, 0.2) for x in np.arange(-1.0, 1.0, 0.1)])
+    np.testing.assert_array_equal(closed(path, beside, 0.3), [False] * 5)
+
+
+def test_a_path_is_free_that_keeps_its_room_everywhere() -> None:
+    path = np.array([(0.0, 0.0), (0.5, 0.0), (1.0, 0.0)])
+    assert is_free(path, NOTHING, 0.3) and is_free(path, np.array([(0.5, 0.31)]), 0.3)
+    assert not is_free(path, np.array([(5.0, 0.0), (1.0, -0.29)]), 0.3)
