@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -33,6 +35,7 @@ from tests.faults.mutants import SURVIVED, UNFINISHED, Mutant, Results
 
 POLL_S: Final = 0.02
 UNFINISHED_CODE: Final = 77  # of a fork; pytest itself uses 0 to 5
+LONGER: Final = 10.0  # Time on the clock in which the tests of a mutant end, by their own time: they may sleep.
 OWN_SHARE: Final = 0.5  # of mutants that a test of the file's own test module notices, before anything is known
 OTHER_SHARE: Final = 0.02
 KNOWN: Final = 4.0  # mutants that the shares above count for
@@ -134,7 +137,7 @@ class MutantRunner:
         if pid == 0:
             _quiet()
             replace_functions(changed)
-            os._exit(_tried(items, time.monotonic() + self._limit_s, begun))
+            os._exit(_tried(items, self._limit_s, begun))
         outcome = _outcome(_waited(pid, patience_s))
         ran = begun.read_text("utf-8").splitlines()
         for name in ran:
@@ -230,13 +233,15 @@ def _reached(
     return durations, calls, sorted(starting & durations.keys())
 
 
-def _tried(items: Iterable[pytest.Item], until_s: float, begun: Path) -> int:
+def _tried(items: Iterable[pytest.Item], limit_s: float, begun: Path) -> int:
     """Run the tests until one fails; return 0 if all pass, UNFINISHED_CODE where the time is over before the last.
 
-    begun: a file to which the name of each test is added before it runs.
+    limit_s: of this process's own time, so that a busy machine changes nothing. begun: a file to which the name of each
+    test is added before it runs.
     """
+    until_s, own_until_s = time.monotonic() + LONGER * limit_s, time.process_time() + limit_s
     for item in items:
-        if time.monotonic() >= until_s:
+        if time.process_time() >= own_until_s or time.monotonic() >= until_s:
             return UNFINISHED_CODE
         with begun.open("a", encoding="utf-8") as file:
             file.write(f"{item.nodeid}\n")
@@ -259,20 +264,32 @@ def _quiet() -> None:
 
 
 def _waited(pid: int, patience_s: float) -> int | None:
-    """Return the exit code of a child, which with all its children is ended after a time; None: it was ended."""
-    until_s = time.monotonic() + patience_s
+    """Return the exit code of a child, which with all its children is ended after a time; None: it was ended.
+
+    What it waits for a processor does not count, and the time that it computes has the same limit.
+    """
+    with suppress(ProcessLookupError):
+        resource.prlimit(pid, resource.RLIMIT_CPU, (math.ceil(patience_s), math.ceil(patience_s) + 1))
+    left_s, last_s = patience_s, time.monotonic()
     status: int | None = None
-    while status is None and time.monotonic() < until_s:
+    while status is None and left_s > 0:
         found, code = os.waitpid(pid, os.WNOHANG)
         if found:
             status = os.waitstatus_to_exitcode(code)
         else:
             time.sleep(POLL_S)
+            now_s = time.monotonic()
+            left_s, last_s = left_s - (0.0 if _computes(pid) else now_s - last_s), now_s
     with suppress(ProcessLookupError):
         os.killpg(pid, signal.SIGKILL)
     if status is None:
         os.waitpid(pid, 0)
-    return status
+    return None if status == -signal.SIGXCPU else status
+
+
+def _computes(pid: int) -> bool:
+    """True if a process computes or waits for a processor: neither sleeps nor has ended."""
+    return Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()[0] == "R"
 
 
 def _outcome(code: int | None) -> str:

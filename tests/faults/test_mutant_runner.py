@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-from tests.faults.mutant_runner import Reached, Record, changed_functions, replace_functions
+from tests.faults.mutant_runner import Reached, Record, _computes, _waited, changed_functions, replace_functions
 from tests.faults.mutants import Mutant, Results, mutants_of
 
 ROOT = Path(__file__).parents[2]
@@ -95,6 +96,14 @@ def test_tests_that_noticed_earlier_mutants_of_the_file_run_first() -> None:
     records |= {name: Record(ran=200) for name in names if name not in records}
     assert reached.of(mutant)[0] == "tests/test_a.py::quick"
     assert reached.of(mutant, records=records)[0] == "tests/test_b.py::slow"
+
+
+def test_a_child_that_sleeps_for_too_long_is_ended_and_one_that_computes_is_known() -> None:
+    assert _computes(os.getpid())
+    sleeping = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"], start_new_session=True)
+    assert _waited(sleeping.pid, 0.3) is None
+    ending = subprocess.Popen([sys.executable, "-c", "import sys; sys.exit(3)"], start_new_session=True)
+    assert _waited(ending.pid, 20.0) == 3
 
 
 def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
