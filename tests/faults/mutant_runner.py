@@ -78,6 +78,8 @@ class Reached:
         every = sorted({name for *_, names in functions for name in names})
         chosen = (min(around)[1] if around and in_function else every) or list(self.tests)
         own, starting = f"test_{Path(mutant.path).name}::", set(self.starting) - set(chosen)
+        if not (around and in_function):  # a constant may be tested without a call
+            chosen = [*chosen, *(name for name in self.tests if own in name)]
 
         def rank(name: str) -> tuple[bool, float, str]:
             share = (records or {}).get(name, Record()).share(own in name)

@@ -88,6 +88,13 @@ def test_the_tests_of_the_own_module_run_first() -> None:
     ]
 
 
+def test_a_constant_gets_the_tests_of_the_own_module_that_call_nothing() -> None:
+    names = {"tests/test_a.py::reads": 0.1, "tests/test_a.py::calls": 0.2, "tests/test_b.py::other": 0.1}
+    reached = Reached(names, {"a.py": [(5, 9, ["tests/test_a.py::calls"])]})
+    assert reached.of(Mutant("a.py", 2, 0, 1, "")) == ["tests/test_a.py::reads", "tests/test_a.py::calls"]
+    assert reached.of(Mutant("a.py", 6, 0, 1, "")) == ["tests/test_a.py::calls"]
+
+
 def test_tests_that_noticed_earlier_mutants_of_the_file_run_first() -> None:
     names = {"tests/test_a.py::quick": 0.1, "tests/test_b.py::slow": 1.0, "tests/test_b.py::fast": 0.01}
     reached = Reached(names, {"a.py": [(1, 9, list(names))]})

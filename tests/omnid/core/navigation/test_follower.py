@@ -38,6 +38,9 @@ def test_a_detour_to_either_side_cuts_the_corner_of_its_own_leg(side: float) -> 
     follower.skip_corner(np.array([3.5, side * 2.95, 0.0]))
     assert follower.leg_left_m == pytest.approx(2.5, abs=0.06)
     np.testing.assert_allclose(follower.path_ahead(0.5)[-1], (4.0, side * 3.0), atol=0.06)
+    assert follower.step(10**8, np.array([3.5, side * 2.95, 0.0]), 0.0, 0.0).left_m == pytest.approx(
+        2.5 + 6.0, abs=0.06
+    )
 
 
 @pytest.mark.parametrize("left_m", [3.0, 0.5])
