@@ -131,6 +131,31 @@ def test_nearer_points_than_10_cm_are_dropped_but_the_last_one_is_kept() -> None
     assert drive_path([(0.0, 0.0), (0.05, 0.0)]).length_m == pytest.approx(0.05)
 
 
+@pytest.mark.parametrize("count", [2, 3, 5])
+@pytest.mark.parametrize("is_back", [False, True])
+def test_a_last_point_nearby_and_aside_is_no_corner(count: int, is_back: bool) -> None:
+    points = [*((x, 0.0) for x in np.linspace(0.0, 1.0, count)), (1.03, 0.05)]
+    (leg,) = drive_path(points, backwards=[is_back] * len(points)).legs
+    np.testing.assert_allclose(leg.xy[-1], (1.03, 0.05))
+    assert leg.backwards == is_back
+    legs = drive_path(points, backwards=[is_back] * count + [not is_back]).legs
+    assert [leg.backwards for leg in legs] == [is_back, not is_back], "but a change of direction is one"
+
+
+def test_there_and_back_is_a_path_of_two_legs() -> None:
+    path = drive_path([(0.0, 0.0), (1.0, 0.0), (0.0, 0.0)])
+    assert len(path.legs) == 2 and path.length_m == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.2, -2.5, math.pi])
+@pytest.mark.parametrize("length_m", [0.004, 0.04, 0.09, 0.2])
+def test_the_shortest_leg_has_the_direction_from_its_start_to_its_goal(heading: float, length_m: float) -> None:
+    leg = straight_leg((1.0, 2.0), (1.0 + length_m * math.cos(heading), 2.0 + length_m * math.sin(heading)))
+    turned = np.remainder(leg.heading - heading + math.pi, math.tau) - math.pi
+    np.testing.assert_allclose(turned, 0.0, atol=1e-6)
+    np.testing.assert_allclose(leg.curvature, 0.0, atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("points", "words"),
     [
