@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from omnid.core.navigation.giving_way import (
     PASS_M,
+    REST_S,
     RETRY_S,
     GivingWay,
     Phase,
@@ -19,6 +20,8 @@ from omnid.core.navigation.giving_way import (
     is_free,
 )
 from omnid.core.navigation.settings import NavigationSettings
+from omnid.navigation_state import NavigationState
+from tests.omnid.core.navigation.test_giving_way import Blocked
 
 Array = NDArray[np.float64]
 SETTINGS = NavigationSettings()
@@ -177,6 +180,47 @@ def test_a_place_is_closed_where_the_way_back_is_too_narrow_and_gets_narrower() 
     np.testing.assert_array_equal(closed(path, NOTHING, 0.3), [False] * 5)
     beside = np.array([(x, 0.2) for x in np.arange(-1.0, 1.0, 0.1)])
     np.testing.assert_array_equal(closed(path, beside, 0.3), [False] * 5)
+
+
+@pytest.mark.parametrize(("gave_way_m", "expected_s"), [(3.95, 8.0), (4.05, 4.0)])
+def test_a_block_one_metre_on_is_a_new_one(gave_way_m: float, expected_s: float) -> None:
+    blocked = Blocked()
+    assert blocked.navigator.drive is not None
+    blocked.navigator.drive.gave_way, blocked.navigator.drive.gave_way_m = 1, gave_way_m
+    assert blocked.wait() == pytest.approx(expected_s, abs=0.3)
+
+
+def test_the_time_until_it_gives_way_again_is_bounded() -> None:
+    blocked = Blocked()
+    assert blocked.navigator.drive is not None
+    blocked.navigator.drive.gave_way, blocked.navigator.drive.gave_way_m = 40, 3.0
+    blocked.step()
+    blocked.navigator.drive.waits[NavigationState.BLOCKED] = 4.0 * 2**6 - 1.0
+    assert blocked.wait() == pytest.approx(1.0, abs=0.3)
+
+
+def test_how_often_it_gave_way_is_counted_with_the_place() -> None:
+    blocked = Blocked()
+    blocked.wait()
+    assert blocked.navigator.drive is not None
+    assert blocked.navigator.drive.gave_way == 1 and blocked.navigator.drive.gave_way_m == pytest.approx(3.0)
+    assert blocked.step(1.9).left_m == pytest.approx(3.0), "it tells the way that is left from the block"
+
+
+@pytest.mark.parametrize(
+    ("place", "looks"), [((2.3, 0.3), True), ((2.3, 0.4), False), ((2.9, -0.2), True), ((3.45, 0.0), False)]
+)
+def test_it_comes_again_where_the_way_and_a_metre_past_the_block_have_room_or_later_to_look(
+    place: tuple[float, float], looks: bool
+) -> None:
+    blocked, rested_s = Blocked(), 0.0
+    blocked.wait()
+    blocked.giving.rest()
+    blocked.obstacles = np.array([place])
+    while blocked.giving.phase is Phase.REST:
+        assert blocked.step(1.5).setpoint is not None
+        rested_s += 0.1
+    assert (rested_s > RETRY_S - 0.15) == looks and rested_s > REST_S - 0.15
 
 
 def test_a_path_is_free_that_keeps_its_room_everywhere() -> None:

@@ -73,7 +73,7 @@ def test_a_base_more_than_30_cm_beside_its_corridor_has_left_its_path(side: floa
     steps = Steps()
     assert steps.step(1.0, side * 1.05).state is NavigationState.DRIVING
     answer = steps.step(1.0, side * 1.15)
-    assert answer.state is NavigationState.FAILED and "1.1 m beside the path" in answer.reason
+    assert answer.state is NavigationState.FAILED and answer.reason.startswith("1.1 m beside the path")
     assert answer.setpoint == STAND
 
 
@@ -83,8 +83,11 @@ def test_the_way_by_odometry_alone_is_measured_along_it_and_ends_where_the_map_i
     driven_m = [steps.step(*place, in_map=UNLOCALISED).state for place in places]
     first = driven_m.index(NavigationState.NOT_LOCALISED)
     assert first == math.ceil(1.0 / math.hypot(0.1, 0.3))
+    answer = steps.step(*places[-1], in_map=UNLOCALISED)
+    assert answer.reason == "not localised in a map"
     answer = steps.step(*places[-1], in_map=STILL_UNCERTAIN)
     assert answer.state is NavigationState.NOT_LOCALISED and answer.setpoint == STAND
+    assert answer.reason == "the pose in the map is uncertain by 0.31 m, more than navigation.map_sigma_m = 0.3"
     assert steps.step(*places[-1], in_map=LOCALISED).state is NavigationState.DRIVING
     assert steps.step(places[-1][0] + 0.9, in_map=UNLOCALISED).state is NavigationState.DRIVING, "begins anew"
 
@@ -93,6 +96,26 @@ def test_a_drive_in_odom_needs_no_map() -> None:
     steps = Steps()
     for x_m in np.arange(0.0, 2.0, 0.2):
         assert steps.step(float(x_m), in_map=None).state is NavigationState.DRIVING
+
+
+def test_nothing_is_sent_before_the_first_request_and_a_stop_after_each_end() -> None:
+    navigator, steps = Navigator(SETTINGS), Steps()
+    assert not navigator.stopping and navigator.step(steps.at(0.0, 0.0)).setpoint is None
+    steps.navigator.cancel("cancelled by a request")
+    sent = []
+    for _ in range(STOPS + 2):
+        sent.append(steps.navigator.stopping)
+        assert (steps.step(0.0).setpoint == STAND) == sent[-1]
+    assert sent == [True] * STOPS + [False] * 2 and STOPS == 5
+
+
+def test_a_hold_without_known_obstacles_is_a_block_without_a_way_back() -> None:
+    steps = Steps()
+    wheels = WheelState(True, False, held_by="the ring is too old")
+    for _ in range(60):
+        answer = steps.step(1.0, wheels=wheels)
+        assert answer.state is NavigationState.BLOCKED and answer.setpoint is not None
+        assert answer.left_m == pytest.approx(4.0)
 
 
 def test_a_paused_drive_sends_a_stop_and_leaves_the_wheels_to_others() -> None:
