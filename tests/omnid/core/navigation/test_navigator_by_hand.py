@@ -146,7 +146,8 @@ def test_the_time_without_progress_begins_anew_after_a_pause() -> None:
 
 
 @pytest.mark.parametrize(
-    ("by", "turned_rad", "ends"), [(0.04, 0.0, True), (0.06, 0.0, False), (0.0, 0.05, True), (0.0, 0.12, False)]
+    ("by", "turned_rad", "ends"),
+    [(0.04, 0.0, True), (0.06, 0.0, False), (0.0, 0.05, True), (0.0, 0.12, False), (0.0, -0.12, False)],
 )
 def test_progress_is_5_cm_of_the_way_or_5_degrees_of_a_turn(by: float, turned_rad: float, ends: bool) -> None:
     steps = Steps()
@@ -155,6 +156,15 @@ def test_progress_is_5_cm_of_the_way_or_5_degrees_of_a_turn(by: float, turned_ra
         later.pose[2] = turned_rad if k > 15 else 0.0
         answer = steps.navigator.step(later)
     assert (answer.state is NavigationState.FAILED) == ends
+
+
+def test_a_turn_across_the_half_turn_is_as_small_as_any_other() -> None:
+    drive = Steps().navigator.drive
+    assert drive is not None
+    drive.stands_since_s(np.array([0.0, 0.0, 3.12]), 1.0, 0.1)
+    assert drive.stands_since_s(np.array([0.0, 0.0, -3.12]), 1.0, 0.1) == pytest.approx(0.1)
+    assert drive.stands_since_s(np.array([0.0, 0.0, 3.12]), 1.0, 0.1) == pytest.approx(0.2)
+    assert drive.stands_since_s(np.array([0.0, 0.0, 3.0]), 1.0, 0.1) == 0.0
 
 
 def test_the_next_path_begins_where_one_ends_and_the_last_end_is_a_stop() -> None:
@@ -203,6 +213,7 @@ def test_a_heading_in_the_map_is_sent_in_odom() -> None:
     turned = MapPosition(np.array([1.0, 2.0, 0.7]), MapState.LOCALIZED, 0.02)
     now = steps.at(0.0, 0.0, in_map=turned)
     assert steps.navigator.drive.in_odom(Setpoint(0.1, 0.5), now) == Setpoint(0.1, pytest.approx(-0.2))
+    assert steps.navigator.drive.in_odom(Setpoint(0.1, -3.0), now) == Setpoint(0.1, pytest.approx(math.tau - 3.7))
     assert steps.navigator.drive.in_odom(Setpoint(0.1, None, 0.3), now) == Setpoint(0.1, None, 0.3)
     ahead = steps.navigator.drive.path_ahead(now, 1.0)
     c, s = math.cos(-0.7), math.sin(-0.7)
