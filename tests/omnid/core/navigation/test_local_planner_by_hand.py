@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed
+from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.forecast import Forecast
 from omnid.core.navigation.grid_ways import (
@@ -104,7 +105,9 @@ def test_a_base_in_a_dead_end_backs_out_of_it_at_12_cm_per_second() -> None:
 def test_it_drives_up_to_what_stands_on_the_path_so_that_it_can_wait_35_cm_before_it(
     place_m: float, left_m: float | None
 ) -> None:
-    detour = LocalPlanner(ON_THE_PATH, OUTLINE).plan(np.zeros(3), PATH, np.array([(place_m, 0.0)]), WANTED)
+    there = np.array([2.0, -3.0, 0.0])
+    box = np.array([(place_m, 0.0)]) + there[:2]
+    detour = LocalPlanner(ON_THE_PATH, OUTLINE).plan(there, PATH + there[:2], box, WANTED)
     if left_m is None:
         assert detour == Detour(None, False, STANDS)
     else:
@@ -114,7 +117,10 @@ def test_it_drives_up_to_what_stands_on_the_path_so_that_it_can_wait_35_cm_befor
         assert detour.setpoint.yaw_rate_radps == pytest.approx(0.3 * speed_mps / 0.4), "on the same arc"
 
 
-@pytest.mark.parametrize(("leg_left_m", "place_m", "counts"), [(0.3, 0.6, True), (0.3, 0.8, False), (9.0, 2.5, False)])
+@pytest.mark.parametrize(
+    ("leg_left_m", "place_m", "counts"),
+    [(0.32, 0.6, True), (0.32, 0.68, True), (0.32, 0.79, False), (9.0, 2.3, True), (9.0, 2.5, False)],
+)
 def test_what_stands_beyond_the_next_corner_or_two_metres_does_not_matter_yet(
     leg_left_m: float, place_m: float, counts: bool
 ) -> None:
@@ -131,6 +137,32 @@ def test_a_new_drive_does_not_know_of_the_detour_of_the_last_one() -> None:
     planner.restart()
     assert planner.plan(beside, PATH, far, WANTED) == Detour(WANTED, False)
     assert LocalPlanner(SETTINGS, OUTLINE).plan(beside, PATH, far, WANTED) == Detour(WANTED, False)
+
+
+def test_a_turn_on_the_spot_neither_begins_nor_ends_a_detour() -> None:
+    beside, far = np.array([0.0, 0.5, 0.0]), np.array([(5.0, 5.0)])
+    planner = LocalPlanner(SETTINGS, OUTLINE)
+    turn = Setpoint(0.0, 1.0)
+    assert planner.plan(beside, PATH, far, turn) == Detour(turn, False)
+    assert planner.plan(beside, PATH, far, WANTED) == Detour(WANTED, False)
+    assert planner.plan(np.zeros(3), PATH, points((1.1, -0.1, 1.1, 0.1)), WANTED).avoiding
+    assert planner.plan(beside, PATH, far, turn).avoiding
+    assert planner.plan(beside, PATH, np.zeros((0, 2)), WANTED) == Detour(WANTED, False), "nothing is there any more"
+    assert planner.plan(beside, PATH, far, WANTED) == Detour(WANTED, False)
+
+
+def test_what_stands_just_behind_the_base_does_not_hold_it() -> None:
+    planner = LocalPlanner(SETTINGS, OUTLINE)
+    assert planner.plan(np.zeros(3), PATH, np.array([(-0.33, 0.0)]), WANTED) == Detour(WANTED, False)
+
+
+@pytest.mark.parametrize(("front_m", "rear_m"), [(0.2, 0.4), (0.4, 0.2)])
+def test_the_ends_of_the_base_may_differ(front_m: float, rear_m: float) -> None:
+    planner = LocalPlanner(SETTINGS, CollisionSettings(front_m=front_m, rear_m=rear_m))
+    straight = planner._w == 0
+    for x_m, towards in ((front_m + 0.02, planner._v > 0), (-rear_m - 0.02, planner._v < 0)):
+        may = planner._keeps_clear(np.zeros(3), np.array([(x_m, 0.0)]))
+        assert not may[straight & towards].any() and may[straight & ~towards].all()
 
 
 def test_a_detour_ends_within_12_cm_of_the_path() -> None:
@@ -180,13 +212,21 @@ def walking(x_m: float, y_m: float, vx_mps: float, vy_mps: float) -> Forecast:
     return Forecast(np.array([(x_m, y_m)]), np.array([(vx_mps, vy_mps)]), np.array([0.2]), np.full((1, 3), 1e-8))
 
 
-@pytest.mark.parametrize(("beside_m", "waits"), [(0.585, True), (0.62, False)])
-def test_the_base_lets_pass_who_comes_into_the_room_before_which_the_collision_monitor_stops(
-    beside_m: float, waits: bool
+@pytest.mark.parametrize(
+    ("settings", "beside_m", "waits"),
+    [
+        (SETTINGS, 0.585, True),
+        (SETTINGS, 0.62, False),
+        (NavigationSettings(clearance_m=0.3), 0.74, True),
+        (NavigationSettings(clearance_m=0.3), 0.78, False),
+    ],
+)
+def test_the_base_lets_pass_who_comes_into_its_clearance_or_the_room_that_the_collision_monitor_demands(
+    settings: NavigationSettings, beside_m: float, waits: bool
 ) -> None:
     person = walking(1.5, beside_m, -0.5, 0.0)
     wanted = Setpoint(0.4, None, 0.2)
-    detour = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), PATH, person.xy, wanted, moving=person, speed_mps=0.4)
+    detour = LocalPlanner(settings, OUTLINE).plan(np.zeros(3), PATH, person.xy, wanted, moving=person, speed_mps=0.4)
     if waits:
         assert detour == Detour(None, False, CROSSES)
     else:
@@ -197,3 +237,22 @@ def test_the_base_follows_a_person_on_the_same_arc_at_half_of_its_speed() -> Non
     person = walking(0.8, 0.0, 0.2, 0.0)
     detour = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), PATH, person.xy, WANTED, moving=person, speed_mps=0.4)
     assert detour == Detour(Setpoint(0.2, None, 0.15), False, CROSSES)
+
+
+def test_the_base_goes_around_who_comes_to_it_where_both_meet_at_the_speed_of_a_detour() -> None:
+    person = walking(3.0, 0.0, -0.5, 0.0)
+    detour = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), PATH, person.xy, WANTED, moving=person, speed_mps=0.4)
+    meeting = person.outlines(np.array([True]), np.zeros(2), 0.7 * 0.4)
+    assert detour.avoiding
+    assert detour.setpoint == LocalPlanner(SETTINGS, OUTLINE)._around(
+        np.zeros(3), PATH, meeting, PATH[_rejoin(0.05 * np.arange(80), blocked_by(meeting), first_by(meeting))], person
+    )
+
+
+def blocked_by(obstacles: Array) -> NDArray[np.bool_]:
+    """Return which points of the path are too near to obstacles."""
+    return np.array([np.hypot(*(obstacles - point).T).min() < HALF_M + 0.1 for point in PATH])
+
+
+def first_by(obstacles: Array) -> float:
+    return 0.05 * int(np.argmax(blocked_by(obstacles)))
