@@ -59,6 +59,16 @@ def test_a_trail_keeps_places_10_cm_apart_and_no_more_than_its_length() -> None:
     assert backwards.all(), "it came there forwards"
 
 
+def test_a_trail_in_any_direction_leads_back_along_it() -> None:
+    trail = Trail(3.0)
+    for s_m in np.arange(0.0, 2.0, 0.02):
+        trail.add(np.array([1.0 + 0.6 * s_m, 0.8 * s_m - 3.0, math.atan2(0.8, 0.6)]), 0.3)
+    xy, _ = trail.back(np.array([2.2, -1.4, math.atan2(0.8, 0.6)]))
+    np.testing.assert_allclose(xy[0], (2.2, -1.4))
+    np.testing.assert_allclose((xy[:, 0] - 1.0) / 0.6, (xy[:, 1] + 3.0) / 0.8, atol=1e-9)
+    assert math.dist(xy[0], xy[-1]) == pytest.approx(2.0)
+
+
 def test_what_was_driven_backwards_is_driven_forwards_on_the_way_back() -> None:
     trail = driven((0.0, 2.0), (2.0, 1.0))
     xy, backwards = trail.back(pose(0.95))

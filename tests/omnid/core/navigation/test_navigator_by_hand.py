@@ -165,6 +165,7 @@ def test_a_turn_across_the_half_turn_is_as_small_as_any_other() -> None:
     assert drive.stands_since_s(np.array([0.0, 0.0, -3.12]), 1.0, 0.1) == pytest.approx(0.1)
     assert drive.stands_since_s(np.array([0.0, 0.0, 3.12]), 1.0, 0.1) == pytest.approx(0.2)
     assert drive.stands_since_s(np.array([0.0, 0.0, 3.0]), 1.0, 0.1) == 0.0
+    assert drive.stands_since_s(np.array([0.0, 0.0, 3.0]), 1.0, 0.1) == pytest.approx(0.1)
 
 
 def test_the_next_path_begins_where_one_ends_and_the_last_end_is_a_stop() -> None:
