@@ -43,7 +43,7 @@ KNOWN: Final = 4.0  # mutants that the shares above count for
 
 @dataclass(slots=True)
 class Record:
-    """How often a test was run on mutants of a file, and noticed them."""
+    """Number of mutants of a file on which a test was run, and of those that it noticed."""
 
     ran: int = 0
     noticed: int = 0

@@ -217,8 +217,10 @@ def tests_of(folder: str) -> tuple[str, ...]:
 
 
 def in_order(mutants: Mapping[str, Mutant]) -> dict[str, Mutant]:
-    """Return the mutants by name, last those that differ only where two values are the same to the last digit: most of
-    these survive, which takes all tests."""
+    """Return the mutants by name, last those that differ only where two values are the same to the last digit.
+
+    Most of these survive, which takes all tests.
+    """
 
     def is_limit(name: str) -> bool:
         mutant = mutants[name]

@@ -1,4 +1,4 @@
-"""What a page is told about the robot: numbers by hand, and which parts come first."""
+"""Messages for a page about the robot: numbers by hand, and the order of parts and warnings."""
 
 from __future__ import annotations
 

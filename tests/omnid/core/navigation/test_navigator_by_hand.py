@@ -89,7 +89,7 @@ def test_the_way_by_odometry_alone_is_measured_along_it_and_ends_where_the_map_i
     assert answer.state is NavigationState.NOT_LOCALISED and answer.setpoint == STAND
     assert answer.reason == "the pose in the map is uncertain by 0.31 m, more than navigation.map_sigma_m = 0.3"
     assert steps.step(*places[-1], in_map=LOCALISED).state is NavigationState.DRIVING
-    assert steps.step(places[-1][0] + 0.9, in_map=UNLOCALISED).state is NavigationState.DRIVING, "begins anew"
+    assert steps.step(places[-1][0] + 0.9, in_map=UNLOCALISED).state is NavigationState.DRIVING, "it begins again"
 
 
 def test_a_drive_in_odom_needs_no_map() -> None:
@@ -133,7 +133,7 @@ def test_a_paused_drive_sends_a_stop_and_leaves_the_wheels_to_others() -> None:
     assert steps.step(0.0).state is NavigationState.DRIVING
 
 
-def test_the_time_without_progress_begins_anew_after_a_pause() -> None:
+def test_the_time_without_progress_begins_again_after_a_pause() -> None:
     steps = Steps()
     for _ in range(28):
         assert steps.step(0.0).state is NavigationState.DRIVING
