@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -50,6 +51,16 @@ def way_back(
     return found
 
 
+def rested_s(giving: GivingWay, at: Array, step_s: float, is_open: Callable[[float], bool] = lambda _: True) -> float:
+    """Let it rest at a pose until it moves on; return how long it took [s]."""
+    giving.rest()
+    for count in range(1, 200):
+        assert giving.move_on(at, step_s, is_open(count * step_s))
+        if giving.phase is not Phase.REST:
+            return count * step_s
+    raise AssertionError("it rests for ever")
+
+
 def test_a_trail_keeps_places_10_cm_apart_and_no_more_than_its_length() -> None:
     xy, backwards = driven((0.0, 5.0)).back(pose(5.0))
     np.testing.assert_allclose(xy[0], (5.0, 0.0))
@@ -82,9 +93,7 @@ def test_what_was_driven_backwards_is_driven_forwards_on_the_way_back() -> None:
 def test_the_way_back_and_the_return_are_driven_in_opposite_directions() -> None:
     giving = way_back(driven((0.0, 4.0)), obstacles=WALLS)
     assert [leg.backwards for leg in giving.follower.path.legs] == [True]
-    giving.rest()
-    while giving.move_on(pose(1.0), 1.0, True) and giving.phase is Phase.REST:
-        pass
+    rested_s(giving, pose(1.0), 1.0)
     (leg,) = giving.follower.path.legs
     assert not leg.backwards and leg.xy[0, 0] == pytest.approx(1.0, abs=0.06) and leg.xy[-1, 0] == pytest.approx(4.0)
     assert leg.speed_at(1.0) == pytest.approx(0.2)
@@ -96,9 +105,7 @@ def test_a_way_back_with_a_change_of_direction_is_returned_with_it() -> None:
     assert giving is not None
     assert [leg.backwards for leg in giving.follower.path.legs] == [False, True]
     end_m = float(giving.follower.path.goal[0])
-    giving.rest()
-    while giving.move_on(pose(end_m), 1.0, True) and giving.phase is Phase.REST:
-        pass
+    rested_s(giving, pose(end_m), 1.0)
     there, back = giving.follower.path.legs
     assert (there.backwards, back.backwards) == (False, True)
     assert there.xy[-1, 0] == pytest.approx(2.0, abs=0.11) and back.xy[-1, 0] == pytest.approx(0.95)
@@ -121,23 +128,12 @@ def test_one_metre_of_the_way_back_must_be_free() -> None:
 
 @pytest.mark.parametrize(("stamp_s", "rest_s"), [(0.9, 3.0), (1.0, 4.0), (6.5, 5.0), (3.0, 6.0), (4.0, 3.0)])
 def test_two_robots_that_met_rest_for_different_times(stamp_s: float, rest_s: float) -> None:
-    giving, waited_s = way_back(stamp_s=stamp_s), 0.0
-    giving.rest()
-    while giving.phase is Phase.REST:
-        assert giving.move_on(pose(3.0), 0.25, True)
-        waited_s += 0.25
-    assert waited_s == rest_s
+    assert rested_s(way_back(stamp_s=stamp_s), pose(3.0), 0.25) == rest_s
 
 
 def test_the_way_must_be_free_for_a_whole_second() -> None:
-    giving, waited_s = way_back(), 0.0
-    giving.rest()
-    while giving.phase is Phase.REST:
-        waited_s += 0.25
-        is_open = waited_s % 1.0 < 0.6 if waited_s < 6.0 else True
-        assert giving.move_on(pose(3.0), 0.25, is_open)
+    waited_s = rested_s(way_back(), pose(3.0), 0.25, lambda t_s: t_s >= 6.0 or t_s % 1.0 < 0.6)
     assert waited_s == 6.75, "from 6 s on, at each step"
-    assert waited_s < RETRY_S
 
 
 def test_at_the_place_of_the_block_there_is_no_way_to_return() -> None:
@@ -149,9 +145,7 @@ def test_at_the_place_of_the_block_there_is_no_way_to_return() -> None:
 
 def test_blocked_at_the_far_end_of_its_return_it_stays_there() -> None:
     giving = way_back()
-    giving.rest()
-    while giving.phase is Phase.REST:
-        giving.move_on(pose(3.0), 1.0, True)
+    rested_s(giving, pose(3.0), 1.0)
     giving.rest()
     end = giving._xy[-1]
     answers = [giving.move_on(pose(float(end[0])), 1.0, False) for _ in range(int(RETRY_S) + 1)]
@@ -223,14 +217,15 @@ def test_how_often_it_gave_way_is_counted_with_the_place() -> None:
 def test_it_comes_again_where_the_way_and_a_metre_past_the_block_have_room_or_later_to_look(
     place: tuple[float, float], looks: bool
 ) -> None:
-    blocked, rested_s = Blocked(), 0.0
+    blocked, waited_s = Blocked(), 0.0
     blocked.wait()
     blocked.giving.rest()
     blocked.obstacles = np.array([place])
-    while blocked.giving.phase is Phase.REST:
+    while blocked.giving.phase is Phase.REST and waited_s < 2 * RETRY_S:
         assert blocked.step(1.5).setpoint is not None
-        rested_s += 0.1
-    assert (rested_s > RETRY_S - 0.15) == looks and rested_s > REST_S - 0.15
+        waited_s += 0.1
+    assert blocked.giving.phase is Phase.RETURN
+    assert (waited_s > RETRY_S - 0.15) == looks and waited_s > REST_S - 0.15
 
 
 def test_a_path_is_free_that_keeps_its_room_everywhere() -> None:
