@@ -20,6 +20,7 @@ from omnid.core.navigation.giving_way import (
     give_way,
     is_free,
 )
+from omnid.core.navigation.navigator import GIVES_WAY
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.test_giving_way import Blocked
@@ -186,25 +187,36 @@ def test_a_place_is_closed_where_the_way_back_is_too_narrow_and_gets_narrower() 
     np.testing.assert_array_equal(closed(path, beside, 0.3), [False] * 5)
 
 
-@pytest.mark.parametrize(("gave_way_m", "expected_s"), [(3.95, 8.0), (4.05, 4.0)])
-def test_a_block_one_metre_on_is_a_new_one(gave_way_m: float, expected_s: float) -> None:
+def blocked_for(waited_s: float, gave_way: int = 0, gave_way_m: float = math.inf) -> Blocked:
+    """Return a blocked base that has waited for a time, and has given way before where this much was left."""
     blocked = Blocked()
-    assert blocked.navigator.drive is not None
-    blocked.navigator.drive.gave_way, blocked.navigator.drive.gave_way_m = 1, gave_way_m
-    assert blocked.wait() == pytest.approx(expected_s, abs=0.3)
+    drive = blocked.navigator.drive
+    assert drive is not None and blocked.step().state is NavigationState.BLOCKED
+    drive.waits[NavigationState.BLOCKED] = waited_s
+    drive.gave_way, drive.gave_way_m = gave_way, gave_way_m
+    return blocked
 
 
-def test_the_time_until_it_gives_way_again_is_bounded() -> None:
-    blocked = Blocked()
-    assert blocked.navigator.drive is not None
-    blocked.navigator.drive.gave_way, blocked.navigator.drive.gave_way_m = 40, 3.0
-    blocked.step()
-    blocked.navigator.drive.waits[NavigationState.BLOCKED] = 4.0 * 2**6 - 1.0
-    assert blocked.wait() == pytest.approx(1.0, abs=0.3)
+@pytest.mark.parametrize(
+    ("waited_s", "gave_way", "gave_way_m", "gives"),
+    [
+        (3.95, 0, math.inf, True),
+        (3.95, 1, 3.95, False),
+        (7.95, 1, 3.95, True),
+        (3.95, 1, 4.05, True),
+        (4.0 * 2**6 - 0.05, 40, 3.0, True),
+        (4.0 * 2**6 - 0.5, 40, 3.0, False),
+    ],
+)
+def test_the_wait_doubles_at_the_same_block_up_to_a_limit_and_a_block_one_metre_on_is_a_new_one(
+    waited_s: float, gave_way: int, gave_way_m: float, gives: bool
+) -> None:
+    blocked = blocked_for(waited_s, gave_way, gave_way_m)
+    assert (GIVES_WAY in [blocked.step().reason for _ in range(3)]) == gives
 
 
 def test_how_often_it_gave_way_is_counted_with_the_place() -> None:
-    blocked = Blocked()
+    blocked = blocked_for(4.0)
     blocked.wait()
     assert blocked.navigator.drive is not None
     assert blocked.navigator.drive.gave_way == 1 and blocked.navigator.drive.gave_way_m == pytest.approx(3.0)
@@ -217,7 +229,7 @@ def test_how_often_it_gave_way_is_counted_with_the_place() -> None:
 def test_it_comes_again_where_the_way_and_a_metre_past_the_block_have_room_or_later_to_look(
     place: tuple[float, float], looks: bool
 ) -> None:
-    blocked, waited_s = Blocked(), 0.0
+    blocked, waited_s = blocked_for(4.0), 0.0
     blocked.wait()
     blocked.giving.rest()
     blocked.obstacles = np.array([place])
