@@ -12,6 +12,7 @@ from omnid.web.guard import POLICY, REPORT_POLICY, Guard, Message, Receive, Scop
 
 HOST = "127.0.0.1:8447"
 ACCESS = Access("abcde-fghjk-mnpqr-stuvw", frozenset(("127.0.0.1",)), False, "omnid_8447")
+CLIENT = ("10.0.0.7", 4711)
 COOKIE = f"omnid_8447={ACCESS.new_cookie(Role.ALL)}"
 PROTECTION = {
     b"x-content-type-options": b"nosniff",
@@ -47,8 +48,9 @@ def asked(
     """Return what is sent for a request, the guard, the application, and what happened in its order."""
     application, sent, order = Application(list(answered)), [], []  # type: ignore[var-annotated]
     guard = Guard(application, ACCESS)
+    guard.places.admit(CLIENT)
     lines = [(name.replace("_", "-").encode(), value.encode()) for name, value in {"host": HOST, **headers}.items()]
-    scope = {"type": kind, "path": path, "method": method, "headers": lines, "client": ("10.0.0.7", 4711)}
+    scope = {"type": kind, "path": path, "method": method, "headers": lines, "client": CLIENT}
 
     async def receive() -> dict[str, Any]:
         order.append("received")
@@ -108,3 +110,9 @@ def test_a_websocket_is_closed_after_its_first_message_where_it_may_not_enter() 
 def test_the_start_and_the_end_of_the_server_pass() -> None:
     _, guard, application, _ = asked("lifespan")
     assert application.reached == 1 and not guard.refused
+
+
+def test_a_connection_that_has_shown_the_token_keeps_its_place() -> None:
+    for headers, is_known in (({"cookie": COOKIE}, True), ({}, False), ({"authorization": "Bearer wrong"}, False)):
+        _, guard, application, _ = asked(path="/", **headers)
+        assert application.reached == 1 and guard.places._places[CLIENT].is_known == is_known
