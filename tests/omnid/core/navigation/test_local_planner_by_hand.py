@@ -153,7 +153,9 @@ def test_a_turn_on_the_spot_neither_begins_nor_ends_a_detour() -> None:
 
 def test_what_stands_just_behind_the_base_does_not_hold_it() -> None:
     planner = LocalPlanner(SETTINGS, OUTLINE)
-    assert planner.plan(np.zeros(3), PATH, np.array([(-0.33, 0.0)]), WANTED) == Detour(WANTED, False)
+    for also in ([], [(3.9, 0.0)]):
+        seen = np.array([(-0.33, 0.0), *also])
+        assert planner.plan(np.zeros(3), PATH, seen, WANTED) == Detour(WANTED, False), "nor what stands far ahead"
 
 
 @pytest.mark.parametrize(("front_m", "rear_m"), [(0.2, 0.4), (0.4, 0.2)])
