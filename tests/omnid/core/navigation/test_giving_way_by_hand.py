@@ -244,3 +244,6 @@ def test_a_path_is_free_that_keeps_its_room_everywhere() -> None:
     path = np.array([(0.0, 0.0), (0.5, 0.0), (1.0, 0.0)])
     assert is_free(path, NOTHING, 0.3) and is_free(path, np.array([(0.5, 0.31)]), 0.3)
     assert not is_free(path, np.array([(5.0, 0.0), (1.0, -0.29)]), 0.3)
+    elsewhere = np.array([-3.0, 2.0])
+    for place, keeps in (((0.5, 0.31), True), ((0.5, 0.29), False)):
+        assert is_free(path + elsewhere, np.array([place]) + elsewhere, 0.3) == keeps
