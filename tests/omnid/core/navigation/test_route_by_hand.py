@@ -135,3 +135,64 @@ def test_a_route_is_closed_whose_ends_are_within_a_metre() -> None:
         poses[-1, :2] = poses[0, :2] + (0.0, away_m)
         assert replace(route, poses=poses).is_closed == is_closed
     assert route.length_m == pytest.approx(3.0) and route.created_s == 7 and route.map_name == "site.omap"
+
+
+@pytest.mark.parametrize(("heading", "place"), [(0.0, (0.0, 5.0)), (math.pi / 2, (-2.0, 1.0)), (-2.0, (3.0, -4.0))])
+def test_a_robot_begins_at_the_part_that_is_near_and_looks_as_it_does_wherever_the_route_lies(
+    heading: float, place: tuple[float, float]
+) -> None:
+    frame = np.array([[*place, heading]])
+    there_and_back = [*((0.1 * k, 0.0, 0.0) for k in range(41)), *((4.0 - 0.1 * k, 0.3, math.pi) for k in range(41))]
+    recorder = RouteRecorder("hall")
+    for pose in there_and_back:
+        recorder.add(composed(frame, np.array(pose))[0], 0.3, 1, np.zeros(3))
+    route = recorder.route(only_keyframe, {1: 5}, 0, "m")
+    for own, left_m in (((1.0, 0.1, 0.2), 7.3), ((1.0, 0.1, math.pi - 0.2), 1.0)):
+        robot = composed(frame, np.array(own))[0]
+        (path,) = repeated_paths(route, only_keyframe, robot, loops=1, reverse=False)
+        assert path.length_m == pytest.approx(left_m, abs=0.35)
+        assert abs(math.remainder((path.final_heading_rad or 0.0) - heading - math.pi, math.tau)) < 1e-5
+    beside = composed(frame, np.array([1.0, -0.5, 0.0]))[0]
+    (path,) = repeated_paths(route, only_keyframe, beside, loops=1, reverse=False)
+    joined = [xy for xy in path.legs[0].xy if math.dist(xy, composed(frame, np.array([2.25, 0.0, 0.0]))[0, :2]) < 0.1]
+    assert joined and np.hypot(*(path.legs[0].xy - composed(frame, np.array([1.3, 0.0, 0.0]))[0, :2]).T).min() > 0.2
+
+
+@pytest.mark.parametrize(("away_m", "enters"), [(1.4, True), (1.6, False)])
+def test_a_robot_is_near_a_route_within_one_and_a_half_metres(away_m: float, enters: bool) -> None:
+    route = straight((0.0, 3.0, 0.3))
+    if enters:
+        repeated_paths(route, only_keyframe, np.array([1.0, away_m, 0.0]), loops=1, reverse=False)
+    else:
+        with pytest.raises(OmnidError, match=r"1\.6 m away"):
+            repeated_paths(route, only_keyframe, np.array([1.0, away_m, 0.0]), loops=1, reverse=False)
+
+
+@pytest.mark.parametrize(("length_m", "is_route"), [(0.4, False), (0.62, True)])
+def test_half_a_metre_is_the_shortest_route(length_m: float, is_route: bool) -> None:
+    if is_route:
+        assert straight((0.0, length_m, 0.3)).length_m == pytest.approx(length_m, abs=0.02)
+    else:
+        with pytest.raises(OmnidError, match=r"expected 0\.5 m and more"):
+            straight((0.0, length_m, 0.3))
+
+
+@pytest.mark.parametrize("turn_deg", [60.0, -60.0])
+def test_a_turn_at_the_end_of_a_route_is_its_last_heading(turn_deg: float) -> None:
+    recorder = RouteRecorder("hall")
+    for x_m in np.arange(0.0, 2.01, 0.05):
+        recorder.add(np.array([x_m, 0.0, 0.0]), 0.3, 1, np.zeros(3))
+    for share in np.linspace(0.0, 1.0, 31):
+        recorder.add(np.array([2.0, 0.0, math.radians(share * turn_deg)]), 0.0, 1, np.zeros(3))
+    assert sum(point[0][2] != 0.0 for point in recorder._points) == 5, "the turn is recorded to either side"
+    route = recorder.route(only_keyframe, {1: 5}, 0, "m")
+    (path,) = repeated_paths(route, only_keyframe, np.zeros(3), loops=1, reverse=False)
+    assert path.final_heading_rad == pytest.approx(math.radians(turn_deg), abs=1e-5)
+    back = route.reversed()
+    np.testing.assert_allclose(back.poses[0, :2], (2.0, 0.0), atol=1e-6)
+    np.testing.assert_allclose(back.poses[-1, :2], (0.0, 0.0), atol=1e-6)
+
+
+def test_two_rounds_are_two_paths() -> None:
+    route = straight((0.0, 3.0, 0.3))
+    assert len(repeated_paths(route, only_keyframe, np.zeros(3), loops=2, reverse=False)) == 2
