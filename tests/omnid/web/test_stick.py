@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 
 import pytest
+from starlette.requests import Request
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
@@ -92,3 +94,26 @@ def test_one_page_drives_until_it_has_asked_for_nothing_for_a_while(at_50_s: Non
 def test_no_command_is_sent_before_the_last_one_has_ended(at_50_s: None, stick: StickCommands) -> None:
     stick._sending = True
     assert "overloaded" in stick._refusal(StickRequest(0.5, 0.0, NOW_MS, "a"))
+
+
+@pytest.mark.parametrize(
+    ("text", "is_sending", "words"),
+    [
+        ("2 0 1 a", False, "the stick"),
+        (f"0.5 0 {NOW_MS - 1001} a", False, "too slow"),
+        (f"0.5 0 {NOW_MS} a", True, "overloaded"),
+        (f"0.5 0 {NOW_MS} a", False, "There is no connection: not connected yet"),
+        (f"0 0 {NOW_MS - 1001} a", False, "There is no connection: not connected yet"),
+    ],
+)
+def test_an_answer_to_what_is_not_sent_says_why(
+    at_50_s: None, stick: StickCommands, text: str, is_sending: bool, words: str
+) -> None:
+    async def receive() -> dict[str, object]:
+        return {"type": "http.request", "body": text.encode(), "more_body": False}
+
+    stick._sending = is_sending
+    asked = Request({"type": "http", "method": "POST", "path": "/drive", "headers": []}, receive)
+    answer = asyncio.run(stick.drive(asked))
+    assert not answer.done and words in answer.text
+    assert stick._page == "" and stick._sending == is_sending, "no page drives"
