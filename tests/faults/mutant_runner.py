@@ -1,7 +1,8 @@
 """The tests of one room, collected once in a process that never runs one itself: each mutant gets a fork of it.
 
 A fork puts the changed functions into the modules that are imported already, runs the tests that called them in
-an unchanged run, those of its file's own test module first, then the fast ones, and ends at the first that fails. A
+an unchanged run, and ends at the first that fails. First come those that promise most in a second: of the file's own
+test module, fast, and such that noticed earlier mutants of the file. A
 mutant outside functions (a constant, a default of a class) needs its module imported again: all tests of its file run
 in a new Python. The changed file also lies in the folder of the copy meanwhile, for tests that start programs.
 """
@@ -10,14 +11,16 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import os
+import resource
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,6 +35,22 @@ from tests.faults.mutants import SURVIVED, UNFINISHED, Mutant, Results
 
 POLL_S: Final = 0.02
 UNFINISHED_CODE: Final = 77  # of a fork; pytest itself uses 0 to 5
+LONGER: Final = 10.0  # Time on the clock in which the tests of a mutant end, by their own time: they may sleep.
+OWN_SHARE: Final = 0.5  # of mutants that a test of the file's own test module notices, before anything is known
+OTHER_SHARE: Final = 0.02
+KNOWN: Final = 4.0  # mutants that the shares above count for
+
+
+@dataclass(slots=True)
+class Record:
+    """Number of mutants of a file on which a test was run, and of those that it noticed."""
+
+    ran: int = 0
+    noticed: int = 0
+
+    def share(self, own: bool) -> float:
+        """Return the share of mutants that the test may notice. own: it is in the file's own test module."""
+        return (self.noticed + KNOWN * (OWN_SHARE if own else OTHER_SHARE)) / (self.ran + KNOWN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,21 +66,26 @@ class Reached:
         called = {first for first, *_ in self.calls.get(path, [])}
         return all(function.co_firstlineno in called for function in functions)
 
-    def of(self, mutant: Mutant, *, in_function: bool = True) -> list[str]:
-        """Return the tests for a mutant: those of its file's own test module first, then the fast ones.
+    def of(self, mutant: Mutant, *, in_function: bool = True, records: Mapping[str, Record] | None = None) -> list[str]:
+        """Return the tests for a mutant: first those that may notice most in a second.
 
         A line in no function that a test has called in this process gets the tests of its file, and if there are none,
         all: they may reach it in another process. in_function: False where more than a function changes, although one
-        (a lambda in a table) may be in the same line.
+        (a lambda in a table) may be in the same line. records: of the tests on earlier mutants of the file.
         """
         functions = self.calls.get(mutant.path, [])
         around = [(last - first, names) for first, last, names in functions if first <= mutant.line <= last]
         every = sorted({name for *_, names in functions for name in names})
         chosen = (min(around)[1] if around and in_function else every) or list(self.tests)
         own, starting = f"test_{Path(mutant.path).name}::", set(self.starting) - set(chosen)
-        return sorted(
-            {*chosen, *starting}, key=lambda name: (name in starting, own not in name, self.tests[name], name)
-        )
+        if not (around and in_function):  # a constant may be tested without a call
+            chosen = [*chosen, *(name for name in self.tests if own in name)]
+
+        def rank(name: str) -> tuple[bool, float, str]:
+            share = (records or {}).get(name, Record()).share(own in name)
+            return name in starting, self.tests[name] / share, name
+
+        return sorted({*chosen, *starting}, key=rank)
 
 
 class MutantRunner:
@@ -78,6 +102,7 @@ class MutantRunner:
         """Run the tests unchanged, then try each mutant."""
         items = {item.nodeid: item for item in session.items}
         reached = self._unchanged(items)
+        records: dict[str, dict[str, Record]] = defaultdict(lambda: defaultdict(Record))
         for mutant in self._mutants:
             path = self._copy / mutant.path
             path.write_text(mutant.apply(self._sources[mutant.path]), "utf-8")
@@ -85,12 +110,13 @@ class MutantRunner:
                 changed = changed_functions(self._sources[mutant.path], path)
                 if not reached.calls_all(mutant.path, changed):
                     changed = {}
-                names = [name for name in reached.of(mutant, in_function=bool(changed)) if name in items]
+                found = reached.of(mutant, in_function=bool(changed), records=records[mutant.path])
+                names = [name for name in found if name in items]
                 # A test that has begun within the limit is given the time to end.
                 times_s = [reached.tests[name] for name in names]
                 patience_s = 10.0 + 5.0 * (min(self._limit_s, sum(times_s)) + max(times_s))
                 outcome = (
-                    self._in_a_fork([items[name] for name in names], changed, patience_s)
+                    self._in_a_fork([items[name] for name in names], changed, patience_s, records[mutant.path])
                     if changed
                     else (self._in_a_new_python(names, patience_s))
                 )
@@ -99,14 +125,28 @@ class MutantRunner:
             self._report(mutant, outcome)
         return True
 
-    def _in_a_fork(self, items: Sequence[pytest.Item], changed: dict[CodeType, CodeType], patience_s: float) -> str:
-        """Return the outcome of the tests with changed functions."""
+    def _in_a_fork(
+        self,
+        items: Sequence[pytest.Item],
+        changed: dict[CodeType, CodeType],
+        patience_s: float,
+        records: dict[str, Record],
+    ) -> str:
+        """Return the outcome of the tests with changed functions, and add to the records of those that ran."""
+        begun = self._copy / "begun-tests.txt"
+        begun.write_text("")
         pid = os.fork()
         if pid == 0:
             _quiet()
             replace_functions(changed)
-            os._exit(_tried(items, time.monotonic() + self._limit_s))
-        return _outcome(_waited(pid, patience_s))
+            os._exit(_tried(items, self._limit_s, begun))
+        outcome = _outcome(_waited(pid, patience_s))
+        ran = begun.read_text("utf-8").splitlines()
+        for name in ran:
+            records[name].ran += 1
+        if ran and outcome not in (SURVIVED, UNFINISHED):
+            records[ran[-1]].noticed += 1
+        return outcome
 
     def _in_a_new_python(self, names: Sequence[str], patience_s: float) -> str:
         """Return the outcome of the tests where the file is imported again."""
@@ -195,11 +235,18 @@ def _reached(
     return durations, calls, sorted(starting & durations.keys())
 
 
-def _tried(items: Iterable[pytest.Item], until_s: float) -> int:
-    """Run the tests until one fails; return 0 if all pass, UNFINISHED_CODE where the time is over before the last."""
+def _tried(items: Iterable[pytest.Item], limit_s: float, begun: Path) -> int:
+    """Run the tests until one fails; return 0 if all pass, UNFINISHED_CODE where the time is over before the last.
+
+    limit_s: of this process's own time, so that a busy machine changes nothing. begun: a file to which the name of each
+    test is added before it runs.
+    """
+    until_s, own_until_s = time.monotonic() + LONGER * limit_s, time.process_time() + limit_s
     for item in items:
-        if time.monotonic() >= until_s:
+        if time.process_time() >= own_until_s or time.monotonic() >= until_s:
             return UNFINISHED_CODE
+        with begun.open("a", encoding="utf-8") as file:
+            file.write(f"{item.nodeid}\n")
         if not all(report.passed or report.skipped for report in _reports(item)):
             return 1
     return 0
@@ -219,20 +266,34 @@ def _quiet() -> None:
 
 
 def _waited(pid: int, patience_s: float) -> int | None:
-    """Return the exit code of a child, which with all its children is ended after a time; None: it was ended."""
-    until_s = time.monotonic() + patience_s
+    """Return the exit code of a child, which with all its children is ended after a time; None: it was ended.
+
+    What it waits for a processor does not count. The time that it computes is limited to a third, because it is longer
+    on a busy machine by a little only.
+    """
+    most_s = math.ceil(patience_s / 3)
+    with suppress(ProcessLookupError):
+        resource.prlimit(pid, resource.RLIMIT_CPU, (most_s, most_s + 1))
+    left_s, last_s = patience_s, time.monotonic()
     status: int | None = None
-    while status is None and time.monotonic() < until_s:
+    while status is None and left_s > 0:
         found, code = os.waitpid(pid, os.WNOHANG)
         if found:
             status = os.waitstatus_to_exitcode(code)
         else:
             time.sleep(POLL_S)
+            now_s = time.monotonic()
+            left_s, last_s = left_s - (0.0 if _computes(pid) else now_s - last_s), now_s
     with suppress(ProcessLookupError):
         os.killpg(pid, signal.SIGKILL)
     if status is None:
         os.waitpid(pid, 0)
-    return status
+    return None if status == -signal.SIGXCPU else status
+
+
+def _computes(pid: int) -> bool:
+    """True if a process computes or waits for a processor: neither sleeps nor has ended."""
+    return Path(f"/proc/{pid}/stat").read_text("utf-8").rpartition(")")[2].split()[0] == "R"
 
 
 def _outcome(code: int | None) -> str:

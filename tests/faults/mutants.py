@@ -14,7 +14,7 @@ import random
 import shutil
 import subprocess
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -216,15 +216,29 @@ def tests_of(folder: str) -> tuple[str, ...]:
     return next(tests for whole, tests in TESTS.items() if folder == whole or folder.startswith(f"{whole}/"))
 
 
-def try_mutants(folder: str, mutants: Mapping[str, Mutant], limit_s: float, results: Path) -> None:
-    """Try mutants of one folder in a copy of the repository; their outcomes are added to the results."""
+def in_order(mutants: Mapping[str, Mutant]) -> dict[str, Mutant]:
+    """Return the mutants by name, last those that differ only where two values are the same to the last digit.
+
+    Most of these survive, which takes all tests.
+    """
+
+    def is_limit(name: str) -> bool:
+        mutant = mutants[name]
+        old = (ROOT / mutant.path).read_text("utf-8")[mutant.start : mutant.end]
+        return {old, mutant.text} in ({"<", "<="}, {">", ">="})
+
+    return {name: mutants[name] for name in sorted(mutants, key=is_limit)}
+
+
+def try_mutants(tests: Sequence[str], mutants: Mapping[str, Mutant], limit_s: float, results: Path) -> None:
+    """Try mutants with these tests in a copy of the repository; their outcomes are added to the results."""
     copy = results.with_suffix(".copy")
     shutil.rmtree(copy, ignore_errors=True)
     copy.mkdir(parents=True)
     try:
         for entry in COPIED:
             (shutil.copytree if (ROOT / entry).is_dir() else shutil.copy2)(ROOT / entry, copy / entry)
-        asked = {"mutants": mutants, "tests": tests_of(folder), "limit_s": limit_s, "results": str(results)}
+        asked = {"mutants": mutants, "tests": tests, "limit_s": limit_s, "results": str(results)}
         subprocess.run(
             [sys.executable, "-m", "tests.faults.mutant_runner"],
             cwd=copy,
@@ -252,24 +266,27 @@ def main() -> int:
     )
     args = parser.parse_args()
     path = args.results.absolute()
-    for folder in args.folders:
-        everything = list(all_mutants([folder]))
-        count = min(args.count or len(everything), len(everything))
-        chosen = {
-            mutant.described((ROOT / mutant.path).read_text("utf-8")): mutant
-            for mutant in random.Random(args.seed).sample(everything, count)
-        }
-        known = Results(path).outcomes
-        if missing := {name: mutant for name, mutant in chosen.items() if name not in known}:
-            try_mutants(folder, missing, args.limit_s, path)
-        outcomes = Results(path).outcomes
-        numbers = Counter(outcomes.get(name, "not tried") for name in chosen)
+    everything = {folder: list(all_mutants([folder])) for folder in args.folders}
+    chosen: dict[str, dict[str, Mutant]] = {}
+    for folder, mutants in everything.items():
+        sample = random.Random(args.seed).sample(mutants, min(args.count or len(mutants), len(mutants)))
+        chosen[folder] = {mutant.described((ROOT / mutant.path).read_text("utf-8")): mutant for mutant in sample}
+    known = Results(path).outcomes
+    missing: dict[tuple[str, ...], dict[str, Mutant]] = defaultdict(dict)
+    for folder, named in chosen.items():
+        missing[tests_of(folder)] |= {name: mutant for name, mutant in named.items() if name not in known}
+    for tests, named in missing.items():
+        if named:
+            try_mutants(tests, in_order(named), args.limit_s, path)
+    outcomes = Results(path).outcomes
+    for folder, named in chosen.items():
+        numbers = Counter(outcomes.get(name, "not tried") for name in named)
         print(
-            f"{folder}: {count} of {len(everything)} mutants, seed {args.seed}: "
+            f"{folder}: {len(named)} of {len(everything[folder])} mutants, seed {args.seed}: "
             f"{', '.join(f'{number} {outcome}' for outcome, number in sorted(numbers.items()))}"
         )
         print(
-            "".join(f"  {outcomes[name]}: {name}\n" for name in chosen if outcomes.get(name) in (SURVIVED, UNFINISHED)),
+            "".join(f"  {outcomes[name]}: {name}\n" for name in named if outcomes.get(name) in (SURVIVED, UNFINISHED)),
             end="",
             flush=True,
         )

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
-from tests.faults.mutant_runner import Reached, changed_functions, replace_functions
+from tests.faults.mutant_runner import Reached, Record, _computes, _waited, changed_functions, replace_functions
 from tests.faults.mutants import Mutant, Results, mutants_of
 
 ROOT = Path(__file__).parents[2]
@@ -85,6 +86,31 @@ def test_the_tests_of_the_own_module_run_first() -> None:
         "tests/test_a.py::slow",
         "tests/test_b.py::fast",
     ]
+
+
+def test_a_constant_gets_the_tests_of_the_own_module_that_call_nothing() -> None:
+    names = {"tests/test_a.py::reads": 0.1, "tests/test_a.py::calls": 0.2, "tests/test_b.py::other": 0.1}
+    reached = Reached(names, {"a.py": [(5, 9, ["tests/test_a.py::calls"])]})
+    assert reached.of(Mutant("a.py", 2, 0, 1, "")) == ["tests/test_a.py::reads", "tests/test_a.py::calls"]
+    assert reached.of(Mutant("a.py", 6, 0, 1, "")) == ["tests/test_a.py::calls"]
+
+
+def test_tests_that_noticed_earlier_mutants_of_the_file_run_first() -> None:
+    names = {"tests/test_a.py::quick": 0.1, "tests/test_b.py::slow": 1.0, "tests/test_b.py::fast": 0.01}
+    reached = Reached(names, {"a.py": [(1, 9, list(names))]})
+    mutant = Mutant("a.py", 2, 0, 1, "")
+    records = {"tests/test_b.py::slow": Record(ran=9, noticed=8)}
+    records |= {name: Record(ran=200) for name in names if name not in records}
+    assert reached.of(mutant)[0] == "tests/test_a.py::quick"
+    assert reached.of(mutant, records=records)[0] == "tests/test_b.py::slow"
+
+
+def test_a_child_that_sleeps_for_too_long_is_ended_and_one_that_computes_is_known() -> None:
+    assert _computes(os.getpid())
+    sleeping = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"], start_new_session=True)
+    assert _waited(sleeping.pid, 0.3) is None
+    ending = subprocess.Popen([sys.executable, "-c", "import sys; sys.exit(3)"], start_new_session=True)
+    assert _waited(ending.pid, 20.0) == 3
 
 
 def test_a_campaign_finds_what_no_test_notices_and_goes_on_where_it_stopped(tmp_path: Path) -> None:

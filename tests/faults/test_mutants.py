@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.faults.mutants import TESTS, Mutant, all_mutants, mutants_of
+from tests.faults.mutants import ROOT, TESTS, Mutant, all_mutants, in_order, mutants_of
 
 SOURCE = '''"""Text of 3 words."""
 LIMIT: int = 5
@@ -33,6 +33,17 @@ def test_each_place_is_changed_once() -> None:
             "return not abs(x) < LIMIT and y == -(3 + 1)",
         ]
     )
+
+
+def test_those_that_differ_only_at_a_limit_are_tried_last() -> None:
+    path = "omnid/core/navigation/forecast.py"
+    source = (ROOT / path).read_text("utf-8")
+    texts = [
+        mutant.text
+        for mutant in in_order({mutant.described(source): mutant for mutant in mutants_of(path, source)}).values()
+    ]
+    first = next(place for place, text in enumerate(texts) if text in ("<", "<=", ">", ">="))
+    assert 0 < first < len(texts) - 1 and set(texts[first:]) <= {"<", "<=", ">", ">="}
 
 
 @pytest.mark.parametrize("folder", TESTS)

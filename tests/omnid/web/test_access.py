@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.web.access import Access, Role, new_token, token_of
+from omnid.web.access import COOKIE_S, MOST_ENDED, Access, Role, new_token, token_of
 
 TOKEN = "abcde-fghjk-mnpqr-stuvw"
 LOCAL = Access(TOKEN, frozenset(("localhost", "127.0.0.1", "[::1]")), False, "omnid_8447")
@@ -191,3 +192,60 @@ def test_a_session_ends_and_others_with_the_same_token_go_on() -> None:
     mine, other = (scope("/metrics", "GET", cookie=f"omnid_8447={access.new_cookie(Role.ALL)}") for _ in range(2))
     access.end_session(mine)
     assert access.refusal(mine) is not None and access.refusal(other) is None
+
+
+def with_cookie(access: Access, role: Role, path: str = "/metrics", method: str = "GET") -> dict[str, Any]:
+    return scope(path, method, cookie=f"{access.cookie}={access.new_cookie(role)}", **OWN)
+
+
+def test_a_cookie_is_valid_for_30_days(monkeypatch: pytest.MonkeyPatch) -> None:
+    request, now_s = with_cookie(LOCAL, Role.ALL), time.time()
+    for later_s, enters in ((30 * 86_400 - 60, True), (30 * 86_400 + 60, False)):
+        monkeypatch.setattr("omnid.web.access.time.time", lambda later_s=later_s: now_s + later_s)
+        assert (LOCAL.refusal(request) is None) == enters
+    assert COOKIE_S == 30 * 86_400
+
+
+def test_a_cookie_of_another_server_or_for_stops_without_a_token_for_stops_is_none() -> None:
+    other = Access("other-other-other-other", LOCAL.hosts, False, LOCAL.cookie)
+    assert LOCAL.refusal(with_cookie(other, Role.ALL)) is not None
+    assert LOCAL.refusal(with_cookie(LOCAL, Role.STOP)) is not None, "its key would be empty"
+    assert LOCAL.has_token(with_cookie(LOCAL, Role.ALL)) and not LOCAL.has_token(with_cookie(other, Role.ALL))
+
+
+def test_of_two_cookies_the_one_that_allows_more_counts() -> None:
+    access = Access(TOKEN, LOCAL.hosts, False, "omnid_8447", "stop-stop-stop-stop")
+    both = [f"omnid_8447={access.new_cookie(role)}" for role in (Role.STOP, Role.ALL)]
+    for cookies in (both, both[::-1]):
+        assert access.refusal(scope("/arm", "POST", cookie="; ".join(cookies), **OWN)) is None
+    assert access.role_of(f" {TOKEN}\n") is Role.ALL and access.role_of("stop-stop-stop-stop") is Role.STOP
+
+
+def test_only_so_many_ended_sessions_are_remembered_and_the_newest_of_them() -> None:
+    access = Access(TOKEN, LOCAL.hosts, False, "omnid_8447")
+    requests = [with_cookie(access, Role.ALL) for _ in range(MOST_ENDED + 1)]
+    for request in requests:
+        access.end_session(request)
+    assert access.refusal(requests[0]) is None and access.refusal(requests[1]) is not None
+    assert access.refusal(requests[-1]) is not None
+    count = len(access._ended)
+    access.end_session(scope("/logout", "POST", cookie="omnid_8447=nonsense; other=1", **OWN))
+    assert len(access._ended) == count == MOST_ENDED
+
+
+@pytest.mark.parametrize(("mode", "enters"), [(0o640, True), (0o604, False), (0o602, False), (0o601, False)])
+def test_a_token_file_is_for_its_owner_and_group(tmp_path: Path, mode: int, enters: bool) -> None:
+    path = tmp_path / "token"
+    path.write_text(f"{TOKEN}\n")
+    path.chmod(mode)
+    if enters:
+        assert token_of(path) == TOKEN
+    else:
+        with pytest.raises(OmnidError, match="chmod 600"):
+            token_of(path)
+
+
+def test_a_token_has_groups_of_letters_that_are_not_mistaken_for_others() -> None:
+    groups = new_token().split("-")
+    assert [len(group) for group in groups] == [5, 5, 5, 5]
+    assert not set("".join(groups)) & set("01loi")

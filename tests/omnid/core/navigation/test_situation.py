@@ -38,3 +38,12 @@ def test_refusals_name_the_remedy(change: dict[str, object], frame: str, words: 
     refusal = refusal_to_drive(now, NavigationFrame(frame), 0.3)
     assert words in refusal and bool(refusal) == bool(words) and "\n" not in refusal
     assert "no pose" in refusal_to_drive(None, NavigationFrame(frame), 0.3)
+
+
+def test_only_a_drive_in_the_map_follows_the_place_of_odom_in_it() -> None:
+    in_map = MapPosition(np.array([1.0, 2.0, math.pi / 2]), MapState.LOCALIZED, 0.02)
+    pose = np.array([0.5, 0.25, 0.1])
+    now = Situation(0, pose, 0.0, 0.0, TrackingState.TRACKING, 0, WheelState(True, False), in_map)
+    np.testing.assert_allclose(now.pose_in(NavigationFrame.ODOM), pose)
+    np.testing.assert_allclose(now.map_pose(), (1.0 - 0.25, 2.0 + 0.5, math.pi / 2 + 0.1))
+    np.testing.assert_allclose(now._replace(in_map=None).map_pose(), pose)

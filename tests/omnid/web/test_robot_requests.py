@@ -1,0 +1,74 @@
+"""Requests of the page to the robot, before they are passed on: goals, and how much of a body is read."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import pytest
+from starlette.requests import Request
+
+from omnid.errors import OmnidError
+from omnid.web import robot_requests, snapshot
+from omnid.web.robot_requests import LONGEST_BODY, goal_of, text_of
+
+NOW_MS = 50_000
+
+
+@pytest.fixture
+def at_50_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the server's time stand."""
+    monkeypatch.setattr(snapshot, "server_ms", lambda: NOW_MS)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (f"1.5 -2 {NOW_MS}", (1.5, -2.0, None)),
+        (f"-0.25 3.1234 -90 {NOW_MS - 1000}", (-0.25, 3.1234, -math.pi / 2)),
+        (f"0 0 0 {NOW_MS}", (0.0, 0.0, 0.0)),
+    ],
+)
+def test_a_goal_is_in_metres_and_degrees(at_50_s: None, text: str, expected: tuple[float, float, float | None]) -> None:
+    assert goal_of(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"1 2 {NOW_MS - 1001}", "too late"),
+        (f"1 2 30 {NOW_MS + 1}", "too late"),
+        (f"1 {NOW_MS}", "X Y STAMP"),
+        (f"1 2 3 4 {NOW_MS}", "X Y STAMP"),
+        (f"1000000.5 2 {NOW_MS * 10**9}00", "X Y STAMP"),
+    ],
+)
+def test_other_goals_are_refused(at_50_s: None, text: str, words: str) -> None:
+    with pytest.raises(OmnidError, match=words):
+        goal_of(text)
+
+
+def body(*chunks: bytes, ends: bool = True) -> str:
+    """Return the text of a request whose body comes in chunks."""
+    messages = [
+        {"type": "http.request", "body": chunk, "more_body": not ends or k < len(chunks) - 1}
+        for k, chunk in enumerate(chunks)
+    ]
+
+    async def receive() -> dict[str, object]:
+        if not messages:
+            await asyncio.Event().wait()
+        return messages.pop(0)
+
+    return asyncio.run(text_of(Request({"type": "http", "method": "POST", "path": "/", "headers": []}, receive)))
+
+
+def test_a_body_is_read_to_its_end_and_no_farther_than_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert body(b"teach ", b"hall") == "teach hall"
+    assert body(b"x" * LONGEST_BODY) == "x" * LONGEST_BODY
+    for chunks in ([b"x" * (LONGEST_BODY + 1)], [b"x" * LONGEST_BODY, b"x", b"x"]):
+        with pytest.raises(OmnidError, match="256 bytes"):
+            body(*chunks)
+    monkeypatch.setattr(robot_requests, "BODY_S", 0.005)
+    with pytest.raises(OmnidError, match="did not come"):
+        body(b"teach ", ends=False)
