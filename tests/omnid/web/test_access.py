@@ -230,6 +230,9 @@ def test_only_so_many_ended_sessions_are_remembered_and_the_newest_of_them() -> 
     assert access.refusal(requests[-1]) is not None
     count = len(access._ended)
     access.end_session(scope("/logout", "POST", cookie="omnid_8447=nonsense; other=1", **OWN))
+    other = access.new_cookie(Role.ALL)
+    access.end_session(scope("/logout", "POST", cookie=f"omnid_1={other}", **OWN))
+    assert other.partition(".")[0] not in access._ended, "that of another port"
     assert len(access._ended) == count == MOST_ENDED
 
 

@@ -9,8 +9,10 @@ import pytest
 from starlette.requests import Request
 
 from omnid.errors import OmnidError
+from omnid.transport.bus_config import BusConfig
 from omnid.web import robot_requests, snapshot
-from omnid.web.robot_requests import LONGEST_BODY, goal_of, text_of
+from omnid.web.feed import RobotFeed
+from omnid.web.robot_requests import LONGEST_BODY, RobotRequests, goal_of, text_of
 
 NOW_MS = 50_000
 
@@ -72,3 +74,28 @@ def test_a_body_is_read_to_its_end_and_no_farther_than_its_limit(monkeypatch: py
     monkeypatch.setattr(robot_requests, "BODY_S", 0.005)
     with pytest.raises(OmnidError, match="did not come"):
         body(b"teach ", ends=False)
+
+
+def asked(text: str) -> Request:
+    """Return a request with a text."""
+
+    async def receive() -> dict[str, object]:
+        return {"type": "http.request", "body": text.encode(), "more_body": False}
+
+    return Request({"type": "http", "method": "POST", "path": "/", "headers": []}, receive)
+
+
+def test_what_is_no_request_and_what_finds_no_robot_is_not_done(at_50_s: None) -> None:
+    requests = RobotRequests(RobotFeed(BusConfig()))
+    for ask, text, words in (
+        (requests.goal, "1 2", "X Y STAMP"),
+        (requests.route, "teach", "no request about routes"),
+        (requests.navigation, "stop", "no request to the navigation"),
+        (requests.goal, f"1 2 {NOW_MS}", "There is no connection: not connected yet"),
+        (requests.route, "teach hall", "There is no connection"),
+        (requests.navigation, "pause", "There is no connection"),
+    ):
+        answer = asyncio.run(ask(asked(text)))
+        assert not answer.done and words in answer.text
+    assert requests.arms == 0
+    assert not asyncio.run(requests.arm()).done and requests.arms == 1

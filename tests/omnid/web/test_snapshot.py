@@ -108,6 +108,19 @@ def test_warnings_come_with_the_worst_first_and_with_their_remedies() -> None:
     assert len(shown(many)["warnings"]) == MOST_WARNINGS
 
 
+def test_ages_are_shown_in_milliseconds() -> None:
+    robot = state()
+    for _ in range(100):
+        robot.age.add(0.08)
+    assert shown(robot)["age_ms"] == pytest.approx([80.0, 80.0], rel=0.2)
+
+
+def test_a_level_beyond_those_of_ros_is_taken_for_one_of_them() -> None:
+    robot = state(DiagnosticStatus(WHEELS, 6, "a fault", {}), DiagnosticStatus(ODOMETRY, 4, "well", {}))
+    assert shown(robot)["wheels"]["level"] == 2
+    assert [(one["level"], one["message"]) for one in shown(robot)["warnings"]] == [(2, "a fault")]
+
+
 def test_all_parts_are_listed_with_the_worst_first_and_stages_last() -> None:
     stage = DiagnosticStatus("omnid: stage x", 0, "", {})
     robot = state(
