@@ -275,7 +275,7 @@ def test_floor_before_a_wall_too_near_for_floor_is_kept_where_the_wall_is_seen(
     assert (np.median(ring.free_m) > near_m - 0.25) == is_known
 
 
-def test_a_single_cell_of_floor_before_a_plain_wall_shows_that_nobody_came(grid: ObstacleGrid) -> None:
+def test_a_single_cell_of_floor_before_a_plain_wall_shows_that_no_one_came(grid: ObstacleGrid) -> None:
     """The floor at its foot is no evidence: in a corridor 2 m wide a cell may be all that there is."""
     wall_m = COLUMNS.nearest_floor_m + 0.05
     found = evidence(stains, plain, wall_m=wall_m)
