@@ -96,7 +96,7 @@ def test_a_robot_that_was_lost_at_rest_finds_back_and_drives_again() -> None:
         if moment.time_s > 4.0:
             yield from forward(moment)
 
-    run = simulate(WORLD, blind, rest_and_drive, seconds=6.0, seed=1, config=CONFIG, faults=[Fault("dark", 1.0, 3.0)])
+    run = simulate(WORLD, blind, rest_and_drive, seconds=5.5, seed=1, config=CONFIG, faults=[Fault("dark", 1.0, 3.0)])
     at_s = (run.stamps_ns - run.stamps_ns[0]) * 1e-9
     states = np.array(run.states)
     assert "lost" in states[(at_s > 1.0) & (at_s < 3.1)]
