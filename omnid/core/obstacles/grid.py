@@ -17,6 +17,18 @@ from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.column import ColumnEvidence
+from omnid.core.obstacles.grid_layers import (
+    ABOVE,
+    FLOOR,
+    FLOORS,
+    FREE_ODDS,
+    PRIOR,
+    SURFACE,
+    TAKEN_ODDS,
+    VISIBLE,
+    cells_of,
+    level_odds,
+)
 from omnid.core.obstacles.grid_ring import GridRing, RingView, ring_of
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor
@@ -32,20 +44,11 @@ CELLS: Final = 256  # Cells of a side: twice the largest range, and the way unti
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
 
-# Layers: floor against upright surfaces, against planes just above and below it; surface; visible floor against floor
-# that something plain hides.
-FLOOR, ABOVE, BELOW, SURFACE, VISIBLE = 0, 1, 2, 3, 4
-FLOORS: Final = slice(FLOOR, SURFACE)
-PRIOR: Final = (-1.0, 0.0, 0.0, -6.0, 3.0)  # log-odds where nothing was seen
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = np.float32(1.0)
 MOST_VISIBLE: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
 LEAST_VISIBLE: Final = -1.0  # One or two pairs with the usual evidence make it free again.
-VISIBLE_ODDS: Final = 0.0  # Log-odds of visible floor above which a cell is free.
-FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
-TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
-CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
 # Mean evidence of a surface where there is none, as the best of many runs is never negative: below 0.13 in 95 % of the
 # cells of bare floor. It would add up as the robot moves: two of three false surfaces before plain walls came of it.
 NOISE_SURFACE: Final = np.float32(0.15)
@@ -56,20 +59,13 @@ CONTRADICTION: Final = -1.5  # Log-odds of a surface where floor is seen and no 
 SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean
 SHOWN_CELLS: Final = 5  # side of the patch of the mean, as errors of the range move what a pair shows by some cells
 MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair; by trial, too
-FREE_SHOWN: Final = 0.1  # largest mean in a free cell
 
 APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.
 APART_S: Final = 0.2  # A pair from the same place counts in full after it, so that a base that stands sees what comes.
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
 # below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
 PLACE_PAIRS: Final = 18.0
-# Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
-SPECK_CELLS: Final = 6
-WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
-# The same of an edge: a hole into which a base falls is wide. With 3, by trial, bases stood before joints of tiles.
-EDGE_CELLS: Final = 5
 THIN_M: Final = 0.03  # width of the thinnest obstacle
-GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
 # Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
@@ -86,6 +82,7 @@ class ObstacleGrid:
         self._max_range_m = min(settings.max_range_m, (MARGIN_CELLS - 2) * CELL_M)
         self._T_rect_base, self._gap_share = np.eye(4), 0.0
         self._azimuths = azimuths()
+        self._directions = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
         self.clear()
 
     def set_floor(self, T_rect_base: Array, height_m: float) -> None:
@@ -134,8 +131,10 @@ class ObstacleGrid:
         )
         # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
         in_view = np.isfinite(cells[FLOOR])
-        lost = np.where(behind, hidden, np.minimum(hidden, 0))[rows, columns]
-        amount = self._add((rows, columns), cells, lost, weight, at_rest)
+        lost = np.where(behind, hidden, np.minimum(hidden, 0))
+        nearest = int(evidence.nearest_floor_m / CELL_M)
+        self._lose_before(lost, place - corner, nearest)
+        amount = self._add((rows, columns), cells, lost[rows, columns], weight, at_rest)
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
         if stamp_ns - self._start_ns >= FRESH_NS:
@@ -143,15 +142,14 @@ class ObstacleGrid:
             visible[rows, columns] = in_view
             flooded = self._watch.spread(stamp_ns, passed_ns, self._odds[FLOOR] > FREE_ODDS, visible)
             self._odds[FLOOR][flooded] = PRIOR[FLOOR]
-        self._clear_seen_past(place - corner, evidence.nearest_floor_m)
+        self._clear_seen_past(place - corner, nearest)
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
         self._odds[FLOORS, *own], self._odds[VISIBLE, *own], self._shown[own] = LIMIT, PRIOR[VISIBLE], 0.0
         # 4. The ring.
-        gap_m = CELL_M + self._gap_share * self._nearest_m
-        in_view_m = evidence.nearest_floor_m
-        view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, self._gap_share, gap_m)
-        return ring_of(self.state(), self._odds[VISIBLE] <= VISIBLE_ODDS, view, arrivals)
+        gaps = self._gap_share, CELL_M + self._gap_share * self._nearest_m
+        view = RingView(place - corner, angles, CELL_M, self._max_range_m, evidence.nearest_floor_m, *gaps)
+        return ring_of(self.state(), view, arrivals)
 
     def _add(
         self, window: tuple[slice, slice], cells: Floats, lost: Floats, weight: np.float32, at_rest: np.float32
@@ -191,30 +189,11 @@ class ObstacleGrid:
     @property
     def floor_odds(self) -> Floats:
         """Log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
-        return np.asarray(np.minimum(np.minimum(self._odds[FLOOR], self._odds[VISIBLE]), self._level_odds()))
+        return np.asarray(np.minimum(np.minimum(self._odds[FLOOR], self._odds[VISIBLE]), level_odds(self._odds)))
 
     def state(self) -> Bytes:
-        """Return the cells: 0 unknown, 1 free (by all layers), 2 taken."""
-        taken = self._odds[SURFACE] > TAKEN_ODDS
-        suspect = ((self._odds[SURFACE] > CLEAR_ODDS) | (self._shown > FREE_SHOWN)) & ~taken
-        floor, level = self._odds[FLOOR], self._level_odds()
-        # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
-        is_floor = (floor > FREE_ODDS) | ((floor > 0) & (_mean(floor, WIDE_CELLS) > FREE_ODDS))
-        is_floor &= (level > FREE_ODDS) & (self._odds[VISIBLE] > VISIBLE_ODDS)
-        free = (is_floor & ~suspect) | taken
-        _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
-        # Specks are noise unless something may stand there.
-        sizes = about[:, cv2.CC_STAT_AREA]
-        cells = np.where(np.bincount(patch[suspect], minlength=len(sizes)) > 0, CELLS * CELLS, sizes)[patch]
-        free |= cells <= SPECK_CELLS
-        # Steps are seen by several directions together, of which those at a corner show half floor.
-        beside = cv2.dilate(((level < 0) & ~free).astype(np.uint8), GAP) > 0
-        free = taken | (free & ~beside)
-        return np.where(taken, np.uint8(2), free.astype(np.uint8))
-
-    def _level_odds(self) -> Floats:
-        """Return the least log-odds (CELLS, CELLS) against steps up and down, which are wider than a cell."""
-        return np.minimum(_mean(self._odds[ABOVE], WIDE_CELLS), _mean(self._odds[BELOW], EDGE_CELLS))
+        """Return the cells (CELLS, CELLS): 0 unknown, 1 free (by all layers), 2 taken."""
+        return cells_of(self._odds, self._shown)
 
     def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
         """Return the evidence (4, N, N) of the cells of the view, the first of which has its middle at first_m."""
@@ -273,18 +252,29 @@ class ObstacleGrid:
         reach_there = reach[np.floor(turned * len(reach)).astype(np.intp) % len(reach)]
         self._odds[FLOORS, (x - at[0]) ** 2 + (y - at[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
 
-    def _clear_seen_past(self, place: Array, nearest_m: float) -> None:
+    def _lose_before(self, lost: Floats, place: Array, nearest: int) -> None:
+        """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen: as behind them.
+
+        What hides the nearest floor in view may stand anywhere before it; as the base moves, directions cross there.
+        """
+        if nearest < 2:
+            return
+        rows, columns = self._ahead(place, nearest + 2)
+        behind = lost[rows[:, nearest:], columns[:, nearest:]].mean(axis=1)
+        near = rows[:, : nearest - 1], columns[:, : nearest - 1]
+        # Of the directions through a cell the most hidden one counts.
+        lost[near] = -np.inf
+        np.maximum.at(lost, near, np.broadcast_to(behind[:, None], near[0].shape))
+
+    def _clear_seen_past(self, place: Array, nearest: int) -> None:
         """End the flood too near to be seen where something behind it is watched: a person would hide that.
 
         Behind it is the floor in view nearest to it, or a surface, such as the walls of a corridor.
         """
-        if not nearest_m or not self._watch.flooded.any():
+        if not nearest or not self._watch.flooded.any():
             return
-        nearest = int(nearest_m / CELL_M)
         steps = nearest + 2
-        direction = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
-        ways = np.arange(1, nearest + BEHIND_CELLS + 1)[None, :, None] * direction[:, None]
-        columns, rows = np.moveaxis(np.floor(place + ways).astype(np.intp), -1, 0)
+        rows, columns = self._ahead(place, nearest + BEHIND_CELLS)
         watched = self._watch.watched[rows, columns]
         surface = np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
         floor = watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS)
@@ -295,6 +285,12 @@ class ObstacleGrid:
         flooded = self._watch.flooded[cells] > 0
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._watch.flooded[cells] = 0
+
+    def _ahead(self, place: Array, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the rows and columns (SECTORS, steps) of the cells along all directions, from the first one on."""
+        ways = place + np.arange(1, steps + 1)[None, :, None] * self._directions[:, None]
+        columns, rows = np.moveaxis(np.floor(ways).astype(np.intp), -1, 0)
+        return rows, columns
 
     def _follow(self, place: Array) -> NDArray[np.int64]:
         """Move the square where the robot comes near its border; return its corner, in cells of odom."""
@@ -315,8 +311,3 @@ class ObstacleGrid:
             layer[gone] = unknown
         self._corner = self._corner + shift
         return self._corner
-
-
-def _mean(odds: Floats, cells: int) -> Floats:
-    """Return the mean (CELLS, CELLS) of log-odds over a patch with a side of so many cells."""
-    return np.asarray(cv2.blur(odds, (cells, cells)), np.float32)

@@ -12,7 +12,6 @@ from omnid.core.obstacles.usual_floor import Arrivals
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
 END_M: Final = 0.1  # Distance kept before the end of the free floor: at the foot of an object patches show both.
@@ -41,25 +40,20 @@ class RingView(NamedTuple):
     gap_m: float  # least gap that is passed
 
 
-def ring_of(cells: Bytes, hidden: Flags, view: RingView, arrivals: Arrivals) -> GridRing:
-    """Return the ring by the cells (H, W): 0 unknown, 1 free, 2 taken; hidden (H, W): floor that something hides."""
+def ring_of(cells: Bytes, view: RingView, arrivals: Arrivals) -> GridRing:
+    """Return the ring by the cells (H, W): 0 unknown, 1 free, 2 taken."""
     hit, free = np.empty(len(view.angles)), np.empty(len(view.angles))
     # 1. Up to the first taken cell, and to the end of the free floor.
     origin = np.array(
         [*view.place, view.cell_m / 2, view.max_range_m, view.cell_m, view.gap_share, view.gap_m], np.float64
     )
     kernels.march(cells, origin, view.angles, hit, free)
-    # 2. What hides the nearest floor in view may be anywhere before it.
-    ways = view.nearest_m / view.cell_m + np.array([[1.0], [2.0]])
-    rows = (view.place[1] + ways * np.sin(view.angles)).astype(int)
-    columns = (view.place[0] + ways * np.cos(view.angles)).astype(int)
-    free[hidden[rows, columns].all(axis=0)] = 0.0
-    # 3. A direction between cells may belong to either side.
+    # 2. A direction between cells may belong to either side.
     free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
     is_open = np.isinf(hit) & (free >= OPEN_SHARE * view.max_range_m)
     ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
     sigma = np.where(np.isfinite(ranges), view.cell_m / 2, np.nan)
-    # 4. What stands at an end may be nearer: in view, by its foot; an end nearer than that, found before, by a cell.
+    # 3. What stands at an end may be nearer: in view, by its foot; an end nearer than that, found before, by a cell.
     end_m = np.where(free > view.nearest_m, np.minimum(END_M, free - view.nearest_m + view.cell_m), view.cell_m)
     free = np.where(free < hit, np.maximum(free - end_m, 0.0), hit)
     return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)

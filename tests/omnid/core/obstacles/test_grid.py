@@ -7,16 +7,9 @@ import pytest
 
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
-from omnid.core.obstacles.grid import (
-    ABOVE,
-    BELOW,
-    CELL_M,
-    FLOOR,
-    FREE_ODDS,
-    PRIOR,
-    SURFACE,
-    ObstacleGrid,
-)
+from omnid.core.obstacles.grid import CELL_M, CELLS, LEAST_VISIBLE, ObstacleGrid
+from omnid.core.obstacles.grid_layers import ABOVE, BELOW, FLOOR, FREE_ODDS, PRIOR, SURFACE
+from omnid.core.obstacles.grid_layers import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
@@ -115,8 +108,28 @@ def test_nothing_is_free_before_hidden_floor_that_is_the_nearest_in_view(grid: O
     bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.04)))
     after(grid, bare, 30)
     ring = after(grid, hidden, 8, first=30)
-    assert np.median(ring.free_m[AHEAD]) == 0.0 and np.median(ring.free_m) > 2.0
+    assert np.median(ring.free_m[AHEAD]) < 0.2 and np.median(ring.free_m) > 2.0
     assert after(grid, bare, 8, first=38).free_m[AHEAD].min() > 2.0
+
+
+def test_directions_cross_where_a_thin_thing_stands_that_is_too_near_to_be_seen(grid: ObstacleGrid) -> None:
+    """A pole of 4 cm, 0.6 m ahead and 0.25 m to the left, hides other floor as the base drives."""
+    middle, nearest, pole = np.full(2, CELLS / 2), round(1.0 / CELL_M), np.array([0.6, 0.25]) / CELL_M
+    centres = np.stack(np.meshgrid(np.arange(CELLS), np.arange(CELLS)), axis=-1) + 0.5 - middle
+    visible = np.full((CELLS, CELLS), PRIOR[VISIBLE_LAYER])
+    for x_m in np.arange(0.0, 0.55, 0.05):
+        base = np.array([x_m / CELL_M, 0.0])
+        away, to_pole = centres - base, pole - base
+        across = np.abs(away[..., 0] * to_pole[1] - away[..., 1] * to_pole[0]) / np.linalg.norm(to_pole)
+        shadow = across / np.linalg.norm(away, axis=-1) < 0.02 / CELL_M / np.linalg.norm(to_pole)
+        lost = np.where(shadow & ((away @ to_pole) > 0), 1.0, -1.0).astype(np.float32)
+        grid._lose_before(lost, middle + base, nearest)
+        visible = np.clip(visible - lost, LEAST_VISIBLE, PRIOR[VISIBLE_LAYER])
+    hidden = visible <= 0.0
+    column, row = np.floor(middle + pole).astype(int)
+    assert hidden[row, column]
+    # Beside it, and where it was looked past before, floor is free again.
+    assert not hidden[row, column + 4] and not hidden[row - 3, column - 3] and not hidden[row + 6, column + 12]
 
 
 @pytest.mark.parametrize("drop_m", [0.3, 0.08, -0.08])

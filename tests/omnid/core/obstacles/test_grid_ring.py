@@ -1,4 +1,4 @@
-"""The ring by drawn cells: ranges, the end of the free floor, and what hides the nearest floor in view."""
+"""The ring by drawn cells: ranges, and the end of the free floor."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ ARRIVALS = Arrivals(np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.na
 AHEAD, LEFT, BEHIND = SECTORS // 2, 3 * SECTORS // 4, 0
 
 
-def ring(cells: np.ndarray, hidden: np.ndarray | None = None) -> GridRing:
-    return ring_of(cells, np.zeros(cells.shape, bool) if hidden is None else hidden, VIEW, ARRIVALS)
+def ring(cells: np.ndarray) -> GridRing:
+    return ring_of(cells, VIEW, ARRIVALS)
 
 
 @pytest.fixture
@@ -59,14 +59,3 @@ def test_an_end_nearer_than_the_floor_in_view_was_found_before_to_a_cell(free: n
     free[:] = 1
     free[ahead(0.85, 1.2)] = 0
     assert ring(free).free_m[AHEAD] == pytest.approx(VIEW.nearest_m - CELL_M, abs=0.01)
-
-
-def test_nothing_is_free_before_what_hides_the_nearest_floor_in_view(free: np.ndarray) -> None:
-    hidden = np.zeros(free.shape, bool)
-    hidden[ahead(0.7, 1.3)] = True
-    found = ring(free, hidden)
-    assert found.free_m[AHEAD] == 0.0 and found.free_m[[LEFT, BEHIND]].min() > 2.0
-    # Farther away the cells themselves end the free floor.
-    hidden[:] = False
-    hidden[ahead(1.3, 1.6)] = True
-    assert ring(free, hidden).free_m[AHEAD] > 2.0
