@@ -105,7 +105,7 @@ class CollisionMonitor:
         self._moving: tuple[MovingPoint, ...] = ()
         self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
         self.reason = ""  # why the last step changed the motion
-        self.share = 1.0  # share of the motion that was allowed
+        self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
         self._stopped_mps = 0.0  # motion that the last step stopped
 
     def set_ring(self, ring: ControllerRing) -> None:

@@ -69,7 +69,7 @@ THIN_M: Final = 0.03  # width of the thinnest obstacle
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
 # Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
-# neither. What stands 0.5 m away and is higher than 0.6 m hides all of them.
+# neither. Before a viewpoint 0.9 m high, what stands 0.5 m away and is higher than 0.6 m hides all of them.
 BEHIND_CELLS: Final = 7
 
 
@@ -259,7 +259,7 @@ class ObstacleGrid:
         """
         if nearest < 2:
             return
-        rows, columns = self._ahead(place, nearest + 2)
+        rows, columns = self._cells_along(place, nearest + 2)
         behind = lost[rows[:, nearest:], columns[:, nearest:]].mean(axis=1)
         near = rows[:, : nearest - 1], columns[:, : nearest - 1]
         # Of the directions through a cell the most hidden one counts.
@@ -274,7 +274,7 @@ class ObstacleGrid:
         if not nearest or not self._watch.flooded.any():
             return
         steps = nearest + 2
-        rows, columns = self._ahead(place, nearest + BEHIND_CELLS)
+        rows, columns = self._cells_along(place, nearest + BEHIND_CELLS)
         watched = self._watch.watched[rows, columns]
         surface = np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
         floor = watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS)
@@ -286,8 +286,8 @@ class ObstacleGrid:
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._watch.flooded[cells] = 0
 
-    def _ahead(self, place: Array, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the rows and columns (SECTORS, steps) of the cells along all directions, from the first one on."""
+    def _cells_along(self, place: Array, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the rows and columns (SECTORS, steps) of the first cells along all directions."""
         ways = place + np.arange(1, steps + 1)[None, :, None] * self._directions[:, None]
         columns, rows = np.moveaxis(np.floor(ways).astype(np.intp), -1, 0)
         return rows, columns
