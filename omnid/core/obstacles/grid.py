@@ -31,7 +31,7 @@ from omnid.core.obstacles.grid_layers import (
 )
 from omnid.core.obstacles.grid_ring import GridRing, RingView, ring_of
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor
+from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor, arrivals_at
 from omnid.core.obstacles.watch import FRESH_NS, Watch
 
 Array = NDArray[np.float64]
@@ -43,6 +43,8 @@ CELL_M: Final = 0.05  # Side of a cell. By judgement; not measured.
 CELLS: Final = 256  # Cells of a side: twice the largest range, and the way until the square is moved.
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
+
+MEAN_FLOOR: Final = 4  # Index in the evidence of cells; the others are those of the layers.
 
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
@@ -65,7 +67,7 @@ APART_S: Final = 0.2  # A pair from the same place counts in full after it, so t
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
 # below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
 PLACE_PAIRS: Final = 18.0
-THIN_M: Final = 0.03  # width of the thinnest obstacle
+THIN_M: Final = 0.035  # width of the thinnest obstacle
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
 # Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
@@ -96,7 +98,8 @@ class ObstacleGrid:
         self._odds = np.empty((len(PRIOR), CELLS, CELLS), np.float32)
         self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
         self._shown = np.zeros((CELLS, CELLS), np.float32)  # mean surface of single pairs
-        self._watch, self._usual = Watch(CELLS, CELL_M), UsualFloor(CELLS)
+        self._watch = Watch(CELLS, CELL_M)
+        self._usual, self._usual_thin = UsualFloor(CELLS), UsualFloor(CELLS)
         self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
         self._start_ns: int | None = None
         self._nearest_m = 0.0  # range of the floor in view at the start
@@ -119,16 +122,18 @@ class ObstacleGrid:
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
         # 1. Evidence of each cell, and what has come onto floor that was free.
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
-        hidden = self._usual.compare((rows, columns), cells[FLOOR], weight)
         angles = self._azimuths + float(se3.yaw(T_odom_base))
-        arrivals, behind = self._usual.arrivals(
-            hidden,
+        ways = (
             self._watch.was_free(stamp_ns),
             self._odds[SURFACE] > TAKEN_ODDS,
             np.array([*(place - corner), CELL_M, self._max_range_m, self._at_1m]),
             angles,
-            evidence.nearest_floor_m,
         )
+        # Who comes is wide: the mean of a cell is less noisy than its weakest directions, which show something thin.
+        comes_m, _ = self._usual.hidden(self._usual.compare((rows, columns), cells[MEAN_FLOOR], weight), *ways)
+        arrivals = arrivals_at(comes_m, evidence.nearest_floor_m + 2 * CELL_M, self._at_1m)
+        hidden = self._usual_thin.compare((rows, columns), cells[FLOOR], weight)
+        _, behind = self._usual_thin.hidden(hidden, *ways)
         # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
         in_view = np.isfinite(cells[FLOOR])
         lost = np.where(behind, hidden, np.minimum(hidden, 0))
@@ -156,7 +161,7 @@ class ObstacleGrid:
     ) -> Floats:
         """Add the evidence of a pair to the log-odds of a window; return the most of each cell, of floor or surface.
 
-        cells (4, N, N): evidence of the cells; lost (N, N): log-odds that visible floor loses; weight, at_rest: of the
+        cells (5, N, N): evidence of the cells; lost (N, N): log-odds that visible floor loses; weight, at_rest: of the
         pair, and the part of it by time alone.
         """
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
@@ -196,12 +201,12 @@ class ObstacleGrid:
         return cells_of(self._odds, self._shown)
 
     def _gathered(self, T_odom_base: Array, first_m: NDArray[np.floating[Any]], evidence: ColumnEvidence) -> Floats:
-        """Return the evidence (4, N, N) of the cells of the view, the first of which has its middle at first_m."""
+        """Return the evidence (5, N, N) of the cells of the view, the first of which has its middle at first_m."""
         T_rect_odom = self._T_rect_base @ se3.inverse(T_odom_base)
         x, y = (T_rect_odom @ np.array([first_m[0], first_m[1], 0.0, 1.0]))[:2]
         c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
         norm = math.hypot(c, s)
-        cells = np.empty((SURFACE + 1, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
+        cells = np.empty((MEAN_FLOOR + 1, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
         floor, level = np.full_like(evidence.floor, np.nan), np.zeros_like(evidence.level)
         floor[END_BINS:], level[:, END_BINS:] = evidence.floor[:-END_BINS], evidence.level[:, :-END_BINS]
         kernels.gather(
@@ -305,7 +310,8 @@ class ObstacleGrid:
         gone = np.ones((CELLS, CELLS), bool)
         x, y = np.clip(shift, -CELLS, CELLS).tolist()
         gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
-        layers = *zip(self._odds, PRIOR, strict=True), (self._shown, 0), (self._usual.mean, 0), *self._watch.layers
+        usual = (self._usual.mean, 0), (self._usual_thin.mean, 0)
+        layers = *zip(self._odds, PRIOR, strict=True), (self._shown, 0), *usual, *self._watch.layers
         for layer, unknown in layers:
             layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
             layer[gone] = unknown

@@ -26,8 +26,8 @@ def gather(
     thin_m: float,
     cells: Floats,
 ) -> None:
-    """Write the evidence (4, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
-    floor against planes above and below it; an upright surface anywhere in it.
+    """Write the evidence (5, N, N) of cells: floor where it is weakest, NaN where none can be seen; the means of the
+    floor against planes above and below it; an upright surface anywhere in it; the mean of the floor.
 
     floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
     compared.
@@ -47,7 +47,13 @@ def gather(
             x = origin[0] + cell_m * (c * j - s * i)
             y = origin[1] + cell_m * (s * j + c * i)
             r = math.sqrt(x * x + y * y)
-            cells[0, i, j], cells[1, i, j], cells[2, i, j], cells[3, i, j] = np.nan, 0.0, 0.0, 0.0
+            cells[0, i, j], cells[1, i, j], cells[2, i, j], cells[3, i, j], cells[4, i, j] = (
+                np.nan,
+                0.0,
+                0.0,
+                0.0,
+                np.nan,
+            )
             if r < cell_m or r > reach_m:
                 continue
             at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
@@ -61,7 +67,7 @@ def gather(
                 continue
             last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
             first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
-            least, likelihood, above, below = np.inf, 0.0, 0.0, 0.0
+            least, sum_floor, likelihood, above, below = np.inf, 0.0, 0.0, 0.0, 0.0
             run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             for u in range(first, last + 1):
                 at_u = (u + width) % width
@@ -70,6 +76,7 @@ def gather(
                 for k in range(far, near + 1):
                     above += level[0, k, at_u]
                     below += level[1, k, at_u]
+                    sum_floor += floor[k, at_u]
                 if u + run <= last + 1:
                     # The mean of the disparities, the sum of the directions that something thin would hide.
                     total = 0.0
@@ -83,6 +90,7 @@ def gather(
             cells[1, i, j], cells[2, i, j] = above / patches, below / patches
             count = (last - first + 1) * (last_surface - first_surface + 1)
             cells[3, i, j] = math.log(likelihood / count)
+            cells[4, i, j] = sum_floor * run / patches  # in units of what something thin would hide, as the weakest
 
 
 @compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("hit", "free"))

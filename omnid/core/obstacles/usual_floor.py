@@ -61,19 +61,23 @@ class UsualFloor:
         found[window] = hidden
         return found
 
-    def arrivals(
-        self, hidden: Floats, was_free: Flags, taken: Flags, origin: Array, azimuths: Array, nearest_m: float
-    ) -> tuple[Arrivals, Flags]:
-        """Return what has come, along directions (N,), and the cells (H, W) of the floor that it hides.
+    def hidden(
+        self, odds: Floats, was_free: Flags, taken: Flags, origin: Array, azimuths: Array
+    ) -> tuple[Array, Flags]:
+        """Return the ranges (N,) [m] from which on floor is hidden, NaN where it is not, and the cells (H, W) behind.
 
-        hidden (H, W): log-odds of cells; was_free: lately; taken: occupied by an object. origin (5,): place [cells],
-        size of a cell [m], longest range [m], disparity at 1 m; nearest_m: of the floor in view.
+        odds (H, W): log-odds of `compare`; was_free: lately; taken: occupied by an object. origin (5,): place [cells],
+        size of a cell [m], longest range [m], disparity at 1 m; azimuths (N,) of the directions in odom.
         """
-        found = np.empty(len(azimuths))
+        ranges_m = np.empty(len(azimuths))
         flags = was_free.view(np.uint8), taken.view(np.uint8)
-        behind = np.zeros(hidden.shape, np.uint8)
-        kernels.hidden_from(hidden, *flags, origin, azimuths, np.array([HIDDEN_SUM, GAP_M]), found, behind)
-        # An object that hides the nearest floor in view may be anywhere before it.
-        is_near = found < nearest_m + 2 * origin[2]
-        sigma_m = np.where(is_near, NEAR_SIGMA * found, found**2 * (BIN_SIGMA / origin[4]))
-        return Arrivals(found.astype(np.float32), sigma_m.astype(np.float32)), behind.view(np.bool_)
+        behind = np.zeros(odds.shape, np.uint8)
+        kernels.hidden_from(odds, *flags, origin, azimuths, np.array([HIDDEN_SUM, GAP_M]), ranges_m, behind)
+        return ranges_m, behind.view(np.bool_)
+
+
+def arrivals_at(ranges_m: Array, nearest_m: float, at_1m: float) -> Arrivals:
+    """Return what hides floor from ranges (N,) on; nearest_m: of the floor in view, at_1m: disparity at 1 m."""
+    # An object that hides the nearest floor in view may be anywhere before it.
+    sigma_m = np.where(ranges_m < nearest_m, NEAR_SIGMA * ranges_m, ranges_m**2 * (BIN_SIGMA / at_1m))
+    return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32))
