@@ -22,7 +22,7 @@ TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
 CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
 FREE_SHOWN: Final = 0.1  # largest mean in a free cell
 # Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
-SPECK_CELLS: Final = 6
+SPECK_CELLS: Final = 4
 WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
 # The same of an edge: a hole into which a base falls is wide. With 3, by trial, bases stood before joints of tiles.
 EDGE_CELLS: Final = 5
