@@ -88,7 +88,7 @@ def test_plain_wall_is_unknown_and_nothing_behind_it_is_free(grid: ObstacleGrid)
 def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: float) -> None:
     """A column of a plain pole shows nothing; the floor that it hides is missing, one degree wide or two."""
     ring = after(grid, evidence(stains, striped, wall_m=3.0, pole=Pole(1.3, 0.05, grey)), 30)
-    assert ring.free_m[AHEAD].min() < 1.5
+    assert ring.free_m[AHEAD].min() < 1.8
     beside = np.r_[SECTORS // 2 - 12 : SECTORS // 2 - 6, SECTORS // 2 + 6 : SECTORS // 2 + 12]
     assert ring.free_m[beside].min() > 2.0
 
@@ -98,14 +98,14 @@ def test_floor_that_was_free_is_not_while_a_thin_plain_pole_hides_it(grid: Obsta
     """As the base drives around a pole it hides floor that was seen from elsewhere, and shows what it hid."""
     bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(1.3, 0.05, grey)))
     assert after(grid, bare, 30).free_m[AHEAD].min() > 2.0
-    assert after(grid, hidden, 8, first=30).free_m[AHEAD].min() < 1.6
+    assert after(grid, hidden, 8, first=30).free_m[AHEAD].min() < 1.8
     assert after(grid, bare, 8, first=38).free_m[AHEAD].min() > 2.0
 
 
 def test_nothing_is_free_before_hidden_floor_that_is_the_nearest_in_view(grid: ObstacleGrid) -> None:
     """A thin plain pole is nearer than all floor in view: it may be anywhere before what it hides."""
     near_m = 0.5 * COLUMNS.nearest_floor_m
-    bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.04)))
+    bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.05)))
     after(grid, bare, 30)
     ring = after(grid, hidden, 8, first=30)
     assert np.median(ring.free_m[AHEAD]) < 0.2 and np.median(ring.free_m) > 2.0
@@ -313,6 +313,15 @@ def test_square_follows_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
     assert np.abs(grid.corner_m - [50.0 - 6.4, -6.4]).max() < 0.1 and not np.isfinite(ring.ranges_m).any()
 
 
+def test_single_directions_that_a_floor_mirrors_are_not_somebody(grid: ObstacleGrid, seen: Pairs) -> None:
+    """On a polished floor single directions match what it mirrors; who comes hides all of them."""
+    after(grid, seen, 20)
+    mirrored = seen[0].floor.copy()
+    mirrored[:, DIRECTIONS // 2 - 15 : DIRECTIONS // 2 + 15 : 3] = -6.0
+    ring = grid.update(20 * PERIOD_NS, np.eye(4), seen[0]._replace(floor=mirrored))
+    assert np.isnan(ring.arrivals.ranges_m).all()
+
+
 @pytest.mark.parametrize("grey", [120.0, 190.0])
 def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid, seen: Pairs, grey: float) -> None:
     """Somebody plain, 30 cm wide; the room that stands, and who has stood there from the start, have not come."""
@@ -320,8 +329,9 @@ def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid
     assert np.isnan(after(grid, seen, 20).arrivals.ranges_m).all()
     came = grid.update(20 * PERIOD_NS, np.eye(4), person[0])
     assert np.nanmedian(came.arrivals.ranges_m[AHEAD]) == pytest.approx(1.3, abs=0.15)
-    assert (came.arrivals.sigma_m[AHEAD] < 0.1).all()
-    assert np.isfinite(came.arrivals.ranges_m).sum() < 2 * np.degrees(0.3 / 1.3)
+    found = np.isfinite(came.arrivals.ranges_m)
+    assert 0.3 * np.degrees(0.3 / 1.3) < found.sum() < 2 * np.degrees(0.3 / 1.3)
+    assert (came.arrivals.sigma_m[found] < 0.1).all()
     stays = after(grid, person, 10, first=21)
     assert np.nanmedian(stays.arrivals.ranges_m[AHEAD]) == pytest.approx(1.3, abs=0.15)
     assert np.isnan(after(grid, seen, 5, first=31).arrivals.ranges_m).all(), "the floor is as it was"
