@@ -47,6 +47,7 @@ VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes:
 MEAN_FLOOR: Final = 4  # Index in the evidence of cells; the others are those of the layers.
 
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
+USUAL: Final = 1.0  # Mean evidence of floor from which it is usual: that of a plain pole's own cells is below.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = np.float32(1.0)
 MOST_VISIBLE: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
@@ -174,7 +175,11 @@ class ObstacleGrid:
         self._keep_shown(surface, in_view, weight, window)
         surface = np.minimum(surface - noise, MOST_SURFACE)
         is_surface = surface > 0
-        odds[FLOOR] += weight * np.where(is_surface, np.minimum(floor, 0), floor)
+        # Where floor is usual, a single cell that shows none is noise unless all floor behind it is hidden, too.
+        least = np.where(
+            ~is_surface & (lost <= 0) & (self._usual_thin.mean[window] > USUAL), np.float32(0), -MOST_RATIO
+        )
+        odds[FLOOR] += weight * np.maximum(np.where(is_surface, np.minimum(floor, 0), floor), least)
         passes = (floor > 0) & ~is_surface
         # The sum over pairs from one place tends to their mean, PLACE_PAIRS times: what is no surface stays none.
         surplus = np.where(is_surface, (odds[SURFACE] - np.float32(PRIOR[SURFACE])) / np.float32(PLACE_PAIRS), 0)

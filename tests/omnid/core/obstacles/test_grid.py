@@ -313,6 +313,19 @@ def test_square_follows_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
     assert np.abs(grid.corner_m - [50.0 - 6.4, -6.4]).max() < 0.1 and not np.isfinite(ring.ranges_m).any()
 
 
+def test_patch_of_usual_floor_that_shows_none_stays_free_where_floor_behind_it_is_seen(
+    grid: ObstacleGrid, seen: Pairs
+) -> None:
+    """What a polished floor mirrors outweighs the floor's own texture for some pairs; who stands there hides more."""
+    after(grid, seen, 20)
+    for n in range(20, 30):
+        dull = seen[n % len(seen)].floor.copy()
+        bins = slice(int(COLUMNS.at_1m / 1.5), int(COLUMNS.at_1m / 1.2))
+        dull[bins, DIRECTIONS // 2 - 6 : DIRECTIONS // 2 + 6] = -2.0
+        ring = grid.update(n * PERIOD_NS, np.eye(4), seen[n % len(seen)]._replace(floor=dull))
+    assert ring.free_m[AHEAD].min() > 1.5
+
+
 def test_single_directions_that_a_floor_mirrors_are_not_somebody(grid: ObstacleGrid, seen: Pairs) -> None:
     """On a polished floor single directions match what it mirrors; who comes hides all of them."""
     after(grid, seen, 20)
