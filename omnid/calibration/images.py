@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -44,6 +44,17 @@ def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
 def is_log(source: Path) -> bool:
     """True if a source of images is a log by its name."""
     return source.suffix in LOG_SUFFIXES
+
+
+def brightest(images: Iterable[Image]) -> Image:
+    """Return the maximum (H, W) of images of one size: of a mirror it shows the rim best."""
+    return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
+
+
+def middle_px(image: Image) -> tuple[float, float]:
+    """Return the middle (u, v) of an image, px."""
+    height, width = image.shape
+    return (width - 1) / 2, (height - 1) / 2
 
 
 def _of_files(sources: Sequence[str]) -> Images:

@@ -34,7 +34,7 @@ from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_wa
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera import MAX_LOG_VIEWS
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
-from omnid.calibration.images import Images
+from omnid.calibration.images import Images, brightest
 from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
@@ -317,4 +317,4 @@ def _mask(center: tuple[float, float], images: Images, file: CameraFile | None, 
         return find_mask(list(images.values()), center)
     if file is not None and file.mask is not None:
         return file.mask
-    return find_rim(np.max(list(images.values()), axis=0), center)
+    return find_rim(brightest(images.values()), center)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -58,12 +59,9 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
     named = read_rig(args.rig) if args.rig else None
-    reader = open_log(args.log, (args.lower, args.upper), named)
-    try:
+    with closing(open_log(args.log, (args.lower, args.upper), named)) as reader:
         rig = named or attached_rig(reader, args.log)
         pairs = read_rig_pairs(reader, rig)
-    finally:
-        reader.close()
     skewed = _skewed(pairs)
     if skewed and args.refine:
         raise OmnidError(

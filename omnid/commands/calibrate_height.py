@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 
 from calib.rig_file import read_rig
@@ -37,11 +38,8 @@ def run(args: argparse.Namespace) -> int:
     topics = args.lower, args.upper
     rig = read_rig(args.rig) if args.rig else None
     if rig is None:
-        reader = open_log(args.log, topics, None)
-        try:
+        with closing(open_log(args.log, topics, None)) as reader:
             rig = attached_rig(reader, args.log)
-        finally:
-            reader.close()
     prepare_kernels()
     found = calibrate_height(args.log, rig, topics)
     print(found)

@@ -13,7 +13,8 @@ from omnid.commands.config import add_settings
 
 if TYPE_CHECKING:  # the list loads none of these
     from drivers.frame import Camera, Frame
-    from omnid.calibration.snapshot import CameraView, Image
+    from omnid.calibration.images import Image
+    from omnid.calibration.snapshot import CameraView
 
 ROOT = Path("/")  # folder of sys and dev
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
