@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
 from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
@@ -39,10 +39,6 @@ class McapImageLog:
             return None
         catalog, counts = self._summary.catalog, self._summary.message_counts
         return {name: sum(counts.get(channel, 0) for channel in catalog.ids(name)) for name in catalog.topics()}
-
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-        return images_of(self)
 
     def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
         """Yield the messages in file order."""

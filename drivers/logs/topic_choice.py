@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from drivers.errors import DriverError
-from drivers.frame import Camera
+from drivers.frame import CAMERAS, Camera
 from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
 from drivers.logs.ros_motion import IMU, ODOMETRY
@@ -44,8 +44,7 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
         )
     given = {name for name in wanted.values() if name is not None}
     free = [name for name in images if name not in given]
-    cameras: tuple[Camera, Camera] = ("lower", "upper")
-    found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in cameras}
+    found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in CAMERAS}
     return _both(log, images, found)
 
 
@@ -67,9 +66,8 @@ class MotionChoice(NamedTuple):
 def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopics) -> MotionChoice:
     """Return the topics of wheels and IMU; where several might be meant, none, and a warning.
 
-    A topic of odometry is that of wheels if its name contains "wheel": others are results; one of joints by any name.
-    Raises DriverError for a
-    requested topic that does not exist or is of another type.
+    A topic of odometry is that of wheels if its name contains "wheel", because others are results; a topic of joints
+    may have any name. Raises DriverError for a requested topic that does not exist or is of another type.
     """
     chosen, warnings = [], []
     wheels = JOINT_STATE if wanted.joints else ODOMETRY
