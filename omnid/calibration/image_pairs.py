@@ -50,7 +50,7 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
     return pairs
 
 
-def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None = None) -> PairedImages:
+def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None) -> PairedImages:
     """Read images of which each holds both views: of a folder, or of a log's topic."""
     if is_log(source):
         topic = image_topic(source, topic)

@@ -39,9 +39,7 @@ class CameraStream:
     bus_mbps: float  # speed of the camera on it
 
 
-def cameras(
-    wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path = Path("/")
-) -> Iterator[Finding]:
+def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path) -> Iterator[Finding]:
     """Yield findings for each configured camera and each USB bus; known: the cameras that are connected.
 
     root: folder of sys, dev and proc.

@@ -62,7 +62,7 @@ class Axis:
         return [k * step for k in range(first, last + 1)]
 
 
-def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool = False, zero: bool = False) -> Axis:
+def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool, zero: bool) -> Axis:
     """Return an axis that holds all values and a margin; zero: it holds 0 as well."""
     if log:
         first, last = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))

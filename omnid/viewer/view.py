@@ -49,7 +49,7 @@ class Log:
     settings: Path | None = None  # file of the configuration
 
 
-def target_for(out: Path | None, web: bool, port: int = 0) -> ViewerTarget:
+def target_for(out: Path | None, web: bool, port: int) -> ViewerTarget:
     """Return the named file as target, else a viewer; port: of a viewer for browsers, 0: any."""
     return RrdFile(out) if out is not None else Viewer(web, port)
 
