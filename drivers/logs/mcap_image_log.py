@@ -15,9 +15,6 @@ from drivers.logs.mcap_records import LogFile
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
 from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
-_SCAN_BYTES = 64 * 2**20
-_SCAN_MESSAGES = 2000
-
 
 class McapImageLog:
     """An ImageLog of one MCAP file; raises DriverError where the path is not one."""
@@ -78,7 +75,7 @@ class McapImageLog:
         """Return the channels from the summary; of a truncated log, which has none, from the start of the file."""
         if self._summary is not None and self._summary.catalog.topics():
             return self._summary.catalog
-        return scan_channels(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
+        return scan_channels(self._file)
 
 
 def _read(kind: str, message: LogMessage, aligned: bool) -> RosImage:

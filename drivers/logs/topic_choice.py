@@ -9,7 +9,7 @@ from typing import NamedTuple
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
 from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES
 from drivers.logs.ros_motion import IMU, ODOMETRY
 
 _WORDS: dict[str, Camera] = {
@@ -91,7 +91,7 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
 
 
 def _is_image(name: str, kind: str) -> bool:
-    return kind in (IMAGE, COMPRESSED_IMAGE) and not name.endswith("/compressedDepth")
+    return kind in IMAGE_TYPES and not name.endswith("/compressedDepth")
 
 
 def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
@@ -99,7 +99,7 @@ def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
         return None
     if name not in topics:
         raise DriverError(f"no topic {name!r} in {log}: found {_listed(topics)}; give one of these")
-    if topics[name] not in (IMAGE, COMPRESSED_IMAGE):
+    if topics[name] not in IMAGE_TYPES:
         raise DriverError(f"topic {name!r} in {log} holds {topics[name] or 'no CDR'}; give one of: {_listed(topics)}")
     return name
 
