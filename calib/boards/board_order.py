@@ -44,7 +44,7 @@ def array_to_grid(corners: Array) -> Grid:
 
 def _board_windows(grid: Grid, board: Board) -> Iterator[Array]:
     """Yield every window of the board's size, upright or rotated, that is well filled and has no row beyond it."""
-    for upright in (grid_to_array(grid), _rotated_quarter(grid_to_array(grid))):
+    for upright in (grid_to_array(grid), np.rot90(grid_to_array(grid))):
         known = np.isfinite(upright[..., 0])
         if known.shape[0] >= board.rows + 2 and known.shape[1] >= board.columns + 2:
             around = np.lib.stride_tricks.sliding_window_view(known, (board.rows + 2, board.columns + 2))
@@ -60,11 +60,6 @@ def _are_isolated(around: NDArray[np.bool_]) -> NDArray[np.bool_]:
     filled = inside.mean(axis=(-2, -1)) >= MIN_FILLED
     ends = np.min([border.mean(axis=-1) for border in borders], axis=0) >= MIN_BORDER
     return np.asarray(filled & ends & (np.max([row.mean(axis=-1) for row in beyond], axis=0) < BEYOND))
-
-
-def _rotated_quarter(corners: Array) -> Array:
-    """Return the corners rotated by 90 degrees: columns and rows are exchanged, the orientation is kept."""
-    return np.rot90(corners, axes=(0, 1))
 
 
 def largest_rectangle(grid: Grid) -> tuple[int, int]:

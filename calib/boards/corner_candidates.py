@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -108,6 +108,7 @@ def smoothed(image: NDArray[np.generic], blur_px: float) -> Grey:
 
 
 def _at_level(image: NDArray[np.uint8], level: ScaleLevel) -> CornerCandidates:
+    """Return the corners of one level, in pixels of the image itself."""
     shrunk = (
         image
         if level.scale == 1
@@ -117,14 +118,7 @@ def _at_level(image: NDArray[np.uint8], level: ScaleLevel) -> CornerCandidates:
     places = _saddles(blurred, int(np.ceil(level.ring_px)))
     found = describe_corners(blurred, places, level.ring_px)
     found = found.select(found.quality > 0)
-    return CornerCandidates(
-        (found.pixels + 0.5) / level.scale - 0.5,
-        found.angles,
-        found.light,
-        found.contrast,
-        found.quality,
-        found.ring_px / level.scale,
-    )
+    return replace(found, pixels=(found.pixels + 0.5) / level.scale - 0.5, ring_px=found.ring_px / level.scale)
 
 
 def _saddles(blurred: Grey, border: int) -> Array:

@@ -91,7 +91,7 @@ def _flood_fill(seed: int, neighbour: NDArray[np.int64], back: NDArray[np.int64]
     return cells
 
 
-def grow_grid(image: Grey, grid: Grid, most: int = MAX_CELLS) -> Grid:
+def grow_grid(image: Grey, grid: Grid, most: int) -> Grid:
     """Return the grid with every corner added that its neighbours predict and the image shows.
 
     A grid of more than most corners does not grow any further.

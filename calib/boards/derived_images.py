@@ -21,7 +21,7 @@ MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
 STRIP_INNER_PART = 1 / 16
 # Outer radius, in parts of the larger side: up to the border.
 STRIP_OUTER_PART = 1 / 2
-# CLAHE (contrast limited adaptive histogram equalisation): clip limit and number of tiles per axis.
+# Contrast limited adaptive histogram equalisation (CLAHE): clip limit, and number of tiles along each axis.
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
 
 
@@ -64,7 +64,7 @@ def unrolled(image: Image) -> DerivedImage:
 
 
 def _strip_scale(shape: tuple[int, int]) -> tuple[float, float, float]:
-    """Return inner and outer radius [px] of a strip, and its pixels per radian."""
+    """Return inner and outer radius [px] of a strip, and its pixels per radian; shape: (H, W) of the image."""
     inner, outer = min(shape) * STRIP_INNER_PART, max(shape) * STRIP_OUTER_PART
     return inner, outer, min(MAX_STRIP_PX, 2 * np.pi * outer) / (2 * np.pi)
 
@@ -77,12 +77,16 @@ def _strip_to_source(shape: tuple[int, int], pixels: Array) -> Array:
 
 
 def _middle(shape: tuple[int, int]) -> Array:
+    """Return the middle (2,) of an image (H, W): u, v [px]."""
     return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])
 
 
 @lru_cache(maxsize=2)
 def _strip_maps(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the tables of a strip for cv2.remap; the images of a camera have one shape."""
+    """Return the columns and rows (H, W) [px] of the image for each pixel of its strip, for cv2.remap.
+
+    They are kept, because all images of a camera have one shape.
+    """
     inner, outer, scale = _strip_scale(shape)
     azimuth = np.arange(int(STRIP_TURNS * 2 * np.pi * scale)) / scale
     radius = outer * np.exp(-np.arange(int(np.log(outer / inner) * scale)) / scale)

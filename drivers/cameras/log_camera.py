@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final, TypeAlias, TypeVar
 
 from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
@@ -22,6 +22,7 @@ MAX_SAMPLES: Final = 4_000_000  # Samples of wheels and IMU that are kept: hours
 MIN_PACE, MAX_PACE = 0.001, 1000.0
 POLL_PERIOD_S: Final = 0.02  # A wait is interrupted with this period to see whether close() was called.
 MAX_DELAY_NS: Final = 100_000_000  # a frame later than that is dropped, as by a camera whose buffers are full
+T = TypeVar("T")
 TimedFrames: TypeAlias = tuple[tuple[int, Frame], ...]  # time since the log's first frame [ns], frame
 
 
@@ -153,13 +154,8 @@ class LogCamera:
         self._closed = True
 
     def _schedule(self) -> Iterator[tuple[int, Frame]]:
-        """Yield each frame with its time since the epoch at pace 1 [ns]; every second pass runs backwards."""
-        last_ns, pass_ns = self._images.last_ns, self._images.pass_ns
-        for start_ns in count(0, 2 * pass_ns):
-            yield from ((start_ns + at_ns, frame) for at_ns, frame in self._frames)
-            if self._once:
-                return
-            yield from ((start_ns + pass_ns + last_ns - at_ns, frame) for at_ns, frame in reversed(self._frames))
+        """Yield each frame with its time since the epoch at pace 1 [ns]."""
+        return ((due_ns, frame) for due_ns, frame, _ in _passes(self._frames, self._images, self._once))
 
     def _sleep_until(self, due_ns: int) -> None:
         while not self._closed and (left_s := (due_ns - time.monotonic_ns()) * 1e-9) > 0:
@@ -179,7 +175,7 @@ class LogMotion:
         if not self._images.motion:
             return
         epoch_ns = self._clock.epoch_ns()
-        for due_ns, sample, direction in self._schedule():
+        for due_ns, sample, direction in _passes(self._images.motion, self._images, self._once):
             stamp_ns = epoch_ns + round(due_ns / self._pace)
             while not self._closed and (left_s := (stamp_ns - time.monotonic_ns()) * 1e-9) > 0:
                 time.sleep(min(left_s, POLL_PERIOD_S))
@@ -191,15 +187,18 @@ class LogMotion:
         """End samples(); may be called twice, from any thread."""
         self._closed = True
 
-    def _schedule(self) -> Iterator[tuple[int, MotionSample, int]]:
-        last_ns, pass_ns = self._images.last_ns, self._images.pass_ns
-        for start_ns in count(0, 2 * pass_ns):
-            yield from ((start_ns + at_ns, sample, 1) for at_ns, sample in self._images.motion)
-            if self._once:
-                return
-            yield from (
-                (start_ns + pass_ns + last_ns - at_ns, sample, -1) for at_ns, sample in reversed(self._images.motion)
-            )
+
+def _passes(entries: Sequence[tuple[int, T]], images: LogImages, once: bool) -> Iterator[tuple[int, T, int]]:
+    """Yield the entries of a log pass after pass, every second pass backwards.
+
+    Each has its time since the epoch at pace 1 [ns], and the direction of the pass: 1, or -1 backwards. once: one pass.
+    """
+    for start_ns in count(0, 2 * images.pass_ns):
+        yield from ((start_ns + at_ns, entry, 1) for at_ns, entry in entries)
+        if once:
+            return
+        turned_ns = start_ns + images.pass_ns + images.last_ns
+        yield from ((turned_ns - at_ns, entry, -1) for at_ns, entry in reversed(entries))
 
 
 def _scaled(sample: MotionSample, stamp_ns: int, factor: float) -> MotionSample:

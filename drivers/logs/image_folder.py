@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage, images_of
+from drivers.logs.image_log import LogDamage, LoggedImage
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
 
@@ -83,10 +83,6 @@ class ImageFolder:
     def counts(self) -> Mapping[str, int] | None:
         """Return the number of images in each folder."""
         return {topic: len(files) for topic, files in self._files.items()}
-
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-        return images_of(self)
 
     def messages(self) -> Iterator[LoggedImage]:
         """Yield the images of all folders in the order of their stamps."""
@@ -151,13 +147,9 @@ def _require_no_gap(files: Sequence[_StampedFile]) -> None:
 def _in_words(gap_ns: int) -> str:
     """Return a time of hours, days or years."""
     hours = gap_ns / 3600e9
-    return (
-        f"{hours:.1f} hours"
-        if hours < 48
-        else f"{hours / 24:.0f} days"
-        if hours < 9000
-        else (f"{hours / 8766:.1f} years")
-    )
+    if hours < 48:
+        return f"{hours:.1f} hours"
+    return f"{hours / 24:.0f} days" if hours < 9000 else f"{hours / 8766:.1f} years"
 
 
 def _require_own_files(top: Path, paths: Sequence[Path]) -> None:

@@ -47,9 +47,6 @@ class ImageLog(Protocol):
     def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
         """Yield the images of all topics, and the messages of wheels and IMUs; ends early after close."""
 
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-
     def attachments(self) -> dict[str, bytes]:
         """Return name -> bytes of the attachments, such as a rig; at most 32 of up to 16 MiB each, 64 MiB in all."""
 

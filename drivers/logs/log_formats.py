@@ -44,7 +44,7 @@ def log_info(path: str | os.PathLike[str]) -> LogInfo:
     try:
         if isinstance(log, McapImageLog):
             return read_log_info(path)
-        times_ns = [(image.topic, image.log_time_ns) for image in log.images()]
+        times_ns = [(image.topic, image.log_time_ns) for image in images_of(log)]
         counts = log.counts() or Counter(topic for topic, _ in times_ns)
         topics = {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())}
         damage, size_bytes = log.damage(), _size_bytes(Path(path))
@@ -145,10 +145,6 @@ class SplitLog:
                 return None
             total.update(counts)
         return total
-
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-        return images_of(self)
 
     def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
         """Yield the messages of one part after the other."""

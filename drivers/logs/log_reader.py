@@ -30,9 +30,7 @@ _WARNINGS = {
 }
 MAX_WAITING_SAMPLES = 65_536  # Samples of wheels and IMU that wait for the next images: some minutes.
 _COUNTERS = ("lower", "upper", *_WARNINGS)
-
-
-WHOLE = (0.0, math.inf)
+WHOLE = (0.0, math.inf)  # span of all of a log [s]
 
 
 class LogReader:
@@ -67,11 +65,8 @@ class LogReader:
             wanted: dict[Camera, str | None] = {"lower": lower, "upper": upper}
             topics = self._log.topics()
             self._cameras = choose_topics(repr(self._log.name), topics, wanted)
-            self._motion = (
-                MotionChoice(frozenset())
-                if motion is None
-                else choose_motion_topics(repr(self._log.name), topics, motion)
-            )
+            if motion is not None:
+                self._motion = choose_motion_topics(repr(self._log.name), topics, motion)
             self._reset()
         except DriverError:
             self.close()

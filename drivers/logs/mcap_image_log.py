@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from functools import partial
 
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
 from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
@@ -14,9 +14,6 @@ from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
 from drivers.logs.mcap_records import LogFile
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
 from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
-
-_SCAN_BYTES = 64 * 2**20
-_SCAN_MESSAGES = 2000
 
 
 class McapImageLog:
@@ -39,10 +36,6 @@ class McapImageLog:
             return None
         catalog, counts = self._summary.catalog, self._summary.message_counts
         return {name: sum(counts.get(channel, 0) for channel in catalog.ids(name)) for name in catalog.topics()}
-
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-        return images_of(self)
 
     def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
         """Yield the messages in file order."""
@@ -82,7 +75,7 @@ class McapImageLog:
         """Return the channels from the summary; of a truncated log, which has none, from the start of the file."""
         if self._summary is not None and self._summary.catalog.topics():
             return self._summary.catalog
-        return scan_channels(self._file, _SCAN_BYTES, _SCAN_MESSAGES)
+        return scan_channels(self._file)
 
 
 def _read(kind: str, message: LogMessage, aligned: bool) -> RosImage:

@@ -42,6 +42,7 @@ class LogSummary:
 
     catalog: Catalog
     message_counts: Mapping[int, int]  # by channel
+    statistics: Statistics | None  # None: the log has none
     attachments: tuple[int, ...] = field(repr=False)  # offsets of their records
 
 
@@ -50,20 +51,23 @@ def read_summary(file: LogFile) -> LogSummary | None:
     section = summary_section(file)
     if section is None:
         return None
-    catalog, counts = Catalog(), Counter[int]()
-    attachments: list[int] = []
+    catalog, attachments = Catalog(), list[int]()
+    found: list[Statistics] = []
     try:
         for record in records(section, 0, section.size):
             body = read_content(section, record)
             if record.opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 catalog.add(record.opcode, body)
             elif record.opcode == Opcode.STATISTICS:
-                counts.update(Statistics.read(parser(body)).channel_message_counts)
+                found.append(Statistics.read(parser(body)))
             elif record.opcode == Opcode.ATTACHMENT_INDEX and len(attachments) < MAX_ATTACHMENTS:
                 attachments.append(AttachmentIndex.read(parser(body)).offset)
     except (RecordError, *PARSE_ERRORS):
         return None
-    return LogSummary(catalog, counts, tuple(attachments))
+    counts = Counter[int]()
+    for statistics in found:
+        counts.update(statistics.channel_message_counts)
+    return LogSummary(catalog, counts, found[0] if found else None, tuple(attachments))
 
 
 def has_footer(file: LogFile) -> bool:

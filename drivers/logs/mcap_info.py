@@ -10,13 +10,12 @@ from enum import Enum
 from pathlib import Path
 
 from mcap.opcode import Opcode
-from mcap.records import Statistics
 
 from drivers.logs.file_lock import is_locked
 from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_index import has_footer, read_attachments, read_summary, summary_section
+from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
 from drivers.logs.mcap_messages import DataSection
-from drivers.logs.mcap_records import MAGIC, PARSE_ERRORS, LogFile, RecordError, parser, read_content, records
+from drivers.logs.mcap_records import MAGIC, LogFile, records
 
 
 class LogState(Enum):
@@ -59,30 +58,17 @@ def read_log_info(path: str | os.PathLike[str]) -> LogInfo:
 
 def _from_index(file: LogFile, locked: bool) -> LogInfo | None:
     """Return the contents by the summary; None without a summary, or where the data section has no end."""
-    summary, statistics = read_summary(file), _statistics(file)
-    if summary is None or statistics is None:
+    summary = read_summary(file)
+    if summary is None or summary.statistics is None:
         return None
     if not any(record.opcode == Opcode.DATA_END for record in records(file, len(MAGIC), file.size)):
         return None
+    statistics = summary.statistics
     span_ns = (statistics.message_start_time, statistics.message_end_time) if statistics.message_count else None
     topics = _by_topic(summary.catalog, Counter(summary.message_counts))
     attachments = {name: len(data) for name, data in read_attachments(file, summary).items()}
     state = LogState.WRITTEN if locked else LogState.WHOLE
     return LogInfo(file.path, file.size, state, file.size, 0, topics, span_ns, attachments)
-
-
-def _statistics(file: LogFile) -> Statistics | None:
-    """Return the statistics record of the summary, None without one."""
-    section = summary_section(file)
-    if section is not None:
-        for record in records(section, 0, section.size):
-            if record.opcode == Opcode.STATISTICS:
-                try:
-                    found: Statistics = Statistics.read(parser(read_content(section, record)))
-                    return found
-                except (RecordError, *PARSE_ERRORS):
-                    return None
-    return None
 
 
 def _from_messages(file: LogFile, locked: bool) -> LogInfo:

@@ -21,6 +21,8 @@ from drivers.logs.mcap_records import (
 )
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_SCAN_BYTES = 64 * 2**20
+_SCAN_MESSAGES = 2000
 
 
 class LogMessage(NamedTuple):
@@ -93,10 +95,10 @@ def _message(source: ByteSource, record: Record) -> LogMessage:
     return LogMessage(channel_id, log_time_ns, source, rest)
 
 
-def scan_channels(file: LogFile, limit_bytes: int, limit_messages: int) -> Catalog:
+def scan_channels(file: LogFile) -> Catalog:
     """Return the channels that are defined at the start of a log, for logs without a summary."""
-    section = DataSection(file, Catalog(), limit_bytes)
+    section = DataSection(file, Catalog(), _SCAN_BYTES)
     for count, _ in enumerate(section.messages()):
-        if count >= limit_messages:
+        if count >= _SCAN_MESSAGES:
             break
     return section.catalog

@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from drivers.frame import Camera, Frame
+from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import RosImage
 
 MAX_HELD_BYTES = 256 * 2**20
@@ -60,19 +61,5 @@ class ReorderBuffer:
             self._counts["late"] += 1
         else:
             self._newest_ns = self._last_ns[oldest.camera] = oldest.stamp_ns
-            yield self._frame(oldest)
-
-    def _frame(self, waiting: _WaitingImage) -> Frame:
-        seq, image = self._counts[waiting.camera], waiting.image
-        self._counts[waiting.camera] += 1
-        return Frame(
-            seq,
-            waiting.stamp_ns,
-            waiting.camera,
-            image.encoding,
-            image.data,
-            image.width,
-            image.height,
-            image.step,
-            image.bigendian,
-        )
+            self._counts[oldest.camera] += 1
+            yield frame_of(oldest.image, oldest.camera, self._counts[oldest.camera] - 1)

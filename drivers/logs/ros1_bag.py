@@ -18,7 +18,7 @@ from typing import BinaryIO, Final, NamedTuple
 import lz4.frame  # type: ignore[import-untyped]
 
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
 from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_catalog import ros_name
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
@@ -115,10 +115,6 @@ class Ros1Bag:
         for connection, (name, _) in self._topics.items():
             total[name] += self._counts[connection]
         return total
-
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-        return images_of(self)
 
     def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
         """Yield the messages in the order of the file."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from drivers.errors import DriverError
-from drivers.events import EventCallback, ignore_event
+from drivers.events import EventCallback
 from drivers.logs.log_folder import LogFolder, RotationSettings, complete_path, delete_file
 from drivers.logs.mcap_writer import LogWriter
 
@@ -44,7 +44,7 @@ class RotatingLog:
 
     def __init__(
         self, folder: LogFolder, rotation: RotationSettings, attachments: Mapping[str, bytes],
-        *, on_event: EventCallback = ignore_event,
+        *, on_event: EventCallback,
     ) -> None:  # fmt: skip
         self.state = RotatingLogState()
         self._folder, self._rotation, self._on_event = folder, rotation, on_event

@@ -21,7 +21,7 @@ import zstandard
 
 from drivers.bounded_sqlite import bound_work, open_bounded
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, images_of
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
 from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
@@ -102,10 +102,6 @@ class SqliteBag:
         except sqlite3.Error:
             return None
         return {name: found[key] for key, (name, _) in self._topics.items()}
-
-    def images(self) -> Iterator[LoggedImage]:
-        """Yield the images among the messages."""
-        return images_of(self)
 
     def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
         """Yield the messages in the order in which they were written."""

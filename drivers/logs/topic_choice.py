@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from drivers.errors import DriverError
-from drivers.frame import Camera
+from drivers.frame import CAMERAS, Camera
 from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES
 from drivers.logs.ros_motion import IMU, ODOMETRY
 
 _WORDS: dict[str, Camera] = {
@@ -44,8 +44,7 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
         )
     given = {name for name in wanted.values() if name is not None}
     free = [name for name in images if name not in given]
-    cameras: tuple[Camera, Camera] = ("lower", "upper")
-    found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in cameras}
+    found = {camera: _given(log, topics, wanted[camera]) or _guessed(log, free, camera) for camera in CAMERAS}
     return _both(log, images, found)
 
 
@@ -67,9 +66,8 @@ class MotionChoice(NamedTuple):
 def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopics) -> MotionChoice:
     """Return the topics of wheels and IMU; where several might be meant, none, and a warning.
 
-    A topic of odometry is that of wheels if its name contains "wheel": others are results; one of joints by any name.
-    Raises DriverError for a
-    requested topic that does not exist or is of another type.
+    A topic of odometry is that of wheels if its name contains "wheel", because others are results; a topic of joints
+    may have any name. Raises DriverError for a requested topic that does not exist or is of another type.
     """
     chosen, warnings = [], []
     wheels = JOINT_STATE if wanted.joints else ODOMETRY
@@ -93,7 +91,7 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
 
 
 def _is_image(name: str, kind: str) -> bool:
-    return kind in (IMAGE, COMPRESSED_IMAGE) and not name.endswith("/compressedDepth")
+    return kind in IMAGE_TYPES and not name.endswith("/compressedDepth")
 
 
 def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
@@ -101,7 +99,7 @@ def _given(log: str, topics: Mapping[str, str], name: str | None) -> str | None:
         return None
     if name not in topics:
         raise DriverError(f"no topic {name!r} in {log}: found {_listed(topics)}; give one of these")
-    if topics[name] not in (IMAGE, COMPRESSED_IMAGE):
+    if topics[name] not in IMAGE_TYPES:
         raise DriverError(f"topic {name!r} in {log} holds {topics[name] or 'no CDR'}; give one of: {_listed(topics)}")
     return name
 

@@ -160,11 +160,14 @@ def remove_attempts(out: Path) -> None:
 
 
 def _failure(code: int | None, folder: Path) -> dict[str, Any]:
-    status = {0: OK, 1: NO_POSE, None: TIMED_OUT}.get(code, FAILED if code is None or code > 0 else KILLED)
-    lines = messages(folder)
-    problem = one_line(lines[-1]).removeprefix("omnid: ") if lines and status not in (OK, NO_POSE) else ""
-    if status == KILLED:
-        problem = f"the program ended by signal {-(code or 0)}"
+    """Return status, error and number of warnings of a replay with this exit code; None: it took too long."""
+    lines, problem = messages(folder), ""
+    if code is not None and code < 0:
+        status, problem = KILLED, f"the program ended by signal {-code}"
+    else:
+        status = {0: OK, 1: NO_POSE, None: TIMED_OUT}.get(code, FAILED)
+        if lines and status not in (OK, NO_POSE):
+            problem = one_line(lines[-1]).removeprefix("omnid: ")
     return {"status": status, "error": problem, "warnings": sum(": warning: " in line for line in lines)}
 
 

@@ -84,7 +84,16 @@ def build_map(
     options: of `omnid map build`, for each log; first: a map that is extended, None: there is none. Raises OmnidError
     where a program fails, or a log shares no place with the others.
     """
-    # 1. A map of each log.
+    parts = _maps_of_logs(logs, options, folder, workers, report)
+    if first is not None:
+        parts.insert(0, _Part(first, (str(first),)))
+    return _joined(parts, folder, workers, report).path if parts else None
+
+
+def _maps_of_logs(
+    logs: Sequence[Path], options: Sequence[str], folder: Path, workers: Workers, report: Report
+) -> list[_Part]:
+    """Return a map of each log that has a keyframe."""
     tasks = [
         MapTask(str(log), ("map", "build", str(log.absolute()), *options, "--quiet"), folder / f"{number}.omap")
         for number, log in enumerate(logs)
@@ -94,10 +103,11 @@ def build_map(
         log, error = failed[0].task.what, failed[0].error
         raise OmnidError(f"map build: {error if log in error else f'{log}: {error}'}")
     empty = {result.task.output for result in results if result.is_empty}
-    parts = [_Part(task.output, (task.what,)) for task in tasks if task.output not in empty]
-    if first is not None:
-        parts.insert(0, _Part(first, (str(first),)))
-    # 2. Rounds of pairs, until one map is left.
+    return [_Part(task.output, (task.what,)) for task in tasks if task.output not in empty]
+
+
+def _joined(parts: list[_Part], folder: Path, workers: Workers, report: Report) -> _Part:
+    """Return one map of one or more, joined in rounds of pairs. Raise OmnidError where some share no place."""
     tried, number = set[tuple[Path, Path]](), len(parts)
     while len(parts) > 1:
         pairs = _pairs(parts, tried)
@@ -121,7 +131,7 @@ def build_map(
                 parts = [whole if part is a else part for part in parts if part is not b]
             elif NO_COMMON_PLACE not in result.error:
                 raise OmnidError(f"map build: {result.error}")
-    return parts[0].path if parts else None
+    return parts[0]
 
 
 def _pairs(parts: Sequence[_Part], tried: set[tuple[Path, Path]]) -> list[tuple[_Part, _Part]]:

@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
+from io import StringIO
 from pathlib import Path
 from typing import Final
 from urllib.parse import quote
@@ -35,6 +36,14 @@ _HEAD: Final = (
     "length error",
     "time",
 )
+_FILES: Final = (  # of a log that are linked, with the words of the link
+    ("report.html", "report"),
+    ("plan.png", "plan"),
+    ("est.txt", "path"),
+    ("map_est.txt", "path in the map"),
+    ("cloud.ply", "cloud"),
+    ("messages.txt", "messages"),
+)
 _FORMULA: Final = ("=", "+", "-", "@")  # first characters that spreadsheets execute
 MOST_CHARACTERS: Final = 5000  # Most characters of a cell, which may contain the path of a log.
 
@@ -56,8 +65,6 @@ def write_tables(results: Sequence[JobResult], out: Path) -> list[Path]:
 
 
 def _csv(results: Sequence[JobResult]) -> str:
-    from io import StringIO
-
     text = StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
@@ -89,14 +96,13 @@ def _index(results: Sequence[JobResult], out: Path) -> list[str]:
 
 def _row(result: JobResult, out: Path) -> tuple[str, ...]:
     folder = quote(result.name)
-    name = escape(result.name)
     links = " ".join(
         f"<a href='{folder}/{file}'>{label}</a>" for file, label in _FILES if (out / result.name / file).is_file()
     )
     outcome = escape(plain(f"{result.status}: {result.error}" if result.error else result.status))
     status = outcome if result.status == OK else f"<span class='bad'>{outcome}</span>"
     return (
-        name,
+        escape(result.name),
         links,
         status,
         str(result.pairs),
@@ -109,16 +115,6 @@ def _row(result: JobResult, out: Path) -> tuple[str, ...]:
         "" if math.isnan(result.length_error_ratio) else f"{result.length_error_ratio:+.3%}",
         f"{result.seconds:.1f} s",
     )
-
-
-_FILES: Final = (
-    ("report.html", "report"),
-    ("plan.png", "plan"),
-    ("est.txt", "path"),
-    ("map_est.txt", "path in the map"),
-    ("cloud.ply", "cloud"),
-    ("messages.txt", "messages"),
-)
 
 
 def _metres(value: float, digits: int = 2) -> str:

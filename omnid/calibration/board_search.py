@@ -19,6 +19,8 @@ from omnid.calibration.progress import Progress, silent
 from omnid.errors import OmnidError
 
 AnyBoard = Board | CharucoBoard | AprilGrid
+# A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
+MAX_LOG_VIEWS = 40
 # Images in which markers of other dictionaries are searched if no board is found.
 HINT_IMAGES = 3
 
@@ -79,12 +81,12 @@ def _marker_hint(images: Images, board: CharucoBoard | AprilGrid) -> str:
     return "its markers were seen, not at the places of such a board: check --corners, --marker-mm, --legacy-charuco"
 
 
-def select_diverse_views(views: Sequence[BoardView], count: int) -> list[BoardView]:
-    """Select at most count views whose first and last corners are far apart (farthest point sampling)."""
+def select_diverse_views(views: Sequence[BoardView]) -> list[BoardView]:
+    """Select at most MAX_LOG_VIEWS whose first and last corners are far apart (farthest point sampling)."""
     corners = np.array([view.pixels[np.flatnonzero(np.isfinite(view.pixels[:, 0]))[[0, -1]]].ravel() for view in views])
     chosen = [0]
     distance = np.full(len(views), np.inf)
-    while len(chosen) < min(count, len(views)):
+    while len(chosen) < min(MAX_LOG_VIEWS, len(views)):
         distance = np.minimum(distance, np.linalg.norm(corners - corners[chosen[-1]], axis=1))
         chosen.append(int(distance.argmax()))
     return [views[index] for index in sorted(set(chosen))]

@@ -30,9 +30,6 @@ from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 
-# A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
-MAX_LOG_VIEWS = 40
-
 
 @dataclass(frozen=True, slots=True)
 class CameraResult:
@@ -111,7 +108,7 @@ def calibrate_camera(
     many = any(is_log(Path(source)) for source in sources)
     # 2. Find the board in each. Of a log the views that differ most are used.
     views = find_boards(images, board, thorough=not many, progress=progress)
-    views = select_diverse_views(views, MAX_LOG_VIEWS) if many else views
+    views = select_diverse_views(views) if many else views
     seen = view_of_images(view, [(images.values(), views)], board, progress)
     # 3. Fit the models, and select the one with the least error at views that it was not fitted to.
     height, width = images[views[0].name].shape

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -108,18 +109,15 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
 
 def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int) -> Drives:
     """Return keyframes of one drive, at most the given number, its landmarks, and their pixels in the images."""
-    reader = open_log(log, topics, place.rig)
-    try:
-        front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
-        collector = DriveCollector(place, front_end.dense)
-        newest = np.eye(4)
+    front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
+    collector = DriveCollector(place, front_end.dense)
+    newest = np.eye(4)
+    with closing(open_log(log, topics, place.rig)) as reader:
         choice = KeyframeChoice(_spacing(reader, most))
         for update, twist in _with_twists(tracked_updates(reader, front_end, config, log)):
             newest = update.T_odom_rig
             if choice.takes(update):
                 collector.add(update, twist)
-    finally:
-        reader.close()
     return collector.drives(newest)
 
 

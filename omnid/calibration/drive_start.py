@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,21 +32,16 @@ SYNCHRONOUS_S = 3e-3
 
 
 def with_masks(log: Path, rig: Rig, topics: Topics) -> Rig:
-    reader = open_log(log, topics, rig)
-    try:
+    """Return the rig with the masks of its mirrors, found in the images of a log where the rig has none."""
+    with closing(open_log(log, topics, rig)) as reader:
         return with_rims(rig, reader.frames())
-    finally:
-        reader.close()
 
 
 def straightened(log: Path, parameters: RigParameters, topics: Topics, config: Config, progress: Progress) -> Array:
     """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
     rig = parameters.rig
-    reader = open_log(log, topics, rig)
-    try:
+    with closing(open_log(log, topics, rig)) as reader:
         pairs = read_rig_pairs(reader, rig)
-    finally:
-        reader.close()
     finding = check_rig(pairs, rig, config.panorama).finding
     progress(finding.summary)
     if finding.drift is None:

@@ -20,6 +20,7 @@ MEASURED, RESIDUAL, CENTER = (80, 200, 0), (0, 60, 255), (255, 200, 0)
 # Fractional bits of pixels in OpenCV's drawing functions.
 FINE = 4
 MARGIN_PX = 40
+RESIDUAL_PX, COVERAGE_PX = 320, 700  # widths of the figures
 CIRCLE_PX, CROSS_PX = 3, 20
 PANORAMA_WIDTH, MIN_PANORAMA_HEIGHT = 1400, 16
 # The panorama begins this far from the ray of the centre, where a cylinder's scale would be too large.
@@ -28,23 +29,21 @@ MIN_PANORAMA_ANGLE_DEG = 15
 RINGS = 8
 
 
-def residual_image(image: Image, pixels: Array, residuals: Array, side: int = 320) -> Image:
-    """Return the square part of an image around a board, side pixels wide, with corners and ARROW times residuals."""
+def residual_image(image: Image, pixels: Array, residuals: Array) -> Image:
+    """Return the square part of an image around a board, RESIDUAL_PX wide, with corners and ARROW times residuals."""
     known = pixels[np.isfinite(pixels[:, 0])]
     edge = int(min(np.ceil(np.ptp(known, axis=0).max()) + 2 * MARGIN_PX, *image.shape))
     middle = (known.min(axis=0) + known.max(axis=0)) / 2
     low = np.clip(np.round(middle - edge / 2).astype(int), 0, np.array(image.shape[::-1]) - edge)
-    part, scale = image[low[1] : low[1] + edge, low[0] : low[0] + edge], side / edge
+    part, scale = image[low[1] : low[1] + edge, low[0] : low[0] + edge], RESIDUAL_PX / edge
     canvas = _color(cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC))
     _arrows(canvas, (pixels - low + 0.5) * scale - 0.5, residuals * scale)
     return canvas
 
 
-def coverage_image(
-    image: Image, views: Sequence[tuple[Array, Array]], center: tuple[float, float], width: int = 700
-) -> Image:
+def coverage_image(image: Image, views: Sequence[tuple[Array, Array]], center: tuple[float, float]) -> Image:
     """Return one image with the corners of all views (pixels, residuals) and ARROW times their residuals."""
-    scale = width / image.shape[1]
+    scale = COVERAGE_PX / image.shape[1]
     canvas = _color(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) // 2)
     for pixels, residuals in views:
         _arrows(canvas, (pixels + 0.5) * scale - 0.5, residuals * scale)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -64,11 +65,8 @@ def calibrate_height(log: Path, rig: Rig, topics: Topics = (None, None)) -> Heig
 
     topics: of the lower and the upper camera. The tilt is against z of the base as the rig states it.
     """
-    reader = open_log(log, topics, rig)
-    try:
+    with closing(open_log(log, topics, rig)) as reader:
         pairs = read_rig_pairs(reader, rig)
-    finally:
-        reader.close()
     config = Config()
     front_end = FrontEnd(geometry(with_masks(log, rig, topics), config.panorama), config)
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +50,7 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
     return pairs
 
 
-def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None = None) -> PairedImages:
+def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None) -> PairedImages:
     """Read images of which each holds both views: of a folder, or of a log's topic."""
     if is_log(source):
         topic = image_topic(source, topic)
@@ -84,13 +84,10 @@ def _of_side(folder: Path, side: str) -> Images:
 
 
 def _of_log(log: Path, lower: str | None, upper: str | None) -> PairedImages:
-    reader = LogReader(log, lower, upper)
-    try:
+    with closing(LogReader(log, lower, upper)) as reader:
         stride = max(1, sum(1 for _ in paired(reader.frames())) // LOG_PAIRS)
         pairs = [_decoded(pair) for number, pair in enumerate(paired(reader.frames())) if number % stride == 0]
         topics = reader.topics
-    finally:
-        reader.close()
     named = {f"pair{number * stride:05d}": pair for number, pair in enumerate(pairs) if pair}
     sides = [{name: pair[side] for name, pair in named.items()} for side in (0, 1)]
     for images in sides:

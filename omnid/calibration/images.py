@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
-from drivers.frame import MAX_PIXELS, Frame, gray
-from drivers.logs.image_log import ImageLog, LoggedImage
+from drivers.frame import MAX_PIXELS, gray
+from drivers.logs.image_log import ImageLog, LoggedImage, images_of
 from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
 from drivers.logs.mcap_records import RecordError
+from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import IMAGE_TYPES
 from omnid.errors import OmnidError
 
@@ -44,6 +45,17 @@ def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
 def is_log(source: Path) -> bool:
     """True if a source of images is a log by its name."""
     return source.suffix in LOG_SUFFIXES
+
+
+def brightest(images: Iterable[Image]) -> Image:
+    """Return the maximum (H, W) of images of one size: of a mirror it shows the rim best."""
+    return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
+
+
+def middle_px(image: Image) -> tuple[float, float]:
+    """Return the middle (u, v) of an image, px."""
+    height, width = image.shape
+    return (width - 1) / 2, (height - 1) / 2
 
 
 def _of_files(sources: Sequence[str]) -> Images:
@@ -123,7 +135,7 @@ def _topic(path: Path, log: ImageLog, topic: str | None) -> str:
 
 
 def _images(log: ImageLog, topic: str) -> Iterator[LoggedImage]:
-    return (image for image in log.images() if image.topic == topic)
+    return (image for image in images_of(log) if image.topic == topic)
 
 
 def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
@@ -132,22 +144,6 @@ def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image
         if number % stride:
             continue
         try:
-            image = logged.read()
-            yield (
-                f"frame{number:06d}",
-                gray(
-                    Frame(
-                        number,
-                        image.stamp_ns,
-                        "lower",
-                        image.encoding,
-                        image.data,
-                        image.width,
-                        image.height,
-                        image.step,
-                        image.bigendian,
-                    )
-                ),
-            )
+            yield f"frame{number:06d}", gray(frame_of(logged.read(), seq=number))
         except (FrameDecodeError, RecordError):
             continue

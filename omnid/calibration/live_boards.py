@@ -17,7 +17,7 @@ from calib.models.camera import Mask
 from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.coverage import NEEDED_PAIRS, NEW_VIEW_PART, STILL_PART, CameraCoverage, moved
 from omnid.calibration.image_pairs import SIDES
-from omnid.calibration.images import Image
+from omnid.calibration.images import Image, middle_px
 
 MOST_PAIRS: Final = 200
 Views = tuple[BoardView | None, BoardView | None]
@@ -116,13 +116,11 @@ class LiveBoards:
         for side, image in enumerate(images):
             if self._rims[side] is None:
                 np.maximum(self._brightest[side], image, out=self._brightest[side])
-                height, width = image.shape
-                found = self._rims[side] = find_rim(self._brightest[side], ((width - 1) / 2, (height - 1) / 2))
+                found = self._rims[side] = find_rim(self._brightest[side], middle_px(image))
                 if found is not None:
                     self._covered()[side].rim = found
 
 
 def _whole(image: Image) -> Mask:
     """Return the largest disc in an image."""
-    height, width = image.shape
-    return Mask(((width - 1) / 2, (height - 1) / 2), 0.0, (min(width, height) - 1) / 2)
+    return Mask(middle_px(image), 0.0, (min(image.shape) - 1) / 2)

@@ -116,16 +116,15 @@ def _runs(dark: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> Iterator[tup
 
 def _page(paper: str, width: float, height: float) -> tuple[float, float]:
     """Return the sides of the paper [mm] the way round in which the board fits."""
-    for page in (PAPERS_MM[paper], PAPERS_MM[paper][::-1]):
-        if width <= page[0] - 2 * EDGE_MM and height <= page[1] - 2 * EDGE_MM - FOOT_MM:
-            return page
-    fitting = [
-        name
+    fitting = {
+        name: page
         for name, sides in PAPERS_MM.items()
-        for page in (sides, sides[::-1])
+        for page in (sides[::-1], sides)  # the last one that fits stays: upright before across
         if width <= page[0] - 2 * EDGE_MM and height <= page[1] - 2 * EDGE_MM - FOOT_MM
-    ]
-    advice = f"give --paper {fitting[0]}, or" if fitting else "give"
+    }
+    if paper in fitting:
+        return fitting[paper]
+    advice = f"give --paper {next(iter(fitting))}, or" if fitting else "give"
     raise OmnidError(
         f"the board is {width:.0f} x {height:.0f} mm and does not fit on {paper} with a margin of "
         f"{EDGE_MM:g} mm and the ruler; {advice} smaller squares, or fewer of them"

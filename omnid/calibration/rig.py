@@ -32,9 +32,8 @@ from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
 from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
-from omnid.calibration.camera import MAX_LOG_VIEWS
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
-from omnid.calibration.images import Images
+from omnid.calibration.images import Images, brightest
 from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
@@ -236,7 +235,7 @@ def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> li
     both = [found[0][name] for name in images.names if name in found[0] and name in found[1]]
     selected = set(images.names)
     if of_log and both:
-        selected = {view.name for view in select_diverse_views(both, MAX_LOG_VIEWS)}
+        selected = {view.name for view in select_diverse_views(both)}
     seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names if name in selected]
     return [view for view in seen if any(view.seen)]
 
@@ -317,4 +316,4 @@ def _mask(center: tuple[float, float], images: Images, file: CameraFile | None, 
         return find_mask(list(images.values()), center)
     if file is not None and file.mask is not None:
         return file.mask
-    return find_rim(np.max(list(images.values()), axis=0), center)
+    return find_rim(brightest(images.values()), center)

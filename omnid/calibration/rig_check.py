@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.drive_observations import Topics, tracked_updates
 from omnid.calibration.image_pairs import SIDES, TOLERANCE_NS, open_log, paired
+from omnid.calibration.images import brightest
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import RigFinding, judge
 from omnid.core.rig.column_matches import Matches, match, together
@@ -77,7 +78,7 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     seen = map(dewarp.process, pairs)
     found = [match(panoramas.lower, panoramas.upper, panoramas.visible) for panoramas in seen]
     rims = tuple(
-        rim_shift(_brightest([getattr(pair, side) for pair in pairs]), mounted.mask)
+        rim_shift(brightest(getattr(pair, side) for pair in pairs), mounted.mask)
         for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)
     )
     return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]))
@@ -92,8 +93,7 @@ def moving_rig_finding(log: Path, rig: Rig, topics: Topics, config: Config) -> R
     place = geometry(rig, config.panorama)
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
     found, number = list[Matches](), 0
-    reader = open_log(log, topics, rig)
-    try:
+    with closing(open_log(log, topics, rig)) as reader:
         stride = max(1, (reader.pair_estimate() or 0) // PAIRS)
         for update in tracked_updates(reader, front_end, config, log):
             exposure, seen = update.depth.exposure, update.depth.panoramas
@@ -102,10 +102,4 @@ def moving_rig_finding(log: Path, rig: Rig, topics: Topics, config: Config) -> R
             if number % stride == 0:
                 found.append(match(seen.lower, seen.upper, seen.visible, exposure))
             number += 1
-    finally:
-        reader.close()
     return judge(together(found[-PAIRS:]), place.cylinder)
-
-
-def _brightest(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    return np.asarray(np.max(np.stack(images), axis=0), np.uint8)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from calib.masks.rim import find_rim
 from calib.models.camera import Mask
+from omnid.calibration.images import Image, brightest, middle_px
 
 IMAGES: Final = 10  # Images of each camera: the rim is searched in their maximum.
 SATURATED: Final = 250
@@ -21,8 +22,6 @@ NOISE_GREY2: Final = 4.0  # of the variance of the grey levels: an image without
 LESS_SHARP: Final = 0.5  # share of the other camera's focus measure
 NEAR_BORDER_PX: Final = 3.0
 _GREEN, _RED = (80, 220, 80), (60, 60, 230)
-
-Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,8 +38,7 @@ class CameraView:
 def view_of(images: Sequence[Image]) -> CameraView:
     """Return the measures of one camera's images (H, W), of one size; at least one."""
     newest = images[-1]
-    height, width = newest.shape
-    rim = find_rim(np.maximum.reduce(images), ((width - 1) / 2, (height - 1) / 2))
+    rim = find_rim(brightest(images), middle_px(newest))
     world = _world(newest, rim)
     smooth = cv2.GaussianBlur(newest, (3, 3), 0).astype(np.float32)  # the Laplacian sees noise first
     laplacian = cv2.Laplacian(smooth, cv2.CV_32F)

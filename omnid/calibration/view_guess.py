@@ -24,7 +24,7 @@ from calib.boards.marker_board import MarkerBoard
 from calib.masks.rim import find_rim
 from calib.models.camera import Array
 from calib.models.ocam import VIEWS, View
-from omnid.calibration.images import Image
+from omnid.calibration.images import Image, brightest, middle_px
 from omnid.calibration.progress import Progress
 from omnid.errors import OmnidError
 
@@ -65,7 +65,7 @@ def view_of_images(
     """
     if choice != "auto":
         return choice
-    shown = {_view_of_camera(_brightest(images), views, board) for images, views in cameras} - {None}
+    shown = {_view_of_camera(brightest(images), views, board) for images, views in cameras} - {None}
     if len(shown) != 1:
         found = "no markers, no mirror's rim with a hub, no lines that are straight as only a lens shows them"
         if shown:
@@ -111,14 +111,9 @@ def _orientation(points: Array, pixels: Array) -> float:
     return float(np.linalg.det(np.linalg.lstsq(known, pixels[seen], rcond=None)[0][:2]))
 
 
-def _brightest(images: Iterable[Image]) -> Image:
-    return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
-
-
 def _view_of_image(image: Image) -> View | None:
     """Return "mirror" where the maximum (H, W) of a camera's images has a rim and a hub."""
-    height, width = image.shape
-    rim = find_rim(image, ((width - 1) / 2, (height - 1) / 2))
+    rim = find_rim(image, middle_px(image))
     return "mirror" if rim is not None and rim.inner_px > 0 else None
 
 

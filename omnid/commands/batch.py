@@ -13,7 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.worker_options import add_workers, end_by_sigterm
+from omnid.commands.log_options import add_topics
+from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
 
 if TYPE_CHECKING:
     from omnid.batch.jobs import BatchOptions
@@ -39,8 +40,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a folder for each log, results.csv, index.html, and results.parquet where pyarrow is installed",
     )
     parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
-    parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
-    parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
+    add_topics(parser)
     parser.add_argument("--config", type=Path, metavar="FILE", help="configuration (TOML) of all replays")
     parser.add_argument(
         "--set",
@@ -103,14 +103,8 @@ def _options(args: argparse.Namespace) -> BatchOptions:
     from omnid.config import load_config
 
     load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
-    arguments: list[str] = []
-    for option, path in (("--rig", args.rig), ("--config", args.config)):
-        if path is not None:
-            arguments += [option, str(path.absolute())]
-    for option, topic in (("--lower", args.lower), ("--upper", args.upper)):
-        arguments += [] if topic is None else [option, topic]
-    for override in args.overrides:
-        arguments += ["--set", override]
+    paths, topics = {"--rig": args.rig, "--config": args.config}, {"--lower": args.lower, "--upper": args.upper}
+    arguments = program_options(paths, topics, args.overrides)
     return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -15,6 +16,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.image_pairs import SIDES, open_log
 from omnid.calibration.rig_check import RigCheckResult, check_rig, moving_rig_finding, read_rig_pairs
+from omnid.commands.log_options import add_topics
 from omnid.config import Config
 from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.core.rig.rig_state import RigState
@@ -42,8 +44,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser = actions.add_parser("check", help="compare a rig with its file, without a board")
     parser.add_argument("log", type=Path, metavar="LOG", help="a log of ordinary driving")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
-    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
+    add_topics(parser, "the {camera} camera's topic")
     parser.add_argument(
         "--refine", action="store_true", help="also correct the upper camera's pose, and write that rig"
     )
@@ -58,12 +59,9 @@ def run(args: argparse.Namespace) -> int:
     if args.output:
         check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
     named = read_rig(args.rig) if args.rig else None
-    reader = open_log(args.log, (args.lower, args.upper), named)
-    try:
+    with closing(open_log(args.log, (args.lower, args.upper), named)) as reader:
         rig = named or attached_rig(reader, args.log)
         pairs = read_rig_pairs(reader, rig)
-    finally:
-        reader.close()
     skewed = _skewed(pairs)
     if skewed and args.refine:
         raise OmnidError(

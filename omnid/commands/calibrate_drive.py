@@ -14,6 +14,7 @@ import numpy as np
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig_file import read_rig, write_rig
 from omnid.commands.height_option import add_height, height_of, with_height
+from omnid.commands.log_options import add_topics
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -38,8 +39,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "mirror data sheet, centre of the images, baseline by ruler; default: the one attached to the "
         "first log",
     )
-    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
-    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
+    add_topics(parser, "the {camera} camera's topic")
     parser.add_argument(
         "--distance-m",
         type=float,

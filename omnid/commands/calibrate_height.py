@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 
 from calib.rig_file import read_rig
-from omnid.calibration.image_pairs import open_log
 from omnid.commands.height_option import height, height_of
-from omnid.runs.log_rig import attached_rig
+from omnid.commands.log_options import add_topics, attached_rig_of
 from omnid.sinks.files import check_outputs
 
 
@@ -18,8 +17,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser = actions.add_parser("height", help="the height of the cameras above the floor, and their tilt, from a log")
     parser.add_argument("log", type=Path, metavar="LOG", help="a log in which the floor is seen all around")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    parser.add_argument("--lower", metavar="TOPIC", help="the lower camera's topic")
-    parser.add_argument("--upper", metavar="TOPIC", help="the upper camera's topic")
+    add_topics(parser, "the {camera} camera's topic")
     parser.add_argument("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the file of --rig"
@@ -34,16 +32,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.output:
         check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
-    topics = args.lower, args.upper
-    rig = read_rig(args.rig) if args.rig else None
-    if rig is None:
-        reader = open_log(args.log, topics, None)
-        try:
-            rig = attached_rig(reader, args.log)
-        finally:
-            reader.close()
+    rig = read_rig(args.rig) if args.rig else attached_rig_of(args)
     prepare_kernels()
-    found = calibrate_height(args.log, rig, topics)
+    found = calibrate_height(args.log, rig, (args.lower, args.upper))
     print(found)
     print(f"the rig so far: {height_of(rig)}")
     if args.ruler_m is not None:

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.log_options import add_topics
 
 if TYPE_CHECKING:  # the list loads none of these
     from drivers.frame import Camera, Frame
-    from omnid.calibration.snapshot import CameraView, Image
+    from omnid.calibration.images import Image
+    from omnid.calibration.snapshot import CameraView
 
 ROOT = Path("/")  # folder of sys and dev
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
@@ -36,8 +38,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png")
     parser.add_argument("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log")
-    parser.add_argument("--lower", metavar="TOPIC", help="of --log: images of the lower camera; default: by name")
-    parser.add_argument("--upper", metavar="TOPIC", help="of --log: images of the upper camera; default: by name")
+    add_topics(parser, "of --log: images of the {camera} camera; default: by name")
     add_settings(parser)
     parser.set_defaults(run=run)
 

@@ -58,15 +58,18 @@ def run(args: argparse.Namespace) -> int:
     from omnid.recordings.comparison import RunComparison, Tolerance
     from omnid.recordings.run_series import read_run_series
 
-    limits = [_limit(args, name) for name in ("tolerance_mm", "tolerance_deg", "shared")]
+    tolerance = Tolerance(
+        1e-3 * _limit(args, "tolerance_mm"),
+        math.radians(_limit(args, "tolerance_deg")),
+        1e-2 * _limit(args, "shared"),
+    )
     a, b = (read_run_series(path, args.topic) for path in (args.a, args.b))
     if _identical(a.path, b.path):
         if args.json:
             print_json({"agree": True, "identical": True, "differences": []})
-            return AGREE
-        print(f"{plain(str(args.a))} and {plain(str(args.b))} are identical, byte for byte")
+        else:
+            print(f"{plain(str(args.a))} and {plain(str(args.b))} are identical, byte for byte")
         return AGREE
-    tolerance = Tolerance(limits[0] * 1e-3, math.radians(limits[1]), limits[2] * 1e-2)
     comparison = RunComparison(a, b, tolerance, align=args.align)
     for warning in (*a.warnings, *b.warnings):
         log_unlimited(logging.WARNING, warning)
@@ -79,6 +82,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _limit(args: argparse.Namespace, name: str) -> float:
+    """Return the value of an option; raise OmnidError where it is negative or not finite."""
     from omnid.errors import OmnidError
 
     value = float(getattr(args, name))

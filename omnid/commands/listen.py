@@ -25,9 +25,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.set_defaults(run=run)
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
-    """Add the options --robot and --connect."""
-    parser.add_argument("--robot", metavar="NAME", help="its name; default: bus.robot of the settings")
+def add_robot(parser: argparse._ActionsContainer, more: str = "") -> None:
+    """Add the options --robot and --connect. more: the end of the help of --robot."""
+    parser.add_argument("--robot", metavar="NAME", help=f"its name; default: bus.robot of the settings{more}")
     parser.add_argument(
         "--connect",
         action="append",
@@ -48,13 +48,19 @@ def config_of(args: argparse.Namespace) -> Config:
     return replace(config, bus=replace(config.bus, robot=robot, connect=connect))
 
 
+def check_seconds(seconds: float | None) -> None:
+    """Raise OmnidError where the value of --seconds is no duration."""
+    from omnid.errors import OmnidError
+
+    if seconds is not None and not 0 < seconds < 1e9:
+        raise OmnidError(f"--seconds {seconds} is not a duration: expected seconds above 0")
+
+
 def run(args: argparse.Namespace) -> int:
     """Show the robot until the end; return 1 if no pose was received."""
-    from omnid.errors import OmnidError
     from omnid.monitor.follow import listen
 
-    if args.seconds is not None and not 0 < args.seconds < 1e9:
-        raise OmnidError(f"--seconds {args.seconds} is not a duration: expected seconds above 0")
+    check_seconds(args.seconds)
     if args.all:
         from omnid.monitor.fleet import check_all, listen_to_all
 

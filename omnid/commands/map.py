@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
@@ -13,9 +13,6 @@ from omnid.commands.listen import add_robot, config_of
 from omnid.commands.map_build import add_build
 from omnid.commands.map_summary import described
 from omnid.commands.map_tags import add_align, add_tags
-
-if TYPE_CHECKING:
-    from omnid.core.places.place_views import PlaceSummary
 
 CELL_M = 0.05
 
@@ -78,7 +75,7 @@ def run_info(args: argparse.Namespace) -> int:
             code = 2
             continue
         sizes = summary(places, rig)
-        found.append({"path": path, "size_bytes": path.stat().st_size, "rig_hash": rig.rig_hash, **_plain(sizes)})
+        found.append({"path": path, "size_bytes": path.stat().st_size, "rig_hash": rig.rig_hash, **asdict(sizes)})
         if not args.json:
             print(*[""] * bool(number), *described(path, sizes, rig), sep="\n")
     if args.json:
@@ -180,9 +177,3 @@ def run_export(args: argparse.Namespace) -> int:
             write_plan(args.plan, points, place_views.base_poses(places, rig)[:, :2, 3])
     print("written     ", ", ".join(str(path) for _, path in [*outputs, *images]))
     return 0
-
-
-def _plain(sizes: PlaceSummary) -> dict[str, object]:
-    from dataclasses import asdict
-
-    return asdict(sizes)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_tags_option, tag_settings
 from omnid.commands.map_summary import described
-from omnid.commands.worker_options import add_workers, end_by_sigterm
+from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
 
 if TYPE_CHECKING:
     from omnid.config import Config
@@ -93,11 +93,8 @@ def _side_by_side(args: argparse.Namespace, config: Config) -> RigPlaces | None:
         if not args.quiet or line.startswith("omnid: "):
             print(line, file=sys.stderr)
 
-    options: list[str] = []
-    for option, path in (("--rig", args.rig), ("--config", args.config), ("--tags", args.tags)):
-        options += [] if path is None else [option, str(path.absolute())]
-    for override in args.overrides:
-        options += ["--set", override]
+    paths = {"--rig": args.rig, "--config": args.config, "--tags": args.tags}
+    options = program_options(paths, {}, args.overrides)
     end_by_sigterm()
     # Beside the output: workers on other machines reach it there.
     output = args.output.absolute()

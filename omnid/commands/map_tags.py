@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from omnid.core.places.place_rig import PlaceRig
     from omnid.core.places.tags import TagEstimate
     from omnid.engine.telemetry import Telemetry
-    from omnid.sinks.tag_collector import TagCollector
     from omnid.stages.front_end import FrontEnd
 
 # Tags by id, the poses of those that were found, and how many views were refused.
@@ -121,7 +120,6 @@ def _of_log(args: argparse.Namespace) -> Found:
     """Return the tags that are asked for, the poses of those that a log shows, and how many views were refused."""
     from omnid.config import load_config
     from omnid.core.places.map_tags import MapTag
-    from omnid.engine.flow import Slot
     from omnid.errors import OmnidError
     from omnid.formats.landmark_file import read_tags
     from omnid.runs.replay import ReplayOptions, run_log
@@ -135,16 +133,16 @@ def _of_log(args: argparse.Namespace) -> Found:
             "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap"
         )
     config = load_config(args.config, [*args.overrides, *map_settings(args)])
-    collector: Slot[TagCollector] = Slot()
+    collectors: list[TagCollector] = []  # the one of the run, which makes it when it knows its rig
 
     def observer(front_end: FrontEnd, _: Telemetry) -> TagCollector:
-        collector.put(TagCollector(front_end.geometry, {id: tag.size_m for id, tag in tags.items()}))
-        return cast("TagCollector", collector.get())
+        collectors.append(TagCollector(front_end.geometry, {id: tag.size_m for id, tag in tags.items()}))
+        return collectors[-1]
 
     result = run_log(args.source, config, ReplayOptions(rig=args.rig, settings=args.config, observer=observer))
     for warning in result.warnings:
         print(f"omnid: warning: {warning}", file=sys.stderr)
-    seen = cast("TagCollector", collector.get())
+    seen = collectors[-1]
     return tags, seen.tags(), seen.refused
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
+from omnid.commands.log_options import add_topics
 from omnid.commands.map_option import add_map, map_settings
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -29,8 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "one or with its parts, or a folder with a folder of stamped images for each camera",
     )
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    parser.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
-    parser.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
+    add_topics(parser)
     parser.add_argument("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
     parser.add_argument("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end")
     _add_outputs(parser)

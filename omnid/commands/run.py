@@ -6,18 +6,17 @@ import argparse
 import logging
 import sys
 from collections import Counter, defaultdict, deque
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.log_options import attached_rig_of
 from omnid.commands.map_option import add_map, map_settings
 
 RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
 
 if TYPE_CHECKING:  # the help and other commands do not load these
-    from calib.rig import Rig
     from drivers.cameras.log_camera import LogCamera, LogMotion
     from drivers.frame import Camera
     from omnid.config import Config
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     config = replace(config, controller=config.controller.of_log)
     opener, motion = _recorded(args, config)
     robot = ConnectedRobot(opener, motion)
-    return LiveRun(config, robot, log, None if args.rig else _rig_of(args), show).run()
+    return LiveRun(config, robot, log, None if args.rig else attached_rig_of(args), show).run()
 
 
 def _require_no_log_options(args: argparse.Namespace) -> None:
@@ -130,11 +129,3 @@ def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, Log
         return LogCamera(images, camera, clocks[opened[camera]], pace=args.pace, once=args.once)
 
     return open_camera, LogMotion(images, clocks[RUNNING], pace=args.pace, once=args.once)
-
-
-def _rig_of(args: argparse.Namespace) -> Rig:
-    from drivers.logs.log_reader import LogReader
-    from omnid.runs.log_rig import attached_rig
-
-    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
-        return attached_rig(reader, args.log)

@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.commands.listen import add_robot, check_seconds, config_of
+from omnid.commands.log_options import add_topics
 from omnid.commands.replay import Output, replay_and_print
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -42,7 +44,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="of --web: serve the page at port N and its data at N + 1, for ssh -L; default: any free ones",
     )
     _add_log(parser)
-    _add_robot(parser)
+    _add_live(parser)
     add_settings(parser)
     parser.set_defaults(run=run)
 
@@ -52,23 +54,13 @@ def _add_log(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several")
     group.add_argument("--replay", action="store_true", help="compute again from the images of a recording")
     group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    group.add_argument("--lower", metavar="TOPIC", help="images of the lower camera; default: found by name")
-    group.add_argument("--upper", metavar="TOPIC", help="images of the upper camera; default: found by name")
+    add_topics(group)
     group.add_argument("--quiet", action="store_true", help="do not show the progress")
 
 
-def _add_robot(parser: argparse.ArgumentParser) -> None:
+def _add_live(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("a robot")
-    group.add_argument(
-        "--robot", metavar="NAME", help="its name; default: bus.robot of the settings, in a recording the only one"
-    )
-    group.add_argument(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help="the robot or a router, such as "
-        "tcp/robot:7447; default: bus.connect of the settings, without them this machine",
-    )
+    add_robot(group, ", in a recording the only one")
     group.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
 
 
@@ -78,9 +70,9 @@ def run(args: argparse.Namespace) -> int:
 
     _refuse_contradictions(args)
     _require_rerun()
-    from omnid.viewer.view import check_file, target_for
+    from omnid.viewer.view import check_file, show_robot, target_for
 
-    config = load_config(args.config, args.overrides)
+    config = config_of(args) if args.log is None else load_config(args.config, args.overrides)
     check_file(
         args.output,
         ("the log that is read", args.log),
@@ -88,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         ("the configuration that is read", args.config),
     )
     place = target_for(args.output, args.web, args.port)
-    return _robot(args, config, place) if args.log is None else _log(args, config, place)
+    return show_robot(config.bus, args.seconds, place) if args.log is None else _log(args, config, place)
 
 
 def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
@@ -106,15 +98,6 @@ def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
         settings=args.config,
     )
     return show_log(log, config, place, partial(replay_and_print, output=Output(quiet=args.quiet)))
-
-
-def _robot(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
-    from dataclasses import replace
-
-    from omnid.viewer.view import show_robot
-
-    bus = replace(config.bus, robot=args.robot or config.bus.robot, connect=tuple(args.connect or config.bus.connect))
-    return show_robot(bus, args.seconds, place)
 
 
 def _refuse_contradictions(args: argparse.Namespace) -> None:
@@ -138,8 +121,7 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
         raise OmnidError("--port belongs to --web: add it, or leave the port out")
     if not 0 <= args.port < 65535:
         raise OmnidError(f"--port {args.port}: expected a port of 1 to 65534")
-    if args.seconds is not None and not 0 < args.seconds < 1e9:
-        raise OmnidError(f"--seconds {args.seconds} is not a duration: expected seconds above 0")
+    check_seconds(args.seconds)
 
 
 def _require_rerun() -> None:

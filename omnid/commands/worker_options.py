@@ -1,9 +1,11 @@
-"""The options --jobs and --dask, and the end of programs that workers have started."""
+"""The options --jobs and --dask, those of the programs that workers start, and the end of these programs."""
 
 from __future__ import annotations
 
 import argparse
 import signal
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
@@ -17,6 +19,19 @@ def add_workers(parser: argparse.ArgumentParser, what: str, default: int) -> Non
         help="run on the workers of this dask scheduler, such as "
         "tcp://HOST:8786; they need the same paths (extra `fleet`)",
     )
+
+
+def program_options(
+    paths: Mapping[str, Path | None], words: Mapping[str, str | None], overrides: Sequence[str]
+) -> list[str]:
+    """Return the given options for the program of a worker, which may run in another folder: its paths are absolute.
+
+    paths, words: values by the names of their options; None: not given. overrides: the settings of --set.
+    """
+    given = {option: str(path.absolute()) for option, path in paths.items() if path is not None}
+    given |= {option: word for option, word in words.items() if word is not None}
+    pairs = [*given.items(), *(("--set", override) for override in overrides)]
+    return [word for pair in pairs for word in pair]
 
 
 def end_by_sigterm() -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from omnid.core.obstacles.unwatched import Unwatched
 from omnid.core.stereo.tiles import SIDES, Side, TileStates
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.engine.flow import nothing
 from omnid.stages.geometry import Geometry
 from omnid.transport.codec import ERROR, OK, STALE
 from omnid.transport.records import DiagnosticStatus
@@ -22,9 +21,7 @@ LIVE = "all parts are live"
 class ImagesStatus:
     """The entry; a call makes it from the newest pair."""
 
-    def __init__(
-        self, geometry: Geometry, statistics: RunStatistics, report: Callable[[str], object] = nothing
-    ) -> None:
+    def __init__(self, geometry: Geometry, statistics: RunStatistics, report: Callable[[str], object]) -> None:
         """report: takes a line for the log where the message changes."""
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._statistics, self._report, self._message = statistics, report, LIVE

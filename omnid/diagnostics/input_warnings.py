@@ -22,7 +22,15 @@ REPEATED: Final = {
 
 
 def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatistics, config: Config) -> Iterator[str]:
-    """Return one line for each problem of the input."""
+    """Yield one line for each problem of the input."""
+    yield from _image_warnings(pairing, config)
+    if rig.warning:
+        yield rig.warning
+    yield from _pose_warnings(statistics, config)
+
+
+def _image_warnings(pairing: Synchronise, config: Config) -> Iterator[str]:
+    """Yield the problems of the images and their stamps."""
     counts = pairing.counts
     if pairing.fault:
         yield f"{counts['broken']} images could not be decoded; the first: {pairing.fault}"
@@ -40,8 +48,10 @@ def input_warnings(pairing: Synchronise, rig: RigHealth, statistics: RunStatisti
                 f"the {camera} camera was frozen: {images.count} of its images had all pixels as before, "
                 f"{images.longest} in a row; {REPEATED[config.pair.repeated_images]}"
             )
-    if rig.warning:
-        yield rig.warning
+
+
+def _pose_warnings(statistics: RunStatistics, config: Config) -> Iterator[str]:
+    """Yield the problems that the odometry has met: dark pairs, parts of images without use, lost poses."""
     if statistics.dark > statistics.poses * DARK_SHARE:
         yield (
             f"it was too dark in {statistics.dark} of {statistics.poses} pairs: the images have more noise than "

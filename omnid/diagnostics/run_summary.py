@@ -70,7 +70,7 @@ def run_summary(
     return "\n".join(lines)
 
 
-def folded_entry(name: str, text: str, columns: int = 0) -> list[str]:
+def folded_entry(name: str, text: str, columns: int) -> list[str]:
     """Return an entry as lines of at most `columns` columns; the texts stay below each other. 0: as one line."""
     line = f"{name:<{_NAME_COLUMNS}} {text}"
     if columns <= 2 * _NAME_COLUMNS:

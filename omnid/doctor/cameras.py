@@ -17,7 +17,7 @@ from drivers.cameras.v4l2_devices import CaptureDevice
 from drivers.cameras.v4l2_modes import choose_format
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-from omnid.doctor.devices import access, holders, is_ours
+from omnid.doctor.devices import access, holders
 from omnid.doctor.finding import Finding
 
 HIGH_SPEED_MBPS: Final = 480.0
@@ -39,9 +39,7 @@ class CameraStream:
     bus_mbps: float  # speed of the camera on it
 
 
-def cameras(
-    wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path = Path("/")
-) -> Iterator[Finding]:
+def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root: Path) -> Iterator[Finding]:
     """Yield findings for each configured camera and each USB bus; known: the cameras that are connected.
 
     root: folder of sys, dev and proc.
@@ -116,7 +114,7 @@ def _camera(name: str, settings: V4l2Settings, device: CaptureDevice | None, roo
         yield Finding("error", subject, f"{settings.device} is no camera", "choose a device that `omnid cameras` lists")
     else:
         problems = [*access(subject, path), *_problems(subject, settings, device)]
-        others = [holder for holder in holders(path, root) if not is_ours(holder)]
+        others = holders(path, root)
         if others:
             problems.append(
                 Finding("warning", subject, f"{settings.device} is open in {', '.join(others)}", "end that program")

@@ -52,19 +52,16 @@ def memberships(names: Sequence[str] = GROUPS) -> Finding:
 
 
 def holders(device: Path, root: Path = Path("/")) -> list[str]:
-    """Return the other processes with the device open, as "name (pid 12)"; without root only those of this user."""
+    """Return the programs but omnid that have the device open: "name (pid 12)"; without root those of this user."""
     target, found = device.resolve(), []
     processes = [entry for entry in (root / "proc").glob("[0-9]*") if entry.name != str(os.getpid())]
     for process in processes[:_MAX_PROCESSES]:
         with suppress(OSError):  # it has ended, or belongs to another user
             if any(_leads_to(entry, target) for entry in (process / "fd").iterdir()):
-                found.append(f"{(process / 'comm').read_text('utf-8', 'replace').strip()} (pid {process.name})")
+                name = (process / "comm").read_text("utf-8", "replace").strip()
+                if not name.startswith(OWN_NAME):
+                    found.append(f"{name} (pid {process.name})")
     return found
-
-
-def is_ours(holder: str) -> bool:
-    """True if a process is the daemon."""
-    return holder.startswith(OWN_NAME)
 
 
 def _leads_to(entry: Path, target: Path) -> bool:

@@ -198,17 +198,9 @@ def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:
     header = re.compile(rf"\s*\[\s*{re.escape(section)}\s*\]\s*(#.*)?")
     begin = next((number for number, line in enumerate(lines) if header.fullmatch(line)), None)
     if begin is None:
-        return (
-            "\n".join(
-                [
-                    *lines,
-                    *([""] if lines else []),
-                    f"[{section}]",
-                    *(f"{key} = {value}" for key, value in values.items()),
-                ]
-            )
-            + "\n"
-        )
+        gap = [""] if lines else []
+        added = [f"{key} = {value}" for key, value in values.items()]
+        return "\n".join([*lines, *gap, f"[{section}]", *added]) + "\n"
     sections = (number for number in range(begin + 1, len(lines)) if lines[number].lstrip().startswith("["))
     end = next(sections, len(lines))
     missing = dict(values)

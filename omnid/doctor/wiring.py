@@ -14,7 +14,7 @@ from typing import Final
 from calib.errors import CalibError
 from calib.rig_file import read_rig
 from omnid.controller.motor import SIMULATED
-from omnid.doctor.devices import access, holders, is_ours
+from omnid.doctor.devices import access, holders
 from omnid.doctor.finding import Finding
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
@@ -40,20 +40,18 @@ def motor(port: str, root: Path = Path("/")) -> Iterator[Finding]:
     elif not stat.S_ISCHR(path.stat().st_mode):
         yield Finding("error", subject, f"{port} is no serial port", "set motor.port")
     else:
-        others = [holder for holder in holders(path, root) if not is_ours(holder)]
-        busy = (
-            [
+        problems = list(access(subject, path))
+        others = holders(path, root)
+        if others:
+            problems.append(
                 Finding(
                     "error",
                     subject,
                     f"{port} is in use by {', '.join(others)}",
                     "end that program; 90-omnid.rules keeps ModemManager away from the port",
                 )
-            ]
-            if others
-            else []
-        )
-        yield from [*access(subject, path), *busy] or [Finding("ok", subject, port)]
+            )
+        yield from problems or [Finding("ok", subject, port)]
 
 
 def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[Finding]:

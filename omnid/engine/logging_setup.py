@@ -25,12 +25,12 @@ LOGGER: Final = logging.getLogger("omnid")
 _PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
 _DEBUG_PRIORITY: Final = 7
 
-_BURST: Final = 5  # lines of a kind that are written within a period
+_BURST: Final = 5  # Most lines of a kind that are written within a period.
 _PERIOD_S: Final = 60.0
-_MAX_KINDS: Final = 256  # whose counts are kept
+_MAX_KINDS: Final = 256  # Most kinds of lines whose counts are kept; the kind not seen for longest is dropped.
 _COLUMNS: Final = 80  # Used for a terminal that does not report its size.
-_ERASE: Final = "\r\x1b[K"  # the line of a terminal that the cursor is in
-_MAX_LENGTH: Final = 4000  # characters of a line
+_ERASE: Final = "\r\x1b[K"  # Erases the line of a terminal that the cursor is in.
+_MAX_LENGTH: Final = 4000  # Most characters of a line.
 _NUMBER = re.compile(r"\d+")
 
 
@@ -68,7 +68,7 @@ class StderrHandler(logging.Handler):
         """stream: None for sys.stderr at the time of writing."""
         super().__init__()
         self._stream, self._clock_s = stream, clock_s
-        self._kinds: dict[str, _Kind] = {}  # the most recent one is the last
+        self._kinds: dict[str, _Kind] = {}  # by the line without its numbers; the kind seen last is the last one
         self._shown = ""  # line that is shown below the others on a terminal
         self.suppressed = 0  # lines in all
 
@@ -90,7 +90,8 @@ class StderrHandler(logging.Handler):
             stream = self._stream or sys.stderr
             with suppress(OSError, ValueError):
                 columns = os.get_terminal_size(stream.fileno()).columns or _COLUMNS
-                self._shown = _fitting(one_line(line, _MAX_LENGTH), max(0, columns - 1))  # of one row
+                # A longer line would fill a second row, which _ERASE does not reach.
+                self._shown = _fitting(one_line(line, _MAX_LENGTH), max(0, columns - 1))
                 stream.write(f"{_ERASE}{self._shown}")
                 stream.flush()
         finally:
@@ -117,6 +118,7 @@ class StderrHandler(logging.Handler):
         kind.written, kind.suppressed = kind.written + 1, 0
 
     def _kind(self, key: str, now_s: float) -> _Kind:
+        """Return the count of a kind of lines, within the present period."""
         kind = self._kinds.pop(key, None) or _Kind(now_s)
         if now_s - kind.since_s > _PERIOD_S:
             kind.since_s, kind.written = now_s, 0

@@ -1,4 +1,4 @@
-"""Rows of a map file: keyframes, links and the head as tuples of values, written and checked."""
+"""Rows of a map file as tuples of values: written from keyframes, links, tags and the head, and read with checks."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ MAX_POSITION_M: Final = 1e5
 MAX_PIXELS: Final = 1 << 15  # Largest width and height of a panorama.
 MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
 LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
-RIGID: Final = 1e-6  # largest difference of R R^T from the identity
-THUMBNAIL: Final = (16, 128)
+RIGID: Final = 1e-6  # Largest difference of an element of R R^T from the identity.
+THUMBNAIL: Final = (16, 128)  # rows and columns
 INDEX_COLUMNS: Final = 10  # Columns of a keyframe up to its scan, the same in all versions.
 MAX_HASH: Final = 128  # characters
-BASELINES_M: Final = (1e-3, 1e2)
+BASELINES_M: Final = (1e-3, 1e2)  # least and largest
 
 
 class BadRowError(ValueError):
@@ -41,17 +41,17 @@ class BadRowError(ValueError):
 
 
 class KeyframeRow(NamedTuple):
-    """A keyframe but for its features."""
+    """A keyframe without its features, and its pose in the map; see PlaceKeyframe."""
 
     id: int
     session: int
     stamp_ns: int
     use: KeyframeUse
-    T_map_rect: Array
-    T_odom_rect: Array
-    covariance: Array
-    thumbnail: NDArray[np.int8]
-    scan: NDArray[np.float16]
+    T_map_rect: Array  # (4, 4)
+    T_odom_rect: Array  # (4, 4)
+    covariance: Array  # (6, 6)
+    thumbnail: NDArray[np.int8]  # (16, 128)
+    scan: NDArray[np.float16]  # (SECTORS,) m
 
     def keyframe(self, features: PlaceFeatures | StoredFeatures) -> PlaceKeyframe:
         """Return the keyframe with its features."""
@@ -68,11 +68,11 @@ class KeyframeRow(NamedTuple):
 
 
 class KeyframeCodes(NamedTuple):
-    """Numbers of features of keyframes (K), and the codes and azimuths of the strongest of them."""
+    """Numbers of features of K keyframes, and the codes of the strongest ones, one keyframe's after the other's."""
 
-    counts: list[int]
-    codes: NDArray[np.uint64]
-    azimuths: NDArray[np.uint8]
+    counts: list[int]  # K
+    codes: NDArray[np.uint64]  # (N,) min(count, INDEXED) of each keyframe
+    azimuths: NDArray[np.uint8]  # (N,) see azimuths_of
 
 
 class Head(NamedTuple):
@@ -95,7 +95,7 @@ def checksum(row: Row) -> int:
 
 
 def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse, width: int) -> Row:
-    """Return the row of a keyframe; width: columns of the panorama."""
+    """Return the row of a keyframe with its pose (4, 4) in the map; width: columns of the panorama."""
     features = keyframe.features.copied()
     return (
         keyframe.id,
@@ -174,7 +174,7 @@ def head_of_version_2(row: Row) -> Row:
 
 
 def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
-    """Return keyframes but for their features. Raises BadRowError. Poses and covariances are not checked.
+    """Return keyframes without their features. Raises BadRowError. Poses and covariances are not checked.
 
     The arrays of all of them are made at once: one by one takes most of the time in which a large map opens.
     """
@@ -202,7 +202,7 @@ def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
 
 
 def read_codes(rows: Sequence[Row]) -> KeyframeCodes:
-    """Return the numbers of features and their codes, one keyframe's after the other's. Raises BadRowError."""
+    """Return the numbers of features and their codes. Raises BadRowError."""
     counts = [_integer(row[INDEX_COLUMNS], 0, MAX_FEATURES) for row in rows]
     for count, row in zip(counts, rows, strict=True):
         codes, azimuths = row[INDEX_COLUMNS + 1 :]
@@ -219,12 +219,12 @@ def read_codes(rows: Sequence[Row]) -> KeyframeCodes:
 
 def read_features(descriptors: object, views: object, rig: PlaceRig) -> PlaceFeatures:
     """Return the features of a keyframe. Raises BadRowError."""
-    features = PlaceFeatures(_array(descriptors, "u1", (-1, DESCRIPTOR)), _array(views, "<f4", (-1, 3)))
+    features = PlaceFeatures(_rows(descriptors, "u1", DESCRIPTOR), _rows(views, "<f4", 3))
     if len(features.descriptors) != len(features.views) or len(features.views) > MAX_FEATURES:
         raise BadRowError(f"{len(features.descriptors)} descriptors and {len(features.views)} views in a keyframe")
     column, lower, upper = features.views.T
     width, height = rig.cylinder.width, rig.cylinder.height
-    # NaN fails too. The horizon of the upper camera may show a point beyond the lower one's panorama.
+    # NaN fails too. The upper camera may show a point at a row below the end of the lower one's panorama.
     if not (
         (np.abs(column) <= 2 * width) & (np.abs(lower) <= 2 * height) & (upper > lower) & (upper <= 3 * height)
     ).all():
@@ -253,11 +253,12 @@ def read_tag_row(row: Row) -> MapTag:
 def read_tag_view_row(row: Row) -> TagView:
     """Return a view of a tag. Raises BadRowError. Its pose and covariance are not checked."""
     keyframe, tag, T_rect_tag, covariance = row
-    return TagView(_integer(keyframe), _integer(tag), _transform(T_rect_tag), _array(covariance, "<f8", (6, 6)))
+    P = _arrays([covariance], "<f8", (6, 6))[0]
+    return TagView(_integer(keyframe), _integer(tag), _transform(T_rect_tag), P)
 
 
 def require_rigid(transforms: Sequence[Array]) -> None:
-    """Check that all are rotations and translations of the size of a place. Raises BadRowError."""
+    """Check that all (4, 4) are rotations with translations up to MAX_POSITION_M. Raises BadRowError."""
     if not transforms:
         return
     T = np.array(transforms)
@@ -269,13 +270,13 @@ def require_rigid(transforms: Sequence[Array]) -> None:
 
 
 def require_covariances(covariances: Sequence[Array], least: float) -> None:
-    """Check that all are symmetric, with eigenvalues from `least` on. Raises BadRowError."""
+    """Check that all (6, 6) are symmetric, without an eigenvalue below `least` [m^2, rad^2]. Raises BadRowError."""
     if not covariances:
         return
     P = np.array(covariances)
     if not np.isfinite(P).all() or (np.abs(P) > MAX_VARIANCE).any():
         raise BadRowError("a covariance is not finite, or too large")
-    rounding = 1e-9 * np.abs(P).max(axis=(1, 2))
+    rounding = 1e-9 * np.abs(P).max(axis=(1, 2))  # an eigenvalue that is 0 may be less by this
     if (np.abs(P - np.swapaxes(P, 1, 2)).max(axis=(1, 2)) > rounding).any():
         raise BadRowError("a covariance is not symmetric")
     if (np.linalg.eigvalsh(P)[:, 0] < (least or -rounding)).any():
@@ -286,17 +287,16 @@ def _bytes(values: NDArray[Any], dtype: str) -> bytes:
     return np.ascontiguousarray(values, np.dtype(dtype)).tobytes()
 
 
-def _array(value: object, dtype: DTypeLike, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an array of a shape, in which -1 is any number of rows."""
+def _rows(value: object, dtype: DTypeLike, columns: int) -> NDArray[Any]:
+    """Return an array (N, columns) with any number of rows."""
     kind = np.dtype(dtype)
-    row_bytes = kind.itemsize * abs(math.prod(shape))
-    if not isinstance(value, bytes) or (len(value) % row_bytes if shape[0] < 0 else len(value) != row_bytes):
+    if not isinstance(value, bytes) or len(value) % (kind.itemsize * columns):
         raise BadRowError("an array has another size")
-    return np.frombuffer(value, kind).reshape(shape).astype(kind.newbyteorder("="))
+    return np.frombuffer(value, kind).reshape(-1, columns).astype(kind.newbyteorder("="))
 
 
 def _arrays(values: Sequence[object], dtype: DTypeLike, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return arrays (N, ...) of a shape, made at once."""
+    """Return N arrays of one shape (...) as one array (N, ...), which can be written to."""
     kind = np.dtype(dtype)
     size = kind.itemsize * math.prod(shape)
     known = [value for value in values if isinstance(value, bytes) and len(value) == size]
@@ -308,7 +308,7 @@ def _arrays(values: Sequence[object], dtype: DTypeLike, shape: tuple[int, ...]) 
 
 
 def _transforms(values: Sequence[object]) -> Array:
-    """Return transforms (N, 4, 4)."""
+    """Return transforms (N, 4, 4); a file holds their upper three rows."""
     upper = _arrays(values, "<f8", (3, 4))
     return np.concatenate([upper, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(upper), 1, 4))], axis=1)
 

@@ -6,25 +6,25 @@ import math
 import shutil
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import IO, Final
 
 from omnid.client import Fleet
 from omnid.errors import OmnidError
+from omnid.monitor.connecting import connected_until
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import CLEAR, fitted
 from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.codec import OK
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.session import Unreachable
 from omnid.transport.status_names import short_name
 
 MAX_ROBOTS: Final = 500
 SHOW_PERIOD_S: Final = 1.0
 _NAME_COLUMNS: Final = 20
-_RETRY_S: Final = 0.5
 FLEET_TOPICS: Final = ("odom", "status")
 _POSE_HEAD: Final = f" {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
 NARROW_COLUMNS: Final = 110  # a terminal with fewer shows no positions: what is wrong must be seen
@@ -36,6 +36,7 @@ class FleetState:
     def __init__(self) -> None:
         self.robots: dict[str, RobotState] = {}
         self.refused: set[str] = set()  # at most MAX_ROBOTS names
+        self._alive: deque[tuple[str, bool]] = deque(maxlen=4 * MAX_ROBOTS)  # robots that came or went
 
     def process(self, message: ReceivedMessage) -> None:
         """Take a message whose topic is the whole key: the robot's name and the topic's."""
@@ -43,6 +44,18 @@ class FleetState:
         state = self.robot(name)
         if state is not None:
             state.process(message._replace(topic=topic))
+
+    def note_alive(self, name: str, alive: bool) -> None:
+        """Note that the daemon of a robot came or went, for `take_alive`; from any thread."""
+        self._alive.append((name, alive))
+
+    def take_alive(self) -> None:
+        """Set which daemons are there, by what was noted since the last call."""
+        while self._alive:
+            name, alive = self._alive.popleft()
+            state = self.robot(name)
+            if state is not None:
+                state.set_alive(alive)
 
     def robot(self, name: str) -> RobotState | None:
         """Return the state of a robot, which is new at its first message; None beyond the limit."""
@@ -60,7 +73,7 @@ def listen_to_all(bus: BusConfig, seconds: float | None) -> int:
     fleet, stream = FleetState(), sys.stdout
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with suppress(KeyboardInterrupt):
-        connection = _connected(bus, end_s)
+        connection = connected_until(end_s, lambda: Fleet(bus))
         if connection is not None:
             with connection:
                 _follow(connection, fleet, stream, end_s)
@@ -68,30 +81,13 @@ def listen_to_all(bus: BusConfig, seconds: float | None) -> int:
     return int(not fleet.robots)
 
 
-def _connected(bus: BusConfig, end_s: float) -> Fleet | None:
-    """Return a connection as soon as the router can be reached, None where the time is over first."""
-    reason = ""
-    while time.monotonic() < end_s:
-        try:
-            return Fleet(bus)
-        except Unreachable as error:
-            if str(error) != reason:
-                print(f"omnid: waiting: {error}", file=sys.stderr, flush=True)
-            reason = str(error)
-        time.sleep(_RETRY_S)
-    return None
-
-
 def _follow(connection: Fleet, fleet: FleetState, stream: IO[str], end_s: float) -> None:
-    inbox, tokens = Inbox(), Inbox()
-    connection.on_alive(lambda robot, alive: tokens.put(robot, b"alive" if alive else b"", b""))
+    inbox = Inbox()
+    connection.on_alive(fleet.note_alive)
     connection.on_message(inbox.put, FLEET_TOPICS)
     next_s = time.monotonic() + SHOW_PERIOD_S
     while (now_s := time.monotonic()) < end_s:
-        while (token := tokens.get(0.0)) is not None:
-            state = fleet.robot(token.topic)
-            if state is not None:
-                state.set_alive(bool(token.payload))
+        fleet.take_alive()
         message = inbox.get(min(next_s, end_s) - now_s)
         if message is not None:
             fleet.process(message)

@@ -12,16 +12,15 @@ from typing import IO, Final, TypeAlias
 from drivers.logs.mcap_writer import LogWriter
 from omnid.client import Robot
 from omnid.formats.tum import tum_row
+from omnid.monitor.connecting import connected_until
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import Screen
 from omnid.sinks.files import check_outputs
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.decode import Pose
-from omnid.transport.session import Unreachable
 from omnid.transport.topics import PUBLISHED, ros_name
 
 SHOW_PERIOD_S: Final = 1.0
-_RETRY_S: Final = 0.5
 # Topics of which the newest message may have been sent before this program came: frames, map, path, status.
 KEPT: Final = tuple(name.removeprefix("/") for name, topic in PUBLISHED.items() if topic.latched and not topic.realtime)
 
@@ -83,7 +82,7 @@ def listen(
     state, screen = RobotState(), Screen(bus.robot, shows_load=shows_load)
     end_s = math.inf if seconds is None else time.monotonic() + seconds
     with suppress(KeyboardInterrupt), ExitStack() as stack:
-        robot = _connected(bus, end_s, screen)
+        robot = connected_until(end_s, lambda: Robot(settings=bus))
         if robot is not None:
             stack.enter_context(robot)
             writers: list[Writer] = [TumWriter(tum)] if tum else []
@@ -94,17 +93,6 @@ def listen(
             _follow(robot, state, screen, writers, end_s)
     screen.show(state)
     return int(state.poses == 0)
-
-
-def _connected(bus: BusConfig, end_s: float, screen: Screen) -> Robot | None:
-    """Return a connection to the robot as soon as it can be reached, None where the time is over first."""
-    while time.monotonic() < end_s:
-        try:
-            return Robot(settings=bus)
-        except Unreachable as error:
-            screen.waiting(str(error))
-        time.sleep(_RETRY_S)
-    return None
 
 
 def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[Writer], end_s: float) -> None:

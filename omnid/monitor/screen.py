@@ -28,13 +28,6 @@ class Screen:
         """shows_load: the share of each thread, in place of the state."""
         self._robot, self._out = robot, out or sys.stdout
         self._line, self._table = (load_line, load_table) if shows_load else (summary_line, status_table)
-        self._last_reason = ""
-
-    def waiting(self, reason: str) -> None:
-        """Print why there is no connection yet, unless that was the last reason printed."""
-        if reason != self._last_reason:
-            print(f"omnid: waiting: {reason}", file=sys.stderr, flush=True)
-        self._last_reason = reason
 
     def show(self, state: RobotState, dropped: int = 0) -> None:
         """Write the state; dropped: messages that the inbox could not hold."""
@@ -70,7 +63,7 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
             f"inliers {details.inliers} of {details.tracked}; resets {details.resets}"
         )
         yield f"  {_latencies(state)}  missed {state.missed}  unreadable {state.broken}  not shown here {dropped}"
-    for status in sorted(state.statuses.values(), key=_importance):
+    for status in sorted(state.statuses.values(), key=importance):
         values = "  ".join(f"{key} {value}" for key, value in status.values.items())
         yield plain(f"  {_LEVELS[status.level % 4]:7s} {short_name(status.name):16s} {status.message}  {values}")
 
@@ -113,7 +106,8 @@ def fitted(lines: Iterable[str], columns: int, rows: int) -> list[str]:
     return [*cut[:shown], f"  ... {len(cut) - shown} more; make the window higher"[:columns]]
 
 
-def _importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
+def importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
+    """Return a key by which entries are sorted: the worst first, stages last, then by name."""
     return -(status.level % 4), status.name.startswith(STAGE_PREFIX), status.name
 
 

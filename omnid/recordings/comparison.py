@@ -53,7 +53,7 @@ class RunComparison:
     align: move B so that the first common poses coincide. Raise OmnidError where no stamp is in both.
     """
 
-    def __init__(self, a: RunSeries, b: RunSeries, tolerance: Tolerance, *, align: bool = False) -> None:
+    def __init__(self, a: RunSeries, b: RunSeries, tolerance: Tolerance, *, align: bool) -> None:
         self._a, self._b, self._tolerance = a, b, tolerance
         common_a, common_b = in_both(a.poses, b.poses)
         self._require_common(common_a)

@@ -68,7 +68,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
 
 
 def associated(
-    estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01
+    estimate: Trajectory, truth: Trajectory, tolerance_s: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the associated poses (N, 4, 4) of both, each in its world; OmnidError for fewer than two."""
     of_estimate, of_truth = _associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))

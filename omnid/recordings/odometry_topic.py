@@ -9,10 +9,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Final
 
 from drivers.logs.mcap_info import LogInfo
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_image import IMAGE_TYPES
 from omnid.errors import OmnidError
 from omnid.transport.codec import ODOMETRY_SCHEMA
 
@@ -48,8 +49,15 @@ def choose_odometry_topic(found: LogInfo, topic: str | None = None, robot: str |
     raise OmnidError(f"{found.path}: several topics with {ODOMETRY_SCHEMA}: {_listed(known)}; choose one with --topic")
 
 
+def no_pose(path: Path, topic: str) -> OmnidError:
+    """Return the error for a log whose topic of the poses has none that can be read."""
+    return OmnidError(
+        f"{path}: topic {topic!r} has no readable pose; `omnid log info {path}` tells whether the log is complete"
+    )
+
+
 def _no_odometry(found: LogInfo) -> str:
-    if any(schema in (IMAGE, COMPRESSED_IMAGE) for schema, _ in found.topics.values()):
+    if any(schema in IMAGE_TYPES for schema, _ in found.topics.values()):
         rig = "" if "rig.toml" in found.attachments else " --rig rig.toml"
         return (
             f"{found.path}: images but no {ODOMETRY_SCHEMA}: run `omnid replay {found.path}{rig} --record "

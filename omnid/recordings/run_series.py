@@ -16,7 +16,7 @@ import numpy as np
 from calib import se3
 from drivers.logs.mcap_info import LogInfo, LogState, read_log_info
 from omnid.errors import OmnidError
-from omnid.recordings.odometry_topic import choose_odometry_topic
+from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose
 from omnid.recordings.recording_reader import DRIVE, ODOMETRY, STATUS, RecordingReader
 from omnid.recordings.series_differences import Series
 from omnid.tracking_state import TrackingState
@@ -60,10 +60,7 @@ def read_run_series(path: Path, topic: str | None = None) -> RunSeries:
                 columns[DRIVE].add(stamp_ns, (velocity_mps, yaw_rate_radps))
     poses, states, drive = (columns[name].series() for name in (ODOMETRY, STATUS, DRIVE))
     if not poses.stamps_ns.size:
-        raise OmnidError(
-            f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
-            "the log is complete"
-        )
+        raise no_pose(path, reader.topic)
     warnings = _warnings(found, reader, {name: column.repeated for name, column in columns.items()})
     return RunSeries(found.path, reader.topic, poses, states, drive, reader.attachments, tuple(warnings))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import cycle, pairwise
@@ -61,6 +61,11 @@ class Clock:
         seconds, _ = self.unit
         return Axis(self.start_s / seconds, self.end_s / seconds, start_px, end_px)
 
+    def column(self, start_px: float, end_px: float) -> Callable[[float], float]:
+        """Return the function from a time [s] to its column [px], with the time range between two columns."""
+        axis, (seconds, _) = self.axis(start_px, end_px), self.unit
+        return lambda t_s: axis.px(t_s / seconds)
+
     def shown(self, points: Sequence[Point]) -> list[Point]:
         """Return the points within the time range, with times in the unit."""
         seconds, _ = self.unit
@@ -83,10 +88,8 @@ def shades(spans: Spans, clock: Clock) -> str:
     """Return the background of all charts, to be put into the page once."""
     seconds, _ = clock.unit
     axis = clock.axis(_LEFT, _RIGHT)
-    areas = (
-        rectangles([(axis.px(a / seconds), axis.px(b / seconds)) for a, b in spans[rank]], (_TOP, _BOTTOM))
-        for rank in (1, 2)
-    )
+    px = clock.column(_LEFT, _RIGHT)
+    areas = (rectangles([(px(a), px(b)) for a, b in spans[rank]], (_TOP, _BOTTOM)) for rank in (1, 2))
     drawn = "".join(f"<path class='r{rank}' d='{d}'/>" for rank, d in enumerate(areas, 1) if d)
     for_script = (
         f"data-clock='{axis.low!r} {axis.high!r} {seconds!r}' data-unit='{clock.unit[1]}' "

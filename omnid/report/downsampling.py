@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 from omnid.core.mapping.thinned_path import ThinnedPath
@@ -54,15 +54,12 @@ class Downsampled:
 
     def _put(self, key: int, new: _Bin) -> None:
         old = self._bins.get(key, new)
-        self._bins[key] = _Bin(min(old.low, new.low, key=_value), max(old.high, new.high, key=_value))
+        self._bins[key] = _Bin(min(old.low, new.low, key=itemgetter(1)), max(old.high, new.high, key=itemgetter(1)))
 
     def _widen(self) -> None:
         bins, self._bins, self._width_s = self._bins, {}, 2 * self._width_s
         for key, bin_ in bins.items():
             self._put(key // 2, bin_)
-
-
-_value: Callable[[Point], float] = lambda point: point[1]  # noqa: E731 - a key for min and max
 
 
 class Corner(NamedTuple):

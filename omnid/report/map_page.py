@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Final
@@ -17,7 +16,7 @@ from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.place_views import MappedDrive, drives, grid
 from omnid.report.page import facts, page, table
 from omnid.report.svg import STYLE as SVG_STYLE
-from omnid.report.svg import Point, coord, key, polyline
+from omnid.report.svg import Point, coord, key, pixel_image, polyline
 
 Array = NDArray[np.float64]
 
@@ -91,13 +90,9 @@ def _image(cells: Grid, corner: Point, px_per_m: float) -> str:
     """Return the grid, whose upper left corner [px] is given."""
     greys = np.where(cells.cells == FREE, FREE_GREY, UNKNOWN_GREY).astype(np.uint8)
     greys[cells.cells == OCCUPIED] = OCCUPIED_GREY
-    png = base64.b64encode(cv2.imencode(".png", greys[::-1])[1].tobytes()).decode()
     rows, columns = greys.shape
-    width, height = columns * cells.cell_m * px_per_m, rows * cells.cell_m * px_per_m
-    return (
-        f"<image x='{coord(corner[0])}' y='{coord(corner[1])}' width='{coord(width)}' height='{coord(height)}' "
-        f"preserveAspectRatio='none' style='image-rendering:pixelated' href='data:image/png;base64,{png}'/>"
-    )
+    size = columns * cells.cell_m * px_per_m, rows * cells.cell_m * px_per_m
+    return pixel_image(cv2.imencode(".png", greys[::-1])[1].tobytes(), corner, size)
 
 
 def _loops(places: PlaceMap, at: Mapping[int, Point]) -> Iterator[str]:

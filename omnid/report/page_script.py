@@ -14,7 +14,7 @@ def chart_script() -> str:
     return (files("omnid.report") / "charts.js").read_text("utf-8")
 
 
-def policy(script: str = "") -> str:
+def policy(script: str) -> str:
     """Return the Content-Security-Policy of a page with this script, "" for none.
 
     A page shows text from logs of unknown origin: it loads nothing, and runs only the script with this digest.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from omnid.report.chart import Clock
 from omnid.report.downsampling import Corner
-from omnid.report.svg import Point, coord, key, label, mark_key, path_d, polyline, round_step, text
+from omnid.report.svg import Point, coord, key, label, mark_key, path_d, pixel_image, polyline, round_step, text
 
 Array = NDArray[np.float64]
 
@@ -135,11 +134,7 @@ def _map(sheet: _PlanArea, points_xy: Array, confidence: NDArray[np.float32]) ->
     ink = np.histogram2d(points_xy[:, 0], points_xy[:, 1], counts, sides, weights=weights)[0].T[::-1]
     png = cv2.imencode(".png", _tone(ink), [cv2.IMWRITE_PNG_COMPRESSION, 9])[1]
     (left, top), (right, bottom) = sheet.px(sides[0][0], sides[1][1]), sheet.px(sides[0][1], sides[1][0])
-    yield (
-        f"<image x='{coord(left)}' y='{coord(top)}' width='{coord(right - left)}' "
-        f"height='{coord(bottom - top)}' preserveAspectRatio='none' style='image-rendering:pixelated' "
-        f"href='data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'/>"
-    )
+    yield pixel_image(png.tobytes(), (left, top), (right - left, bottom - top))
 
 
 def _tone(ink: Array) -> NDArray[np.uint8]:

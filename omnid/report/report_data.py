@@ -17,10 +17,9 @@ from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.mcap_info import LogInfo, read_log_info
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
-from omnid.errors import OmnidError
+from drivers.logs.ros_image import IMAGE_TYPES
 from omnid.formats.tum import POSITION_LIMIT_M
-from omnid.recordings.odometry_topic import choose_odometry_topic
+from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose
 from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
 from omnid.report.downsampling import Corner, Downsampled, path_trace
 from omnid.report.events import Events
@@ -103,7 +102,7 @@ class ReportData:
     @property
     def has_images(self) -> bool:
         """True if the recording holds images."""
-        return any(schema in (IMAGE, COMPRESSED_IMAGE) for schema, _ in self.info.topics.values())
+        return any(schema in IMAGE_TYPES for schema, _ in self.info.topics.values())
 
 
 def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool = False) -> ReportData:
@@ -128,10 +127,7 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
     )
     _Collector(data).collect(reader)
     if not data.poses.poses:
-        raise OmnidError(
-            f"{path}: topic {data.topic!r} has no readable pose; `omnid log info {path}` tells whether "
-            "the log is complete"
-        )
+        raise no_pose(path, data.topic)
     return data
 
 

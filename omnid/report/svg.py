@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -61,7 +62,7 @@ class Axis:
         return [k * step for k in range(first, last + 1)]
 
 
-def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool = False, zero: bool = False) -> Axis:
+def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool, zero: bool) -> Axis:
     """Return an axis that holds all values and a margin; zero: it holds 0 as well."""
     if log:
         first, last = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
@@ -123,6 +124,15 @@ def rectangles(spans: Iterable[Point], rows: Point) -> str:
     """Return the data of a path of rectangles from x to x, all between two rows [px]."""
     top, height = coord(rows[0]), coord(rows[1] - rows[0])
     return "".join(f"M{coord(a)} {top}H{coord(max(b, a + 0.6))}v{height}H{coord(a)}z" for a, b in spans)
+
+
+def pixel_image(png: bytes, corner: Point, size: Point) -> str:
+    """Return an embedded image whose pixels stay sharp: upper left corner, width and height [px of the page]."""
+    return (
+        f"<image x='{coord(corner[0])}' y='{coord(corner[1])}' width='{coord(size[0])}' height='{coord(size[1])}' "
+        f"preserveAspectRatio='none' style='image-rendering:pixelated' "
+        f"href='data:image/png;base64,{base64.b64encode(png).decode()}'/>"
+    )
 
 
 def hidden(definitions: str) -> str:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from omnid.report.chart import Clock, Spans, time_ticks
 from omnid.report.events import ERROR, GOOD, Event
-from omnid.report.svg import Axis, Point, area_key, coord, mark_key, rectangles, text
+from omnid.report.svg import Point, area_key, coord, mark_key, rectangles, text
 
 _LEFT, _RIGHT, _BAND, _LANE = 124, 1030, (8, 36), 26
 _LANES: Final = 14
@@ -18,14 +18,14 @@ _MISSING: Final = "class='none'"
 def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock: Clock) -> str:
     """Return the figure; parts without events have no lane."""
     sources = sorted({event.source for event in events} - {"state", "poses"}, key=lambda s: ("stage" in s, s))[:_LANES]
-    x, height = clock.axis(_LEFT, _RIGHT), 42 + _LANE * len(sources)
+    px, height = clock.column(_LEFT, _RIGHT), 42 + _LANE * len(sources)
     parts = [
-        *_band(spans, gaps, (x, clock.unit[0])),
-        *(_reset(x.px(event.start_s / clock.unit[0]), 19) for event in events if _is_reset(event)),
+        *_band(spans, gaps, clock),
+        *(_reset(px(event.start_s), 19) for event in events if _is_reset(event)),
     ]
     for row, source in enumerate(sources):
-        parts += _lane(source, 42 + _LANE * row, [e for e in events if e.source == source], (x, clock.unit[0]))
-    parts += time_ticks(x, float(height), clock)
+        parts += _lane(source, 42 + _LANE * row, [e for e in events if e.source == source], px)
+    parts += time_ticks(clock.axis(_LEFT, _RIGHT), float(height), clock)
     return (
         f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption>"
         f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events' "
@@ -34,16 +34,16 @@ def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock
     )
 
 
-def _band(spans: Spans, gaps: Sequence[Point], axis: tuple[Axis, float]) -> Iterator[str]:
+def _band(spans: Spans, gaps: Sequence[Point], clock: Clock) -> Iterator[str]:
     """Yield the band; the states cover the style that means unknown."""
-    x, seconds = axis
+    px = clock.column(_LEFT, _RIGHT)
     yield text((_LEFT - 8, 27), "state", "text-anchor='end'")
     for style, found in (
-        (_MISSING, [(x.low * seconds, x.high * seconds)]),
+        (_MISSING, [(clock.start_s, clock.end_s)]),
         *zip(_FILLS, spans, strict=True),
         (_MISSING, gaps),
     ):
-        d = rectangles([(x.px(a / seconds), x.px(b / seconds)) for a, b in found], _BAND)
+        d = rectangles([(px(a), px(b)) for a, b in found], _BAND)
         yield f"<path {style} d='{d}'/>" if d else ""
 
 
@@ -70,13 +70,13 @@ def _reset(x: float, bottom: float) -> str:
     return f"<path d='M{coord(x)} {coord(bottom)}l-5.5 -11h11z' fill='#000'/>"
 
 
-def _lane(source: str, top: float, events: Sequence[Event], axis: tuple[Axis, float]) -> Iterator[str]:
-    x, seconds = axis
+def _lane(source: str, top: float, events: Sequence[Event], px: Callable[[float], float]) -> Iterator[str]:
+    """Yield the events of a source in a row of its own; px: the column [px] of a time [s]."""
     middle = top + _LANE / 2
     yield text((_LEFT - 8, middle + 4), source[:18], "text-anchor='end'")
     yield f"<path class='grid' d='M{_LEFT} {coord(middle)}H{_RIGHT}'/>"
     for event in events:
-        a, b = x.px(event.start_s / seconds), x.px(event.end_s / seconds)
+        a, b = px(event.start_s), px(event.end_s)
         if b - a > 3:
             yield f"<path d='M{coord(a)} {coord(middle)}H{coord(b)}' stroke='#555' stroke-width='5'/>"
         yield _mark(event.level, a, middle)

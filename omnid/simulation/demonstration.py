@@ -24,7 +24,7 @@ from omnid.formats.plan_sheet import (
     draw_start,
     with_legend,
 )
-from omnid.messages import ObstacleRing
+from omnid.messages import NavigationUpdate, ObstacleRing, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.simulation.clearance import footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun
@@ -68,16 +68,21 @@ class TeachAndRepeat:
         if moment.place is None:
             return
         if not self._asked_s:
-            if not moment.controller.armed:
-                yield "arm"
-                return
-            self._tell(moment, "is taught the route: it is driven along an oval")
-            yield RouteRequest(RouteAction.TEACH, ROUTE, replace=True)  # that of an earlier demonstration
-            yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
+            yield from self._teach(moment)
+        elif moment.navigation is not None and moment.time_s >= self._asked_s + ANSWER_S:
+            yield from self._continue(moment, moment.place, moment.navigation)
+
+    def _teach(self, moment: Moment) -> Iterator[Request]:
+        """Arm the wheels, then teach the route along an oval."""
+        if not moment.controller.armed:
+            yield "arm"
             return
-        navigation = moment.navigation
-        if navigation is None or moment.time_s < self._asked_s + ANSWER_S:
-            return
+        self._tell(moment, "is taught the route: it is driven along an oval")
+        yield RouteRequest(RouteAction.TEACH, ROUTE, replace=True)  # that of an earlier demonstration
+        yield PathRequest(NavigationFrame.ODOM, oval(), 0.0)
+
+    def _continue(self, moment: Moment, place: PlaceUpdate, navigation: NavigationUpdate) -> Iterator[Request]:
+        """Show the progress; at the end of the oval repeat the route, and at that of the repetition end the run."""
         if moment.time_s >= self._shown_s + SHOWN_S and math.isfinite(navigation.left_m):
             self._shown_s = moment.time_s
             self._show(f"{moment.time_s:5.1f} s: {navigation.left_m:.1f} m left")
@@ -87,7 +92,7 @@ class TeachAndRepeat:
             yield "end"
         elif navigation.state is NavigationState.REACHED and not self._taught:
             self._driven_s = min(self._driven_s, moment.time_s)
-            if moment.place.state is not MapState.LOCALIZED:
+            if place.state is not MapState.LOCALIZED:
                 if moment.time_s > self._driven_s + RECOGNISED_S:
                     self.end = "the start of the route was not recognised"
                     yield "end"

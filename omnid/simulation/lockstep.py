@@ -1,7 +1,7 @@
 """A drive in lock-step: the daemon's stages inline, the real controller, and a robot whose wheels change what it sees.
 
-Time is simulated: same world, robot, drive, seed and configuration, same bytes, on any host. Between two pairs of
-images the controller ticks; a pose reaches it robot.pose_delay_s after its images were exposed.
+Time is simulated. The same world, robot, drive, seed and configuration give the same bytes on any host. Between two
+pairs of images the controller ticks. A pose reaches it robot.pose_delay_s after its images were exposed.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ Array = NDArray[np.float64]
 class Moment:
     """State of a drive when a pair of images is due. Scripts that watch use the true pose, planners must not."""
 
-    time_s: float  # since the start
-    T_world_base: Array  # (4, 4) true
+    time_s: float  # since the start of the drive
+    T_world_base: Array  # (4, 4) true pose
     controller: ControllerState
     odometry: OdometryUpdate | None  # newest pose of odometry
     T_odom_base: Array  # (4, 4) the same pose as a transform; the identity before the first one
@@ -76,7 +76,7 @@ Tamper: TypeAlias = Callable[[float, Frame], Frame]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """A fault of the surroundings or of the hardware during a time [s]."""
+    """A fault of the surroundings or of the hardware, between two times [s] since the start of the drive."""
 
     kind: Literal["dark", "no lower image", "no upper image", "motor cut"]
     start_s: float
@@ -101,12 +101,12 @@ class SimulatedRun:
 
     @property
     def truth_in_odom(self) -> Array:
-        """Return the true poses (N, 4, 4) in odom."""
+        """The true poses (N, 4, 4) in odom."""
         return np.asarray(se3.inverse(self.T_world_base[:1]) @ self.T_world_base)
 
     @property
     def contacts(self) -> list[Tick]:
-        """Return the first tick of each contact with an obstacle."""
+        """The first tick of each contact with an obstacle."""
         before = [None, *self.ticks]
         return [
             tick
@@ -116,7 +116,7 @@ class SimulatedRun:
 
     @property
     def clearance_m(self) -> float:
-        """Return the smallest distance of the robot's outline to an obstacle [m]."""
+        """The smallest distance of the robot's outline to an obstacle [m]; 0 or less: contact."""
         return min(tick.clearance_m for tick in self.ticks)
 
 
@@ -134,6 +134,7 @@ def simulate(
     """Drive for a number of seconds of simulated time and return the run.
 
     tamper: changes the images; None: they are as the simulated cameras make them.
+
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does.
     """
@@ -175,9 +176,9 @@ class _Lockstep:
         self._requests = LockstepRequests()
         self._files = RouteFiles(RouteFolder(Path(config.navigation.routes)), self._requests.put)
         self._ends = False
-        self._truth: dict[int, Array] = {}
+        self._truth: dict[int, Array] = {}  # T_world_base by the stamp of a pair [ns]
         self._odometry: OdometryUpdate | None = None
-        self._poses: list[tuple[int, Array, str]] = []
+        self._poses: list[tuple[int, Array, str]] = []  # stamp [ns], T_odom_base, tracking state
         self._rings: list[ObstacleRing] = []
         self._navigation: list[NavigationUpdate] = []
         self._places: list[PlaceUpdate] = []
@@ -187,6 +188,7 @@ class _Lockstep:
     def run(self, seconds: float) -> SimulatedRun:
         """Drive; return the run."""
         config = self._config
+        # 1. The stages of the daemon between the simulated cameras and the lists of results.
         graph = Graph(threaded=False)
         frames = graph.source("cameras", lambda: self._messages(seconds))
         shape = geometry(self._rig, config.panorama)
@@ -201,8 +203,10 @@ class _Lockstep:
         self._stages = wire(
             graph, pairs, FrontEnd(shape, config), config, sinks, run_places.known_to(RunParts(navigation=navigation))
         )
+        # 2. The drive: the stages take what `_messages` yields.
         graph.run()
         run_places.finish()
+        # 3. Truth and estimates, at the stamps of the poses.
         return SimulatedRun(
             np.array([stamp for stamp, _, _ in self._poses], np.int64),
             np.array([self._truth[stamp] for stamp, _, _ in self._poses]).reshape(-1, 4, 4),
@@ -221,20 +225,25 @@ class _Lockstep:
         """Advance the robot from pair to pair; the stages work while frames and samples are yielded."""
         vehicle, period_s = self._vehicle, 1.0 / self._robot.rate_hz
         for seq in range(int(seconds / period_s)):
+            # 1. The robot moves until this pair is exposed.
             stamp_ns = START_NS + round(seq * period_s * 1e9)
             vehicle.motor.cut = self._has("motor cut")
             vehicle.advance(stamp_ns)
+            # 2. The drive sees the newest estimates, and asks for what it wants.
             self._send()
             if self._ends:
                 break
+            # 3. What the sensors have measured goes through the stages.
             self._truth[stamp_ns] = vehicle.T_world_base
             yield from vehicle.take_samples()
             yield from self._pair(seq, stamp_ns)
+        # 4. The wheels come to rest.
         vehicle.controller.end()
         vehicle.advance(vehicle.now_ns + STOPPING_NS)
         self._requests.end()
 
     def _pair(self, seq: int, stamp_ns: int) -> Iterator[Frame]:
+        """Yield the frames of a pair, without those that a fault takes away."""
         T_world_rig = self._vehicle.T_world_base @ self._rig.T_base_rig
         brightness = 0.0 if self._has("dark") else 1.0
         for camera in CAMERAS:
@@ -245,7 +254,7 @@ class _Lockstep:
                 yield frame if self._tamper is None else self._tamper(self._vehicle.time_s, frame)
 
     def _has(self, kind: str) -> bool:
-        """True while there is a fault."""
+        """True while there is a fault of this kind."""
         return any(fault.kind == kind and fault.start_s <= self._vehicle.time_s < fault.end_s for fault in self._faults)
 
     def _send(self) -> None:

@@ -14,6 +14,7 @@ posters_per_m = 0.5
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
@@ -117,7 +118,7 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     people = tuple(_person(rng, table) for table in persons)
     if options.other_posters:
         standing = _exchanged(standing, options)
-    brightness = options.brightness * (_positive(top, "light", 0.05, 3.0) if top.has("light") else 1.0)
+    brightness = options.brightness * _within(top, "light", 0.05, 3.0, 1.0)
     start = x_m, y_m, math.radians(heading_deg)
     return World(name, tuple(standing), people if options.people else (), start, brightness, space.is_polished)
 
@@ -138,12 +139,13 @@ class _Space:
         (x0, y0), (x1, y1) = table.numbers("low", 2), table.numbers("high", 2)
         if not (0.5 <= x1 - x0 <= LARGEST_M and 0.5 <= y1 - y0 <= LARGEST_M):
             table.fail("high", f"a corner 0.5 to {LARGEST_M:g} m beyond low")
-        ceiling_m = _positive(table, "ceiling_m", 1.5, 20.0) if table.has("ceiling_m") else CEILING_M
-        floor, ceiling = (
-            table.choice(key, textures.PAINTERS) if table.has(key) else "tiles" for key in ("floor", "ceiling")
+        ceiling_m = _within(table, "ceiling_m", 1.5, 20.0, CEILING_M)
+        kinds = (
+            _choice(table, "floor", textures.PAINTERS, "tiles"),
+            _choice(table, "ceiling", textures.PAINTERS, "tiles"),
         )
-        is_polished = table.has("finish") and table.choice("finish", ("matt", "polished")) == "polished"
-        return _Space((x0, y0), (x1, y1), ceiling_m, (floor, ceiling), is_polished)
+        is_polished = _choice(table, "finish", ("matt", "polished"), "matt") == "polished"
+        return _Space((x0, y0), (x1, y1), ceiling_m, kinds, is_polished)
 
     @property
     def area_m2(self) -> float:
@@ -201,7 +203,7 @@ def _wall_area_m2(table: ValidatedTable, ceiling_m: float) -> float:
 
 
 def _wall_height_m(table: ValidatedTable, ceiling_m: float) -> float:
-    return _positive(table, "height_m", 0.05, 20.0) if table.has("height_m") else ceiling_m
+    return _within(table, "height_m", 0.05, 20.0, ceiling_m)
 
 
 def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangle]:
@@ -209,9 +211,9 @@ def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangl
     table.allow_only(("points", "texture", "height_m", "posters_per_m", "poster_sides", "doors"))
     points = table.points("points", 2, MOST_POINTS)
     height_m = _wall_height_m(table, ceiling_m)
-    kind = table.choice("texture", TEXTURES) if table.has("texture") else RANDOM
-    per_m = _positive(table, "posters_per_m", 0.0, 4.0) if table.has("posters_per_m") else 0.0
-    both = table.has("poster_sides") and table.choice("poster_sides", ("front", "both")) == "both"
+    kind = _choice(table, "texture", TEXTURES, RANDOM)
+    per_m = _within(table, "posters_per_m", 0.0, 4.0, 0.0)
+    both = _choice(table, "poster_sides", ("front", "both"), "front") == "both"
     doors = [_door(door) for door in table.tables("doors", MOST_DOORS)]
     parts: list[Rectangle] = []
     for number, (a, b) in enumerate(pairwise(points)):
@@ -229,9 +231,9 @@ def _door(table: ValidatedTable) -> tuple[float, float, float]:
     """Return the distance from the wall's beginning, width and height [m] of a door."""
     table.allow_only(("at_m", "width_m", "height_m"))
     return (
-        _positive(table, "at_m", 0.0, LARGEST_M),
-        _positive(table, "width_m", 0.3, 10.0),
-        _positive(table, "height_m", 0.3, 20.0) if table.has("height_m") else 2.1,
+        _within(table, "at_m", 0.0, LARGEST_M),
+        _within(table, "width_m", 0.3, 10.0),
+        _within(table, "height_m", 0.3, 20.0, 2.1),
     )
 
 
@@ -271,7 +273,7 @@ def _box(rng: Random, table: ValidatedTable) -> list[Rectangle]:
     table.allow_only(("at", "size_m", "yaw_deg", "texture"))
     x_m, y_m, yaw_rad = _box_pose(table)
     faces = box(rng, (x_m, y_m), _size(table), yaw_rad)
-    kind = table.choice("texture", BOX_TEXTURES) if table.has("texture") else "poster"
+    kind = _choice(table, "texture", BOX_TEXTURES, "poster")
     if kind == "poster":
         return faces
     return [replace(face, texture=painted(rng, kind, (face.width_m, face.height_m))) for face in faces]
@@ -282,13 +284,11 @@ def _person(rng: Random, table: ValidatedTable) -> Person:
     return Person(
         tuple(box(rng, (0.0, 0.0), _person_size(table), 0.0)),
         tuple(table.points("path", 2, MOST_POINTS)),
-        _positive(table, "speed_mps", 0.0, 5.0) if table.has("speed_mps") else 1.0,
-        table.choice("repeat", ("once", "loop", "back and forth")) if table.has("repeat") else "once",
-        _positive(table, "start_s", 0.0, 1e5) if table.has("start_s") else 0.0,
-        *(
-            _positive(table, key, 0.0, 100.0) if table.has(key) else 0.0
-            for key in ("starts_within_m", "waits_within_m")
-        ),
+        _within(table, "speed_mps", 0.0, 5.0, 1.0),
+        _choice(table, "repeat", ("once", "loop", "back and forth"), "once"),
+        _within(table, "start_s", 0.0, 1e5, 0.0),
+        _within(table, "starts_within_m", 0.0, 100.0, 0.0),
+        _within(table, "waits_within_m", 0.0, 100.0, 0.0),
     )
 
 
@@ -303,11 +303,18 @@ def _size(table: ValidatedTable) -> tuple[float, float, float]:
     return x_m, y_m, z_m
 
 
-def _positive(table: ValidatedTable, key: str, low: float, high: float) -> float:
+def _within(table: ValidatedTable, key: str, low: float, high: float, default: float | None = None) -> float:
+    """Return the number under a key, from low to high; default: None where the key is required."""
+    if default is not None and not table.has(key):
+        return default
     value = table.number(key)
     if not low <= value <= high:
         table.fail(key, f"a number from {low:g} to {high:g}")
     return value
+
+
+def _choice(table: ValidatedTable, key: str, options: Collection[str], default: str) -> str:
+    return table.choice(key, options) if table.has(key) else default
 
 
 def _exchanged(standing: list[Rectangle], options: WorldOptions) -> list[Rectangle]:

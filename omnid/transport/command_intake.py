@@ -1,4 +1,4 @@
-"""Commands and requests from the bus: a ring for each topic, and one pass over them in the order that is safe."""
+"""Commands and requests from the bus: a ring buffer for each topic, and one pass over all of them, stops first."""
 
 from __future__ import annotations
 
@@ -39,7 +39,10 @@ class CommandIntake:
         requests: OpenRequests,
         callback: RequestCallback,
     ) -> None:
-        """topics: those with a ring of their own; all others below `cmd` share one. requests: keeps the queries."""
+        """topics: those with a ring of their own; all others below `cmd` share one. requests: keeps unanswered queries.
+
+        callback: takes each message, in the thread of `process`.
+        """
         self._callback, self._open = callback, requests
         self._topics = frozenset((*topics, *_LAST))
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
@@ -48,16 +51,17 @@ class CommandIntake:
 
     @property
     def intakes(self) -> Sequence[Intake[Any]]:
-        """The rings, with what they have refused."""
+        """The takers of the messages of all rings, with the counts of refused messages."""
         return [ring.intake for ring in self._rings]
 
     def process(self) -> None:
-        """Pass on what has come: stops first, and again after the requests to arm that came with them.
+        """Pass on what has come. Of a stop and a request to arm in one pass the stop wins.
 
-        The order of messages of different topics is not known: of a stop and a request to arm in one pass the stop
-        wins.
+        Which of the two was sent first is not known, because messages of different topics have no common order.
         """
+        # 1. Stops.
         stopped, asked_to_arm = self._stop(), False
+        # 2. All other messages; requests to arm are the last of them.
         for ring in self._rings:
             if ring.topic == STOP:
                 continue
@@ -65,6 +69,7 @@ class CommandIntake:
                 asked_to_arm |= ring.topic == ARM
                 if topic := self._topic(ring, message):
                     self._pass_on(topic, message)
+        # 3. After a request to arm: a stop that came in the meantime, or else that of step 1 once more.
         if asked_to_arm and not self._stop() and stopped:
             self._callback(Request(STOP))
 
@@ -82,16 +87,18 @@ class CommandIntake:
         self._callback(Request(topic, payload, sender_of(message), ros2.sent_ns_in(attached), id))
 
     def _topic(self, ring: _Ring, message: zenoh.Sample | zenoh.Query) -> str:
-        """Return the topic of a message; empty where another ring has it, and for a query of several keys.
+        """Return the topic of a message; empty for a message that is not passed on.
 
-        A request names one robot and one topic.
+        These are queries of several keys, since a request names one robot and one topic, and messages in the shared
+        ring whose topic has a ring of its own.
         """
         key = str(message.key_expr).removeprefix(ring.prefix)
         if isinstance(message, zenoh.Query):
             return ring.topic if key == request_key(ring.topic) else ""
         if ring.topic != _UNKNOWN:
             return ring.topic
-        topic = key if ring.prefix == self._rings[0].prefix else key.rsplit("/", 2)[0]  # its type and their hash
+        # A key of rmw_zenoh ends with the type of the message and the hash of that type.
+        topic = key if ring.prefix == self._rings[0].prefix else key.rsplit("/", 2)[0]
         return "" if topic in self._topics else topic
 
     def _declare(self, session: zenoh.Session, config: BusConfig) -> Iterator[_Ring]:
@@ -114,9 +121,9 @@ class CommandIntake:
 def sender_of(message: zenoh.Sample | zenoh.Query) -> str:
     """Return the identity of the program that sent a message, empty where it names none.
 
-    Programs with omnid.client give the source of their messages and attach an identity to their requests, those of
-    rmw_zenoh attach the gid of their publisher; zenoh itself adds nothing. No proof: permissions are those of the
-    access rules.
+    Programs with omnid.client give the source of their messages and attach an identity to their requests. Programs
+    with rmw_zenoh attach the gid of their publisher. zenoh itself adds nothing. The identity proves nothing: what a
+    program may do is decided by the access rules.
     """
     if isinstance(message, zenoh.Sample) and message.source_info is not None:
         return str(message.source_info.source_id.zid)

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.frame import Frame, gray
+from drivers.frame import gray
+from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import RosImage
 
 COMPRESSED: Final = ("jpeg", "png")
@@ -24,18 +25,4 @@ def compressed(image: RosImage) -> tuple[bytes, str]:
     """Return compressed bytes and their kind; raw images become grey JPEG. Raise FrameDecodeError where damaged."""
     if image.encoding in COMPRESSED:
         return bytes(image.data), image.encoding
-    return jpeg(
-        gray(
-            Frame(
-                0,
-                image.stamp_ns,
-                "lower",
-                image.encoding,
-                image.data,
-                image.width,
-                image.height,
-                image.step,
-                image.bigendian,
-            )
-        )
-    ), "jpeg"
+    return jpeg(gray(frame_of(image))), "jpeg"

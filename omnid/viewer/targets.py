@@ -107,7 +107,7 @@ class RrdFile:
 class Viewer:
     """rerun's viewer in a process of its own; a window outlives this program, the server for a browser does not."""
 
-    def __init__(self, web: bool, port: int = 0) -> None:
+    def __init__(self, web: bool, port: int) -> None:
         """web: serve a browser, at a port of this machine and the next one; port 0: any two that are free."""
         self._web, self._port = web, port
         self._process: subprocess.Popen[bytes] | None = None

@@ -14,7 +14,7 @@ from drivers.logs.mcap_info import LogInfo, read_log_info
 from drivers.logs.ros_image import RosImage
 from omnid.config import Config
 from omnid.errors import OmnidError
-from omnid.recordings.odometry_topic import choose_odometry_topic, odometry_topics
+from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose, odometry_topics
 from omnid.recordings.recording_reader import CLOUD, ODOMETRY, STATUS, RecordingReader
 from omnid.runs.replay import ReplayOptions, Topics
 from omnid.sinks.files import check_outputs
@@ -49,7 +49,7 @@ class Log:
     settings: Path | None = None  # file of the configuration
 
 
-def target_for(out: Path | None, web: bool, port: int = 0) -> ViewerTarget:
+def target_for(out: Path | None, web: bool, port: int) -> ViewerTarget:
     """Return the named file as target, else a viewer; port: of a viewer for browsers, 0: any."""
     return RrdFile(out) if out is not None else Viewer(web, port)
 
@@ -134,10 +134,7 @@ def _recorded(reader: RecordingReader, scene: RerunScene) -> int:
             file=sys.stderr,
         )
     if not scene.poses:
-        raise OmnidError(
-            f"{path}: topic {reader.topic!r} has no readable pose; `omnid log info {path}` tells whether "
-            "the log is complete"
-        )
+        raise no_pose(path, reader.topic)
     return 0
 
 

@@ -43,7 +43,7 @@ class FleetFeed:
     def __init__(self, bus: BusConfig) -> None:
         """bus: settings of the connection, which has been checked."""
         self._bus = bus
-        self.state, self.inbox, self._tokens = FleetState(), Inbox(), Inbox()
+        self.state, self.inbox = FleetState(), Inbox()
         self.link = "not connected yet"  # why there is no connection; empty with one
         self.stops = 0  # stops that were requested
         self._fleet: Fleet | None = None
@@ -103,7 +103,7 @@ class FleetFeed:
                 self.link = str(error)
                 await asyncio.sleep(_RETRY_S)
         self.link = ""
-        self._fleet.on_alive(lambda robot, alive: self._tokens.put(robot, b"1" if alive else b"", b""))
+        self._fleet.on_alive(self.state.note_alive)
         await asyncio.to_thread(self._fleet.on_message, self.inbox.put, FLEET_TOPICS)
 
     async def _process(self) -> None:
@@ -118,10 +118,7 @@ class FleetFeed:
             await asyncio.sleep(0.0 if taken == _MOST_AT_ONCE else _POLL_S)
 
     def _take(self) -> int:
-        while (token := self._tokens.get(0.0)) is not None:
-            state = self.state.robot(token.topic)
-            if state is not None:
-                state.set_alive(bool(token.payload))
+        self.state.take_alive()
         for count in range(_MOST_AT_ONCE):
             message = self.inbox.get(0.0)
             if message is None:

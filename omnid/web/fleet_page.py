@@ -11,7 +11,6 @@ from typing import Final
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, Router, WebSocketRoute
-from starlette.websockets import WebSocket
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
@@ -19,7 +18,7 @@ from omnid.web.feed import RobotFeed
 from omnid.web.fleet_feed import FleetFeed
 from omnid.web.guard import Guard, Receive, Scope, Send
 from omnid.web.metrics import fleet_metrics
-from omnid.web.robot_page import RobotPage, answered
+from omnid.web.robot_page import RobotPage, command_route
 from omnid.web.site import STATIC
 
 MOST_OPEN: Final = 8  # robots whose pages are open
@@ -53,8 +52,8 @@ class FleetPage:
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
         return [
-            WebSocketRoute("/live", self._live),
-            Route("/stop", self._stop, methods=["POST"]),
+            WebSocketRoute("/live", self._feed.browsers.serve),
+            command_route("/stop", lambda _: self._feed.stop_all()),
             Mount("/robot/{key}", app=self._robot),
         ]
 
@@ -70,12 +69,6 @@ class FleetPage:
         finally:
             for key in list(self._open):
                 await self._close(key)
-
-    async def _live(self, websocket: WebSocket) -> None:
-        await self._feed.browsers.serve(websocket)
-
-    async def _stop(self, _: Request) -> Response:
-        return answered(await self._feed.stop_all())
 
     async def _robot(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request about one robot."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
-from starlette.websockets import WebSocket
 
 from omnid.client import Answer
 from omnid.web.feed import RobotFeed
@@ -26,14 +27,14 @@ class RobotPage:
     def routes(self) -> list[BaseRoute]:
         """Return the addresses."""
         return [
-            WebSocketRoute("/live", self._live),
-            Route("/stop", self._stop, methods=["POST"]),
-            Route("/arm", self._arm, methods=["POST"]),
-            Route("/route", self._route, methods=["POST"]),
-            Route("/navigation", self._navigation, methods=["POST"]),
-            Route("/map", self._map, methods=["POST"]),
-            Route("/drive", self._drive, methods=["POST"]),
-            Route("/goal", self._goal, methods=["POST"]),
+            WebSocketRoute("/live", self.feed.browsers.serve),
+            command_route("/stop", lambda _: self.wheels.stop()),
+            command_route("/arm", lambda _: self._arm()),
+            command_route("/route", self._requests.route),
+            command_route("/navigation", self._requests.navigation),
+            command_route("/map", lambda _: self._requests.save_map()),
+            command_route("/drive", self._stick.drive),
+            command_route("/goal", self._requests.goal),
         ]
 
     def metrics(self, guard: Guard) -> str:
@@ -41,33 +42,17 @@ class RobotPage:
         counts = {"dropped": self.feed.inbox.dropped, "stops": self.wheels.stops, "arms": self._requests.arms}
         return metrics(self.feed.state, self.feed.browsers, guard.refused, counts)
 
-    async def _live(self, websocket: WebSocket) -> None:
-        await self.feed.browsers.serve(websocket)
-
-    async def _stop(self, _: Request) -> Response:
-        return answered(await self.wheels.stop())
-
-    async def _arm(self, _: Request) -> Response:
+    async def _arm(self) -> Answer:
         if self.wheels.is_stopping:
-            return answered(Answer(False, "a stop is not confirmed yet: arm after it"))
-        return answered(await self._requests.arm())
-
-    async def _route(self, request: Request) -> Response:
-        return answered(await self._requests.route(request))
-
-    async def _navigation(self, request: Request) -> Response:
-        return answered(await self._requests.navigation(request))
-
-    async def _drive(self, request: Request) -> Response:
-        return answered(await self._stick.drive(request))
-
-    async def _goal(self, request: Request) -> Response:
-        return answered(await self._requests.goal(request))
-
-    async def _map(self, _: Request) -> Response:
-        return answered(await self._requests.save_map())
+            return Answer(False, "a stop is not confirmed yet: arm after it")
+        return await self._requests.arm()
 
 
-def answered(answer: Answer) -> Response:
-    """Return the answer to a command as JSON."""
-    return JSONResponse(answer._asdict(), 200 if answer.done else 409)
+def command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Route:
+    """Return the address of a command, which comes by POST; the answer is JSON, with status 409 if it was not done."""
+
+    async def respond(request: Request) -> Response:
+        answer = await act(request)
+        return JSONResponse(answer._asdict(), 200 if answer.done else 409)
+
+    return Route(path, respond, methods=["POST"])

@@ -13,12 +13,12 @@ import numpy as np
 from calib import se3
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState
+from omnid.monitor.screen import importance
 from omnid.plain_text import plain
 from omnid.transport.codec import OK
 from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
-from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import Scan
-from omnid.transport.status_names import PLACES, STAGE_PREFIX, WHEELS, Key, short_name
+from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
 from omnid.web.remedies import remedy_of
 
@@ -85,7 +85,7 @@ def map_in_odom(in_map: PoseInMap, poses: Iterable[Pose]) -> list[float | None] 
 
 def parts_message(state: RobotState) -> str:
     """Return the message `parts`: all status entries, the worst first, stages last."""
-    parts = sorted(state.statuses.values(), key=_importance)
+    parts = sorted(state.statuses.values(), key=importance)
     return compact(
         {
             "type": "parts",
@@ -225,17 +225,13 @@ def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
         found.append(_warning(2, "connection", link, "is the robot on, and on this network? check --connect"))
     elif state.alive is False:
         found.append(_warning(2, "robot", "its daemon has ended or cannot be reached", _ROBOT_GONE))
-    parts = sorted((part for part in state.statuses.values() if part.level % 4 != OK), key=_importance)
+    parts = sorted((part for part in state.statuses.values() if part.level % 4 != OK), key=importance)
     found += [_warning(part.level % 4, short_name(part.name), part.message, remedy_of(part)) for part in parts]
     return found[:MOST_WARNINGS]
 
 
 def _warning(level: int, name: str, message: str, remedy: str) -> dict[str, Any]:
     return {"level": level, "name": plain(name), "message": plain(message), "remedy": plain(remedy)}
-
-
-def _importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
-    return -(status.level % 4), status.name.startswith(STAGE_PREFIX), status.name
 
 
 def _quantiles_ms(histogram: Histogram) -> list[float | None]:

@@ -21,21 +21,21 @@ from calib.fit.least_squares import Ending, minimise
 from calib.models.camera import Array
 from calib.rig import Rig
 
-# Observations that fit no better than to a pixel are not of one rigid world: patches are matched to a tenth of it.
+# Patches are matched to a tenth of a pixel: observations that fit no better than to a pixel show no rigid world.
 MAX_SIGMA_PX = 1.0
-# A landmark is not one point of one surface if the RMS of its errors exceeds this number of sigmas; an observation
-# farther off is a wrong match. The kernel alone would leave a part of their weight.
+# A landmark is not one point of one surface if the RMS of its errors exceeds the first number of sigmas. An
+# observation is a wrong match if its error exceeds the second. The robust kernel alone would leave them some weight.
 LOOSE_LANDMARK, LOOSE_OBSERVATION = 2.0, 6.0
-# Rounds of leaving out loose landmarks, because without them the rig moves, and others become loose.
+# Loose landmarks are left out in several rounds, because the rig moves without them, and others become loose.
 SELECTIONS = 3
-# A bound for the steps of a search. Its relative gain at the end is rough while landmarks are selected, because the
-# search continues with the next selection, and fine in the last one.
+# A search ends after this number of steps, or where a step reduces the cost by less than a share of it: the rough one
+# while landmarks are still selected, because the search goes on with the next selection, the fine one at the end.
 MAX_STEPS = 30
 ROUGH_GAIN, FINE_GAIN = 1e-3, 1e-6
-# About six times the number of parameters of a rig: fewer landmarks would not show that one of them is wrong.
+# About six times the number of parameters of a rig. Fewer landmarks would not show that a parameter is wrong.
 MIN_LANDMARKS = 100
-# Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms):
-# compared with a calibration by boards about one observation of ten counts.
+# Errors of a patch are alike in both cameras, and from keyframe to keyframe (correlation 0.9 in rendered rooms),
+# so ten of these observations tell about as much as one corner in a calibration by boards.
 OBSERVATIONS_ALIKE = 10.0
 # Every third landmark is held out of a comparison of models, so that most remain for the fit.
 HOLD_OUT = 3
@@ -43,14 +43,14 @@ HOLD_OUT = 3
 
 @dataclass(frozen=True, slots=True)
 class DriveAdjustment:
-    """The rig that fits a drive, and how well; covariance and prior information (P, P) are of the steps."""
+    """The rig that fits a drive, and how well."""
 
     parameters: RigParameters
     state: DriveState
-    observations: DriveObservations
-    covariance: Array  # (P, P)
+    observations: DriveObservations  # those that were used
+    covariance: Array  # (P, P) of the steps
     sigma_px: float  # of one coordinate of an observation
-    prior: Array
+    prior: Array  # (P, P) information of the steps about zero
 
     @property
     def rig(self) -> Rig:
@@ -64,7 +64,7 @@ class DriveAdjustment:
 
     @property
     def seen(self) -> Flags:
-        """True (P,) for the parameters that the drive determines better than the prior."""
+        """True (P,) for the parameters whose sigma the drive has reduced to less than half of that of the prior."""
         return np.asarray(self.sigmas < np.sqrt(np.diag(np.linalg.inv(self.prior))) / 2)
 
 
@@ -80,8 +80,8 @@ def adjust_drive(
     """Return the rig, poses and landmarks of least robust reprojection error near those given.
 
     prior: information (P, P) of the steps about zero. fixed: keyframes whose pose stays, one for each drive. alike:
-    number of observations that are no more than one, which gives the prior more weight. CalibError where fewer than
-    MIN_LANDMARKS landmarks agree.
+    number of observations that tell as much as one independent one; the prior gets so many times its weight.
+    CalibError where fewer than MIN_LANDMARKS landmarks agree.
     """
     problem = DriveProblem(parameters, observations, alike * prior, np.asarray(fixed))
     state, sigma_px = _minimised(problem, state, ROUGH_GAIN)
@@ -107,7 +107,8 @@ def adjust_drive(
 def adjust_pairs(parameters: RigParameters, state: DriveState, observations: DriveObservations, prior: Array) -> Array:
     """Return the steps (P,) by points that both cameras saw at once, near those of the state: a start for a drive.
 
-    Rays of both cameras must meet: columns of the panoramas, but no lengths. The poses of the keyframes do not matter.
+    The only condition is that the rays of both cameras meet. It tells the columns of the panoramas, but no lengths. The
+    poses of all keyframes stay; wherever they are, the result is the same.
     """
     everything = np.arange(len(state.T_rig_odom))
     return _minimised(DriveProblem(parameters, observations, prior, everything), state, ROUGH_GAIN)[0].steps
@@ -118,23 +119,27 @@ def held_out_error(
 ) -> float:
     """Return the error [px] of landmarks that another model of the rig was not fitted to; robust (Cauchy's function).
 
-    Rig and poses are fitted to the other landmarks of an adjustment; then only the points of those held out are.
+    parameters: of the other model. found: an adjustment, which gives observations, poses and points to start from.
     """
+    # 1. The landmarks in two parts: those for the fit, and those held out.
     held = found.observations.landmark % HOLD_OUT == 0
     parts = [found.observations.only(chosen) for chosen in (~held, held)]
     states = [replace(found.state, points=found.state.points[used], steps=np.zeros(len(prior))) for _, used in parts]
+    # 2. The rig of the other model and the poses, by the first part; parameters that both models have start alike.
     steps = dict(zip(found.parameters.names, found.state.steps.tolist(), strict=True))
     states[0] = replace(states[0], steps=np.array([steps.get(name, 0.0) for name in parameters.names]))
     fitted, _ = _minimised(DriveProblem(parameters, parts[0][0], prior, np.asarray(fixed)), states[0], FINE_GAIN)
+    # 3. With that rig and those poses, the points that are held out.
     everything = np.arange(len(fitted.T_rig_odom))
     test = DriveProblem(parameters, parts[1][0], prior, everything, held=True)
     tried, _ = _minimised(test, replace(fitted, points=states[1].points), ROUGH_GAIN)
+    # 4. Their robust mean error.
     squared = (test.residuals(tried) ** 2).sum(axis=1) / (KERNEL * found.sigma_px) ** 2
     return float(KERNEL * found.sigma_px * np.sqrt(np.mean(np.log1p(squared)) / 2))
 
 
 def observation_sigma(rig: Rig, found: DriveAdjustment, fixed: Sequence[int] = (0,)) -> float:
-    """Return the sigma [px] of one coordinate with another rig, which stays; poses and landmarks are adjusted to it."""
+    """Return the sigma [px] of one coordinate with another rig, which stays; poses and landmarks are adjusted."""
     parameters = RigParameters.about(rig)
     still = np.zeros(len(parameters.names))
     problem = DriveProblem(parameters, found.observations, np.eye(len(still)), np.asarray(fixed), held=True)
@@ -148,7 +153,7 @@ def _minimised(problem: DriveProblem, state: DriveState, gain: float) -> tuple[D
 
 
 def _consistent(problem: DriveProblem, state: DriveState, sigma_px: float) -> Flags:
-    """Return the observations (M,) of landmarks that behave as one point, without those that are far off."""
+    """Return True (M,) for observations that are not far off, of landmarks that behave as one point."""
     seen, squared = problem.observations, (problem.residuals(state) ** 2).sum(axis=1)
     total, count = np.zeros(len(state.points)), np.zeros(len(state.points))
     np.add.at(total, seen.landmark, np.minimum(squared, 1.0))

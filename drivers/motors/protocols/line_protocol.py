@@ -222,7 +222,7 @@ class LineFramer:
         lines = []
         for byte in data:
             if byte == ord("$") or len(self._line) >= MAX_LINE:
-                self._discard()
+                self.reset()
             if not self._line and byte != ord("$"):
                 self.garbage += byte not in b"\r\n"
                 continue
@@ -232,13 +232,10 @@ class LineFramer:
                 self._line.clear()
         return lines
 
-    def _discard(self) -> None:
-        self.garbage += len(self._line)
-        self._line.clear()
-
     def reset(self) -> None:
         """Discard the incomplete line."""
-        self._discard()
+        self.garbage += len(self._line)
+        self._line.clear()
 
 
 class LineProtocol:

@@ -28,15 +28,15 @@ from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
 
-STOPS: Final = 5  # poses after an end at which a stop is sent: one might be lost
+STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
 BESIDE_M: Final = 0.3  # The path counts as left this far beyond the corridor; by trial on development seeds.
-PLANNED_M: Final = 4.0  # Length of the path that the local planner is given; enough: its grid ends at 3.2 m.
-LONGEST_STEP_S: Final = 1.0  # a gap between two poses counts as no more
+PLANNED_M: Final = 4.0  # Length of the path that the local planner is given: its grid ends at 3.2 m.
+LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"
 GIVES_WAY: Final = "it drives back to let others pass"
 WAITS: Final = "it goes on by itself when the way is free"
-AGAIN_M: Final = 1.0  # Progress after which a block is a new one; by trial on development seeds.
+AGAIN_M: Final = 1.0  # After this progress the next block is a new one; by trial on development seeds.
 MOST_DOUBLINGS: Final = 6  # Most doublings of the time until the base gives way again: to four minutes by default.
 PAST_M: Final = 1.0  # Length of the path past the block that must be free, too; by trial on development seeds.
 
@@ -52,12 +52,12 @@ class Navigator:
         self._half_width_m = collision.half_width_m + collision.side_m
         self._trail = Trail(settings.give_way_m)
         self._last_ns: int | None = None
-        self._stops = 0  # still to be sent
+        self._stops = 0  # number of stops that are still to be sent
         self.drive: Drive | None = None
         self.state = NavigationState.IDLE
         self.reason = ""
         self.task = ""  # description of the drive, kept after its end
-        self.command_ns = 0
+        self.command_ns = 0  # stamp of the request for the drive
 
     @property
     def stopping(self) -> bool:
@@ -105,7 +105,7 @@ class Navigator:
         return refusal
 
     def step(self, now: Situation) -> Navigation:
-        """Return the motion at a pose."""
+        """Return the motion for a new pose, and the state with its reason."""
         dt_s = 0.0 if self._last_ns is None else min(max((now.stamp_ns - self._last_ns) * 1e-9, 0.0), LONGEST_STEP_S)
         self._last_ns = now.stamp_ns
         drive = self.drive
@@ -131,7 +131,7 @@ class Navigator:
         if self._is_beside(following):
             return self._taken_away(following)
         setpoint = drive.in_odom(following.setpoint, now)
-        # 5. Obstacles.
+        # 5. Obstacles, and a safety rule that holds the wheels because of one.
         plan = self._around_obstacles(drive.follower, drive.path_ahead(now, PLANNED_M), now, setpoint)
         if plan.avoiding:
             drive.follower.skip_corner(pose)
@@ -139,7 +139,7 @@ class Navigator:
             return self._blocked(drive, plan.reason, now, following, dt_s)
         if now.wheels.held_by:  # the setpoint is still sent: the monitor lets go by itself
             return self._blocked(drive, now.wheels.held_by, now, following, dt_s)._replace(setpoint=plan.setpoint)
-        # 6. What holds the wheels, and progress.
+        # 6. Progress: where it is missing for too long, the base gives way or the drive fails.
         if self._is_stuck(drive, now, following, dt_s):
             if plan.avoiding and not drive.gave_way and self._begins_to_give_way(drive, now, following.left_m):
                 return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
@@ -165,7 +165,7 @@ class Navigator:
             drive.paused = f"disarmed: {wheels.disarmed_by}: see to it, then {RESUME}"
 
     def _advance(self, drive: Drive, now: Situation) -> None:
-        """Sum up the way since the pose in the map was known."""
+        """Add the pose to the trail, and its way to that without a pose in the map; begin again after a reset."""
         moved_m = 0.0 if drive.last_xy is None else float(np.hypot(*(now.pose[:2] - drive.last_xy)))
         drive.last_xy = now.pose[:2].copy()
         drive.unlocalised_m += moved_m
@@ -289,7 +289,7 @@ class Navigator:
         )
 
     def _is_stuck(self, drive: Drive, now: Situation, following: Following, dt_s: float) -> bool:
-        """True if the base has come neither nearer to the end nor turned for too long."""
+        """True if for too long the base has neither come nearer to the end nor turned."""
         return drive.stands_since_s(now.pose, following.left_m, dt_s) > self._settings.stuck_s
 
     def _finished(self, drive: Drive, missed_m: float) -> Navigation:
@@ -305,7 +305,7 @@ class Navigator:
         return self._idle()._replace(left_m=0.0)
 
     def _is_beside(self, following: Following) -> bool:
-        """True if the base is not on its way any more, as where an operator has taken it away."""
+        """True if the base is no longer near its path, for example because an operator has taken it away."""
         return abs(following.offset_m) > self._settings.corridor_m + BESIDE_M
 
     def _taken_away(self, following: Following) -> Navigation:

@@ -1,4 +1,4 @@
-"""Input of the localisation in a map, from the odometry, and its result."""
+"""Input of the localisation in a map, which is a frame of the odometry, and its result."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ class OdometryFrame:
     stereo: StereoFrame
     stamp_ns: int
     T_odom_rect: Array  # (4, 4)
-    covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
+    covariance: Array  # (6, 6) of T_odom_rect, [t; r] in the rectified frame: m^2, m rad, rad^2
     lost: bool
     resets: int  # gaps of unknown motion so far
-    is_keyframe: bool  # its dense depth is known
-    scan: Callable[[], NDArray[np.float32]]  # returns the nearest obstacles by azimuth, see mapping/range_scan.py
+    is_keyframe: bool  # True if its dense depth is known
+    scan: Callable[[], NDArray[np.float32]]  # returns distances (SECTORS,) [m], see mapping/range_scan.py
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapPose:
-    """Pose of odom in the map, and of the frame."""
+    """Pose of odom in the map, and pose of the frame in the newest keyframe."""
 
-    T_map_odom: Array  # (4, 4) of the rectified frame of the first pair
-    covariance: Array  # (6, 6) of T_map_rect, [t; r] in the rectified frame
+    T_map_odom: Array  # (4, 4); odom is the rectified frame of the first pair
+    covariance: Array  # (6, 6) of T_map_rect, the pose of the frame in the map; [t; r] in the rectified frame
     state: MapState
     keyframe: int  # id of the newest keyframe of the run; NO_KEYFRAME: none since the last gap
-    T_keyframe_rect: Array  # (4, 4) of the frame in it, by odometry
+    T_keyframe_rect: Array  # (4, 4) pose of the frame in that keyframe by odometry; the identity where there is none

@@ -45,7 +45,7 @@ class RayTable:
     reach_m: float  # of the farthest origin from the camera's
 
 
-def ray_table(mounted: MountedCamera, supersample: int = 2) -> RayTable:
+def ray_table(mounted: MountedCamera, supersample: int) -> RayTable:
     """Return the rays of all samples (supersample^2 per pixel) inside the camera's mask."""
     width, height = mounted.camera.size
     rays, spacing = _lift_grid(mounted, supersample)
