@@ -65,6 +65,12 @@ def replays_of(log: Path) -> list[int]:
     return found
 
 
+def is_pending(process: int, number: signal.Signals) -> bool:
+    """Whether a signal waits for a process that is stopped."""
+    (line,) = (line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line.startswith("ShdPnd:"))
+    return bool(int(line.split()[1], 16) >> (number - 1) & 1)
+
+
 def test_results_are_those_of_single_runs_and_a_bad_log_stops_nothing(tmp_path: Path) -> None:
     """Also where a truth lies beside the log, here the trajectory of the single run."""
     good, out = short_log(tmp_path / "logs" / "day1" / "log.mcap"), tmp_path / "out"
@@ -135,9 +141,14 @@ def test_an_interrupted_batch_leaves_no_program_and_goes_on_later(
         stdout=subprocess.PIPE,
     ) as batch:
         wait_until(lambda: bool(replays_of(log)))
+        # The replay stands until the batch has told it to end: on a busy machine it would be over before.
+        (replay,) = replays_of(log)
+        os.kill(replay, signal.SIGSTOP)
         second = omnid("batch", log, "--out", out)
         assert second.returncode == 2 and "another batch writes into" in second.stderr
         batch.send_signal(number)
+        wait_until(lambda: is_pending(replay, signal.SIGTERM))
+        os.kill(replay, signal.SIGCONT)
         batch.communicate(timeout=DEADLINE_S)
     assert batch.returncode == 130
     wait_until(lambda: not replays_of(log))
