@@ -74,8 +74,7 @@ class Obstacles:
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         # 2. The floor; while it is unknown, so is the ring.
         if self.floor.wants_points:
-            # As they were matched: the fit leaves out what is no floor, and without some of its edges the floor of a
-            # plain room was found worse (docs/notes/odometry.md).
+            # As they were matched: the fit leaves out by itself what is no floor.
             self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
         columns = self._columns_of(self.floor.floor, panoramas)
         if columns is None:
