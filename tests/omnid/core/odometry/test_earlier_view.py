@@ -11,7 +11,10 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.earlier_kernels import HALF_PX, correlate
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
+from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.pixel_times import PixelTimes
+from omnid.core.types.stereo_model import StereoModel
 from tests.omnid.core.scenery import texture, wrapped
 
 Array = NDArray[np.float64]
@@ -43,11 +46,18 @@ def with_reflection(image: Image) -> Image:
     return reflected
 
 
-def wrong(now: Image, earlier: Image, range_m: float, rows: slice, usable: NDArray[np.bool_] = EVERYWHERE) -> float:
+def wrong(
+    now: Image,
+    earlier: Image,
+    range_m: float,
+    rows: slice,
+    usable: NDArray[np.bool_] = EVERYWHERE,
+    exposure: Exposure | None = None,
+) -> float:
     """Return the share of contradicted points of some rows of the first pose's panorama at a distance."""
     u, v = (a.ravel() for a in np.meshgrid(np.arange(0.0, 480, 5), np.arange(120.0)[rows]))
     pixels = np.column_stack([u, v])
-    view = EarlierView(wrapped(earlier), usable, T_EARLIER_NOW)
+    view = EarlierView(wrapped(earlier), usable, T_EARLIER_NOW, exposure)
     found = contradicted(wrapped(now), pixels, range_m * CYLINDER.rays(pixels), CYLINDER, view)
     return float(found.mean())
 
@@ -72,6 +82,16 @@ def test_what_is_fixed_to_the_camera_is_contradicted() -> None:
     # Where turn and translation cancel, both hypotheses are the same place.
     assert wrong(now, earlier, 1.5 * RANGE_M, inside) > 0.75
     assert wrong(now, earlier, RANGE_M, MIDDLE) < 0.02
+
+
+def test_points_are_seen_where_the_motion_puts_them_when_their_pixels_were_exposed() -> None:
+    late_s, twist = 0.02, np.array([3.0, 0, 0, 0, 0, 4.0])
+    now, earlier = seen_from(np.eye(4)), seen_from(se3.exp(-late_s * twist) @ T_EARLIER_NOW)
+    rows_s = np.full((120, 480), late_s, np.float32)
+    motion = RigVelocity(twist, np.zeros((6, 6)))
+    exposure = Exposure(PixelTimes(0.0, rows_s, rows_s), motion, StereoModel(CYLINDER, 0.2))
+    assert wrong(now, earlier, RANGE_M, MIDDLE, exposure=exposure) < 0.02
+    assert wrong(now, earlier, RANGE_M, MIDDLE) > 0.2
 
 
 def test_what_the_earlier_view_does_not_show_is_not_contradicted() -> None:
