@@ -19,6 +19,7 @@ from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.navigation.requests import TaughtRoute
 from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features
 from omnid.core.stereo.photometry import Light
@@ -81,6 +82,8 @@ class StereoDepth:
     panoramas: Panoramas
     # The motion during the exposures, for which the depth is corrected; None: not known, or all pixels at once.
     exposure: Exposure | None = None
+    # What the camera saw at the last keyframe; None: there was none, or the motion since then is not known well.
+    earlier: EarlierView | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

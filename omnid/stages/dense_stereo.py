@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import StereoConfig
 from omnid.core.odometry.dense_correction import DenseCorrection
+from omnid.core.odometry.earlier_view import contradicted
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.matcher import Matcher, MatchingSettings
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import DensePoints, Panoramas
+from omnid.messages import DensePoints, Panoramas, StereoDepth
 from omnid.stages.geometry import Geometry
 
 Array = NDArray[np.float64]
@@ -51,6 +52,17 @@ class DenseStereo:
         variance_m2 = self._variance_m2(points[kept], by_motion[kept])
         points, pixels = se3.apply(self._geometry.T_rig_rect, points[kept]), np.column_stack([columns, rows])[kept]
         return DensePoints(disparity, pixels.astype(float), points, variance_m2)
+
+    def confirmed(self, depth: StereoDepth, dense: DensePoints) -> DensePoints:
+        """Return the dense points of a pair without those that its earlier view contradicts."""
+        if depth.earlier is None:
+            return dense
+        points = se3.apply(se3.inverse(self._geometry.T_rig_rect), dense.points)
+        wrong = contradicted(depth.panoramas.lower, dense.pixels, points, self._cylinder, depth.earlier)
+        disparity = dense.disparity.copy()
+        columns, rows = dense.pixels[wrong].astype(np.intp).T
+        disparity[rows, columns] = np.nan
+        return DensePoints(disparity, dense.pixels[~wrong], dense.points[~wrong], dense.variance_m2[~wrong])
 
     def _match(
         self, panoramas: Panoramas, correction: DenseCorrection | None

@@ -30,7 +30,8 @@ class FrontEnd:
         self.geometry = geometry
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)
         self.dewarp = Dewarp(geometry, config.panorama, config.camera)
-        self.dense = DenseDepths(DenseStereo(geometry, config.stereo_settings()).compute)
+        stereo = DenseStereo(geometry, config.stereo_settings())
+        self.dense = DenseDepths(stereo.compute, stereo.confirmed)
         self.odometry = OdometryStage(geometry, config.odometry, self.dense, load)
         self.poses = CheckedOdometry(self.odometry, self.health)
 

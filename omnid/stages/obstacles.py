@@ -74,7 +74,8 @@ class Obstacles:
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         # 2. The floor; while it is unknown, so is the ring.
         if self.floor.wants_points:
-            self.floor.add(self._dense.of(odometry.depth))
+            # As they were matched: the fit leaves out by itself what is no floor.
+            self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
         columns = self._columns_of(self.floor.floor, panoramas)
         if columns is None:
             return ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import OdometryConfig
 from omnid.core.control.motion_monitor import Witness
+from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.motion_agreement import MotionAgreement
@@ -51,6 +52,7 @@ class OdometryStage:
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
+        self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, at a pose known well
         T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
         self._to_base = se3.adjoint(T_base_rect)
         self.sensors, self._agreement = MotionSensors(se3.inverse(T_base_rect)), MotionAgreement()
@@ -91,6 +93,7 @@ class OdometryStage:
             seen = self._to_base @ se3.log(estimate.step[0])
             self._agreement.add_step(last_ns, pair.stamp_ns, float(seen[0]), float(seen[5]))
         # 4. The message, in the frame of the rig.
+        earlier = self._earlier(pair, estimate)
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         return OdometryUpdate(
             pair.seq,
@@ -103,7 +106,7 @@ class OdometryStage:
             estimate.resets,
             estimate.inliers,
             estimate.tracked,
-            StereoDepth(pair, _moving(estimate.exposure)),
+            StereoDepth(pair, _moving(estimate.exposure), earlier),
             estimate.features,
             pair.light,
             pair.motion,
@@ -117,6 +120,17 @@ class OdometryStage:
     def after(self) -> None:
         """Make the keyframe of the last pair, whose pose was passed on, if there is to be one."""
         self._method.complete()
+
+    def _earlier(self, pair: Panoramas, estimate: OdometryEstimate) -> EarlierView | None:
+        """Return the view at the last keyframe, as it is seen from a pose; remember the pair if it is one."""
+        is_known = estimate.state is TrackingState.TRACKING
+        before = self._keyframe
+        if estimate.is_keyframe:
+            self._keyframe = (pair, estimate) if is_known else None
+        if before is None or not is_known or before[1].resets != estimate.resets:
+            return None
+        T_earlier_now = se3.inverse(before[1].T_odom_rect) @ estimate.T_odom_rect
+        return EarlierView(before[0].lower, before[0].usable, T_earlier_now, _moving(before[1].exposure))
 
     def _disparity(self, pair: Panoramas, exposure: Exposure | None) -> NDArray[np.float32]:
         """Return the disparities (H, W) of a pair for a motion during its exposures."""

@@ -6,6 +6,7 @@ import gc
 import threading
 import time
 import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import pytest
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.config import MappingConfig
+from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.core.types.stereo_model import StereoModel
@@ -171,6 +173,21 @@ def test_depth_is_computed_for_each_motion_that_is_asked_for() -> None:
     assert depths.of(StereoDepth(pair, fast)) is depths.points(pair, fast) and len(counted.exposures) == 2
     depths.of(StereoDepth(pair))
     assert counted.exposures == [slow, fast, None]
+
+
+def test_points_are_confirmed_once_for_each_earlier_view() -> None:
+    """Odometry, which makes the keyframe before its pose is known well, gets the points as they were matched."""
+    pair, views = panoramas(3), [EarlierView(wrapped(IMAGE), IMAGE > 0, np.eye(4)) for _ in range(2)]
+    confirmed: list[EarlierView | None] = []
+
+    def none_of(depth: StereoDepth, dense: DensePoints) -> DensePoints:
+        confirmed.append(depth.earlier)
+        return replace(dense, points=dense.points[:0])
+
+    depths = DenseDepths(Counted(), none_of)
+    for view in (views[0], views[0], views[1]):
+        assert len(depths.of(StereoDepth(pair, earlier=view)).points) == 0
+    assert confirmed == views and len(depths.points(pair).points) == 1
 
 
 def test_depth_is_forgotten_with_its_pair() -> None:

@@ -7,16 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib import se3
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.rig.column_matches import PanoramaPair
 from omnid.core.rig.rig_health import RigHealth
+from omnid.formats.tum import read_tum
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
 from omnid.stages.synchronise import Synchronise
+from tests.simulation.disturbances import DisturbedCamera
 
 PAIRS = 4
 
@@ -73,3 +76,24 @@ def test_the_stereo_of_the_papers_method_is_chosen_for_all(place: Geometry, pair
     panoramas = FrontEnd(place, Config()).dewarp.process(pairs[0])
     disparities = [np.nan_to_num(dense.points(panoramas).disparity) for dense in found]
     assert not np.array_equal(*disparities)
+
+
+def test_the_reflection_of_a_lens_in_its_mirror_has_no_depth(place: Geometry, scene: Path) -> None:
+    """Both panoramas show it at the same pixels, so that stereo puts it far below the floor, which is z = 0."""
+    front_end, truth = FrontEnd(place, Config()), read_tum(scene / "truth.txt")
+    cameras = place.rig.lower, place.rig.upper
+    reflected = [DisturbedCamera.of(["flare"], k, m.visible, m.camera.size, 1) for k, m in enumerate(cameras)]
+    pairing = Synchronise(place.rig, Config().pair)
+    below, confirmed = 0, 0
+    for pair in filter(None, map(pairing.process, LogReader(scene / "log.mcap").frames())):
+        lower, upper = (
+            np.clip(camera.shown(image.astype(np.float32), pair.seq, 0.0), 0, 255).astype(np.uint8)
+            for camera, image in zip(reflected, (pair.lower, pair.upper), strict=True)
+        )
+        update = front_end.process(FramePair(pair.seq, pair.stamp_ns, lower, upper))
+        if update.depth.earlier is not None and update.is_keyframe:
+            T = truth.T[truth.stamps_ns == pair.stamp_ns][0]
+            matched = front_end.dense.points(update.depth.panoramas, update.depth.exposure)
+            below += int((se3.apply(T, matched.points)[:, 2] < -0.5).sum())
+            confirmed += int((se3.apply(T, front_end.dense.of(update.depth).points)[:, 2] < -0.5).sum())
+    assert below > 100 and confirmed < 0.4 * below, (below, confirmed)

@@ -1,0 +1,65 @@
+"""Dense points that an earlier view of the same camera contradicts.
+
+What is fixed to a camera, as the reflection of its lens in its mirror, lies at the same pixels of both panoramas of the
+pair: they match, at some disparity. In a window of K pixels with unknown gain and offset, a hypothesis h of where the
+earlier panorama showed the same surface has the log-likelihood -K/2 log(1 - rho_h^2), rho_h > 0 the correlation of the
+windows. There are three: the point stood in the world at its range, so that it was seen where the motion puts it; it is
+fixed to the rig, so that it was seen at the same pixel; or none of both, with the likelihood of rho = LEAST. A point is
+contradicted where the first is not the likeliest. The third one also finds wrong periods of repeated texture, and edges
+between two surfaces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.panorama import Cylinder
+from omnid.core.odometry.earlier_kernels import HALF_PX, correlate
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.types.panorama import PaddedPanorama
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Least correlation of a point that is confirmed, by trial on development seeds: of the right points of clean logs 3.6 %
+# are lost with 0.3, and 6.4 % with 0.5, which finds hardly more wrong ones.
+LEAST = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlierView:
+    """The lower panorama of an earlier pair, and the motion since."""
+
+    lower: PaddedPanorama
+    usable: Flags  # (H, W) pixels that show the world
+    T_earlier_now: Array  # (4, 4) of the rectified frames
+    exposure: Exposure | None = None  # motion during its exposures; None: all pixels were exposed at the stamp
+
+
+def contradicted(
+    lower: PaddedPanorama, pixels: Array, points: Array, cylinder: Cylinder, earlier: EarlierView
+) -> Flags:
+    """Return flags (N,) of points (N, 3) [m] in the rectified frame, found at pixels (N, 2) of the lower panorama.
+
+    A point that the earlier panorama does not show is not contradicted.
+    """
+    # 1. Where the earlier panorama showed the points, and whether it did.
+    there = se3.apply(earlier.T_earlier_now, points)
+    seen = cylinder.pixels(there)
+    if earlier.exposure is not None:
+        seen -= earlier.exposure.shift(there).lower
+    columns = np.clip(np.rint(lower.own(seen[:, 0])), 0, lower.width - 1).astype(np.intp)
+    rows = np.clip(np.rint(seen[:, 1]), 0, cylinder.height - 1).astype(np.intp)
+    shown = cylinder.shows(seen[:, 0]) & earlier.usable[rows, columns]
+    # 2. The correlations of both hypotheses, which differ only where the windows do.
+    found = np.empty((len(points), 2))
+    here = np.column_stack([pixels[:, 0] + lower.pad_px, pixels[:, 1]]).astype(np.int64)
+    padded = np.column_stack([lower.padded(seen[:, 0]), seen[:, 1]])
+    correlate(lower.image, earlier.lower.image, here, padded, found)
+    moved_px = np.hypot(cylinder.wrap(seen[:, 0] - pixels[:, 0]), seen[:, 1] - pixels[:, 1])
+    in_world, on_rig = found[:, 0], found[:, 1]
+    return np.asarray(shown & ((in_world < LEAST) | ((moved_px > HALF_PX) & (on_rig > in_world))))
