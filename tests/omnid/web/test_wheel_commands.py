@@ -40,6 +40,7 @@ class Rover:
         self.is_stopped, self.is_granted = False, True
         self.answering = threading.Event()
         self.answering.set()
+        bus.serve("config", "[controller.limits]\nvelocity_mps = 0.7\nyaw_rate_radps = 1.5\n")
         bus.subscribe_commands(self._take, command_topics(("operator",)), lambda: self.is_stopped)
 
     def _take(self, request: Request) -> None:
@@ -176,7 +177,7 @@ def test_the_stick_sends_a_share_of_the_limits(
     rover: Rover, connected: RobotFeed, clock_ms: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     commands = StickCommands(connected, WheelCommands(connected))
-    reads, takes_ms, limits = list[bool](), [0], VelocityLimits()
+    reads, takes_ms, limits = list[bool](), [0], VelocityLimits(velocity_mps=0.7, yaw_rate_radps=1.5)
     mps, radps = FIRST_SHARE * limits.velocity_mps, FIRST_SHARE * limits.yaw_rate_radps
 
     def slow_limits_of(robot: Robot) -> VelocityLimits:
