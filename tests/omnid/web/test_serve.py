@@ -16,12 +16,12 @@ from typing import Any, cast
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.transport.bus_config import BusConfig
+from omnid.transport.bus import Bus, BusConfig
 from omnid.web import server
 from omnid.web.access import Access, new_token
 from omnid.web.guard import Guard
 from omnid.web.server import WebSettings, _address, _check_names, _listening, _print_addresses, _uvicorn_config, serve
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import wait_until
 from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer
 from tests.replay.live import answers, free_port
 
@@ -36,7 +36,9 @@ def kept_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
-def run(client: Callable[[WebServer], None], token_file: Path, host: str = "127.0.0.1", **settings: Any) -> None:
+def run(
+    client: Callable[[WebServer], None], endpoint: str, token_file: Path, host: str = "127.0.0.1", **settings: Any
+) -> None:
     """Serve, let a client use it in a thread, and end it by a signal."""
     token_file.write_text(new_token())
     token_file.chmod(0o600)
@@ -55,7 +57,7 @@ def run(client: Callable[[WebServer], None], token_file: Path, host: str = "127.
     thread.start()
     try:
         serve(
-            BusConfig(connect=(free_endpoint(),)),
+            BusConfig(connect=(endpoint,)),
             WebSettings(listen=f"{host}:{port}", token_file=token_file, **settings),
         )
     finally:
@@ -67,7 +69,12 @@ def run(client: Callable[[WebServer], None], token_file: Path, host: str = "127.
 
 
 def test_a_local_server_answers_to_its_names_until_a_signal(
-    tmp_path: Path, kept_signals: None, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    bus: Bus,
+    endpoint: str,
+    tmp_path: Path,
+    kept_signals: None,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as with nohup
     shown = list[str]()
@@ -91,12 +98,17 @@ def test_a_local_server_answers_to_its_names_until_a_signal(
         shown.append(f"http://127.0.0.1:{web.port}/?token={web.token}\n")
 
     with caplog.at_level(logging.WARNING):
-        run(client, tmp_path / "token", names=("ROBOT.example",))
+        run(client, endpoint, tmp_path / "token", names=("ROBOT.example",))
     assert "without encryption" not in caplog.text and capsys.readouterr().out == shown[0]
 
 
 def test_a_server_on_the_network_warns_and_answers_to_the_name_of_the_machine(
-    tmp_path: Path, kept_signals: None, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+    bus: Bus,
+    endpoint: str,
+    tmp_path: Path,
+    kept_signals: None,
+    caplog: pytest.LogCaptureFixture,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     (tmp_path / "stop").write_text("abcdefghijklmnop")
     (tmp_path / "stop").chmod(0o600)
@@ -110,14 +122,14 @@ def test_a_server_on_the_network_warns_and_answers_to_the_name_of_the_machine(
         assert web.request("/recordings", headers=web.bearer).status == 404, "a page about all robots"
 
     with caplog.at_level(logging.WARNING):
-        run(client, tmp_path / "token", "0.0.0.0", stop_token_file=tmp_path / "stop", all_robots=True)
+        run(client, endpoint, tmp_path / "token", "0.0.0.0", stop_token_file=tmp_path / "stop", all_robots=True)
     assert "without encryption" in caplog.text
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 and lines[1].endswith("?token=abcdefghijklmnop (may see and stop, not arm)")
 
 
 def test_connections_without_a_whole_request_are_closed_and_others_stay(
-    tmp_path: Path, kept_signals: None, monkeypatch: pytest.MonkeyPatch
+    bus: Bus, endpoint: str, tmp_path: Path, kept_signals: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server, "REQUEST_S", 0.1)
 
@@ -143,7 +155,7 @@ def test_connections_without_a_whole_request_are_closed_and_others_stay(
             used.sock.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: ")
             assert closed(used.sock), "half a request after a whole one"
 
-    run(client, tmp_path / "token")
+    run(client, endpoint, tmp_path / "token")
 
 
 def test_settings_that_cannot_be_used_are_refused_before_anything_is_served(tmp_path: Path) -> None:
