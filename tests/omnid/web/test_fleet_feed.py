@@ -16,16 +16,17 @@ import zenoh
 from omnid.client import Fleet
 from omnid.errors import OmnidError
 from omnid.monitor.fleet import MAX_ROBOTS
-from omnid.monitor.robot_state import ReceivedMessage, RobotState
-from omnid.transport import codec
+from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
+from omnid.transport import codec, session
 from omnid.transport.bus import BusConfig
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import BUS, DISARMED_BY_STOP, WHEELS
 from omnid.web import fleet_feed, fleet_page
+from omnid.web.access import Access
 from omnid.web.fleet_feed import FleetFeed, robot_key
 from omnid.web.fleet_page import MOST_OPEN, FleetPage
-from omnid.web.metrics import fleet_metrics
+from omnid.web.site import Site
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
 
 ARMED = DiagnosticStatus(WHEELS, 0, "armed", {"armed": "1"})
@@ -185,8 +186,36 @@ def test_messages_are_taken_in_groups_and_tokens_before_them() -> None:
     assert len(feed.state.robots) == MAX_ROBOTS
 
 
+def test_a_flood_delays_neither_stops_nor_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    feed = FleetFeed(BusConfig())
+    payload = codec.diagnostics_cdr(10**18, [ARMED])
+    for number in range(450):
+        feed.inbox.put(f"r{number % 3}/status", payload, b"")
+    waits_s, pauses_s, get = set[float](), list[float](), Inbox.get
+
+    def recorded_get(inbox: Inbox, timeout_s: float) -> ReceivedMessage | None:
+        waits_s.add(timeout_s)
+        return get(inbox, 0.0)
+
+    async def recorded_sleep(pause_s: float) -> None:
+        pauses_s.append(pause_s)
+        if len(pauses_s) == 4:
+            raise asyncio.CancelledError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Inbox, "get", recorded_get)
+        patched.setattr(asyncio, "sleep", recorded_sleep)
+        patched.setattr(fleet_feed, "SHOW_S", 1000.0)
+        with pytest.raises(asyncio.CancelledError):
+            asyncio.run(feed._process())
+    assert waits_s == {0.0}, "the event loop, which sends stops, never waits for a message"
+    assert pauses_s == [0.0, 0.0, fleet_feed._POLL_S, fleet_feed._POLL_S]
+    assert feed._channel.version == 1, "the table is sent at its period only"
+
+
 def test_the_feed_follows_as_soon_as_there_is_a_router(router: Router, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fleet_feed, "_RETRY_S", 0.01)
+    monkeypatch.setattr(session, "_CONNECT_TIMEOUT_MS", 50)
     monkeypatch.setattr(fleet_feed, "SHOW_S", 0.02)
     feed = FleetFeed(BusConfig(connect=(free_endpoint(),)))
     assert feed.link == "not connected yet"
@@ -337,8 +366,8 @@ def test_the_metrics_of_a_fleet_count_stops_and_name_robots() -> None:
         assert state is not None
         state.alive = alive
     feed.stops, feed.inbox.dropped = 4, 5
-    counts = {"dropped": 5, "stops": 4, "arms": 0}
-    lines = fleet_metrics(feed.state.robots, feed.browsers, {}, counts).splitlines()
+    access = Access("abcdefghijklmnop", frozenset(), False, "omnid_1", "")
+    lines = FleetPage(feed, BusConfig()).metrics(Site("fleet.html", [], lambda _: "", access, False).guard).splitlines()
     for line in (
         'omnid_up{robot="one"} 1',
         'omnid_up{robot="two"} 0',

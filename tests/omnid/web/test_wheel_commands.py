@@ -8,9 +8,11 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from typing import Any
 
 import pytest
 from starlette.requests import Request as HttpRequest
+from starlette.responses import Response
 
 from omnid.client import Robot
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -162,7 +164,16 @@ def test_a_driver_is_there_with_the_connection_and_without_one_the_reason(connec
 def test_a_robot_that_does_not_read_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     reads = threading.Event()
     wheels = WheelCommands(RobotFeed(BusConfig()))
-    assert asyncio.run(within(wheels._thread, lambda: 7)) == 7
+    wait, timeouts_s = asyncio.wait, list[float | None]()
+
+    async def recorded(calls: list[asyncio.Future[Any]], timeout: float | None = None) -> Any:
+        timeouts_s.append(timeout)
+        return await wait(calls, timeout=timeout)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(asyncio, "wait", recorded)
+        assert asyncio.run(within(wheels._thread, lambda: 7)) == 7
+    assert timeouts_s == [driver.ANSWER_S / 2]
     monkeypatch.setattr(wheel_commands, "ANSWER_S", 0.01)
 
     async def blocked() -> object:
@@ -227,19 +238,19 @@ def test_nothing_drives_or_arms_while_a_stop_is_not_confirmed(
 ) -> None:
     page = RobotPage(connected)
 
-    async def refused() -> tuple[Answer, bytes]:
+    async def refused() -> tuple[Answer, Response]:
         stopping = asyncio.create_task(page.wheels.stop())
         await until(lambda: "cmd/stop" in rover.topics)
-        answers = await page._stick.drive(asked(f"1 0 {clock_ms[0]} a")), bytes((await page._arm(asked(""))).body)
+        answers = await page._stick.drive(asked(f"1 0 {clock_ms[0]} a")), await page._arm(asked(""))
         rover.is_stopped = True
         assert (await stopping).done
         return answers
 
     drive, arm = asyncio.run(refused())
     assert drive == Answer(False, "a stop is not confirmed yet: drive after it")
-    assert arm == b'{"done":false,"text":"a stop is not confirmed yet: arm after it"}'
+    assert arm.status_code == 409 and arm.body == b'{"done":false,"text":"a stop is not confirmed yet: arm after it"}'
     assert set(rover.topics) == {"cmd/stop"}
-    asyncio.run(page._arm(asked("")))
+    assert asyncio.run(page._arm(asked(""))).status_code == 200
     assert rover.topics[-1] == "cmd/arm"
 
 
