@@ -15,6 +15,7 @@ import zenoh
 from starlette.websockets import WebSocket
 
 from drivers.frame import Frame
+from omnid.monitor.robot_state import Inbox, ReceivedMessage
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.image_codec import image_cdr
@@ -134,6 +135,19 @@ def test_a_status_makes_new_parts_and_a_daemon_that_has_ended_takes_them_along()
     feed.inbox.put("map_pose", b"nonsense", b"")
     feed._process_inbox()
     assert feed.state.broken == 1
+
+
+def test_the_event_loop_never_waits_for_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    feed, waits_s, get = RobotFeed(BusConfig()), set[float](), Inbox.get
+
+    def recorded(inbox: Inbox, timeout_s: float) -> ReceivedMessage | None:
+        waits_s.add(timeout_s)
+        return get(inbox, 0.0)
+
+    monkeypatch.setattr(Inbox, "get", recorded)
+    add_pose(feed, 1)
+    feed._process_inbox()
+    assert waits_s == {0.0} and feed.state.poses == 1
 
 
 def test_large_messages_reach_their_channels_and_wrong_ones_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
