@@ -14,6 +14,7 @@ import pytest
 import zenoh
 from starlette.websockets import WebSocket
 
+from calib import se3
 from drivers.frame import Frame
 from omnid.monitor.robot_state import Inbox, ReceivedMessage
 from omnid.transport import codec, map_codec
@@ -137,6 +138,23 @@ def test_a_status_makes_new_parts_and_a_daemon_that_has_ended_takes_them_along()
     assert feed.state.broken == 1
 
 
+def test_the_place_of_the_map_is_kept_until_another_is_known() -> None:
+    feed = RobotFeed(BusConfig())
+    add_pose(feed, 4)  # at 1 m, -1 m, stamped 10**9 + 4
+
+    def map_pose(stamp_ns: int, x_m: float) -> list[float | None] | None:
+        T = se3.transform(se3.rotation_exp([0.0, 0.0, 0.4]), [x_m, 0.0, 0.0])
+        feed.inbox.put("map_pose", codec.pose_with_covariance_cdr(stamp_ns, T, np.eye(6)), b"")
+        feed._process_inbox()
+        return feed._map_in_odom
+
+    assert map_pose(10**9 + 5, 0.0) is None
+    assert map_pose(10**9 + 4, 0.25) == pytest.approx([0.75, -1.0, 0.0], abs=1e-6)
+    assert map_pose(10**9 + 5, 7.0) == pytest.approx([0.75, -1.0, 0.0], abs=1e-6)
+    assert map_pose(10**9 + 4, 0.5) == pytest.approx([0.5, -1.0, 0.0], abs=1e-6)
+    assert json.loads(feed._encode_state())["map_in_odom"] == feed._map_in_odom
+
+
 def test_the_event_loop_never_waits_for_a_message(monkeypatch: pytest.MonkeyPatch) -> None:
     feed, waits_s, get = RobotFeed(BusConfig()), set[float](), Inbox.get
 
@@ -187,17 +205,19 @@ def test_the_state_counts_browsers_and_panoramas() -> None:
     assert feed._panorama_s == -feed_module.PANORAMA_S, "the first panorama after the start of the machine counts"
 
 
-def test_it_follows_a_robot_from_what_was_published_before(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("has_map", [True, False])
+def test_it_follows_a_robot_from_what_was_published_before(monkeypatch: pytest.MonkeyPatch, has_map: bool) -> None:
     monkeypatch.setattr(feed_module, "REQUEST_S", 0.001)
     monkeypatch.setattr(feed_module, "QUIET_S", 0.02)
     endpoint = free_endpoint()
 
     async def check(bus: Bus) -> RobotFeed:
         bus.publish("status", STATUS)
-        bus.publish("map", MAP)
+        if has_map:
+            bus.publish("map", MAP)
         feed = RobotFeed(BusConfig(connect=(endpoint,)))
         following = asyncio.create_task(feed.run())
-        await until(lambda: feed._map_channel.version)
+        await until(lambda: feed._map_channel.version if has_map else feed._parts_channel.version)
         assert not feed.link and WHEELS in feed.state.statuses and feed._parts_channel.version
         await until(lambda: feed.state.alive)
         shown = feed._state_channel.version
@@ -210,6 +230,10 @@ def test_it_follows_a_robot_from_what_was_published_before(monkeypatch: pytest.M
         await until(lambda: bus.is_received("panorama"))
         bus.publish("panorama", panorama(b"\xff\xd8 bytes"))
         await until(lambda: feed._panorama_channel.version)
+        end = feed._end_panorama
+        assert end is not None and feed.robot is not None
+        await feed._follow_requests(feed.robot, feed._receiver(asyncio.get_running_loop()))
+        assert feed._end_panorama is end, "it goes on while it is asked for"
         browser.wanted.clear()
         await until(lambda: not bus.is_received("panorama"))
         assert feed._end_panorama is None
