@@ -27,7 +27,7 @@ from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.web import browsers as browsers_module
 from omnid.web import feed as feed_module
 from omnid.web.browsers import MOST_BROWSERS, MOST_REQUESTS, Browsers
-from omnid.web.channels import Newest
+from omnid.web.channels import LivePath, Newest
 from omnid.web.feed import RobotFeed
 from omnid.web.snapshot import MOST_CELLS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
@@ -335,6 +335,26 @@ def test_a_browser_that_sends_what_no_page_sends_is_closed(text: str) -> None:
         page.say(text)
         await page.serving
         assert page.closed == 1008 and browsers.closed == {"unexpected message": 1} and not len(browsers)
+
+    asyncio.run(check())
+
+
+def test_each_message_is_answered_once_and_points_of_the_path_are_never_skipped() -> None:
+    async def check() -> None:
+        path = LivePath()
+        browsers = Browsers((path,))
+        page = Page(browsers)
+        for x_m in (0.0, 0.5, 1.0, 1.5):
+            path.add(x_m, 0.0)
+            if x_m != 0.5:
+                browsers.notify()
+                await until(lambda x_m=x_m: page.texts and f"[{x_m}," in page.texts[-1])
+                page.say("ok")
+                await until(lambda: page._events.empty())
+        assert [json.loads(text)["from"] for text in page.texts] == [0, 1, 3] and not browsers.skipped
+        page.say("ok")
+        await page.serving
+        assert page.closed == 1008
 
     asyncio.run(check())
 
