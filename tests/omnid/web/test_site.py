@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
+import signal
 import socket
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -124,6 +127,7 @@ def test_connections_that_have_ended_leave_their_places_first(monkeypatch: pytes
         ended.opening = asyncio.create_task(done.wait())  # type: ignore[arg-type]
         opening.opening = asyncio.create_task(waits.wait())  # type: ignore[arg-type]
         await ended.opening
+        assert [place.host for place in (ended, opening, new)] == ["a", "b", "c"]
         assert [place.is_left for place in (ended, opening, new)] == [True, False, False]
         found.admit(("d", 1))
         assert len(found) == 3 and found.lost == 0 and ended not in found._places.values()
@@ -166,6 +170,7 @@ def test_a_new_connection_gets_the_place_of_a_silent_one(monkeypatch: pytest.Mon
             with pytest.raises((asyncio.IncompleteReadError, ConnectionError)):
                 await reader.readexactly(1)
         places_left = list(found._places.values())
+        assert [place.host for place in places_left] == ["127.0.0.1"] * 2 and all(port for _, port in found._places)
         assert not any(place.is_left for place in places_left)
         for _, writer in readers:
             writer.close()
@@ -285,16 +290,48 @@ def test_a_report_is_answered_as_a_page_or_as_json(tmp_path: Path) -> None:
     asyncio.run(check())
 
 
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        ("open(page, 'w').write('it')", ""),
+        ("", "failed (exit code 0)"),
+        ("open(page, 'w').write('it'); sys.exit(1)", "failed (exit code 1)"),
+        ("print('one; omnid: two', 'omnid: three', sep=chr(10), file=sys.stderr); sys.exit(2)", "omnid: three"),
+    ],
+)
+def test_a_report_is_there_where_its_program_ends_well_and_has_made_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, words: str
+) -> None:
+    code = f"import os, sys; page = sys.argv[-1]; {program}"
+    monkeypatch.setattr(recordings, "python", lambda *given: [sys.executable, "-S", "-c", code, *given])
+    (tmp_path / "a.mcap").write_bytes(b"")
+    found = Recordings(tmp_path, tmp_path)
+    made = found.report(found.list()[0].key)
+    if words:
+        with pytest.raises(OmnidError, match=re.escape(words)):
+            asyncio.run(made)
+    else:
+        assert asyncio.run(made).read_text() == "it"
+
+
 def test_a_report_that_takes_too_long_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recordings, "REPORT_S", 0.001)
     (tmp_path / "a.mcap").write_bytes(b"")
-    found = Recordings(tmp_path, tmp_path)
-    with pytest.raises(OmnidError, match=r"not ready within 0\.001 s"):
-        asyncio.run(found.report(found.list()[0].key))
+    found, start, processes = Recordings(tmp_path, tmp_path), asyncio.create_subprocess_exec, list[Any]()
+
+    async def kept(*words: str, **settings: Any) -> Any:
+        processes.append(await start(*words, **settings))
+        return processes[-1]
+
+    with monkeypatch.context() as patched:
+        patched.setattr(asyncio, "create_subprocess_exec", kept)
+        with pytest.raises(OmnidError, match=r"not ready within 0\.001 s"):
+            asyncio.run(found.report(found.list()[0].key))
+    assert processes[0].returncode == -signal.SIGKILL
 
 
 def test_the_reason_is_the_last_line_where_the_user_can_correct_it() -> None:
-    assert _reason(2, "one\nomnid: two\x1b\n", "a") == r"omnid: two\x1b"
+    assert _reason(2, "one\na half\nomnid: two\x1b\n", "a") == r"omnid: two\x1b"
     for code, messages in ((2, ""), (1, "a traceback"), (-9, "x"), (None, "x")):
         assert _reason(code, messages, "a\x1b") == (
             rf"omnid: the report about a\x1b failed (exit code {code}): run `omnid report` on it to see why"
