@@ -79,11 +79,12 @@ def test_versions_count_from_one_and_a_message_that_was_never_changed_is_empty()
 @pytest.mark.parametrize("value", [1e6, -1e6, 1e6 + 0.5, 2e6, -2e6, math.nan, math.inf, -math.inf])
 def test_positions_that_cannot_be_drawn_are_no_points(axis: int, value: float) -> None:
     path = LivePath()
-    place = [0.0, 0.0]
-    place[axis] = value
-    assert path.add(*place) is False and path.version == 0
-    place[axis] = math.copysign(999_999.5, value)
-    assert path.add(*place) is True and path.version == 1
+
+    def add(value: float) -> bool:
+        return path.add(value, 0.0) if axis == 0 else path.add(0.0, value)
+
+    assert add(value) is False and path.version == 0
+    assert add(math.copysign(999_999.5, value)) is True and path.version == 1
 
 
 def test_a_gap_is_a_jump_of_more_than_a_metre_or_ten_steps() -> None:

@@ -234,7 +234,7 @@ def test_the_feed_follows_as_soon_as_there_is_a_router(router: Router, monkeypat
             return state is not None and bool(state.alive) and WHEELS in state.statuses
 
         await _until(is_known)
-        token.undeclare()
+        token.undeclare()  # type: ignore[no-untyped-call]
         await _until(lambda: feed.state.robots["hall/one"].alive is False)
         shown = feed._channel.version
         await _until(lambda: feed._channel.version > shown)

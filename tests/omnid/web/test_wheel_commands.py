@@ -54,6 +54,10 @@ class Rover:
             self.answering.wait(30.0)
             self._bus.answer(request.id, Answer(self.is_granted, "as asked" if self.is_granted else "a fault holds"))
 
+    def has_more_than(self, count: int) -> bool:
+        """True if it got more twists."""
+        return len(self.twists) > count
+
     def feed(self) -> RobotFeed:
         """Return a feed that has no connection yet."""
         return RobotFeed(BusConfig(connect=(self.endpoint,)))
@@ -215,7 +219,7 @@ def test_the_stick_sends_a_share_of_the_limits(
         before_s = time.monotonic()
         assert answer(forward, turn) == Answer(True, words)
         assert before_s + stick.HELD_S <= commands._held_until_s <= time.monotonic() + stick.HELD_S
-        wait_until(lambda count=count: len(rover.twists) > count)
+        wait_until(partial(rover.has_more_than, count))
         assert rover.twists[count:] == [pytest.approx((forward * mps, turn * radps))]
         assert not commands._sending
     assert len(reads) == 1, "the limits are read once"
