@@ -149,7 +149,7 @@ def _row(name: str, state: RobotState) -> dict[str, Any]:
         "level": severity(state),
         "state": word_of(state),
         "rate_hz": finite(state.rate_hz),
-        "silent_s": finite(round(state.time_since_pose_s)),
+        "silent_s": None if pose is None else round(state.time_since_pose_s),
         "x_m": None if pose is None else finite(pose.x_m),
         "y_m": None if pose is None else finite(pose.y_m),
         "yaw_rad": None if pose is None else finite(pose.yaw_rad),

@@ -110,6 +110,7 @@ class Recordings:
         finally:
             if process.returncode is None:
                 process.kill()
+                await process.wait()
         if process.returncode != 0 or not page.is_file():
             raise OmnidError(_reason(process.returncode, errors.decode("utf-8", "replace"), log.name))
         return page

@@ -70,7 +70,11 @@ class Site:
                         return PlainTextResponse("omnid web: this is no token\n", 413)
         except TimeoutError:
             return PlainTextResponse("omnid web: the form did not come\n", 408)
-        return self._let_in(parse_qs(form.decode("latin-1"), max_num_fields=4).get("token", [""])[0])
+        try:
+            fields = parse_qs(form.decode("latin-1"), max_num_fields=4)
+        except ValueError:  # more fields
+            return PlainTextResponse("omnid web: this is no token\n", 413)
+        return self._let_in(fields.get("token", [""])[0])
 
     def _let_in(self, token: str) -> Response:
         """Return the answer to a token: the address of the page, with a cookie that takes the token's place."""
