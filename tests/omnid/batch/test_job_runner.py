@@ -66,7 +66,7 @@ def replays_of(log: Path) -> list[int]:
 
 
 def is_pending(process: int, number: signal.Signals) -> bool:
-    """Whether a signal waits for a process that is stopped."""
+    """Return whether a signal waits for a process that is stopped."""
     (line,) = (line for line in Path(f"/proc/{process}/status").read_text().splitlines() if line.startswith("ShdPnd:"))
     return bool(int(line.split()[1], 16) >> (number - 1) & 1)
 

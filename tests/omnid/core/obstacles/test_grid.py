@@ -316,7 +316,7 @@ def test_square_follows_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
 def test_patch_of_usual_floor_that_shows_none_stays_free_where_floor_behind_it_is_seen(
     grid: ObstacleGrid, seen: Pairs
 ) -> None:
-    """What a polished floor mirrors outweighs the floor's own texture for some pairs; who stands there hides more."""
+    """A polished floor shows what it mirrors in the place of its own texture; who stands there hides more."""
     after(grid, seen, 20)
     for n in range(20, 30):
         dull = seen[n % len(seen)].floor.copy()
