@@ -9,6 +9,7 @@ import json
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -31,6 +32,7 @@ from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_unt
 
 ARMED = DiagnosticStatus(WHEELS, 0, "armed", {"armed": "1"})
 STOPPED = DiagnosticStatus(WHEELS, 1, "stopped", {"armed": "0", "disarmed_by": DISARMED_BY_STOP})
+STOP_S = 1000.0
 FAULT = DiagnosticStatus(WHEELS, 2, "a fault", {"armed": "0", "disarmed_by": "a fault"})
 
 
@@ -117,16 +119,25 @@ def test_a_stop_for_all_ends_once_each_robot_with_wheels_confirms_it(router: Rou
 def test_robots_that_do_not_confirm_are_named(
     router: Router, feed: FleetFeed, count: int, more: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fleet_feed, "STOP_S", 0.1)
     names = [f"r{number:02}\x1b" for number in range(count)]
     for name in (*names, "good"):
         report(feed, name, ARMED)
     router.on_stop = lambda name: report(feed, name, STOPPED if name == "good" else FAULT)
+    told = list[float]()
+
+    def clock_s() -> float:
+        """Return the time, which is over some looks after each robot was told twice."""
+        if router.stops["good"] and all(router.stops[name] > 1 for name in names):
+            told.append(time.monotonic())
+        return time.monotonic() + (STOP_S if len(told) > 5 else 0.0)
+
+    monkeypatch.setattr(fleet_feed, "STOP_S", STOP_S)
+    monkeypatch.setattr(fleet_feed, "time", SimpleNamespace(monotonic=clock_s, time_ns=time.time_ns))
     answer = asyncio.run(feed.stop_all())
     named = ", ".join(rf"r{number:02}\x1b" for number in range(min(count, 10)))
     assert not answer.done
     assert answer.text == (f"NOT confirmed by {named}{more}: use the emergency stop. 1 of {count + 1} robots stop")
-    assert all(router.stops[name] > 1 for name in names) and router.stops["good"] == 1
+    assert all(router.stops[name] > 1 for name in names)
 
 
 def test_where_no_robot_has_wheels_each_gets_one_stop_and_none_is_reported(router: Router, feed: FleetFeed) -> None:
@@ -179,8 +190,8 @@ def test_messages_are_taken_in_groups_and_tokens_before_them() -> None:
     payload = codec.diagnostics_cdr(10**18, [ARMED])
     for number in range(450):
         feed.inbox.put(f"r{number % 3}/status", payload, b"")
-    for name, token in (("r0", b""), ("r1", b"1"), *((f"other {k}", b"1") for k in range(MAX_ROBOTS))):
-        feed._tokens.put(name, token, b"")
+    for name, alive in (("r0", False), ("r1", True), *((f"other {k}", True) for k in range(MAX_ROBOTS))):
+        feed.state.note_alive(name, alive)
     assert [feed._take() for _ in range(4)] == [200, 200, 50, 0]
     assert [feed.state.robots[name].alive for name in ("r0", "r1", "other 0")] == [False, True, True]
     assert len(feed.state.robots) == MAX_ROBOTS
