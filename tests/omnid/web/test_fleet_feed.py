@@ -123,13 +123,13 @@ def test_robots_that_do_not_confirm_are_named(
     for name in (*names, "good"):
         report(feed, name, ARMED)
     router.on_stop = lambda name: report(feed, name, STOPPED if name == "good" else FAULT)
-    told = list[float]()
+    ready = list[float]()
 
     def clock_s() -> float:
-        """Return the time, which is over some looks after each robot was told twice."""
+        """Return the time, which is over some looks after each robot got two stops."""
         if router.stops["good"] and all(router.stops[name] > 1 for name in names):
-            told.append(time.monotonic())
-        return time.monotonic() + (STOP_S if len(told) > 5 else 0.0)
+            ready.append(time.monotonic())
+        return time.monotonic() + (STOP_S if len(ready) > 5 else 0.0)
 
     monkeypatch.setattr(fleet_feed, "STOP_S", STOP_S)
     monkeypatch.setattr(fleet_feed, "time", SimpleNamespace(monotonic=clock_s, time_ns=time.time_ns))
