@@ -1,4 +1,4 @@
-"""Process that estimates, at the lowest priority: a request on stdin, a RigChange or a reason on stdout."""
+"""Process that estimates, at a low priority: a request on stdin, a RigChange or a reason on stdout."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import pickle
 import sys
 from typing import Final
 
-# Nice value of the lowest priority.
-LOWEST: Final = 19
+# Low priority: beside a program at the usual one it gets a tenth of a core. At 19, the lowest, other programs that keep
+# all cores busy left it so little that an estimate of some seconds had not ended after its five minutes.
+NICE: Final = 10
 
 
 def main() -> None:
     """Answer one request. Both pipes belong to the daemon that started this process."""
-    os.nice(LOWEST)
+    os.nice(NICE)
     from calib.errors import CalibError
     from omnid.refinement.estimate import estimate
 

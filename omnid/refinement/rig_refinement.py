@@ -1,7 +1,7 @@
 """Estimate the rig's errors by the same landmarks seen from near and from far, which shows elevation and scale.
 
 Landmarks of a window of keyframes are followed in a thread of the daemon; the bundle adjustment runs in a process of
-its own at the lowest priority, because a thread would hold Python's global lock. One window at a time, then a pause.
+its own at a low priority, because a thread would hold Python's global lock. One window at a time, then a pause.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PROCESS = "omnid.refinement.process"
 KEYFRAME_M, KEYFRAME_RAD = 0.25, np.deg2rad(15)
 # Landmarks in view of a keyframe: fewer than for a calibration, as the daemon follows them while it runs.
 LANDMARKS: Final = 200
-# Longest time of an estimate, which takes some seconds of processor time, at the lowest priority.
+# Longest time of an estimate, which takes some seconds of processor time, at a low priority.
 TIMEOUT_S: Final = 300.0
 ADVICE = (
     "the landmarks of this run do not fit the rig: a camera or a mirror has moved, or the calibration was not "
