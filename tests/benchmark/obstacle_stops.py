@@ -35,6 +35,7 @@ from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, lowered, room_text
+from tests.benchmark.corridor_worlds import POLISHED, SPEED_MPS, world_text
 from tests.benchmark.fine_robot import fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
@@ -42,7 +43,6 @@ from tests.benchmark.uneven_floors import with_edge, with_ramp
 
 Array = NDArray[np.float64]
 
-SPEED_MPS: Final = 0.5
 SIZE_PX: Final = 512
 RATE_HZ: Final = 10.0
 REMARKS: Final = (
@@ -55,7 +55,6 @@ FALSE_M: Final = 1.0
 BESIDE_M: Final = 0.2  # of the robot's outline: what stands there may be its reason to stop
 WALKS_M: Final = 2.0  # nearer than this, a person who walks may be the reason to stop
 OWN_MPS: Final = 0.05  # a contact at a lower speed is not the robot's own
-STARTED_S: Final = 0.74  # by which a robot that starts is late against one that drives at SPEED_MPS from 0 s on
 AHEAD: Final = slice(170, 190)  # sectors of the ring
 CASES: Final = {
     "person at 0.8 m": 12.0,
@@ -76,8 +75,6 @@ CASES: Final = {
 } | dict.fromkeys(KINDS, 12.0)
 CASES |= dict.fromkeys(ROOMS, 40.0)  # The operator drives at random.
 UNEVEN: Final = ("edge", "ramp", AT_EDGE)  # Cases whose floor has two heights.
-# The same worlds with a floor that mirrors what stands on it, which is one plane.
-POLISHED: Final = "polished "
 CASES |= {POLISHED + case: seconds for case, seconds in CASES.items() if not case.startswith(UNEVEN)}
 
 
@@ -93,79 +90,6 @@ class Drive(NamedTuple):
     near_mps: float  # highest speed within FALSE_M of what stands ahead
     unknown: tuple[int, int]  # rings that told it as unknown, of those within FALSE_M of it
     reasons: str
-
-
-def world_text(case: str, rng: random.Random) -> str:
-    """Return a corridor along x with what the case says in it, as a world file."""
-    finish = "polished" if case.startswith(POLISHED) else "matt"
-    case = case.removeprefix(POLISHED)
-    left, right, length = rng.uniform(0.9, 1.5), -rng.uniform(0.9, 1.5), 12.0
-    if case.startswith("person crosses"):
-        left, right = rng.uniform(2.0, 2.6), -rng.uniform(2.0, 2.6)
-    walls = [rng.choice(("brick", "granite", "plaster")) for _ in range(2)]
-    end = "plain" if case == "white wall" else "brick"
-    end_m = rng.uniform(3.5, 4.5) if case == "white wall" else length
-    posters = 0.0 if case == "white wall" else 0.6
-    lines = [
-        "schema = 1",
-        "start = [0.0, 0.0, 0.0]",
-        "[space]",
-        f"low = [-2.0, {right}]",
-        f"high = [{end_m}, {left}]",
-        f'finish = "{finish}"',
-    ]
-    corners = [[-2.0, left], [end_m, left], [end_m, right], [-2.0, right]]
-    for first, last, texture, per_m in (
-        (0, 1, walls[0], 0.6),
-        (2, 3, walls[1], 0.6),
-        (1, 2, end, posters),
-        (3, 0, "brick", 0.0),
-    ):
-        points = [corners[first], corners[last]]
-        lines += ["[[wall]]", f"points = {points}", f'texture = "{texture}"', f"posters_per_m = {per_m}"]
-    if case.endswith("box"):
-        size = [rng.uniform(0.25, 0.6), rng.uniform(0.25, 0.6), 0.08 if case == "low box" else rng.uniform(0.4, 1.2)]
-        lines += [
-            "[[box]]",
-            f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
-            f"size_m = {size}",
-            f"yaw_deg = {rng.uniform(-40, 40)}",
-        ]
-    if case.endswith("pole"):
-        side = rng.uniform(0.03, 0.06)
-        texture = "white" if case == "plain pole" else "granite"
-        lines += [
-            "[[box]]",
-            f"at = [{rng.uniform(2.0, 3.0)}, {rng.uniform(-0.15, 0.15)}]",
-            f"size_m = [{side}, {side}, 1.8]",
-            f'texture = "{texture}"',
-            f"yaw_deg = {rng.uniform(-40, 40)}",
-        ]
-    if case.startswith("person crosses"):
-        # Unless one of them stops, the person is in the way when the robot comes there, or 0.8 s before at most.
-        at_m, side, speed_mps = rng.uniform(2.8, 3.5), rng.choice((1, -1)), rng.uniform(0.8, 1.6)
-        aside = side * (min(left, -right) - 0.3)
-        along_m = rng.choice((-1, 1)) * abs(aside) if case.endswith("diagonally") else 0.0
-        before_m = SPEED_MPS * (math.hypot(along_m, aside) / speed_mps + rng.uniform(0.0, 0.8))
-        lines += [
-            "[[person]]",
-            f"path = [[{at_m - along_m}, {aside}], [{at_m + along_m}, {-aside}]]",
-            f"speed_mps = {speed_mps}",
-        ]
-        if along_m:
-            lines += [f"start_s = {STARTED_S + (at_m - before_m) / SPEED_MPS}"]
-        else:
-            lines += [f"starts_within_m = {math.hypot(before_m, aside)}"]
-    elif case.startswith("person"):
-        within_m, side = float(case.split()[2]), rng.choice((1, -1))
-        at_m, aside = rng.uniform(2.3, 3.0), side * (min(left, -right) - 0.3)
-        lines += [
-            "[[person]]",
-            f"path = [[{at_m}, {aside}], [{at_m}, {rng.uniform(-0.1, 0.1)}]]",
-            f"speed_mps = {rng.uniform(0.8, 1.4)}",
-            f"starts_within_m = {within_m + 0.2 + abs(aside) * 0.4}",
-        ]
-    return "\n".join(lines) + "\n"
 
 
 def ahead(moment: Moment, speed_mps: float = SPEED_MPS) -> Iterator[Request]:

@@ -27,7 +27,8 @@ from omnid.core.control.collision_monitor import RING_STALE, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Fault, Moment, Request, Tamper, simulate
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world_file import load_world
-from tests.benchmark.obstacle_stops import ahead, world_text
+from tests.benchmark.corridor_worlds import world_text
+from tests.benchmark.obstacle_stops import ahead
 from tests.benchmark.results import Column, ResultTable
 
 Image = NDArray[np.uint8]
@@ -113,7 +114,7 @@ def pixels(frame: Frame) -> Image:
 class Case(NamedTuple):
     """A fault of the images, and the world in which it happens."""
 
-    world: str  # of tests.benchmark.obstacle_stops
+    world: str  # of tests.benchmark.corridor_worlds
     tamper: Callable[[], Tamper | None]
     faults: tuple[Fault, ...] = ()
     since_s: float = STARTS_S  # of the fault
