@@ -84,9 +84,9 @@ def _edge_seen(
     """True (M,) if light and dark along the line from a to b lie on the same sides as at a's arm."""
     start, step = corners.pixels[pair[0]], corners.pixels[pair[1]] - corners.pixels[pair[0]]
     # Perpendicular to the line, towards larger angles.
-    aside = ASIDE * np.column_stack([-step[:, 1], step[:, 0]])
+    across = ASIDE * np.column_stack([-step[:, 1], step[:, 0]])
     middle = start[:, None] + ALONG[:, None] * step[:, None]
-    difference = sample(image, middle + aside[:, None]) - sample(image, middle - aside[:, None])
+    difference = sample(image, middle + across[:, None]) - sample(image, middle - across[:, None])
     signed = np.where(_left_is_light(corners, pair[0], arm), 1, -1)[:, None] * difference
     contrast = np.minimum(corners.contrast[pair[0]], corners.contrast[pair[1]])
     return np.asarray(signed.min(axis=1) > MIN_EDGE * contrast)

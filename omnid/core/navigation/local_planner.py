@@ -213,17 +213,17 @@ class LocalPlanner:
         x, y = c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]
         dx, dy = x - self._arc_x[..., None], y - self._arc_y[..., None]
         cos, sin = np.cos(self._turned)[..., None], np.sin(self._turned)[..., None]
-        along, aside = cos * dx + sin * dy, np.abs(cos * dy - sin * dx)
+        along, across = cos * dx + sin * dy, np.abs(cos * dy - sin * dx)
         reach = np.array([self._turning if v == 0 else self._ahead if v > 0 else self._behind for v in self._v])
         inside = (
             (along < reach[:, 0, None, None] + MARGIN_M)
             & (along > -reach[:, 1, None, None] - MARGIN_M)
-            & (aside < self._half_m + MARGIN_M)
+            & (across < self._half_m + MARGIN_M)
         )
         # An obstacle that is within that room already must not come nearer to the outline.
         gap_m = np.hypot(
             np.maximum(np.maximum(along - self._turning[0], -self._turning[1] - along), 0.0),
-            np.maximum(aside - self._width_m, 0.0),
+            np.maximum(across - self._width_m, 0.0),
         )
         nearer = (gap_m < gap_m[:, :1] - NEARER_M).any(axis=1)
         hits = np.where(inside[:, 0], nearer, inside.any(axis=1))

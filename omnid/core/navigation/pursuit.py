@@ -74,7 +74,7 @@ class Pursuit:
             heading_rad = wrap_angle(bearing_rad + (math.pi if self.leg.backwards else 0.0))
             return Approach(Setpoint(0.0, heading_rad), self.s_m, left_m, offset_m, True)
         self._turning = False
-        # 4. The arc to it (Coulter 1992): curvature 2 sin(aside) / distance.
+        # 4. The arc to it (Coulter 1992): curvature 2 sin(bearing) / distance.
         curvature = 2 * math.sin(aside_rad) / max(math.hypot(target[0] - pose[0], target[1] - pose[1]), 0.5 * low_m)
         # 5. The speed, regulated.
         wanted_mps = self._regulated(curvature, reach_m, obstacle_m)

@@ -81,9 +81,9 @@ def pixels_in_upper(
     lower, upper = pair
     finite = np.flatnonzero(np.isfinite(guess).all(axis=1))
     there, good = (track if checked else flow)(lower, upper, points[finite], guess[finite], klt)
-    aside = lower.apart(there[:, 0] - guess[finite, 0])
+    shift = lower.apart(there[:, 0] - guess[finite, 0])
     largest = CROSS_PX + np.broadcast_to(spread_px, len(points))[finite]
-    good &= (np.abs(aside) < largest) & (there[:, 1] > points[finite, 1])
+    good &= (np.abs(shift) < largest) & (there[:, 1] > points[finite, 1])
     pixels = np.full((len(points), 2), np.nan)
     pixels[finite[good]] = there[good]
     return pixels

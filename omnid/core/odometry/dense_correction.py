@@ -81,8 +81,8 @@ def _exact(exposure: Exposure, pixels: Array, disparity: float) -> Array:
     columns, _ = exposure.upper_columns(pixels, rows)
     shifts = views - np.column_stack([pixels, rows])
     variance = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
-    aside = exposure.model.cylinder.wrap(columns - pixels[:, 0])
-    return np.column_stack([shifts, aside, np.sqrt(np.maximum(variance, 0.0))])
+    column_shift = exposure.model.cylinder.wrap(columns - pixels[:, 0])
+    return np.column_stack([shifts, column_shift, np.sqrt(np.maximum(variance, 0.0))])
 
 
 def _resized(field: Floats, size: tuple[int, int]) -> Floats:

@@ -122,9 +122,9 @@ def write_normal(point: Array, slope: Array, baseline_m: float, normal: Array) -
     """
     per_r = 1 / math.hypot(point[0], point[1])
     x, y = point[0] * per_r, point[1] * per_r
-    aside, up = -slope[0] / baseline_m, -slope[1] / baseline_m
+    sideways, up = -slope[0] / baseline_m, -slope[1] / baseline_m
     ahead = (1 - up * point[2]) * per_r
-    normal[0], normal[1], normal[2] = ahead * x - aside * y, ahead * y + aside * x, up
+    normal[0], normal[1], normal[2] = ahead * x - sideways * y, ahead * y + sideways * x, up
 
 
 @inner

@@ -104,8 +104,8 @@ class Doubt:
     def covariance(self, T_odom_rect: Array) -> Array:
         """Return the covariance (6, 6) of a later pose by it."""
         moved = se3.adjoint(se3.inverse(T_odom_rect) @ self.T_odom_rect) @ self.displacement
-        aside = np.repeat([RUNNER_UP_ERROR * float(np.linalg.norm(moved[:3])), 0.0], 3)
-        return np.outer(moved, moved) + np.diag(aside**2)
+        sigmas = np.repeat([RUNNER_UP_ERROR * float(np.linalg.norm(moved[:3])), 0.0], 3)
+        return np.outer(moved, moved) + np.diag(sigmas**2)
 
     def after_clear_step(self, velocity_mps: Array, dt_s: float) -> Doubt | None:
         """Return the doubt after a step of dt_s without a runner-up, by its velocity (3,) in odom; None: settled."""

@@ -95,8 +95,8 @@ def matches(a: PlaceFeatures, b: PlaceFeatures, turn_rad: float, model: StereoMo
     squared = distances(a, b)
     # Azimuth falls with the column, and a turn to the left moves the world to the right.
     turned = a.views[:, 0] + np.float32(model.cylinder.focal_px * turn_rad)
-    aside = _apart(turned, b.views[:, 0], model.cylinder.width)
-    squared[aside > YAW_WINDOW_RAD * model.cylinder.focal_px] = np.inf
+    apart = _apart(turned, b.views[:, 0], model.cylinder.width)
+    squared[apart > YAW_WINDOW_RAD * model.cylinder.focal_px] = np.inf
     best = squared.argmin(axis=1)
     nearest = squared[np.arange(len(squared)), best]
     second = np.partition(squared, 1, axis=1)[:, 1]

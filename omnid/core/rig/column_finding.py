@@ -77,10 +77,10 @@ class RigFinding:
 def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     """Return what the matches of some pairs say about their rig."""
     # 1. Offsets of the columns, as they are.
-    aside = cylinder.wrap(found.upper[:, 0] - found.lower[:, 0])
-    offset = float(np.median(aside)) if len(aside) else float("nan")
-    spread = SIGMA_PER_MAD * float(np.median(np.abs(aside - offset))) if len(aside) else float("nan")
-    enough = len(aside) >= MIN_MATCHES
+    shifts = cylinder.wrap(found.upper[:, 0] - found.lower[:, 0])
+    offset = float(np.median(shifts)) if len(shifts) else float("nan")
+    spread = SIGMA_PER_MAD * float(np.median(np.abs(shifts - offset))) if len(shifts) else float("nan")
+    enough = len(shifts) >= MIN_MATCHES
     # 2. The rotation and shift of the upper camera that explain them.
     drift = estimate_rig_drift(cylinder.rays(found.lower), cylinder.rays(found.upper)) if enough else None
     # 3. What is left in each direction shows a camera whose intrinsics have changed.
@@ -88,12 +88,12 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
     return RigFinding(
-        _state(drift, left_px, (len(aside), found.clear)),
-        len(aside),
+        _state(drift, left_px, (len(shifts), found.clear)),
+        len(shifts),
         found.tried,
         offset,
         spread,
-        _by_azimuth(found.lower, aside, cylinder),
+        _by_azimuth(found.lower, shifts, cylinder),
         left_px,
         drift,
     )
@@ -117,12 +117,12 @@ def _misfit_deg(drift: RigDrift) -> float:
     return float(max(max(0.0, turn - unsure[0]), SHIFT_WEIGHT * max(0.0, shift - unsure[1])))
 
 
-def _by_azimuth(lower: Array, aside: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
+def _by_azimuth(lower: Array, shifts: Array, cylinder: Cylinder) -> tuple[tuple[float, float, int], ...]:
     """Return azimuth of the middle [deg], median offset [px], NaN without matches, and matches of each sector."""
     azimuth = cylinder.azimuth(lower[:, 0])
     sector = np.floor((azimuth + np.pi) / (2 * np.pi) * SECTORS).astype(int) % SECTORS
     middle = -180 + (np.arange(SECTORS) + 0.5) * 360 / SECTORS
-    chosen = [aside[sector == k] for k in range(SECTORS)]
+    chosen = [shifts[sector == k] for k in range(SECTORS)]
     return tuple(
         (float(middle[k]), float(np.median(part)) if len(part) else float("nan"), len(part))
         for k, part in enumerate(chosen)

@@ -121,8 +121,8 @@ def _at_stamp(found: Matches, exposure: Exposure) -> Matches:
     columns, _ = exposure.upper_columns(found.lower, found.upper[:, 1])
     known = np.isfinite(columns)
     upper = found.upper[known]
-    aside = exposure.model.cylinder.wrap(views[known, 0] - columns[known])
-    return Matches(views[known, :2], np.column_stack([upper[:, 0] + aside, views[known, 2]]), found.tried, found.clear)
+    shift = exposure.model.cylinder.wrap(views[known, 0] - columns[known])
+    return Matches(views[known, :2], np.column_stack([upper[:, 0] + shift, views[known, 2]]), found.tried, found.clear)
 
 
 def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tuple[Array, Flags, int]:
@@ -141,8 +141,8 @@ def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tupl
         patch = small_lower[max(0, top) : row + PATCH_PX + 1, max(0, left) : right]
         if left < 0 or top < 0 or right > width or patch.shape[0] != 2 * PATCH_PX + 1 or strip.shape[0] < len(patch):
             continue
-        _, best, _, (aside, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
-        guess[index] += COARSE * (low + aside - left), COARSE * down
+        _, best, _, (right, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
+        guess[index] += COARSE * (low + right - left), COARSE * down
         likely[index] = best >= MIN_CORRELATION
         clear += bool(patch.std() > CONTRAST_GREY)
     return guess, likely, clear

@@ -67,10 +67,10 @@ class MatchingSettings:
 class CandidateSearch(Protocol):
     """A method that chooses among candidates."""
 
-    def search(self, lower: Image, upper: Image, pixels: Indices, aside: ColumnShift | None) -> Matches:
+    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
         """Return the matches of some pixels of the lower panorama (H, W) in the upper one.
 
-        aside: see Matcher.match; a method may ignore it.
+        column_shift: see Matcher.match; a method may ignore it.
         """
         ...
 
@@ -83,18 +83,18 @@ class Matcher:
         self._search: CandidateSearch = SEARCHES[matching.method](shape, matching)
 
     def match(
-        self, lower: Image, upper: Image, valid: Flags, noise_grey: float = 0.0, aside: ColumnShift | None = None
+        self, lower: Image, upper: Image, valid: Flags, noise_grey: float = 0.0, column_shift: ColumnShift | None = None
     ) -> Matches:
         """Return the matches of panoramas (H, W) uint8, padded at the seam, among the valid pixels (H, W).
 
         noise_grey: standard deviation of the noise; where it is large, the threshold of the edges follows it.
-        aside: of a pair whose images were not exposed at once; the default method searches there.
+        column_shift: of a pair whose images were not exposed at once; the default method searches there.
         """
         m = self._matching
         lower, upper = smooth(lower, m.sigma_px), smooth(upper, m.sigma_px)
         least = max(m.edge_threshold, round(EDGE_NOISE * noise_grey))
         pixels = edge_pixels(lower, valid, least, m.max_points)
-        return self._search.search(lower, upper, pixels, aside)
+        return self._search.search(lower, upper, pixels, column_shift)
 
 
 class SemiGlobalSearch:
@@ -106,11 +106,11 @@ class SemiGlobalSearch:
         self._disparities = matching.disparities  # the prior may search more
         self._max_cost = matching.max_difference * matching.window_px**2
 
-    def search(self, lower: Image, upper: Image, pixels: Indices, aside: ColumnShift | None) -> Matches:
+    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
         """Return the pixels with a prior and a minimum of the SAD near it, whose match lies in the image."""
         prior, known = self._prior.disparity(lower, upper)
         pixels = pixels[known.reshape(-1)[pixels]]
-        costs = self._sad.costs(lower, upper, prior, pixels, aside)
+        costs = self._sad.costs(lower, upper, prior, pixels, column_shift)
         is_minimum = local_minima(costs, int(self._max_cost))
         step = np.where(is_minimum, costs, NO_MATCH).argmin(axis=0)
         disparity = refined(prior, pixels, costs, step)
@@ -127,7 +127,7 @@ class ColumnSearch:
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
         self._max_cost = matching.max_difference * matching.window_px**2
 
-    def search(self, lower: Image, upper: Image, pixels: Indices, aside: ColumnShift | None) -> Matches:
+    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
         """Return the pixels whose lowest SAD is below the threshold and is the lowest from the upper panorama too."""
         self._volume.fill(lower, upper)
         costs = self._volume.at(pixels)
@@ -145,7 +145,7 @@ class EnhancedSearch:
         self._matching = matching
         self._volume = SadVolume(shape, matching.disparities, matching.window_px)
 
-    def search(self, lower: Image, upper: Image, pixels: Indices, aside: ColumnShift | None) -> Matches:
+    def search(self, lower: Image, upper: Image, pixels: Indices, column_shift: ColumnShift | None) -> Matches:
         """Return the pixels whose match the upper panorama confirms.
 
         Where the lines to anchors decided clearly, the match need only be one of the candidates of the upper pixel:

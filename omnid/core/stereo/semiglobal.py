@@ -91,12 +91,12 @@ class WarpedSad:
         self._columns, self._rows = np.meshgrid(*(np.arange(n, dtype=np.float32) for n in shape[::-1]))
 
     def costs(
-        self, lower: Image, upper: Image, prior: Floats, pixels: Indices, aside: ColumnShift | None = None
+        self, lower: Image, upper: Image, prior: Floats, pixels: Indices, column_shift: ColumnShift | None = None
     ) -> Costs:
         """Return the costs (2 REACH_PX + 1, N) of pixels (flat indices) of the lower panorama, by shift."""
         height, columns = len(lower), self._columns
-        if aside is not None:
-            columns = columns + aside.at_infinity + aside.per_disparity * prior
+        if column_shift is not None:
+            columns = columns + column_shift.at_infinity + column_shift.per_disparity * prior
         warped = cv2.remap(upper, columns, self._rows + prior, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         padded = cv2.copyMakeBorder(warped, REACH_PX, REACH_PX, 0, 0, cv2.BORDER_REPLICATE)
         costs = np.empty((2 * REACH_PX + 1, len(pixels)), np.uint16)

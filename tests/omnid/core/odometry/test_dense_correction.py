@@ -27,9 +27,9 @@ def test_interpolated_corrections_are_those_of_each_pixel(times: PixelTimes) -> 
     assert np.abs(found.views - views).max() < 0.15  # the noise of a dense disparity is 0.5
     expected = noise[:, 1, 1] + noise[:, 2, 2] - 2 * noise[:, 1, 2]
     np.testing.assert_allclose(np.sqrt(found.variance), np.sqrt(expected), rtol=0.3, atol=0.05)
-    aside = correction.column_shift(48)
+    column_shift = correction.column_shift(48)
     there, _ = exposure.upper_columns(pixels, rows + disparity)
-    shift = aside.at_infinity[rows, columns + 48] + aside.per_disparity[rows, columns + 48] * disparity
+    shift = column_shift.at_infinity[rows, columns + 48] + column_shift.per_disparity[rows, columns + 48] * disparity
     assert np.abs(MODEL.cylinder.wrap(there - columns - shift)).max() < 0.2
 
 

@@ -238,6 +238,8 @@ def test_the_search_follows_columns_that_have_moved() -> None:
         np.full(SHAPE, aside_px / 2, np.float32), np.full(SHAPE, aside_px / 2 / SHIFT_PX, np.float32)
     )
     matcher = Matcher(SHAPE, MatchingSettings(disparities=DISPARITIES))
-    errors = [np.abs(matcher.match(lower, upper, middle(), aside=aside)[1] - SHIFT_PX) for aside in (expected, None)]
+    errors = [
+        np.abs(matcher.match(lower, upper, middle(), column_shift=shift)[1] - SHIFT_PX) for shift in (expected, None)
+    ]
     assert len(errors[0]) > 500 and np.mean(errors[0] < 0.2) > 0.85
     assert np.mean(errors[1] < 0.2) < 0.6  # without it
