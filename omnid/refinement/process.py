@@ -7,8 +7,8 @@ import pickle
 import sys
 from typing import Final
 
-# Low priority: beside a program at the usual one it gets a tenth of a core. At 19, the lowest, other programs that keep
-# all cores busy left it so little that an estimate of some seconds had not ended after its five minutes.
+# Low priority: beside a program at the usual one it gets a tenth of a core. At 19, the lowest, four busy
+# programs on two cores left it less than a second in 97: an estimate of some seconds could not end in its five minutes.
 NICE: Final = 10
 
 

@@ -47,7 +47,6 @@ VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes:
 MEAN_FLOOR: Final = 4  # Index in the evidence of cells; the others are those of the layers.
 
 LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
-USUAL: Final = 1.0  # Mean evidence of floor from which it is usual: that of a plain pole's own cells is below.
 # Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
 MOST_SURFACE: Final = np.float32(1.0)
 MOST_VISIBLE: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
@@ -68,7 +67,10 @@ APART_S: Final = 0.2  # A pair from the same place counts in full after it, so t
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
 # below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
 PLACE_PAIRS: Final = 18.0
-THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, bases stood on polished floors for good.
+# Mean evidence of a cell's floor from which it is usual. With 1.5 and 2, by trial, more bases stood on polished floors;
+# of the directions of white poles as many were free with all three.
+USUAL: Final = 1.0
+THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
 # Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
