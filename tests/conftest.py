@@ -24,6 +24,11 @@ PAIRS = 24
 COURSE_PAIRS = 22  # before the turn
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """Return the number of workers of `-n auto`: one more than cores, as tests of live runs often wait."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 @pytest.fixture(scope="session", autouse=True)
 def kernels(request: pytest.FixtureRequest) -> None:
     """Compile the functions of omnid once, or read them from the cache folder, before the first test.

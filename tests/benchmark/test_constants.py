@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tests.benchmark.constants import PAGE, by_judgement, constants, constants_of, missing, page
+import pytest
+
+from tests.benchmark.constants import PAGE, Constant, by_judgement, constants, constants_of, missing, page
 
 # Lower them with each reason that is written.
 MOST_WITHOUT_A_REASON = 0
@@ -70,12 +72,18 @@ def test_a_judgement_is_no_reason_and_is_counted_apart() -> None:
     assert "| all | 11 | 1 | 5 |" in page(found), "settings and constants, judged ones, those without a reason"
 
 
-def test_the_table_is_as_the_sources_are() -> None:
-    assert PAGE.read_text() == page(constants()), "python -m tests.benchmark.constants --write"
+@pytest.fixture(scope="module")
+def found() -> list[Constant]:
+    """Return all constants of the packages."""
+    return constants()
 
 
-def test_constants_without_a_reason_do_not_become_more() -> None:
-    judged = by_judgement(constants())
+def test_the_table_is_as_the_sources_are(found: list[Constant]) -> None:
+    assert PAGE.read_text() == page(found), "python -m tests.benchmark.constants --write"
+
+
+def test_constants_without_a_reason_do_not_become_more(found: list[Constant]) -> None:
+    judged = by_judgement(found)
     assert len(judged) <= MOST_BY_JUDGEMENT, f"derive or measure a new constant: {[one.name for one in judged]}"
-    without = missing(constants())
+    without = missing(found)
     assert len(without) <= MOST_WITHOUT_A_REASON, f"give a reason for a new constant: {[one.name for one in without]}"

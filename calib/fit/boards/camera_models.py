@@ -52,7 +52,7 @@ def fit_model(
     """
     match model:
         case "omni":
-            return _fit_omni(observed, ocam or _with_best_degree(observed, _first_ocam(observed, size, view)))
+            return _fit_omni(observed, ocam or _first_ocam(observed, size, view))
         case "ocam":
             return _with_best_degree(observed, _first_ocam(observed, size, view))
         case "ocam_tangential":

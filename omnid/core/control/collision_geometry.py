@@ -6,6 +6,7 @@ The base moves with (v, w): in its own frame a point at rest turns with -w about
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from calib.se2 import Point, Pose2, seen_from
@@ -63,25 +64,34 @@ class Outline(NamedTuple):
         return self.approach_mps(x_m, y_m, motion) > TINY
 
 
-def contact_s(outline: Outline, motion: Twist, x_m: float, y_m: float) -> float:
-    """Return the time until the outline touches a point outside it, inf if it never does."""
+def contact_s(outline: Outline, motion: Twist, points: Iterable[Point]) -> float:
+    """Return the time until the outline first touches one of the points outside it, inf if it never does."""
     v, w = motion.velocity_mps, motion.yaw_rate_radps
     if abs(w) >= STRAIGHT_RADPS:
-        return _on_arc_s(outline, v / w, w, x_m, y_m)
-    if v == 0.0 or abs(y_m) > outline.half_width_m:
+        return _on_arc_s(outline, v / w, w, points)
+    if v == 0.0:
         return math.inf
-    ahead_m = x_m - outline.front_m if v > 0.0 else -outline.rear_m - x_m
-    return ahead_m / abs(v) if ahead_m >= 0.0 else math.inf
+    edge_m, side = (outline.front_m, 1.0) if v > 0.0 else (outline.rear_m, -1.0)
+    ways_m = (side * x - edge_m for x, y in points if abs(y) <= outline.half_width_m)
+    return min((way_m for way_m in ways_m if way_m >= 0.0), default=math.inf) / abs(v)
 
 
-def _on_arc_s(outline: Outline, radius_m: float, w: float, x_m: float, y_m: float) -> float:
-    """Return the time until the first crossing of the point's circle about (0, radius_m) with an edge."""
-    rho2 = x_m**2 + (y_m - radius_m) ** 2
-    start = math.atan2(y_m - radius_m, x_m)
+def _on_arc_s(outline: Outline, radius_m: float, w: float, points: Iterable[Point]) -> float:
+    """Return the time until the first crossing of a point's circle about (0, radius_m) with an edge."""
+    # 1. The edges lie in a ring about the centre, and so does what they can touch: most points are left out by that.
+    front_m, rear_m, half_width_m = outline
+    beside_m = half_width_m - abs(radius_m)
+    nearest_m = min(front_m, rear_m, beside_m) if beside_m > 0.0 else -beside_m
+    farthest2 = max(front_m, rear_m) ** 2 + (half_width_m + abs(radius_m)) ** 2
+    # 2. The angle to the first crossing of each of the others.
     first = math.inf
-    for x, y in _crossings(outline, radius_m, rho2):
-        turned = (start - math.atan2(y - radius_m, x)) * math.copysign(1.0, w)
-        first = min(first, turned % math.tau)
+    for x_m, y_m in points:
+        rho2 = x_m**2 + (y_m - radius_m) ** 2
+        if nearest_m**2 <= rho2 <= farthest2:
+            start = math.atan2(y_m - radius_m, x_m)
+            for x, y in _crossings(outline, radius_m, rho2):
+                turned = (start - math.atan2(y - radius_m, x)) * math.copysign(1.0, w)
+                first = min(first, turned % math.tau)
     return first / abs(w)
 
 

@@ -208,13 +208,13 @@ class CollisionMonitor:
         """Return the share before points; slope: those in the stop polygon count where the way to them is steeper."""
         settings, least_mps = self._settings, max(slope * abs(motion.velocity_mps), TINY)
         stop = self._stop_polygon(motion)
-        first_s = math.inf
+        outside = []
         for x, y in points:
-            if stop.contains(x, y):
-                if self._outline.approach_mps(x, y, motion) > least_mps:
-                    return 0.0
-            else:
-                first_s = min(first_s, contact_s(stop, motion, x, y))
+            if not stop.contains(x, y):
+                outside.append((x, y))
+            elif self._outline.approach_mps(x, y, motion) > least_mps:
+                return 0.0
+        first_s = contact_s(stop, motion, outside)
         if first_s == math.inf:
             return 1.0
         share, speed_mps = first_s / settings.time_s, abs(motion.velocity_mps)

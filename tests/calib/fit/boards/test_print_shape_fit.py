@@ -59,11 +59,11 @@ def test_given_cameras_find_the_shape_too() -> None:
 
 
 def test_one_camera_finds_the_shape_and_selects_its_model_with_it() -> None:
-    seen = [lower for view in views_of(BENT) if (lower := view.seen[0])]
+    seen = [lower for view in views_of(BENT, count=9) if (lower := view.seen[0])]
     flat = select_calibration(seen, ODD, LOWER.size, "omni")
     found = with_print_shape(flat, "mirror").calibration
     np.testing.assert_allclose(found.shape.bends_m, BENT.bends_m, atol=2e-4)
     assert found.fit.mean_px < flat.calibration.fit.mean_px
-    straight = [lower for view in views_of(AS_DRAWN) if (lower := view.seen[0])]
+    straight = [lower for view in views_of(AS_DRAWN, count=9) if (lower := view.seen[0])]
     flat = select_calibration(straight, ODD, LOWER.size, "omni")
     assert with_print_shape(flat, "mirror") is flat

@@ -36,7 +36,7 @@ def test_the_time_is_that_of_a_sweep() -> None:
         if swept_outline.depth_m(outline, point) < 0.01:
             continue
         longest_s = math.tau / abs(motion.yaw_rate_radps) if motion.yaw_rate_radps else 5.0
-        found = contact_s(outline, motion, point.real, point.imag)
+        found = contact_s(outline, motion, [(point.real, point.imag)])
         times, seen = swept_outline.sweep(pair, [point], longest_s)
         depths = swept_outline.depth_m(outline, seen)[:, 0]
         assert depths[times < found].min() > -SLACK_M, (outline, motion, point)
@@ -61,7 +61,7 @@ def test_the_time_is_that_of_a_sweep() -> None:
     ],
 )
 def test_the_time_by_hand(motion: Twist, point: tuple[float, float], expected: float) -> None:
-    assert contact_s(OUTLINE, motion, *point) == pytest.approx(expected)
+    assert contact_s(OUTLINE, motion, [point]) == pytest.approx(expected)
 
 
 def test_a_motion_approaches_a_point_or_leaves_it() -> None:
