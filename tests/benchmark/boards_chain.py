@@ -13,6 +13,7 @@ import argparse
 import contextlib
 import io
 import math
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,6 +42,11 @@ BOARD = Board(9, 6, 0.05)
 SENSOR = Sensor(noise_sigma=2.0)
 SIZE, PAIRS, DRIVE, ROOM = 768, 24, "two_walls", "rooms"
 DISTANCE_M = (0.3, 0.7)
+REMARKS = (
+    "24 pairs of a 9x6 board of 50 mm, 768 px, noise 2, JPEG; `calibrate rig` with all defaults; then a drive of 5 m "
+    "with a turn of 94 degrees (99 pairs). Real mirrors: ray-traced, up to 1.5 % off shape, cameras tilted by 0.7 "
+    "degrees below them. Wanted: 0.1 % of the length on 10 of 10 rigs of each.",
+)
 
 
 def board_rig(seed: int, amount: float) -> tuple[Rig, Rig]:
@@ -99,6 +105,14 @@ def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> str:
     return text.getvalue().strip()
 
 
+def sigma(line: str) -> float:
+    """Return the standard deviation of the length of drives [%] that a calibration states in its line."""
+    found = re.search(r"scale uncertain by ([0-9.e-]+) %", line)
+    if found is None:
+        raise SystemExit(f"no sigma in: {line}")
+    return float(found[1])
+
+
 def in_true_frame(found: Rig, truth: Rig) -> Rig:
     """Return a calibrated rig in the frame of the true one, by the rays of the lower camera."""
     rng, (u, v) = np.random.default_rng(0), truth.lower.visible.center
@@ -136,13 +150,15 @@ def main(arguments: Sequence[str]) -> int:
     args = parser.parse_args(arguments)
     columns = (
         Column("seed"),
+        Column("mirrors"),
         Column("calibrated by"),
         Column("length", "%", 3),
         Column("ATE", "mm", 2),
         Column("heading, max", "deg", 3),
-        Column("calibration"),
+        Column("stated sigma of the length", "%", 3),
     )
-    table = ResultTable("boards_chain", "calibration", "Boards, rig, drive with real mirrors", columns)
+    table = ResultTable("boards_chain", "calibration", "Boards, rig, drive", columns, REMARKS)
+    mirrors = "real" if args.amount else "perfect"
     for seed in args.seeds:
         boards, log = (args.folder / f"{kind}_a{args.amount:g}_s{seed}" for kind in ("boards", "drive"))
         if args.only != "drive":
@@ -155,20 +171,14 @@ def main(arguments: Sequence[str]) -> int:
         line = calibrate(boards, boards / "rig.toml", options)
         truth = board_rig(seed, args.amount)[0]
         found = in_true_frame(read_rig(boards / "rig.toml"), truth)
-        table.add(seed, "boards", *drive(log, found), line, seed=("rigs of boards", seed))
+        table.add(seed, mirrors, "boards", *drive(log, found), sigma(line), seed=("rigs of boards", seed))
         if args.drives:
             room = args.folder / f"{ROOM}_a{args.amount:g}_s{seed}"
             render_drive(ROOM, seed, args.amount, room)
             again = calibrate_drive([room / "log.mcap"], read_rig(boards / "rig.toml"))
             write_rig(boards / "rig_drive.toml", again.rig)
-            errors = f"{again.first_sigma_px:.3f} -> {again.adjustment.sigma_px:.3f} px"
-            table.add(
-                seed,
-                "boards, then a drive",
-                *drive(log, in_true_frame(again.rig, truth)),
-                f"{errors}, lengths {100 * again.scale_change:+.3f} %",
-                seed=("rigs of boards", seed),
-            )
+            errors = drive(log, in_true_frame(again.rig, truth))
+            table.add(seed, mirrors, "boards, then a drive", *errors, None, seed=("rigs of boards", seed))
     return 0
 
 
