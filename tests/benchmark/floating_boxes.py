@@ -15,17 +15,21 @@ from omnid.simulation.world import World
 Size = tuple[float, float, float]  # along x, y, z [m]
 
 BAR_M: Final = 0.03
+END_ON_M: Final[Size] = (1.4, 0.04, 0.04)  # a bar that points at the robot
 TINE_M: Final[Size] = (1.0, 0.12, 0.06)
 TABLE_M: Final[Size] = (0.8, 0.6, 0.04)
 LEG_M: Final = 0.04
-KINDS: Final = ("bar", "table", "tines")
+KINDS: Final = ("bar", "bar end-on", "table", "tines")
 
 
 def with_floating(world: World, kind: str, rng: random.Random) -> World:
-    """Return the world with a thing of KINDS across the x axis, 2 to 3 m ahead of the origin."""
+    """Return the world with a thing of KINDS on the x axis, 2 to 3 m ahead of the origin."""
     texture_rng, at_m = np.random.default_rng(rng.randrange(2**32)), rng.uniform(2.0, 3.0)
     if kind == "bar":
         parts = raised_box(texture_rng, (at_m, 0.0, rng.uniform(0.12, 1.1)), (BAR_M, 1.4, BAR_M))
+    elif kind == "bar end-on":
+        at = (at_m + END_ON_M[0] / 2, rng.uniform(-0.15, 0.15), rng.uniform(0.12, 1.1))
+        parts = raised_box(texture_rng, at, END_ON_M)
     elif kind == "table":
         top_m, (length, width, _) = rng.uniform(0.6, 0.8), TABLE_M
         parts = raised_box(texture_rng, (at_m, 0.0, top_m), TABLE_M)
