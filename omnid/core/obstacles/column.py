@@ -79,6 +79,16 @@ class ColumnEvidence(NamedTuple):
     nearest_floor_m: float  # nearest floor that both cameras see, 0: none
 
 
+class _Views(NamedTuple):
+    """Normalised panoramas (H, DIRECTIONS) of a pair, as the kernels compare them."""
+
+    lower: Bytes
+    upper: Bytes
+    upright: Bytes  # (2, H, DIRECTIONS) least and most of the upper one within half a row of each pixel
+    plane: Bytes  # the same of the upper one on the plane of the floor
+    live: Bytes  # 255 where pixels may be compared, else 0
+
+
 def floor_plane(T_rect_floor: Array) -> FloorPlane:
     """Return the floor's plane z = 0 of a level frame, from which T_rect_floor (4, 4) leads to the rectified one."""
     T = se3.inverse(T_rect_floor)
@@ -131,59 +141,42 @@ class Columns:
         one, two = self._normalised(lower, noise), self._normalised(upper, noise)
         if self._plane.a or self._plane.b:
             one, two = self._warped(one, 0), self._warped(two, 0)
-        upright, plane = _bounds(two), _bounds(self._warped(two, 1))
         shown = self._visible if lost is None else self._visible & (self._working(lost * np.uint8(255)) == 0)
-        mask = np.where(shown, np.uint8(255), np.uint8(0))
-        # 2. Likelihoods.
-        scale = np.float32(DIFFERENCE_RATIO / UNITS)
-        others = np.empty((self.bins, DIRECTIONS), np.float32)
-        kernels.floor_evidence(
-            one,
-            upright,
-            plane,
-            mask,
-            self._floor_bins,
-            OUTLIER,
-            scale,
-            np.float32(NEAR_SHARE) * scale,
-            self._prior,
-            others,
-        )
-        surface = np.empty((self.bins, DIRECTIONS), np.float32)
-        kernels.surface_evidence(
-            one,
-            upright,
-            plane,
-            mask,
-            self._strips,
-            OUTLIER,
-            scale,
-            np.float32(FLOOR_WEIGHT),
-            np.float32(STRIP_BOUND),
-            np.float32(STRIP_PRIOR),
-            surface,
-        )
+        live = np.where(shown, np.uint8(255), np.uint8(0))
+        views = _Views(one, two, _bounds(two), _bounds(self._warped(two, 1)), live)
+        # 2. Each explanation against all others.
+        return ColumnEvidence(self._floor(views), self._surface(views), self._level(views), self.nearest_floor_m)
+
+    def _floor(self, views: _Views) -> Floats:
+        """Return the log-likelihood ratios (K, DIRECTIONS) of the floor against all other disparities."""
+        others, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
+        near = np.float32(NEAR_SHARE) * scale
+        compared = views.lower, views.upright, views.plane, views.live
+        kernels.floor_evidence(*compared, self._floor_bins, OUTLIER, scale, near, self._prior, others)
+        floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
+        floor[~self._tested] = np.nan
+        floor[:, self._unseen] = np.nan
+        return floor
+
+    def _surface(self, views: _Views) -> Floats:
+        """Return the log-likelihood ratios (K, DIRECTIONS) of the best run of rows, where k fits best."""
+        surface, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
+        limits = np.float32(FLOOR_WEIGHT), np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
+        compared = views.lower, views.upright, views.plane, views.live
+        kernels.surface_evidence(*compared, self._strips, OUTLIER, scale, *limits, surface)
         # A surface fits a little at the disparities next to its own.
         peak = np.ones_like(surface, bool)
         peak[1:] &= surface[1:] >= surface[:-1]
         peak[:-1] &= surface[:-1] >= surface[1:]
         surface[~peak] = 0.0
-        floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
-        level = np.empty((2, self.bins, DIRECTIONS), np.float32)
-        kernels.level_evidence(
-            one,
-            two,
-            self._plane_rows,
-            mask,
-            self._floor_bins,
-            self._offsets,
-            OUTLIER,
-            np.float32(LEVEL_RATIO / 64 / UNITS),
-            level,
-        )
-        floor[~self._tested] = np.nan
-        floor[:, self._unseen] = np.nan
-        return ColumnEvidence(floor, surface, level, self.nearest_floor_m)
+        return surface
+
+    def _level(self, views: _Views) -> Floats:
+        """Return the log-likelihood ratios (2, K, DIRECTIONS) of the floor against planes just above and below it."""
+        level, scale = np.empty((2, self.bins, DIRECTIONS), np.float32), np.float32(LEVEL_RATIO / 64 / UNITS)
+        compared = views.lower, views.upper, self._plane_rows, views.live
+        kernels.level_evidence(*compared, self._floor_bins, self._offsets, OUTLIER, scale, level)
+        return level
 
     def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
