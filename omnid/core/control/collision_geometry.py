@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 from calib.se2 import Point, Pose2, seen_from
@@ -114,3 +115,10 @@ def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point
     """Return the points within reach of a pose, in its axes."""
     reach2 = reach_m * reach_m
     return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])
+
+
+@lru_cache(maxsize=2)
+def sector_directions(count: int) -> tuple[tuple[float, float, float], ...]:
+    """Return the azimuth of the middle of each sector of a ring, its cosine and its sine."""
+    azimuths = ((k + 0.5) * (math.tau / count) - math.pi for k in range(count))
+    return tuple((azimuth, math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths)

@@ -13,7 +13,7 @@ from collections import deque
 from typing import Final, NamedTuple
 
 from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
-from omnid.core.control.collision_geometry import TINY, Outline, contact_s, within_reach
+from omnid.core.control.collision_geometry import TINY, Outline, contact_s, sector_directions, within_reach
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.nanoseconds import S_PER_NS
@@ -114,11 +114,9 @@ class CollisionMonitor:
             return
         self._stamp_ns, self._moving = ring.stamp_ns, ring.moving[:MOST_MOVING]
         count = len(ring.ranges_m)
-        step = math.tau / count
+        directions = sector_directions(count)
         self._points = [
-            (r * math.cos((k + 0.5) * step - math.pi), r * math.sin((k + 0.5) * step - math.pi))
-            for k, r in enumerate(ring.ranges_m)
-            if math.isfinite(r)
+            (r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)
         ]
         ends_m = tuple(r if math.isfinite(r) else 0.0 for r in ring.ranges_m)
         free = ring.free_m if len(ring.free_m) == count else ends_m
@@ -130,10 +128,10 @@ class CollisionMonitor:
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
         for k in _in_long_runs(unknown):
-            azimuth = (k + 0.5) * step - math.pi
+            azimuth, c, s = directions[k]
             begins_m = self._around.edge_m(azimuth) if unwatched[k] else max(free[k], self._outline.edge_m(azimuth))
             ends = self._unwatched if unwatched[k] else self._gaps if has_gap[k] else self._unknown
-            ends.append((begins_m * math.cos(azimuth), begins_m * math.sin(azimuth)))
+            ends.append((begins_m * c, begins_m * s))
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc.
