@@ -25,8 +25,9 @@ COURSE_PAIRS = 22  # before the turn
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Return the number of workers of `-n auto`: one more than cores, as tests of live runs often wait."""
-    return len(os.sched_getaffinity(0)) + 1
+    """Return the number of workers of `-n auto`: one more than cores, as live tests wait, unless the cores are busy."""
+    cores = len(os.sched_getaffinity(0))
+    return cores + (os.getloadavg()[0] < cores)
 
 
 @pytest.fixture(scope="session", autouse=True)
