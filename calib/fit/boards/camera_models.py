@@ -47,8 +47,8 @@ def fit_model(
 ) -> FittedModel:
     """Fit the camera of a model.
 
-    All models start from an ocam camera, which has a linear initialisation; ocam: the one fitted to the same
-    observations, if it is known.
+    All models start from an ocam camera of degree DEGREE, which has a linear initialisation; ocam: the one fitted to
+    the same observations, if it is known, of any degree.
     """
     match model:
         case "omni":

@@ -172,7 +172,7 @@ def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: 
 
 
 def test_weak_evidence_of_one_place_is_no_surface_however_long_the_base_stands(grid: ObstacleGrid, seen: Pairs) -> None:
-    """Errors of pairs from one place are the same: 20 s of them are no obstacle, and hides none that comes."""
+    """Errors of pairs from one place are the same: 20 s of them are no obstacle, and hide none that comes."""
     weak, strong = (
         seen[0]._replace(
             surface=np.full_like(seen[0].surface, log_odds), floor=0 * seen[0].floor, level=0 * seen[0].level
