@@ -8,11 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.simulation import build
+from tests.simulation import Scene, build
 from tests.simulation.photographs import POSTERS, SURFACES, photographed, with_photographs
 
 pytestmark = pytest.mark.skipif(find_spec("skimage") is None, reason="needs the files of scikit-image")
-SCENE = build("rooms", 3, 160, 4).scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return build("rooms", 3, 160, 4).scene
 
 
 def test_every_photograph_is_there_in_grey() -> None:
@@ -20,10 +24,10 @@ def test_every_photograph_is_there_in_grey() -> None:
         assert photographed(name).ndim == 2 and photographed(name).std() > 10
 
 
-def test_all_but_the_ceiling_shows_photographs_of_the_seed() -> None:
-    first, again, other = (with_photographs(SCENE, seed) for seed in (3, 3, 4))
+def test_all_but_the_ceiling_shows_photographs_of_the_seed(scene: Scene) -> None:
+    first, again, other = (with_photographs(scene, seed) for seed in (3, 3, 4))
     for before, now, same, third in zip(
-        SCENE.rectangles, first.rectangles, again.rectangles, other.rectangles, strict=True
+        scene.rectangles, first.rectangles, again.rectangles, other.rectangles, strict=True
     ):
         assert np.array_equal(now.texture, same.texture)
         if before.name == "ceiling":
@@ -34,14 +38,14 @@ def test_all_but_the_ceiling_shows_photographs_of_the_seed() -> None:
         assert np.array_equal(now.corners, before.corners)
 
 
-def test_a_surface_repeats_in_mirror_images_without_seams() -> None:
-    floor = with_photographs(SCENE, 3).named("floor").texture.astype(float)
+def test_a_surface_repeats_in_mirror_images_without_seams(scene: Scene) -> None:
+    floor = with_photographs(scene, 3).named("floor").texture.astype(float)
     columns, rows = np.abs(np.diff(floor, axis=1)).mean(axis=0), np.abs(np.diff(floor, axis=0)).mean(axis=1)
     assert columns.max() < 2 * np.median(columns) and rows.max() < 2 * np.median(rows)
 
 
-def test_posters_keep_their_form_and_are_parts_of_photographs() -> None:
-    faces = zip(SCENE.rectangles, with_photographs(SCENE, 3).rectangles, strict=True)
+def test_posters_keep_their_form_and_are_parts_of_photographs(scene: Scene) -> None:
+    faces = zip(scene.rectangles, with_photographs(scene, 3).rectangles, strict=True)
     posters = [(before, now) for before, now in faces if before.name.startswith("poster")]
     assert all(now.texture.shape == before.texture.shape for before, now in posters)
     shown = posters[0][1].texture

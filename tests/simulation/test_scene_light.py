@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -11,52 +11,63 @@ import pytest
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats
 from omnid.simulation.rendering.surfaces import LIGHT, Rectangle, Scene
-from tests.simulation import build
+from tests.simulation import SimulatedRun, build
 from tests.simulation.disturbances import Disturbance
 from tests.simulation.scene_light import BLACK, GLASS, GLOSS, SHADOW, WHITE, light_of, mirrored, shadow_map
 
 SIDE: Final = 160
-RUN: Final = build("rooms", 3, SIDE, 4)
-HERE: Final = RUN.poses[0]
-RENDERED: Final = partial(render_grey, mounted=RUN.rig.lower, T_world_rig=HERE)
-CLEAN: Final = RENDERED(RUN.scene)
 
 
-def lit(*names: Disturbance, scene: Scene = RUN.scene) -> Floats:
-    return light_of(scene, RENDERED, names, HERE[:2, 3])
+@cache
+def run() -> SimulatedRun:
+    return build("rooms", 3, SIDE, 4)
 
 
-def shown(prefix: str, scene: Scene = RUN.scene) -> np.ndarray:
+def rendered(scene: Scene) -> Floats:
+    return render_grey(scene, run().rig.lower, run().poses[0])
+
+
+@cache
+def clean() -> Floats:
+    return rendered(run().scene)
+
+
+def lit(*names: Disturbance) -> Floats:
+    return light_of(run().scene, rendered, names, run().poses[0][:2, 3])
+
+
+def shown(prefix: str) -> np.ndarray:
     """Return the mask (H, W) of pixels that show surfaces whose name starts so."""
-    textures = [WHITE if face.name.startswith(prefix) else BLACK for face in scene.rectangles]
+    faces = run().scene.rectangles
+    textures = [WHITE if face.name.startswith(prefix) else BLACK for face in faces]
     painted = (
         Rectangle(face.origin, face.edge_u, face.edge_v, texture, face.name)
-        for face, texture in zip(scene.rectangles, textures, strict=True)
+        for face, texture in zip(faces, textures, strict=True)
     )
-    return RENDERED(Scene(tuple(painted))) > 0
+    return rendered(Scene(tuple(painted))) > 0
 
 
 def test_without_a_name_nothing_changes() -> None:
-    assert np.array_equal(lit(), CLEAN)
+    assert np.array_equal(lit(), clean())
 
 
 def test_a_glossy_floor_shows_the_room_upside_down() -> None:
-    changed, on_floor = np.abs(lit("gloss") - CLEAN) > 1e-3, shown("floor")
+    changed, on_floor = np.abs(lit("gloss") - clean()) > 1e-3, shown("floor")
     assert changed[on_floor].mean() > 0.3 and not changed[~on_floor].any()
-    assert np.abs(lit("gloss") - CLEAN).max() <= 255 * GLOSS
+    assert np.abs(lit("gloss") - clean()).max() <= 255 * GLOSS
 
 
 def test_windows_saturate_and_the_floor_shows_them() -> None:
     windows = lit("windows")
-    assert CLEAN.max() < 255 < windows.max() and (windows >= CLEAN).all() and 0 < (windows > CLEAN).mean() < 0.1
+    assert clean().max() < 255 < windows.max() and (windows >= clean()).all() and 0 < (windows > clean()).mean() < 0.1
     assert (lit("gloss", "windows") - lit("gloss"))[shown("floor")].max() > 20
 
 
 def test_glass_reflects_in_front_of_some_posters_only() -> None:
-    changed, on_poster = np.abs(lit("glass") - CLEAN), shown("poster")
+    changed, on_poster = np.abs(lit("glass") - clean()), shown("poster")
     assert changed[on_poster].max() > 1 and not changed[~on_poster].any()
     assert 0.1 < (changed[on_poster] > 0.1).mean() < 0.6 and changed.max() <= 255 * GLASS
-    assert not ((changed > 0.1) & (lit("windows") - CLEAN > 100)).any(), "a window has no picture behind it"
+    assert not ((changed > 0.1) & (lit("windows") - clean() > 100)).any(), "a window has no picture behind it"
 
 
 def test_a_reflection_is_where_the_mirror_image_of_its_object_is() -> None:
@@ -69,11 +80,11 @@ def test_a_reflection_is_where_the_mirror_image_of_its_object_is() -> None:
 
 
 def test_shadows_lie_on_the_floor_away_from_the_light_and_follow_the_robot() -> None:
-    share = lit("shadows") / np.maximum(CLEAN, 1)
-    dark, on_floor = (share < 0.99) & (CLEAN > 1), shown("floor")
-    assert dark[on_floor].any() and not dark[~on_floor].any() and share[CLEAN > 1].min() > 0.99 - SHADOW
+    share = lit("shadows") / np.maximum(clean(), 1)
+    dark, on_floor = (share < 0.99) & (clean() > 1), shown("floor")
+    assert dark[on_floor].any() and not dark[~on_floor].any() and share[clean() > 1].min() > 0.99 - SHADOW
 
-    floor = RUN.scene.named("floor")
+    floor = run().scene.named("floor")
     empty = Scene((floor,))
     centres = []
     for x_m, y_m in ((0.0, 0.0), (0.101, 0.203)):

@@ -16,10 +16,10 @@ from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.sinks.static_frames import StaticFrames
 from tests.omnid.small_pair import small_depth
-from tests.simulation import build
+from tests.simulation import make_rig
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-RIG = replace(build("two_walls", seed=3, size=256, pairs=2).rig, T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
+RIG = replace(make_rig(size=256), T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
 
 
 def edges(payload: bytes) -> dict[tuple[str, str], np.ndarray]:
