@@ -62,8 +62,8 @@ def gather(
             if last < first:
                 first = last = round(at)
             near = min(math.floor(at_1m / (r - 0.5 * cell_m)), bins - 1)
-            far = min(math.floor(at_1m / (r + 0.5 * cell_m)), near)
-            if far < 0:
+            far = math.floor(at_1m / (r + 0.5 * cell_m))
+            if far > near:
                 continue
             last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
             first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
