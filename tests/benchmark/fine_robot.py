@@ -1,18 +1,55 @@
-"""A simulated robot whose images are rendered finely enough that they show what a lens would."""
+"""Simulated robots of several builds whose images are rendered finely enough that they show what a lens would."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
-from omnid.simulation.robot import SimulatedRobot, make_robot
+import numpy as np
+
+from calib import se3
+from omnid.simulation.rendering.rigs import make_rig
+from omnid.simulation.robot import BASELINE_M, CAMERA_HEIGHT_M, SimulatedRobot
 
 # Least number of rays along a side of an image: with two a pixel and axis at 512 px, joints of tiles come and go from
 # pixel to pixel, as no lens shows them, and a base stood before them for good; with three they do not.
 SIDE_RAYS: Final = 3 * 512
+# Distances of the configured outline from the disc, as those of the default settings from the default robot.
+ALONG_M, ACROSS_M = 0.05, 0.02
 
 
-def fine_robot(size_px: int) -> SimulatedRobot:
+class Build(NamedTuple):
+    """Dimensions of a robot, m."""
+
+    camera_height_m: float = CAMERA_HEIGHT_M
+    baseline_m: float = BASELINE_M
+    radius_m: float = 0.2
+    height_m: float = 1.2
+
+    @property
+    def settings(self) -> list[str]:
+        """Settings of the outline."""
+        along_m, across_m = self.radius_m + ALONG_M, self.radius_m + ACROSS_M
+        sides = {"front_m": along_m, "rear_m": along_m, "half_width_m": across_m}
+        return [f"controller.collision.{name}={side_m:.2f}" for name, side_m in sides.items()]
+
+
+USUAL: Final = "usual"
+BUILDS: Final = {
+    USUAL: Build(),
+    "low": Build(0.45, 0.12, 0.18, 0.7),
+    "lowest": Build(0.3, 0.1, 0.16, 0.5),
+    "tall": Build(1.3, 0.2, 0.3, 1.6),
+}
+
+
+def fine_robot(size_px: int, build: Build = BUILDS[USUAL]) -> SimulatedRobot:
     """Return a robot with images of a size, of at least SIDE_RAYS rays along a side."""
-    return replace(make_robot(size_px), samples=math.ceil(SIDE_RAYS / size_px))
+    rig = make_rig(size=size_px, baseline_m=build.baseline_m)
+    return SimulatedRobot(
+        replace(rig, T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, build.camera_height_m])),
+        radius_m=build.radius_m,
+        height_m=build.height_m,
+        samples=math.ceil(SIDE_RAYS / size_px),
+    )

@@ -30,13 +30,13 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.people import Walkers
-from omnid.simulation.robot import make_robot
+from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, lowered, room_text
 from tests.benchmark.corridor_worlds import POLISHED, SPEED_MPS, world_text
-from tests.benchmark.fine_robot import fine_robot
+from tests.benchmark.fine_robot import BUILDS, USUAL, fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
@@ -106,8 +106,10 @@ def run(
     overrides: list[str],
     speed_mps: float = SPEED_MPS,
     rate_hz: float = RATE_HZ,
+    build: str = USUAL,
 ) -> Drive:
-    """Drive one seed of a case along x, backwards at a negative speed."""
+    """Drive one seed of a case along x, backwards at a negative speed, with a robot of BUILDS."""
+    robot = replace(fine_robot(size_px, BUILDS[build]), rate_hz=rate_hz)
     limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
@@ -131,24 +133,29 @@ def run(
             world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
         done = simulate(
             world,
-            replace(fine_robot(size_px), rate_hz=rate_hz),
+            robot,
             Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=speed_mps),
             seconds=CASES[case],
             seed=seed,
-            config=load_config(None, ["places.enabled=false", *limits, *overrides]),
+            config=load_config(None, ["places.enabled=false", *limits, *BUILDS[build].settings, *overrides]),
         )
-    return judged(done, world, edges, backwards=speed_mps < 0, everywhere=is_cluttered)
+    return judged(done, world, robot, edges, backwards=speed_mps < 0, everywhere=is_cluttered)
 
 
 def judged(
-    done: SimulatedRun, world: World, edges: Array, *, backwards: bool = False, everywhere: bool = False
+    done: SimulatedRun,
+    world: World,
+    robot: SimulatedRobot,
+    edges: Array,
+    *,
+    backwards: bool = False,
+    everywhere: bool = False,
 ) -> Drive:
     """Return the result of a run, from the truth at its ticks; edges (N, 2, 2): where the floor falls.
 
     everywhere: what stands in any direction may be the reason of a stop, and not only what stands ahead.
     """
     turn_rad = math.pi if backwards else 0.0
-    robot = make_robot()
     standing, people = np.concatenate([footprints(world.standing, robot.height_m), edges]), Walkers(world.people)
     to_edge_m = [clearance_m(edges, tick.pose[:2], robot.radius_m) for tick in done.ticks]
     over = int(min(to_edge_m) <= 0.0)
@@ -221,6 +228,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=(512,), help="of the images, px")
     parser.add_argument("--speeds", type=float, nargs="+", default=(SPEED_MPS,), help="m/s; below 0: backwards")
     parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="of the cameras")
+    parser.add_argument("--robot", choices=BUILDS, default=USUAL, help="its dimensions (fine_robot.py)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
@@ -249,7 +257,10 @@ def main() -> None:
     parts = list(itertools.product(arguments.cases, arguments.speeds, arguments.sizes))
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
         runs = [
-            [pool.submit(run, case, seed, size_px, arguments.overrides, speed_mps, arguments.rate) for seed in seeds]
+            [
+                pool.submit(run, case, seed, size_px, arguments.overrides, speed_mps, arguments.rate, arguments.robot)
+                for seed in seeds
+            ]
             for case, speed_mps, size_px in parts
         ]
         for part, futures in zip(parts, runs, strict=True):
@@ -257,14 +268,14 @@ def main() -> None:
             for seed, future in zip(seeds, futures, strict=True):
                 drives.append(future.result())
                 print(f"{part[0]} {seed}: {drives[-1]}", flush=True)
-            _add(table, *part, arguments.rate, drives)
+            _add(table, *part, arguments.rate, arguments.robot, drives)
 
 
 def _add(
-    table: ResultTable, case: str, speed_mps: float, size_px: int, rate_hz: float, drives: Sequence[Drive]
+    table: ResultTable, case: str, speed_mps: float, size_px: int, rate_hz: float, build: str, drives: Sequence[Drive]
 ) -> None:
     at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
-    at += f", {rate_hz:g} Hz" * (rate_hz != RATE_HZ)
+    at += f", {rate_hz:g} Hz" * (rate_hz != RATE_HZ) + f", {build} robot" * (build != USUAL)
     table.add(
         case + at,
         len(drives),
