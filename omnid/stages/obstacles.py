@@ -85,7 +85,7 @@ class Obstacles:
         # 4. The grid, its ring, and the obstacles that move.
         pose = transform(planar(T_odom_base))
         ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched)
-        moving = self._tracker.update(odometry.stamp_ns, pose, ring.arrivals)
+        moving = self._tracker.update(odometry.stamp_ns, self._grid.viewpoint(pose), ring.arrivals)
         return ObstacleRing(
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )

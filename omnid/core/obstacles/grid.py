@@ -29,7 +29,7 @@ from omnid.core.obstacles.grid_layers import (
     cells_of,
     level_odds,
 )
-from omnid.core.obstacles.grid_ring import GridRing, RingView, ring_of
+from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor, arrivals_at
 from omnid.core.obstacles.watch import FRESH_NS, Watch
@@ -85,7 +85,7 @@ class ObstacleGrid:
         """at_1m: disparity at 1 m; `set_floor` comes before the first pair."""
         self._at_1m, self._low_m = at_1m, settings.heights_m[0]
         self._max_range_m = min(settings.max_range_m, (MARGIN_CELLS - 2) * CELL_M)
-        self._T_rect_base, self._gap_share = np.eye(4), 0.0
+        self._T_rect_base, self._T_base_eye, self._gap_share = np.eye(4), np.eye(4), 0.0
         self._azimuths = azimuths()
         self._directions = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
         self.clear()
@@ -93,8 +93,13 @@ class ObstacleGrid:
     def set_floor(self, T_rect_base: Array, height_m: float) -> None:
         """Take T_rect_base (4, 4), from the base level on the floor to the columns, and the viewpoint's height."""
         self._T_rect_base = T_rect_base
+        self._T_base_eye[:2, 3] = se3.inverse(T_rect_base)[:2, 3]
         # What is lower than an obstacle may hide this share of the range.
         self._gap_share = self._low_m / max(height_m - self._low_m, self._low_m)
+
+    def viewpoint(self, T_odom_base: Array) -> Array:
+        """Return the pose (4, 4) of axes parallel to the base's at the viewpoint: what stands hides floor behind it."""
+        return np.asarray(T_odom_base @ self._T_base_eye)
 
     def clear(self) -> None:
         """Forget everything: the pose has lost its relation to the past."""
@@ -114,24 +119,21 @@ class ObstacleGrid:
         place = T_odom_base[:2, 3] / CELL_M
         corner = self._follow(place)
         at = np.floor(place).astype(np.int64) - corner
+        eye = self.viewpoint(T_odom_base)[:2, 3] / CELL_M - corner
         rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
         if self._start_ns is None:
             # The robot is where nothing else can be: the floor too near to be seen counts until it is reached.
             self._start_ns = stamp_ns
             self._nearest_m = evidence.nearest_floor_m
-            self._assume_free(at, T_odom_base, evidence)
+            self._assume_free(np.floor(eye).astype(np.int64), T_odom_base, evidence)
         passed_ns = FRESH_NS if self._last_ns is None else max(stamp_ns - self._last_ns, 0)
         self._last_ns = stamp_ns
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
         # 1. Evidence of each cell, and what has come onto floor that was free.
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         angles = self._azimuths + float(se3.yaw(T_odom_base))
-        ways = (
-            self._watch.was_free(stamp_ns),
-            self._odds[SURFACE] > TAKEN_ODDS,
-            np.array([*(place - corner), CELL_M, self._max_range_m, self._at_1m]),
-            angles,
-        )
+        origin = np.array([*eye, CELL_M, self._max_range_m, self._at_1m])
+        ways = self._watch.was_free(stamp_ns), self._odds[SURFACE] > TAKEN_ODDS, origin, angles
         # Who comes is wide: the mean of a cell is less noisy than its weakest directions, which show something thin.
         comes_m, _ = self._usual.hidden(self._usual.compare((rows, columns), cells[MEAN_FLOOR], weight), *ways)
         arrivals = arrivals_at(comes_m, evidence.nearest_floor_m + 2 * CELL_M, self._at_1m)
@@ -141,7 +143,7 @@ class ObstacleGrid:
         in_view = np.isfinite(cells[FLOOR])
         lost = np.where(behind, hidden, np.minimum(hidden, 0))
         nearest = int(evidence.nearest_floor_m / CELL_M)
-        self._lose_before(lost, place - corner, nearest)
+        self._lose_before(lost, eye, nearest)
         amount = self._add((rows, columns), cells, lost[rows, columns], weight, at_rest)
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
@@ -150,13 +152,14 @@ class ObstacleGrid:
             visible[rows, columns] = in_view
             flooded = self._watch.spread(stamp_ns, passed_ns, self._odds[FLOOR] > FREE_ODDS, visible)
             self._odds[FLOOR][flooded] = PRIOR[FLOOR]
-        self._clear_seen_past(place - corner, nearest)
+        self._clear_seen_past(eye, nearest)
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
         self._odds[FLOORS, *own], self._odds[VISIBLE, *own], self._shown[own] = LIMIT, PRIOR[VISIBLE], 0.0
         # 4. The ring.
         gaps = self._gap_share, CELL_M + self._gap_share * self._nearest_m
-        view = RingView(place - corner, angles, CELL_M, self._max_range_m, evidence.nearest_floor_m, *gaps)
+        nearest_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
+        view = RingView(place - corner, angles, CELL_M, self._max_range_m, nearest_m, *gaps)
         return ring_of(self.state(), view, arrivals)
 
     def _add(
@@ -249,7 +252,7 @@ class ObstacleGrid:
         changed = in_view | (amount > 0)
         self._shown[window] += np.where(changed, weight * SHOWN_RATE * (amount - self._shown[window]), np.float32(0))
 
-    def _assume_free(self, at: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
+    def _assume_free(self, eye: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
         """Take the floor nearer than what is in view for free, up to a surface that hides the nearest floor in view."""
         y, x = np.ogrid[:CELLS, :CELLS]
         in_view = np.isfinite(evidence.floor)
@@ -260,25 +263,25 @@ class ObstacleGrid:
         range_m = self._at_1m / np.maximum(evidence.surface.argmax(axis=0), 1)
         reach[stands] = np.minimum(reach, range_m / CELL_M - 1.0)[stands]
         yaw = float(se3.yaw(self._T_rect_base)) - float(se3.yaw(T_odom_base))
-        turned = (math.pi - np.arctan2(y - at[1], x - at[0]) - yaw) / math.tau
+        turned = (math.pi - np.arctan2(y - eye[1], x - eye[0]) - yaw) / math.tau
         reach_there = reach[np.floor(turned * len(reach)).astype(np.intp) % len(reach)]
-        self._odds[FLOORS, (x - at[0]) ** 2 + (y - at[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
+        self._odds[FLOORS, (x - eye[0]) ** 2 + (y - eye[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
 
-    def _lose_before(self, lost: Floats, place: Array, nearest: int) -> None:
+    def _lose_before(self, lost: Floats, eye: Array, nearest: int) -> None:
         """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen: as behind them.
 
         What hides the nearest floor in view may stand anywhere before it; as the base moves, directions cross there.
         """
         if nearest < 2:
             return
-        rows, columns = self._cells_along(place, nearest + 2)
+        rows, columns = self._cells_along(eye, nearest + 2)
         behind = lost[rows[:, nearest:], columns[:, nearest:]].mean(axis=1)
         near = rows[:, : nearest - 1], columns[:, : nearest - 1]
         # Of the directions through a cell the most hidden one counts.
         lost[near] = -np.inf
         np.maximum.at(lost, near, np.broadcast_to(behind[:, None], near[0].shape))
 
-    def _clear_seen_past(self, place: Array, nearest: int) -> None:
+    def _clear_seen_past(self, eye: Array, nearest: int) -> None:
         """End the flood too near to be seen where something behind it is watched: a person would hide that.
 
         Behind it is the floor in view nearest to it, or a surface, such as the walls of a corridor.
@@ -286,7 +289,7 @@ class ObstacleGrid:
         if not nearest or not self._watch.flooded.any():
             return
         steps = nearest + 2
-        rows, columns = self._cells_along(place, nearest + BEHIND_CELLS)
+        rows, columns = self._cells_along(eye, nearest + BEHIND_CELLS)
         watched = self._watch.watched[rows, columns]
         surface = np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
         floor = watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS)
@@ -298,9 +301,9 @@ class ObstacleGrid:
         self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
         self._watch.flooded[cells] = 0
 
-    def _cells_along(self, place: Array, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _cells_along(self, eye: Array, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the rows and columns (SECTORS, steps) of the first cells along all directions."""
-        ways = place + np.arange(1, steps + 1)[None, :, None] * self._directions[:, None]
+        ways = eye + np.arange(1, steps + 1)[None, :, None] * self._directions[:, None]
         columns, rows = np.moveaxis(np.floor(ways).astype(np.intp), -1, 0)
         return rows, columns
 

@@ -35,9 +35,15 @@ class RingView(NamedTuple):
     angles: Array  # (N,) of the directions, in the axes of the grid
     cell_m: float
     max_range_m: float
-    nearest_m: float  # of the floor in view
+    nearest_m: Array  # (N,) of the floor in view
     gap_share: float  # of the range, that what is lower than an obstacle may hide: such gaps are passed
     gap_m: float  # least gap that is passed
+
+
+def circle_from(directions: Array, middle_m: Array, radius_m: float) -> Array:
+    """Return the way (N,) from the origin along directions (N, 2) to a circle around it, whose middle lies off it."""
+    along_m = directions @ middle_m
+    return np.asarray(along_m + np.sqrt(np.maximum(radius_m**2 - middle_m @ middle_m + along_m**2, 0.0)))
 
 
 def ring_of(cells: Bytes, view: RingView, arrivals: Arrivals) -> GridRing:

@@ -98,14 +98,14 @@ class MovingTracker:
         """Forget everything: odom has lost its relation to the past."""
         self._tracks.clear()
 
-    def update(self, stamp_ns: int, T_odom_base: Array, arrivals: Arrivals) -> tuple[MovingObstacle, ...]:
+    def update(self, stamp_ns: int, T_odom_eye: Array, arrivals: Arrivals) -> tuple[MovingObstacle, ...]:
         """Return the moving obstacles after a pair, by what has come onto free floor."""
         # 1. Predict the tracks.
         for track in self._tracks:
             track.predict(stamp_ns)
         # 2. Give each cluster to the nearest track within the gate, or begin one.
         waiting = list(self._tracks)
-        for cluster in self._clusters(T_odom_base, *arrivals):
+        for cluster in self._clusters(T_odom_eye, *arrivals):
             distances = [float(np.linalg.norm(track.place - cluster.middle)) for track in waiting]
             if distances and min(distances) <= GATE_M:
                 waiting.pop(int(np.argmin(distances))).update(cluster)
@@ -115,7 +115,7 @@ class MovingTracker:
         self._tracks = [track for track in self._tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
         return tuple(found for track in self._tracks if (found := track.obstacle()) is not None)
 
-    def _clusters(self, T_odom_base: Array, arrived_m: RangeScan, sigma_m: RangeScan) -> list[_Cluster]:
+    def _clusters(self, T_odom_eye: Array, arrived_m: RangeScan, sigma_m: RangeScan) -> list[_Cluster]:
         """Return the clusters that are narrow enough."""
         near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
         found = []
@@ -124,8 +124,8 @@ class MovingTracker:
             width_m = float(np.linalg.norm(at[-1] - at[0]))
             if len(sectors) < LEAST_SECTORS or width_m > WIDEST_M:
                 continue
-            middle = at.mean(axis=0) @ T_odom_base[:2, :2].T + T_odom_base[:2, 3]
-            along = (middle - T_odom_base[:2, 3]) / np.linalg.norm(middle - T_odom_base[:2, 3])
+            middle = at.mean(axis=0) @ T_odom_eye[:2, :2].T + T_odom_eye[:2, 3]
+            along = (middle - T_odom_eye[:2, 3]) / np.linalg.norm(middle - T_odom_eye[:2, 3])
             across = np.array([-along[1], along[0]])
             along2 = SIGMA_M**2 + float((sigma_m[sectors] ** 2).mean())
             # Of a person who comes out of a hidden area only a part hides floor that was free.
