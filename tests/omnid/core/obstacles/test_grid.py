@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib import se3
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.grid import CELL_M, CELLS, LEAST_VISIBLE, ObstacleGrid
 from omnid.core.obstacles.grid_layers import ABOVE, BELOW, FLOOR, FREE_ODDS, PRIOR, SURFACE
 from omnid.core.obstacles.grid_layers import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.grid_ring import GridRing
+from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
 from tests.omnid.core.obstacles.drawn_floor import (
@@ -350,3 +352,20 @@ def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid
     assert np.isnan(after(grid, seen, 5, first=31).arrivals.ranges_m).all(), "the floor is as it was"
     grid.clear()
     assert np.isnan(after(grid, person, 20).arrivals.ranges_m).all()
+
+
+def test_who_comes_is_where_the_cameras_see_them_wherever_they_are_on_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
+    """The cameras are 0.4 m ahead of the base's origin and 0.3 m to the right; the base has turned by 50 degrees."""
+    T_base_eye, T_odom_base = np.eye(4), np.eye(4)
+    T_base_eye[:2, 3] = 0.4, -0.3
+    T_odom_base[:3, :3] = se3.rotation_exp([0.0, 0.0, np.deg2rad(50.0)])
+    grid.set_floor(T_RECT_BASE @ se3.inverse(T_base_eye), HEIGHT_M)
+    person, tracker = evidence(stains, striped, pole=Pole(1.3, 0.3)), MovingTracker()
+    for n in range(20):
+        grid.update(n * PERIOD_NS, T_odom_base, seen[n % len(seen)])
+    for n in range(20, 23):
+        ring = grid.update(n * PERIOD_NS, T_odom_base, person[n % len(person)])
+        moving = tracker.update(n * PERIOD_NS, grid.viewpoint(T_odom_base), ring.arrivals)
+    (found,) = moving
+    truth = T_odom_base @ T_base_eye @ np.array([1.3, 0.0, 0.0, 1.0])
+    assert (found.x_m, found.y_m) == pytest.approx(tuple(truth[:2]), abs=0.1)

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.grid_ring import END_M, GridRing, RingView, ring_of
+from omnid.core.obstacles.grid_ring import END_M, GridRing, RingView, circle_from, ring_of
 from omnid.core.obstacles.usual_floor import Arrivals
 
 CELLS, CELL_M, MAX_RANGE_M = 120, 0.05, 2.5
 MIDDLE = CELLS // 2
-VIEW = RingView(np.full(2, MIDDLE + 0.5), azimuths(), CELL_M, MAX_RANGE_M, nearest_m=0.8, gap_share=0.07, gap_m=0.1)
+NEAREST_M = np.full(SECTORS, 0.8)
+VIEW = RingView(np.full(2, MIDDLE + 0.5), azimuths(), CELL_M, MAX_RANGE_M, NEAREST_M, gap_share=0.07, gap_m=0.1)
 ARRIVALS = Arrivals(np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.nan, np.float32))
 AHEAD, LEFT, BEHIND = SECTORS // 2, 3 * SECTORS // 4, 0
 
@@ -59,3 +60,9 @@ def test_an_end_nearer_than_the_floor_in_view_was_found_before_to_a_cell(free: n
     free[:] = 1
     free[ahead(0.85, 1.2)] = 0
     assert ring(free).free_m[AHEAD] == pytest.approx(VIEW.nearest_m - CELL_M, abs=0.01)
+
+
+def test_the_way_to_a_circle_depends_on_the_direction_where_its_middle_lies_ahead() -> None:
+    directions = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
+    ways_m = circle_from(directions, np.array([0.3, 0.0]), 0.5)
+    assert ways_m == pytest.approx([0.8, 0.2, 0.4])
