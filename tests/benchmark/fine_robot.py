@@ -6,8 +6,6 @@ import math
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from calib import se3
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.robot import BASELINE_M, CAMERA_HEIGHT_M, SimulatedRobot
@@ -20,12 +18,15 @@ ALONG_M, ACROSS_M = 0.05, 0.02
 
 
 class Build(NamedTuple):
-    """Dimensions of a robot, m."""
+    """Dimensions of a robot, and where its cameras are on the base."""
 
     camera_height_m: float = CAMERA_HEIGHT_M
     baseline_m: float = BASELINE_M
     radius_m: float = 0.2
     height_m: float = 1.2
+    ahead_m: float = 0.0
+    left_m: float = 0.0
+    turned_deg: float = 0.0
 
     @property
     def settings(self) -> list[str]:
@@ -41,14 +42,16 @@ BUILDS: Final = {
     "low": Build(0.45, 0.12, 0.18, 0.7),
     "lowest": Build(0.3, 0.1, 0.16, 0.5),
     "tall": Build(1.3, 0.2, 0.3, 1.6),
+    "mast ahead": Build(ahead_m=0.2, left_m=0.1, turned_deg=35.0),
 }
 
 
 def fine_robot(size_px: int, build: Build = BUILDS[USUAL]) -> SimulatedRobot:
     """Return a robot with images of a size, of at least SIDE_RAYS rays along a side."""
     rig = make_rig(size=size_px, baseline_m=build.baseline_m)
+    R_base_rig = se3.rotation_exp([0.0, 0.0, math.radians(build.turned_deg)])
     return SimulatedRobot(
-        replace(rig, T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, build.camera_height_m])),
+        replace(rig, T_base_rig=se3.transform(R_base_rig, [build.ahead_m, build.left_m, build.camera_height_m])),
         radius_m=build.radius_m,
         height_m=build.height_m,
         samples=math.ceil(SIDE_RAYS / size_px),
