@@ -140,9 +140,9 @@ def hidden_from(
 
     The sum of log-odds from a range to the end of the way is that of all less that of what is nearer: it is largest
     from where the latter is least. Each disparity counts once, however many cells it has.
-    hidden (H, W): log-odds of cells; was_free, taken (H, W): 1 where so. origin (5,): place in cells, size of a cell
-    [m], longest way [m], disparity at 1 m. bounds (2,): least sum, and gap [m] in what was free that ends a way: the
-    floor behind an object there may be hidden by it.
+    hidden (H, W): log-odds of cells; was_free, taken (H, W): 1 where so. origin (5,): viewpoint in cells, size of a
+    cell [m], longest way [m], disparity at 1 m. bounds (2,): least sum, and gap [m] in what was free that ends a way:
+    the floor behind an object there may be hidden by it.
     """
     height, width = hidden.shape
     cell, longest, at_1m = origin[2], origin[3], origin[4]

@@ -99,7 +99,10 @@ class MovingTracker:
         self._tracks.clear()
 
     def update(self, stamp_ns: int, T_odom_eye: Array, arrivals: Arrivals) -> tuple[MovingObstacle, ...]:
-        """Return the moving obstacles after a pair, by what has come onto free floor."""
+        """Return the moving obstacles after a pair, by what has come onto free floor about the viewpoint.
+
+        T_odom_eye (4, 4): pose of the viewpoint, with the axes of the base.
+        """
         # 1. Predict the tracks.
         for track in self._tracks:
             track.predict(stamp_ns)

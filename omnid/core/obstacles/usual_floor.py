@@ -31,7 +31,7 @@ GAP_M: Final = 0.1  # Length of floor that was not free lately and ends a free w
 
 
 class Arrivals(NamedTuple):
-    """Ranges of what has come onto floor that was free, by one pair."""
+    """Ranges from the viewpoint of what has come onto floor that was free, by one pair."""
 
     ranges_m: Floats  # (SECTORS,) from which on that floor is hidden, NaN where it is not
     sigma_m: Floats  # (SECTORS,)
@@ -66,8 +66,8 @@ class UsualFloor:
     ) -> tuple[Array, Flags]:
         """Return the ranges (N,) [m] from which on floor is hidden, NaN where it is not, and the cells (H, W) behind.
 
-        odds (H, W): log-odds of `compare`; was_free: lately; taken: occupied by an object. origin (5,): place [cells],
-        size of a cell [m], longest range [m], disparity at 1 m; azimuths (N,) of the directions in odom.
+        odds (H, W): log-odds of `compare`; was_free: lately; taken: occupied by an object. origin (5,): viewpoint
+        [cells], size of a cell [m], longest range [m], disparity at 1 m; azimuths (N,) of the directions in odom.
         """
         ranges_m = np.empty(len(azimuths))
         flags = was_free.view(np.uint8), taken.view(np.uint8)
