@@ -108,7 +108,7 @@ class MovingTracker:
             track.predict(stamp_ns)
         # 2. Give each cluster to the nearest track within the gate, or begin one.
         waiting = list(self._tracks)
-        for cluster in self._clusters(T_odom_eye, *arrivals):
+        for cluster in self._clusters(T_odom_eye, arrivals):
             distances = [float(np.linalg.norm(track.place - cluster.middle)) for track in waiting]
             if distances and min(distances) <= GATE_M:
                 waiting.pop(int(np.argmin(distances))).update(cluster)
@@ -118,19 +118,23 @@ class MovingTracker:
         self._tracks = [track for track in self._tracks if (stamp_ns - track.seen_ns) * 1e-9 <= FORGOTTEN_S]
         return tuple(found for track in self._tracks if (found := track.obstacle()) is not None)
 
-    def _clusters(self, T_odom_eye: Array, arrived_m: RangeScan, sigma_m: RangeScan) -> list[_Cluster]:
+    def _clusters(self, T_odom_eye: Array, arrivals: Arrivals) -> list[_Cluster]:
         """Return the clusters that are narrow enough."""
+        arrived_m, sigma_m = arrivals.ranges_m, arrivals.sigma_m
         near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
         found = []
         for sectors in surfaces(np.where(near, arrived_m, np.nan), sigma_m):
-            at = arrived_m[sectors, None] * self._directions[sectors]
+            # What hides the nearest floor in view is anywhere before it: as near as a person is who fills that angle.
+            most_m = PERSON_M * SECTORS / (math.tau * len(sectors))
+            share = np.where(arrivals.is_nearer[sectors], np.minimum(most_m / arrived_m[sectors], 1.0), 1.0)
+            at = (share * arrived_m[sectors])[:, None] * self._directions[sectors]
             width_m = float(np.linalg.norm(at[-1] - at[0]))
             if len(sectors) < LEAST_SECTORS or width_m > WIDEST_M:
                 continue
             middle = at.mean(axis=0) @ T_odom_eye[:2, :2].T + T_odom_eye[:2, 3]
             along = (middle - T_odom_eye[:2, 3]) / np.linalg.norm(middle - T_odom_eye[:2, 3])
             across = np.array([-along[1], along[0]])
-            along2 = SIGMA_M**2 + float((sigma_m[sectors] ** 2).mean())
+            along2 = SIGMA_M**2 + float(((share * sigma_m[sectors]) ** 2).mean())
             # Of a person who comes out of a hidden area only a part hides floor that was free.
             across2 = SIGMA_M**2 + (max(PERSON_M - width_m, 0.0) / 2) ** 2
             covariance = along2 * np.outer(along, along) + across2 * np.outer(across, across)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.grid_ring import GridRing
-from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.core.stereo.tiles import tile_columns
 
 Array = NDArray[np.float64]
@@ -65,5 +64,5 @@ def without(ring: GridRing, unwatched: Flags) -> GridRing:
         np.where(unwatched, nan, ring.ranges_m),
         np.where(unwatched, nan, ring.sigma_m),
         np.where(unwatched, np.float32(0), ring.free_m),
-        Arrivals(*(np.where(unwatched, nan, found) for found in ring.arrivals)),
+        ring.arrivals._replace(ranges_m=np.where(unwatched, nan, ring.arrivals.ranges_m)),
     )

@@ -35,6 +35,7 @@ class Arrivals(NamedTuple):
 
     ranges_m: Floats  # (SECTORS,) from which on that floor is hidden, NaN where it is not
     sigma_m: Floats  # (SECTORS,)
+    is_nearer: Flags  # (SECTORS,) the nearest floor in view is hidden: the range is the most that it may be
 
 
 class UsualFloor:
@@ -79,5 +80,6 @@ class UsualFloor:
 def arrivals_at(ranges_m: Array, nearest_m: float, at_1m: float) -> Arrivals:
     """Return what hides floor from ranges (N,) on; nearest_m: of the floor in view, at_1m: disparity at 1 m."""
     # An object that hides the nearest floor in view may be anywhere before it.
-    sigma_m = np.where(ranges_m < nearest_m, NEAR_SIGMA * ranges_m, ranges_m**2 * (BIN_SIGMA / at_1m))
-    return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32))
+    is_nearer = ranges_m < nearest_m
+    sigma_m = np.where(is_nearer, NEAR_SIGMA * ranges_m, ranges_m**2 * (BIN_SIGMA / at_1m))
+    return Arrivals(ranges_m.astype(np.float32), sigma_m.astype(np.float32), is_nearer)

@@ -70,7 +70,7 @@ class BaseAmongPeople(BaseAmongBoxes):
             self.moving = self.tracker.update(
                 now.stamp_ns,
                 T,
-                Arrivals(np.where(person < walls, ranges, math.nan), np.full(360, 0.01)),
+                Arrivals(np.where(person < walls, ranges, math.nan), np.full(360, 0.01), np.zeros(360, bool)),
             )
             points = tuple(
                 MovingPoint(

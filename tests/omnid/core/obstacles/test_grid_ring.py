@@ -13,7 +13,8 @@ CELLS, CELL_M, MAX_RANGE_M = 120, 0.05, 2.5
 MIDDLE = CELLS // 2
 NEAREST_M = np.full(SECTORS, 0.8)
 VIEW = RingView(np.full(2, MIDDLE + 0.5), azimuths(), CELL_M, MAX_RANGE_M, NEAREST_M, gap_share=0.07, gap_m=0.1)
-ARRIVALS = Arrivals(np.full(SECTORS, np.nan, np.float32), np.full(SECTORS, np.nan, np.float32))
+NOTHING = np.full(SECTORS, np.nan, np.float32)
+ARRIVALS = Arrivals(NOTHING, NOTHING, np.zeros(SECTORS, bool))
 AHEAD, LEFT, BEHIND = SECTORS // 2, 3 * SECTORS // 4, 0
 
 

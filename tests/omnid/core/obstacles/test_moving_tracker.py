@@ -15,6 +15,7 @@ from omnid.core.obstacles.usual_floor import Arrivals
 
 S = 1_000_000_000
 PERIOD_S = 0.2
+NOT_NEARER = np.zeros(SECTORS, bool)
 
 
 def arrived(x_m: float, people: list[tuple[float, float]], rng: np.random.Generator) -> np.ndarray:
@@ -38,7 +39,7 @@ def tracked(
         x_m = speed_mps * period_s * i
         ranges = arrived(x_m, [place], rng)
         T = se3.transform(np.eye(3), [x_m, 0, 0])
-        found.append(tracker.update(round(i * period_s * S), T, Arrivals(ranges, 0.01 * ranges**2)))
+        found.append(tracker.update(round(i * period_s * S), T, Arrivals(ranges, 0.01 * ranges**2, NOT_NEARER)))
     return found
 
 
@@ -83,8 +84,22 @@ def test_range_of_who_hides_the_nearest_floor_in_view_is_not_taken_for_a_stop() 
         is_near = ranges < 1.0
         ranges = np.where(is_near, 1.0, ranges).astype(np.float32)
         sigma_m = np.where(is_near, 0.3, 0.01 * ranges**2).astype(np.float32)
-        found = tracker.update(round(i * 0.1 * S), np.eye(4), Arrivals(ranges, sigma_m))
+        found = tracker.update(round(i * 0.1 * S), np.eye(4), Arrivals(ranges, sigma_m, is_near))
     assert found[0].vx_mps < -0.9
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_who_crosses_nearer_than_all_floor_in_view_is_as_near_as_a_person_of_that_angle(side: int) -> None:
+    """All floor in view, from 1.3 m on, is hidden over up to 60 degrees: 1.4 m there, a person 0.5 m away."""
+    tracker, rng, speed_mps = MovingTracker(), np.random.default_rng(1), 1.2
+    for i in range(16):
+        y_m = side * (1.3 - speed_mps * 0.1 * i)
+        ranges = np.where(np.isfinite(arrived(0.0, [(0.5, y_m)], rng)), np.float32(1.3), np.float32(np.nan))
+        arrivals = Arrivals(ranges, 0.3 * ranges, np.isfinite(ranges))
+        found = tracker.update(round(i * 0.1 * S), np.eye(4), arrivals)
+        if i >= 6:
+            assert len(found) == 1 and math.dist((found[0].x_m, found[0].y_m), (0.5, y_m)) < 0.25
+            assert found[0].vy_mps * side == pytest.approx(-speed_mps, rel=0.35)
 
 
 def test_a_person_who_stops_is_no_longer_moving() -> None:

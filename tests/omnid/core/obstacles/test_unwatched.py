@@ -50,7 +50,7 @@ def test_spans_are_named_counter_clockwise_from_ahead() -> None:
 def test_unwatched_sectors_have_neither_range_nor_free_floor() -> None:
     """No range, no free floor, and the rest as it was."""
     ranges = np.full(SECTORS, 2.0, np.float32)
-    seen = GridRing(ranges, 0.1 * ranges, ranges, Arrivals(ranges, 0.1 * ranges))
+    seen = GridRing(ranges, 0.1 * ranges, ranges, Arrivals(ranges, 0.1 * ranges, np.zeros(SECTORS, bool)))
     where = np.arange(SECTORS) < 90
     found = without(seen, where)
     assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any()
