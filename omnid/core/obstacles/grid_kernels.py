@@ -63,7 +63,7 @@ def gather(
                 first = last = round(at)
             near = min(math.floor(at_1m / (r - 0.5 * cell_m)), bins - 1)
             far = math.floor(at_1m / (r + 0.5 * cell_m))
-            if far > near:
+            if far > near:  # nearer than the last disparity that is compared
                 continue
             last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
             first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
