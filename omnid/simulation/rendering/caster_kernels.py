@@ -19,8 +19,8 @@ Rows = tuple[Floats, Floats, Floats]  # x, y, z (N,), each contiguous: loops ove
 # Least cosine between a ray and a rectangle's normal in a sample's footprint.
 MIN_SLANT = np.float32(0.02)
 # Columns of a surface: unit normal (3), fractions u and v per metre (3 each); distance along the normal, u and v of the
-# frame's origin; brightness, texels per m^2.
-SURFACE_COLUMNS = 14
+# frame's origin; brightness, texels per m^2, least distance from the origin of any ray.
+SURFACE_COLUMNS = 15
 ZERO, HALF, ONE, FAR_M = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(np.inf)
 # Fractions u, v of a rectangle: it reaches beyond its outline by the rounding, so that no ray passes between two walls.
 LEAST, MOST = np.float32(-2e-6), np.float32(1.0 + 2e-6)
@@ -47,8 +47,8 @@ def bilinear(
 @inner
 def take_nearer(
     number: np.int32, surface: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
-) -> None:
-    """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays."""
+) -> int:
+    """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays; return of how many."""
     n0, n1, n2, u0, u1, u2, v0, v1, v2 = (
         surface[0],
         surface[1],
@@ -62,6 +62,7 @@ def take_nearer(
     )
     n, u, v = surface[9], surface[10], surface[11]
     (x, y, z), (a, b, c) = rays, origins
+    hits = 0
     for i in range(len(x)):
         s = -(n + n0 * a[i] + n1 * b[i] + n2 * c[i]) / (n0 * x[i] + n1 * y[i] + n2 * z[i])
         px, py, pz = a[i] + s * x[i], b[i] + s * y[i], c[i] + s * z[i]
@@ -71,6 +72,17 @@ def take_nearer(
         is_hit = (s > ZERO) & (s < distance[i]) & inside
         distance[i] = s if is_hit else distance[i]
         nearest[i] = number if is_hit else nearest[i]
+        hits += is_hit
+    return hits
+
+
+@inner
+def farther(distance: Floats, limit: np.float32) -> int:
+    """Return how many distances (N,) are larger than a limit."""
+    count = 0
+    for i in range(len(distance)):
+        count += distance[i] > limit
+    return count
 
 
 @inner
@@ -144,8 +156,8 @@ def cast(
 
     rays (3, N), origins (3, N) [m] in the camera frame, (3, 1) where all are the same; spacing (N,) [rad]; index (2, N)
     of pixel and pose; starts (M + 1,) of the tiles; poses (H, 3, 4) of the camera in the frame of the first one,
-    (1, 3, 4) where all are the same; seen (M, R): tile may see rectangle. surfaces (R, SURFACE_COLUMNS), in that frame.
-    pyramids (R, 2): first level, number of levels; levels (L, 3): first texel, height, width.
+    (1, 3, 4) where all are the same; seen (M, R): tile may see rectangle. surfaces (R, SURFACE_COLUMNS), in that frame,
+    by their least distance. pyramids (R, 2): first level, number of levels; levels (L, 3): first texel, height, width.
     """
     largest = starts[0]
     for tile in range(len(starts) - 1):
@@ -157,6 +169,7 @@ def cast(
     for k in range(3):
         for i in range(largest):
             moved[k, i] = ZERO
+    found = np.empty(len(surfaces), np.int64)
     for tile in range(len(starts) - 1):
         low, high = starts[tile], starts[tile + 1]
         count = high - low
@@ -174,21 +187,27 @@ def cast(
             ray = turned[0, :count], turned[1, :count], turned[2, :count]
         for i in range(count):
             nearest[i], distance[i] = -1, FAR_M
+        # The nearest rectangle comes first, so that none can be met any more once it is farther than all rays reach.
+        hit = 0
         for k in range(len(surfaces)):
-            if seen[tile, k]:
-                take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count])
-        for k in range(len(surfaces)):
-            if seen[tile, k]:
-                place_on(
-                    np.int32(k),
-                    surfaces[k],
-                    ray,
-                    origin,
-                    spacing[low:high],
-                    nearest[:count],
-                    distance[:count],
-                    (places[0, :count], places[1, :count], places[2, :count]),
-                )
+            if not seen[tile, k]:
+                continue
+            if farther(distance[:count], surfaces[k, 14]) == 0:
+                break
+            if take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count]) > 0:
+                found[hit] = k
+                hit += 1
+        for n in range(hit):
+            place_on(
+                np.int32(found[n]),
+                surfaces[found[n]],
+                ray,
+                origin,
+                spacing[low:high],
+                nearest[:count],
+                distance[:count],
+                (places[0, :count], places[1, :count], places[2, :count]),
+            )
         for i in range(count):
             k = nearest[i]
             if k < 0:

@@ -2,7 +2,8 @@
 
 The camera's lift() defines the rays of a central camera. A non-central one has a ray of its own, with its own origin,
 for every pixel. Rays are cast in square tiles, and a rectangle is intersected only with the rays of the tiles whose
-cone of directions overlaps its own. With a rolling shutter every row has a pose of its own.
+cone of directions overlaps the pyramid through its corners, unless all of them meet something nearer. With a rolling
+shutter every row has a pose of its own.
 """
 
 from __future__ import annotations
@@ -21,10 +22,9 @@ from omnid.simulation.rendering.caster_kernels import SURFACE_COLUMNS, cast
 from omnid.simulation.rendering.ray_table import Floats, RayTable, cached_table
 from omnid.simulation.rendering.surfaces import Rectangle, Scene, Texture
 
-# A cone bounds a rectangle between its corners only if it is narrower than a half space.
-MAX_CONE_RAD = 1.5
 # Guards against division by zero at a rectangle through the viewpoint [m].
 MIN_DISTANCE_M = 1e-9
+MARGIN_M = 1e-4  # Subtracted from the least distance of a rectangle: rounding of float32 rays.
 # Number of scenes whose textures are kept.
 MAX_ATLASES = 3
 SMALLEST_PX = 8
@@ -49,7 +49,7 @@ def render_grey(
     reach_m = table.reach_m + float(np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max())
     corners = se3.apply(se3.inverse(poses[0]), np.array([r.corners for r in scene.rectangles]))
     distance_m = _distances_m(corners)
-    seen = tiles_that_see(table, corners, turned_rad, np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
+    seen = tiles_that_see(table, corners, turned_rad + np.arcsin(np.clip(reach_m / distance_m, 0, 1)))
     order = np.argsort(distance_m, kind="stable")
     atlas = cached_atlas([r.texture for r in scene.rectangles])
     image = np.zeros(table.shape[0] * table.shape[1], np.float32)
@@ -61,7 +61,7 @@ def render_grey(
         table.starts,
         np.ascontiguousarray((se3.inverse(poses[:1]) @ poses)[:, :3]),
         np.ascontiguousarray(seen[:, order]),
-        _surfaces([scene.rectangles[i] for i in order], poses[0]),
+        _surfaces([scene.rectangles[i] for i in order], poses[0], distance_m[order] - reach_m),
         atlas.pyramids[order],
         atlas.levels,
         atlas.texels,
@@ -79,8 +79,11 @@ def _row_poses(table: RayTable, T_world_rig: Array, row_twist: Array) -> tuple[A
     return T_world_rig @ se3.exp(rows[:, None] * row_twist), height * float(np.linalg.norm(row_twist[3:]))
 
 
-def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array) -> Floats:
-    """Return what the caster knows of rectangles (R, SURFACE_COLUMNS), in the camera frame."""
+def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array, nearest_m: Array) -> Floats:
+    """Return what the caster knows of rectangles (R, SURFACE_COLUMNS), in the camera frame.
+
+    nearest_m (R,): least distance of each from the origin of any ray.
+    """
     rows = np.empty((len(rectangles), SURFACE_COLUMNS))
     edges = np.array([np.column_stack([r.edge_u, r.edge_v, r.normal]) for r in rectangles])
     from_origin = T_world_cam[:3, 3] - np.array([r.origin for r in rectangles])
@@ -89,21 +92,24 @@ def _surfaces(rectangles: Sequence[Rectangle], T_world_cam: Array) -> Floats:
     rows[:, 9:12] = np.einsum("rij,rj->ri", u_v_n, from_origin)[:, [2, 0, 1]]
     rows[:, 12] = [r.brightness for r in rectangles]
     rows[:, 13] = [r.texture.size / (r.width_m * r.height_m) for r in rectangles]
+    rows[:, 14] = nearest_m - MARGIN_M
     return rows.astype(np.float32)
 
 
-def tiles_that_see(table: RayTable, corners: Array, turned_rad: float, aside_rad: Array) -> NDArray[np.bool_]:
-    """Return the mask (M, R) of tiles whose cone overlaps the cone through the corners (R, 4, 3) of a rectangle.
+def tiles_that_see(table: RayTable, corners: Array, aside_rad: Array) -> NDArray[np.bool_]:
+    """Return the mask (M, R) of tiles that may see the rectangles with corners (R, 4, 3) in the camera frame.
 
-    Rays that start off the camera's origin see a point up to aside_rad (R,) off its direction.
+    A tile sees none of what lies between the sides of a pyramid if its whole cone is beyond one of them. aside_rad
+    (R,): largest angle between a ray and the direction from the camera's origin of what it meets.
     """
-    rays = corners / np.maximum(np.linalg.norm(corners, axis=2, keepdims=True), MIN_DISTANCE_M)
-    axes = rays.sum(axis=1)
-    axes /= np.maximum(np.linalg.norm(axes, axis=1, keepdims=True), MIN_DISTANCE_M)
-    angles = np.arccos(np.clip(np.einsum("rci,ri->rc", rays, axes), -1, 1)).max(axis=1)
-    reached = np.where(angles > MAX_CONE_RAD, 2 * np.pi, angles + aside_rad + turned_rad)
-    between = np.arccos(np.clip(table.axes @ axes.T, -1, 1))
-    return np.asarray(between <= table.angles[:, None] + reached)
+    # 1. The four sides through the origin and an edge, with normals to the inside; 0 where an edge leads to the origin.
+    normals = np.cross(corners, np.roll(corners, -1, axis=1))
+    inwards = np.sign((normals * corners.mean(axis=1, keepdims=True)).sum(axis=(1, 2)))
+    normals *= (inwards[:, None] / np.maximum(np.linalg.norm(normals, axis=2), MIN_DISTANCE_M**2))[:, :, None]
+    # 2. The least sine, of all four, of the angle from a side to the tile's axis.
+    sines = np.min([table.axes @ normals[:, side].T for side in range(4)], axis=0)
+    reach_rad = np.minimum(table.angles[:, None] + aside_rad, np.pi / 2)
+    return np.asarray(sines >= -np.sin(reach_rad))
 
 
 def _distances_m(corners: Array) -> Array:

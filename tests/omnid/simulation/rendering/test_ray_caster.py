@@ -147,11 +147,16 @@ def test_distant_texture_is_averaged() -> None:
     assert image[inner].std() < 3
 
 
-def test_a_ray_traced_mirror_sees_what_all_tiles_would_show(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_real", [False, True])
+def test_a_camera_sees_what_all_tiles_would_show(monkeypatch: pytest.MonkeyPatch, is_real: bool) -> None:
     run = build("rooms", 3, SIZE, 5)
-    mounted = with_real_mirrors(run.rig, 3).lower
-    culled = render(run.scene, mounted, run.poses[2])
+    mounted = (with_real_mirrors(run.rig, 3) if is_real else run.rig).lower
+    twists = None, np.array([1.5e-3, 1.5e-3, 0, 0, 0, 0]), np.array([0, 0, 0, 0, 0, 6e-4])  # from row to row
+    found = [ray_caster.render_grey(run.scene, mounted, run.poses[2], 2, twist) for twist in twists]
+    # All rectangles are tried in all tiles, however far they are.
     monkeypatch.setattr(
         ray_caster, "tiles_that_see", lambda table, corners, *_: np.ones((len(table.angles), len(corners)), bool)
     )
-    np.testing.assert_array_equal(culled, render(run.scene, mounted, run.poses[2]))
+    monkeypatch.setattr(ray_caster, "MARGIN_M", 1e6)
+    wanted = [ray_caster.render_grey(run.scene, mounted, run.poses[2], 2, twist) for twist in twists]
+    np.testing.assert_array_equal(found, wanted)
