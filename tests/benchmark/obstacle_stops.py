@@ -35,7 +35,7 @@ from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, lowered, room_text
-from tests.benchmark.corridor_worlds import POLISHED, SPEED_MPS, world_text
+from tests.benchmark.corridor_worlds import CROSSING, LIKE_FLOOR, POLISHED, SPEED_MPS, like_the_floor, world_text
 from tests.benchmark.fine_robot import BUILDS, USUAL, fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.results import Column, ResultTable
@@ -65,14 +65,13 @@ CASES: Final = {
     "pole": 12.0,
     "white wall": 20.0,
     "free": 24.0,
-    "person crosses": 9.0,
-    "person crosses diagonally": 9.0,
     "edge 8 cm": 10.0,
     "edge 15 cm": 10.0,
     "edge 30 cm": 10.0,
     "edge 50 cm": 10.0,
     "ramp": 10.0,
 } | dict.fromkeys(KINDS, 12.0)
+CASES |= dict.fromkeys(CROSSING, 9.0)
 CASES |= dict.fromkeys(ROOMS, 40.0)  # The operator drives at random.
 UNEVEN: Final = ("edge", "ramp", AT_EDGE)  # Cases whose floor has two heights.
 CASES |= {POLISHED + case: seconds for case, seconds in CASES.items() if not case.startswith(UNEVEN)}
@@ -123,6 +122,8 @@ def run(
             world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
         if case.removeprefix(POLISHED) in KINDS:
             world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
+        if case == LIKE_FLOOR:
+            world = like_the_floor(world)
         towards_rad = None
         if case == AT_EDGE:
             world, edges = lowered(world, random.Random(seed))

@@ -1,7 +1,7 @@
 """Tracks of moving obstacles: clusters of the ring where it was free before, filtered in odom.
 
-Association to the nearest predicted track within a gate; a Kalman filter of constant velocity each (Bar-Shalom, Li,
-Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", 6.3).
+Association to the most likely track within a gate of its innovation; a Kalman filter of constant velocity each
+(Bar-Shalom, Li, Kirubarajan 2001, "Estimation with Applications to Tracking and Navigation", 3.6 and 6.3).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SECTOR_GAP: Final = 2  # sectors without range within a cluster. By judgement; n
 WIDEST_M: Final = 1.2  # Width of the widest cluster that may be a person or a cart. By judgement; not measured.
 LEAST_SECTORS: Final = 3  # because a person is five sectors wide at FARTHEST_M
 FARTHEST_M: Final = 4.0  # Farther clusters are ignored because stereo's noise there appears as motion.
-GATE_M: Final = 0.7  # Most distance of a cluster from a track's prediction. By judgement; not measured.
+GATE: Final = 13.8  # Most squared Mahalanobis distance of a cluster from a track: 99.9 % of two degrees of freedom.
 ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person. By judgement; not measured.
 SIGMA_M: Final = 0.06  # Least sigma of a cluster's middle: its visible side changes.
 PERSON_M: Final = 0.4  # width of a person: the rest of a narrower cluster may be on either side
@@ -62,6 +62,11 @@ class _Track:
     @property
     def place(self) -> Array:
         return np.array(self._filter.x[:2, 0])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (2, 2) of the place."""
+        return np.array(self._filter.P[:2, :2])
 
     def predict(self, stamp_ns: int) -> None:
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
@@ -106,12 +111,12 @@ class MovingTracker:
         # 1. Predict the tracks.
         for track in self._tracks:
             track.predict(stamp_ns)
-        # 2. Give each cluster to the nearest track within the gate, or begin one.
-        waiting = list(self._tracks)
-        for cluster in self._clusters(T_odom_eye, arrivals):
-            distances = [float(np.linalg.norm(track.place - cluster.middle)) for track in waiting]
-            if distances and min(distances) <= GATE_M:
-                waiting.pop(int(np.argmin(distances))).update(cluster)
+        # 2. Give the clusters to tracks, or begin one.
+        clusters = self._clusters(T_odom_eye, arrivals)
+        track_of = assignment(self._tracks, clusters)
+        for n, cluster in enumerate(clusters):
+            if n in track_of:
+                track_of[n].update(cluster)
             elif len(self._tracks) < MOST_TRACKS:
                 self._tracks.append(_Track(stamp_ns, cluster))
         # 3. Forget what was long not seen.
@@ -140,6 +145,26 @@ class MovingTracker:
             covariance = along2 * np.outer(along, along) + across2 * np.outer(across, across)
             found.append(_Cluster(middle, covariance, max(0.15, width_m / 2)))
         return found
+
+
+def assignment(tracks: list[_Track], clusters: list[_Cluster]) -> dict[int, _Track]:
+    """Return the track of each cluster, by its number, that has one: of all pairs the likeliest first.
+
+    The cost of a pair is -2 log of its likelihood without constants, `v S^-1 v + log |S|` of the innovation v; the
+    first part is bounded by the gate.
+    """
+    found: dict[int, _Track] = {}
+    if not tracks or not clusters:
+        return found
+    S = np.array([track.covariance for track in tracks])[:, None] + np.array([one.covariance for one in clusters])
+    v = np.array([one.middle for one in clusters]) - np.array([track.place for track in tracks])[:, None]
+    distance2 = np.einsum("kni,knij,knj->kn", v, np.linalg.inv(S), v)
+    cost = np.where(distance2 <= GATE, distance2 + np.log(np.linalg.det(S)), np.inf)
+    while np.isfinite(cost).any():
+        k, n = np.unravel_index(int(cost.argmin()), cost.shape)
+        found[int(n)] = tracks[k]
+        cost[k], cost[:, n] = np.inf, np.inf
+    return found
 
 
 def surfaces(ranges_m: RangeScan, sigma_m: RangeScan) -> list[NDArray[np.intp]]:

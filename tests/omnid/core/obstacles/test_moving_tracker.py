@@ -102,6 +102,21 @@ def test_who_crosses_nearer_than_all_floor_in_view_is_as_near_as_a_person_of_tha
             assert found[0].vy_mps * side == pytest.approx(-speed_mps, rel=0.35)
 
 
+def test_who_comes_out_from_behind_another_one_has_a_track_of_their_own() -> None:
+    """One walks away to a wall and stops there; the other one comes from there, 0.4 m beside, and is not the first."""
+    rng, tracker, period_s = np.random.default_rng(1), MovingTracker(), 0.1
+    found = []
+    for i in range(30):
+        first, second = (2.85, max(-0.3 - 1.5 * period_s * i, -1.9)), (3.2, -3.3 + 1.6 * period_s * i)
+        ranges = arrived(0.0, [first, second] if second[1] > -1.55 else [first], rng)
+        arrivals = Arrivals(ranges, 0.01 * ranges**2, NOT_NEARER)
+        found.append((second, tracker.update(round(i * period_s * S), np.eye(4), arrivals)))
+    seen = [(at, moving) for at, moving in found if -1.55 < at[1] < 1.0]
+    for at, moving in seen[2:]:
+        one = min(moving, key=lambda obstacle: math.dist((obstacle.x_m, obstacle.y_m), at))
+        assert math.dist((one.x_m, one.y_m), at) < 0.35 and one.vy_mps > 0.7
+
+
 def test_a_person_who_stops_is_no_longer_moving() -> None:
     found = tracked([(2.0, min(-2.0 + 0.8 * PERIOD_S * i, -0.5)) for i in range(40)])
     assert any(found[:12]) and not any(found[-8:])
