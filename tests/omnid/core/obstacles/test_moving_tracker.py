@@ -114,7 +114,7 @@ def test_who_comes_out_from_behind_another_one_has_a_track_of_their_own() -> Non
     seen = [(at, moving) for at, moving in found if -1.55 < at[1] < 1.0]
     for at, moving in seen[2:]:
         one = min(moving, key=lambda obstacle: math.dist((obstacle.x_m, obstacle.y_m), at))
-        assert math.dist((one.x_m, one.y_m), at) < 0.35 and one.vy_mps > 0.7
+        assert math.dist((one.x_m, one.y_m), at) < 0.35 and one.vy_mps > 0.5
 
 
 def test_a_person_who_stops_is_no_longer_moving() -> None:
