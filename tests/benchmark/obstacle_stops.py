@@ -42,6 +42,7 @@ from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
 
 Array = NDArray[np.float64]
+Pose = tuple[float, float, float]  # x, y [m], heading [rad]
 
 SIZE_PX: Final = 512
 RATE_HZ: Final = 10.0
@@ -164,12 +165,7 @@ def judged(
     for tick in done.ticks:
         people.advance(tick.time_s, tick.pose[:2])
         before, places = places, people.places()
-        walks.append(
-            any(
-                then != now and math.dist(now[:2], tick.pose[:2]) < WALKS_M
-                for then, now in zip(before, places, strict=True)
-            )
-        )
+        walks.append(_walks(before, places, tick.pose))
         segments = np.concatenate([standing, footprints(people.faces(), robot.height_m)])
         x_m, y_m, heading_rad = tick.pose
         ahead_m.append(
@@ -210,7 +206,13 @@ def judged(
     )
 
 
-def room_ahead_m(segments: Array, pose: tuple[float, float, float], radius_m: float) -> float:
+def _walks(before: Sequence[Pose], now: Sequence[Pose], robot: Pose) -> bool:
+    """Return whether somebody walks near the robot, by people's places before and now."""
+    pairs = zip(before, now, strict=True)
+    return any(then != place and math.dist(place[:2], robot[:2]) < WALKS_M for then, place in pairs)
+
+
+def room_ahead_m(segments: Array, pose: Pose, radius_m: float) -> float:
     """Return the way [m] from a disc to the nearest of segments (N, 2, 2) that stands ahead or a little beside it."""
     x_m, y_m, heading_rad = pose
     c, s = math.cos(heading_rad), math.sin(heading_rad)

@@ -104,14 +104,8 @@ class VisualOdometry:
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
-        too_fast_mps = 0.0
-        if estimate is not None and self._has_support(estimate) and not self._is_plausible(estimate, dt_s):
-            too_fast_mps = self._moved_m(estimate) / self._since_fix_s(dt_s)
-        # Where it is not known how far the vehicle has come, a few landmarks agree on a wrong pose, too.
-        is_doubtful = estimate is None or estimate.inliers < min(
-            self._limits.good_inliers, AGAIN_SHARE * estimate.visible
-        )
-        if searched and after_break and (is_doubtful or not self._is_plausible(estimate, dt_s)):
+        too_fast_mps = self._too_fast_mps(estimate, dt_s) if estimate and self._has_support(estimate) else 0.0
+        if searched and after_break and (self._is_doubtful(estimate) or not self._is_plausible(estimate, dt_s)):
             estimate = self.relocalise(frame, self._exposures.predicted(frame, dt_s))
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
@@ -172,18 +166,24 @@ class VisualOdometry:
 
     def _is_plausible(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
-        if estimate is None or not self._has_support(estimate):
-            return False
-        return self._moved_m(estimate) <= self._limits.max_speed_mps * self._since_fix_s(dt_s)
+        return estimate is not None and self._has_support(estimate) and not self._too_fast_mps(estimate, dt_s)
+
+    def _is_doubtful(self, estimate: PoseEstimate | None) -> bool:
+        """True if so few landmarks agree that the pose may be wrong where it is not known how far the vehicle came."""
+        if estimate is None:
+            return True
+        return estimate.inliers < min(self._limits.good_inliers, AGAIN_SHARE * estimate.visible)
+
+    def _too_fast_mps(self, estimate: PoseEstimate, dt_s: float) -> float:
+        """Return the speed that a pose implies since the last accepted one if it is impossible, else 0."""
+        moved_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
+        since_s = self._since_fix_s(dt_s)
+        return moved_m / since_s if moved_m > self._limits.max_speed_mps * since_s else 0.0
 
     def _has_support(self, estimate: PoseEstimate) -> bool:
         """True if the pose has enough inliers."""
         limits = self._limits
         return estimate.inliers >= limits.min_inliers and estimate.inlier_ratio >= limits.min_inlier_ratio
-
-    def _moved_m(self, estimate: PoseEstimate) -> float:
-        """Return the way from the last pose."""
-        return float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
 
     def _since_fix_s(self, dt_s: float) -> float:
         """Return the time since the last accepted pose, at a frame dt_s after the one before."""

@@ -157,21 +157,26 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     opposed = [each for each in (found, *near) if contradict(each, cheapest)]
     best = min([cheapest, *opposed], key=lambda each: _apart_m(each, T_predicted))
     # 2. The others are at the same pose, or runners-up if they contradict the best one or cost little more.
-    candidates = [*views, *(each for each in opposed if all(each is not view for view in views))]
+    candidates = list({id(each): each for each in (*views, *opposed)}.values())
     steps = [(each, se3.log(se3.inverse(best.T_odom_rect) @ each.T_odom_rect)) for each in candidates]
     same = [each for each, step in steps if np.linalg.norm(step[:3]) <= SAME_M]
     runners_up = [
         step
         for each, step in steps
-        if np.linalg.norm(step[:3]) > SAME_M
-        and (contradict(each, best) or (each.cost - best.cost) * min(best.in_view, each.in_view) < RUNNER_UP_COST)
-        and _apart_m(each, T_predicted) < reach_m
+        if np.linalg.norm(step[:3]) > SAME_M and _rivals(each, best) and _apart_m(each, T_predicted) < reach_m
     ]
     farthest = max(runners_up, key=lambda step: float(np.linalg.norm(step[:3])), default=None)
+    # 3. Landmarks of contradicting poses that do not support the chosen one.
     wrong = [each.landmarks for each in candidates if contradict(each, best)]
     chosen = max(same, key=lambda estimate: estimate.inliers)
     contradicting = np.setdiff1d(np.concatenate(wrong), chosen.landmarks) if wrong else chosen.contradicting
     return replace(chosen, runner_up=farthest, contradicting=contradicting)
+
+
+def _rivals(other: PoseEstimate, best: PoseEstimate) -> bool:
+    """True if an estimate contradicts the best one or costs little more."""
+    excess = (other.cost - best.cost) * min(best.in_view, other.in_view)
+    return contradict(other, best) or excess < RUNNER_UP_COST
 
 
 def contradict(a: PoseEstimate, b: PoseEstimate) -> bool:

@@ -52,39 +52,48 @@ class MapCorrection:
         """Add loops and optimise the keyframes (ids) of a connected part, the oldest first, the newest last.
 
         fixed: keyframes (ids) that stay where they are; if there is none in the part, the oldest one stays.
-
-        Loops that the map fits already wait for others, so that its cost does not grow with the square of the map.
         """
+        # 1. Loops that the map fits already wait for others, so that its cost does not grow with the square of the map.
         self._places.links += loops
         self._waiting += len(loops)
         if all(map(self._fits, loops)) and self._waiting <= LOOPS_THAT_FIT + len(part) // KEYFRAMES_PER_LOOP:
             return
         self._waiting = 0
         self.optimisations += 1
+        # 2. The drift that the loops show, which weighs odometry in the graph.
         among = set(part)
         links = [link for link in self._places.links if link.a in among]
         self.factor = self._drift_factor(links)
-        # What joins two keyframes that stay says nothing of those that move.
+        # 3. The poses by all links but those between keyframes that stay, which say nothing of the others.
         links = [link for link in links if link.a not in fixed or link.b not in fixed]
         joined = {id for link in links for id in (link.a, link.b)}
         part = [id for id in part if id not in fixed or id in joined]
+        stays = np.array([id in fixed for id in part])
+        poses = np.array([self._places.poses[id] for id in part])
+        result = optimise(poses, self._edges(part, links), stays if stays.any() else None)
+        self._places.move(dict(zip(part, result.poses, strict=True)))
+        # 4. Loops that the graph refuses go.
+        self._refuse([links[n] for n in np.flatnonzero(result.weights < ACCEPTED)], links)
+        # 5. The covariance of later poses in the map.
+        newest = self._places.keyframes[part[-1]]
+        if np.isfinite(result.covariance).all():
+            self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
+
+    def _edges(self, part: list[int], links: list[Link]) -> PoseEdges:
+        """Return the edges of the graph of a part (ids of keyframes) by its links."""
         row = {id: n for n, id in enumerate(part)}
-        edges = PoseEdges(
+        return PoseEdges(
             np.array([(row[link.a], row[link.b]) for link in links]),
             np.array([link.T_a_b for link in links]),
             np.array([self._covariance(link) for link in links]),
             np.array([link.is_loop for link in links]),
         )
-        stays = np.array([id in fixed for id in part])
-        result = optimise(np.array([self._places.poses[id] for id in part]), edges, stays if stays.any() else None)
-        self._places.move(dict(zip(part, result.poses, strict=True)))
-        bad = {id(link) for link, weight in zip(links, result.weights.tolist(), strict=True) if weight < ACCEPTED}
-        bad -= {id(link) for link in _recent_loops(links)}
+
+    def _refuse(self, refused: list[Link], links: list[Link]) -> None:
+        """Remove refused links of some from the map, but the newest loops."""
+        bad = {id(link) for link in refused} - {id(link) for link in _recent_loops(links)}
         self._places.links = [link for link in self._places.links if id(link) not in bad]
         self.rejected += len(bad)
-        newest = self._places.keyframes[part[-1]]
-        if np.isfinite(result.covariance).all():
-            self._anchor = _Anchor(newest.T_odom_rect, newest.covariance, result.covariance)
 
     def _fits(self, loop: Link) -> bool:
         """True if the poses of a map agree with a loop."""
