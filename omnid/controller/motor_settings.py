@@ -45,7 +45,7 @@ class MotorSettings:
     port: str = knob("", "serial port of the motor controller, or simulated; empty: none")
     protocol: str = knob("line", "protocol of the motor controller", choices=tuple(PROTOCOLS))
     baud: int = knob(0, "bits per second; 0: the protocol's own", low=0, high=4_000_000)
-    rate_hz: float = knob(20.0, "commands per second", low=1, high=200)
+    rate_hz: float = knob(20.0, "commands per second", low=5, high=200)
     watchdog_ms: int = knob(
         500, "the motor controller stops the wheels by itself after so long without a command, ms", low=50, high=10_000
     )

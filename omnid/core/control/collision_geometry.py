@@ -6,7 +6,7 @@ The base moves with (v, w): in its own frame a point at rest turns with -w about
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -115,6 +115,37 @@ def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point
     """Return the points within reach of a pose, in its axes."""
     reach2 = reach_m * reach_m
     return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])
+
+
+def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps: float) -> bool:
+    """Return whether a base that has come to this pose drove over a point that was ahead of the edge that leads.
+
+    Such a point is inside the outline or behind it, where a motion straight on does not take it nearer.
+    """
+    side = math.copysign(1.0, velocity_mps)
+    edge_m = outline.front_m if side > 0.0 else outline.rear_m
+    way_m = math.hypot(pose.x_m, pose.y_m)
+    ahead = [(x, y) for x, y in points if side * x >= edge_m - TINY]
+    return any(
+        edge_m - way_m <= side * x < edge_m and abs(y) <= outline.half_width_m for x, y in seen_from(pose, ahead)
+    )
+
+
+def long_runs(flags: Sequence[bool], least: int) -> list[int]:
+    """Return the indices of the true flags in runs of at least so many, around the full turn."""
+    count = len(flags)
+    if all(flags):
+        return list(range(count))
+    start = flags.index(False)
+    found: list[int] = []
+    run: list[int] = []
+    for k in (*range(start, count), *range(start + 1)):
+        if flags[k]:
+            run.append(k)
+            continue
+        found += run if len(run) >= least else []
+        run = []
+    return found
 
 
 @lru_cache(maxsize=2)

@@ -13,7 +13,15 @@ from collections import deque
 from typing import Final, NamedTuple
 
 from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
-from omnid.core.control.collision_geometry import TINY, Outline, contact_s, sector_directions, within_reach
+from omnid.core.control.collision_geometry import (
+    TINY,
+    Outline,
+    contact_s,
+    driven_over,
+    long_runs,
+    sector_directions,
+    within_reach,
+)
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.nanoseconds import S_PER_NS
@@ -92,8 +100,7 @@ class CollisionMonitor:
         """deceleration_mps2: with which the base can brake."""
         self._settings, self._deceleration = settings, deceleration_mps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
-        # Nothing may be free any more where the images show nothing: no way is left ahead, but room for turns at the
-        # sides.
+        # Where the images show nothing, no way is left ahead, but room for turns at the sides.
         side_m = settings.half_width_m + settings.side_m + BESIDE_M
         self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
         self._stamp_ns: int | None = None
@@ -127,7 +134,7 @@ class CollisionMonitor:
         self._unknown, self._gaps, self._unwatched = [], [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
-        for k in _in_long_runs(unknown):
+        for k in long_runs(unknown, UNKNOWN_SECTORS):
             azimuth, c, s = directions[k]
             begins_m = self._around.edge_m(azimuth) if unwatched[k] else max(free[k], self._outline.edge_m(azimuth))
             ends = self._unwatched if unwatched[k] else self._gaps if has_gap[k] else self._unknown
@@ -170,7 +177,7 @@ class CollisionMonitor:
         if not settings.check or (motion.velocity_mps == 0.0 and motion.yaw_rate_radps == 0.0):
             return FREE
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        is_stale = not abs(age_s) <= settings.stale_s
+        is_stale = not abs(age_s) <= settings.stale_s or self._has_forgotten()
         if is_stale and settings.stale == IGNORE:
             return FREE
         if is_stale or (self._is_blind and settings.stale != IGNORE):
@@ -181,8 +188,15 @@ class CollisionMonitor:
         moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
         speed_mps = abs(motion.velocity_mps)
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
-        reach_m = way_m + self._outline.radius_m + settings.stop_m + settings.slow_m
-        # 3. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
+        around_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
+        reach_m = way_m + self._outline.radius_m + around_m
+        # 3. What the base has driven over since the ring's images is not passed as if it were free.
+        unknown = self._unknown + self._gaps, settings.unknown, UNKNOWN
+        known = (self._points, STOP, BLOCKED), unknown, (self._unwatched, settings.stale, UNWATCHED)
+        for points, policy, reason in known if speed_mps > TURN_MPS else ():
+            if policy == STOP and driven_over(self._outline, points, moved, motion.velocity_mps):
+                return Allowance(0.0, reason)
+        # 4. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
         points = within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
@@ -295,6 +309,10 @@ class CollisionMonitor:
         edge_mps = max(abs(motion.velocity_mps), abs(motion.yaw_rate_radps) * self._outline.radius_m)
         return FREE if edge_mps <= speed_mps else Allowance(speed_mps / edge_mps, reason)
 
+    def _has_forgotten(self) -> bool:
+        """Return whether motions since the ring's images are remembered no more: it is not known where they are."""
+        return len(self._motions) == MOST_MOTIONS and self._motions[0][0] > (self._stamp_ns or 0)
+
     def _moved_since(self, stamp_ns: int, now_ns: int) -> Pose2:
         """Return the pose of the base now in the frame of the ring, by the motions since its images."""
         pose, until_ns = IDENTITY, now_ns
@@ -309,20 +327,3 @@ class CollisionMonitor:
         for motion, dt_s in reversed(pieces):
             pose = composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, dt_s))
         return pose
-
-
-def _in_long_runs(unknown: list[bool]) -> list[int]:
-    """Return the unknown sectors in runs of at least UNKNOWN_SECTORS, around the full turn."""
-    count = len(unknown)
-    if all(unknown):
-        return list(range(count))
-    start = unknown.index(False)
-    found: list[int] = []
-    run: list[int] = []
-    for k in (*range(start, count), *range(start + 1)):
-        if unknown[k]:
-            run.append(k)
-            continue
-        found += run if len(run) >= UNKNOWN_SECTORS else []
-        run = []
-    return found

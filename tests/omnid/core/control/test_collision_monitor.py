@@ -247,6 +247,38 @@ def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: 
     assert missing.step(S, AHEAD).velocity_mps == pytest.approx(expected_mps)
 
 
+@pytest.mark.parametrize("age_s", [0.1, 0.2, 0.3, 0.4, 0.5])
+@pytest.mark.parametrize("speed_mps", [0.6, -0.6, 1.5])
+def test_an_older_ring_makes_the_base_no_freer(age_s: float, speed_mps: float) -> None:
+    """What was the end of the floor in front of the base is inside its outline by now, or behind it."""
+    nothing_ahead = tuple(0.0 if abs(abs(k - 179.5) - 180 * (speed_mps < 0)) < 60 else 6.0 for k in range(360))
+    ranges = tuple(math.nan if free == 0.0 else math.inf for free in nothing_ahead)
+    for unwatched in ((), tuple(free == 0.0 for free in nothing_ahead)):
+        monitor = CollisionMonitor(SETTINGS, 1.5)
+        monitor.set_ring(ControllerRing(10 * S, ranges, nothing_ahead, unwatched=unwatched))
+        for tick in range(round(20 * age_s)):
+            monitor.follow(10 * S + tick * S // 20, Twist(speed_mps))
+        now_ns = 10 * S + round(age_s * S)
+        assert monitor.step(now_ns, Twist(speed_mps)) == Twist()
+        if age_s * abs(speed_mps) < SETTINGS.front_m:
+            assert monitor.step(now_ns, Twist(-speed_mps)) == Twist(-speed_mps), "it may back out"
+
+
+def test_a_ring_from_before_all_motions_that_are_remembered_is_stale() -> None:
+    monitor = CollisionMonitor(replace(SETTINGS, stale_s=10.0), 1.5)
+    monitor.set_ring(ControllerRing(10 * S, FREE_RING))
+    for tick in range(monitor_module.MOST_MOTIONS + 1):
+        assert monitor.step(10 * S + tick * S // 200, Twist(0.2)) == Twist(0.2)
+        monitor.follow(10 * S + tick * S // 200, Twist(0.2))
+    assert monitor.step(12 * S + S // 100, Twist(0.2)) == Twist()
+    assert monitor.reason == monitor_module.RING_STALE
+
+
+def test_what_is_beside_the_base_counts_as_far_as_the_settings_say() -> None:
+    allowed, reason = after(with_points((0.1, 2.0)), AHEAD, replace(SETTINGS, slow_side_m=2.5))
+    assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.NEAR
+
+
 def test_is_off_when_it_is_off() -> None:
     off = replace(SETTINGS, check=False)
     assert after(with_points((0.3, 0.0)), settings=off, age_s=9.0) == (AHEAD, "")

@@ -156,8 +156,22 @@ def check(
     return (low + high) / 2
 
 
+def drove_over(
+    settings: CollisionSettings, motion: Pair, before: Sequence[complex], now: Sequence[complex], way_m: float
+) -> bool:
+    """True if a point that was ahead of the leading edge is now behind that, between the sides, by the way at most."""
+    side = math.copysign(1.0, motion[0])
+    edge_m = settings.front_m if side > 0 else settings.rear_m
+    return abs(motion[0]) > TURN_MPS and any(
+        side * then.real >= edge_m
+        and 0 < edge_m - side * point.real <= way_m
+        and abs(point.imag) < settings.half_width_m
+        for then, point in zip(before, now, strict=True)
+    )
+
+
 def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
-    rng, shares = random.Random(1), []
+    rng, shares, over = random.Random(1), list[float](), 0
     for _ in range(220):
         settings, braking_mps2, motion = any_settings(rng), rng.uniform(0.05, 2.0), any_motion(rng)
         monitor = CollisionMonitor(settings, braking_mps2)
@@ -174,8 +188,14 @@ def test_the_share_is_that_of_a_sweep_after_any_way_since_the_images() -> None:
         monitor.set_ring(ControllerRing(ring_ns, tuple(ranges)))
         allowed = monitor.step(now_ns, Twist(*motion))
         found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)
-        shares.append(check(settings, braking_mps2, motion, points, found))
         assert bool(monitor.reason) == (found < 1.0) and monitor.share == pytest.approx(found)
+        before = [cmath.rect(r, azimuth_rad(k)) for k, r in enumerate(ranges) if r < math.inf]
+        if drove_over(settings, motion, before, points, abs(place)):
+            over += 1
+            assert found == 0.0
+            continue
+        shares.append(check(settings, braking_mps2, motion, points, found))
+    assert over > 3
     reduced = [share for share in shares if 0.0 < share < 1.0]
     assert len(reduced) > 15 and shares.count(0.0) > 15 and shares.count(1.0) > 15
 
