@@ -151,6 +151,7 @@ class Controller:
             self._report(f"disarmed while the wheels stand: {arming.reason}; {UNTIL_ARMED}")
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, answer
         state.needs_request = arming.needs_request
+        state.halts, state.halted_by = arming.halts, arming.halted_by
         state.refused = commands.refused
         state.source = "" if self._law.reason or commands.current is None else commands.current.source
 

@@ -25,6 +25,8 @@ class ControllerState:
     armed: bool = False
     disarmed_by: str = STARTED  # empty while armed
     needs_request: bool = False  # only cmd/arm lets the wheels turn again
+    halts: int = 0  # how often a stop or a fault has made cmd/arm necessary
+    halted_by: str = ""  # the newest of their reasons, kept while armed again
     arm_answer: ArmAnswer = NO_ANSWER
     source: str = ""  # source of the commands that drive; empty while none does
     failed: bool = False  # the motor controller did not take the last command

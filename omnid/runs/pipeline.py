@@ -107,6 +107,8 @@ def wheel_state(state: ControllerState) -> WheelState:
         state.reason,
         state.source,
         state.obstacle if state.blocked else "",
+        state.halts,
+        state.halted_by,
     )
 
 

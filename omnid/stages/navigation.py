@@ -72,6 +72,7 @@ class NavigationStage:
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self._tie: KeyframeTie | None = None
+        self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._ring: ObstacleRing | None = None
         self._ring_points: Array = np.zeros((0, 2))  # (N, 2) positions in odom of what the ring shows
         self._seq = 0
@@ -102,6 +103,9 @@ class NavigationStage:
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
         T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
         self._seq = odometry.seq
+        if self._now is not None and self._now.resets != odometry.reset_counter:
+            # Poses in the map from before lead from another odom.
+            self._in_map, self._reset_ns = None, odometry.stamp_ns
         pose, speed_mps = planar(T_odom_base), float(velocity[0])
         obstacles = self._obstacles(odometry.stamp_ns)
         nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._half_width_m
@@ -137,11 +141,13 @@ class NavigationStage:
         return forecast(ring.moving, age_s) if ring is not None and 0 <= age_s <= RING_NS * 1e-9 else None
 
     def _place(self, update: PlaceUpdate) -> None:
+        if update.stamp_ns < self._reset_ns:
+            return
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
         T_map_odom = self._T_base_rig @ update.T_map_odom @ self._T_rig_base
         in_plane = in_outer_axes(T_map_base, covariance)[:2, :2]
         sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(in_plane)[-1])))
-        self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m)
+        self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m, update.stamp_ns)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
         self._tie = KeyframeTie(update.keyframe, planar(T_map_keyframe))
         self._routes.follow_map(update.keyframes)

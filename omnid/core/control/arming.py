@@ -72,6 +72,8 @@ class Arming:
         self.armed = False
         self.reason = STARTED  # why the base is disarmed: a requested stop, else the first fault; empty while armed
         self.answer = NO_ANSWER
+        self.halts = 0  # how often a stop or a fault has made a request necessary
+        self.halted_by = ""  # the newest of their reasons, kept while armed again
 
     @property
     def stop_asked(self) -> bool:
@@ -97,11 +99,14 @@ class Arming:
         fault: the fault that holds now, empty without one. longest_s: an older request is refused.
         """
         # 1. A fault or a requested stop disarms.
+        waited = self.reason if self.needs_request else ""
         self._touched |= fault in LATCHING
         if self.armed and fault:
             self.armed, self.reason = False, fault
         if self.stop_asked:
             self.armed, self.reason = False, ASKED
+        if self.needs_request and self.reason != waited:
+            self.halts, self.halted_by = self.halts + 1, self.reason
         # 2. The newest request is answered, and arms where nothing refuses it.
         request, self._request = self._request, None
         if request is not None:

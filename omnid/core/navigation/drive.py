@@ -35,7 +35,9 @@ class Drive:
     command_ns: int = 0  # stamp of the request
     paused: str = ""  # reason of the pause; empty: it is not paused
     waits: dict[NavigationState, float] = field(default_factory=dict)  # durations [s] of the waits by their reason
+    halts: int = 0  # WheelState.halts at the start, or when a person let it go on
     unlocalised_m: float = 0.0  # distance driven since the pose in the map was known
+    localised_ns: int = -1  # stamp of that pose
     nearest_m: float = math.inf  # length of the path that was left at the last progress
     heading_rad: float = 0.0  # heading at the last progress
     stuck_s: float = 0.0  # time since the last progress

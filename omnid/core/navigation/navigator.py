@@ -77,6 +77,7 @@ class Navigator:
             Follower(paths[0], self._settings),
             now.resets,
             command_ns,
+            halts=now.wheels.halts,
             heading_rad=float(now.pose[2]),
         )
         self.task, self.command_ns, self._stops = task, command_ns, 0
@@ -99,7 +100,7 @@ class Navigator:
             return "nothing is under way: give a goal, or repeat a route"
         refusal = refusal_to_drive(now, NavigationFrame.ODOM, math.inf)
         if not refusal:
-            self.drive.paused = ""
+            self.drive.paused, self.drive.halts = "", now.wheels.halts
             self.drive.waits.clear()
             self.drive.stuck_s = 0.0
         return refusal
@@ -157,12 +158,12 @@ class Navigator:
 
     def _check_wheels(self, drive: Drive, now: Situation) -> None:
         wheels = now.wheels
-        if wheels.armed or not wheels.needs_request:
-            return
-        if wheels.disarmed_by == ASKED:
+        # Between two poses it may have been armed again, which alone moves nothing.
+        by = wheels.halted_by if wheels.halts != drive.halts else wheels.disarmed_by if wheels.needs_request else ""
+        if by == ASKED:
             self._end(NavigationState.CANCELLED, ASKED)
-        else:
-            drive.paused = f"disarmed: {wheels.disarmed_by}: see to it, then {RESUME}"
+        elif by:
+            drive.paused = f"disarmed: {by}: see to it, then {RESUME}"
 
     def _advance(self, drive: Drive, now: Situation) -> None:
         """Add the pose to the trail, and its way to that without a pose in the map; begin again after a reset."""
@@ -177,12 +178,11 @@ class Navigator:
             drive.resets, drive.unlocalised_m = now.resets, math.inf
             if drive.frame is NavigationFrame.ODOM:
                 self._end(NavigationState.FAILED, "odometry has lost its map and begun again: ask again")
-        if (
-            now.in_map is not None
-            and now.in_map.state is MapState.LOCALIZED
-            and now.in_map.sigma_m <= self._settings.map_sigma_m
-        ):
-            drive.unlocalised_m = 0.0
+        in_map = now.in_map
+        if in_map is None or in_map.stamp_ns <= drive.localised_ns:  # no new pose in the map has come
+            return
+        if in_map.state is MapState.LOCALIZED and in_map.sigma_m <= self._settings.map_sigma_m:
+            drive.unlocalised_m, drive.localised_ns = 0.0, in_map.stamp_ns
 
     def _halt(self, drive: Drive, now: Situation) -> tuple[NavigationState, str] | None:
         """Return why the base must wait at this pose."""

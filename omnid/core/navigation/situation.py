@@ -25,6 +25,8 @@ class WheelState(NamedTuple):
     reason: str = ""  # why the wheels must stop now; empty: they may turn
     source: str = ""  # source of the commands that drive; empty while none does
     held_by: str = ""  # why the collision monitor stops the base; empty: it does not
+    halts: int = 0  # how often a stop or a fault has made cmd/arm necessary, also if it has come since
+    halted_by: str = ""  # the newest of their reasons
 
 
 class MapPosition(NamedTuple):
@@ -33,6 +35,7 @@ class MapPosition(NamedTuple):
     T_map_odom: Array  # x, y, yaw (3,), of the base's frames
     state: MapState
     sigma_m: float  # standard deviation of the base's position in the map
+    stamp_ns: int = 0  # of the pair to which it belongs
 
 
 class Situation(NamedTuple):

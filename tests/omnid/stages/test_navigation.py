@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.local_planner import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
@@ -281,9 +282,22 @@ def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path
         if is_new:
             robot.resets = 1
             robot.pass_on()
+            robot.pass_on()  # with the first place in the new odom
             answer = robot.updates[-1].answer
             assert answer is not None and "teach it again" in answer.refusal and not robot.updates[-1].teaching
             assert "not localised" in robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer.refusal
+
+
+def test_after_a_reset_a_place_from_before_it_is_none(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(GoalRequest(NavigationFrame.MAP, 5.0, 0.0))
+    robot.pass_on()
+    assert robot.updates[-1].state is NavigationState.DRIVING
+    robot.resets, robot.in_map = 1, False
+    for _ in range(3):
+        robot.pass_on()
+    assert robot.updates[-1].state is NavigationState.NOT_LOCALISED and robot.updates[-1].setpoint == STAND
 
 
 def test_the_state_is_given_each_second_while_nothing_happens(tmp_path: Path) -> None:

@@ -360,3 +360,30 @@ def test_a_contact_that_was_released_no_longer_counts() -> None:
     assert not arming.armed and not arming.needs_request
     arming.step("", 50, 1.0)
     assert arming.armed
+
+
+@pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
+def test_each_halt_that_needs_a_person_is_counted_also_where_it_is_armed_again_at_once(mode: str) -> None:
+    arming = Arming(mode)
+    arming.request(ArmRequest(1))
+    arming.step("", 2, 1.0)
+    halts = arming.halts
+    assert arming.armed
+    # A stop and a request that follows it, between two ticks.
+    arming.stop(10)
+    arming.request(ArmRequest(11))
+    arming.step("", 12, 1.0)
+    assert arming.armed and arming.halts == halts + 1 and arming.halted_by == safety_rules.ASKED
+    # A fault that needs a request, and a stop on top of it.
+    arming.step(BUMPER, 20, 1.0)
+    arming.step(BUMPER, 21, 1.0)
+    assert arming.halts == halts + 2 and arming.halted_by == BUMPER
+    arming.stop(30)
+    arming.step("", 31, 1.0)
+    assert arming.halts == halts + 3 and arming.halted_by == safety_rules.ASKED
+    # One that passes by itself is none.
+    arming.request(ArmRequest(40))
+    arming.step("", 41, 1.0)
+    arming.step("no pose", 50, 1.0)
+    arming.step("", 51, 1.0)
+    assert arming.halts == halts + 3 + (mode == MANUAL)

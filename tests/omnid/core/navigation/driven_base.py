@@ -89,7 +89,7 @@ class DrivenBase:
             self.state,
             self.resets,
             self.wheels,
-            MapPosition(self.T_map_odom, state, 0.02),
+            MapPosition(self.T_map_odom, state, 0.02, round(self.t_s * 1e9)),
             obstacle_m=self.obstacle_m,
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.control.safety_rules import COMMAND_STALE, IDLE
+from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, IDLE
 from omnid.core.navigation.drive import Navigation
 from omnid.core.navigation.follower import SETTLED, STAND
 from omnid.core.navigation.navigator import STOPS, Navigator
@@ -50,7 +50,11 @@ class Steps:
             WheelState(True, False),
             LOCALISED,
         )
-        return now._replace(**change)  # type: ignore[arg-type]
+        now = now._replace(**change)  # type: ignore[arg-type]
+        return now if now.in_map is None else now._replace(in_map=self._stamped(now.in_map, now.stamp_ns))
+
+    def _stamped(self, in_map: MapPosition, stamp_ns: int) -> MapPosition:
+        return in_map if in_map.stamp_ns else in_map._replace(stamp_ns=stamp_ns)
 
     def step(self, x_m: float, y_m: float = 0.0, step_s: float = 0.1, **change: object) -> Navigation:
         return self.navigator.step(self.at(x_m, y_m, step_s, **change))
@@ -90,6 +94,30 @@ def test_the_way_by_odometry_alone_is_measured_along_it_and_ends_where_the_map_i
     assert answer.reason == "the pose in the map is uncertain by 0.31 m, more than navigation.map_sigma_m = 0.3"
     assert steps.step(*places[-1], in_map=LOCALISED).state is NavigationState.DRIVING
     assert steps.step(places[-1][0] + 0.9, in_map=UNLOCALISED).state is NavigationState.DRIVING, "it begins again"
+
+
+def test_a_pose_in_the_map_counts_once() -> None:
+    """Where no more of them come, as the search for places hangs, the drive ends as without any."""
+    steps = Steps(NavigationFrame.MAP)
+    old = LOCALISED._replace(stamp_ns=round(steps.now_s * 1e9))
+    found = [steps.step(0.3 * k, in_map=old).state for k in range(1, 6)]
+    assert found.index(NavigationState.NOT_LOCALISED) + 1 == math.ceil(SETTINGS.unlocalised_m / 0.3)
+    assert steps.step(1.5).state is NavigationState.DRIVING
+
+
+@pytest.mark.parametrize(
+    ("halted_by", "state"), [(ASKED, NavigationState.CANCELLED), ("the bumper is pressed", NavigationState.PAUSED)]
+)
+def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
+    halted_by: str, state: NavigationState
+) -> None:
+    steps = Steps()
+    armed = WheelState(True, False, halts=1, halted_by=halted_by)
+    assert steps.step(0.1, wheels=armed).state is state
+    assert steps.step(0.1, wheels=armed).state is state
+    if state is NavigationState.PAUSED:
+        assert not steps.navigator.resume(steps.at(0.1, 0.0, wheels=armed))
+        assert steps.step(0.1, wheels=armed).state is NavigationState.DRIVING, "a person resumed it"
 
 
 def test_a_drive_in_odom_needs_no_map() -> None:
