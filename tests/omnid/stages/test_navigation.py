@@ -298,6 +298,10 @@ def test_after_a_reset_a_place_from_before_it_is_none(tmp_path: Path) -> None:
     for _ in range(3):
         robot.pass_on()
     assert robot.updates[-1].state is NavigationState.NOT_LOCALISED and robot.updates[-1].setpoint == STAND
+    late = PlaceUpdate(1, PERIOD_NS, np.eye(4), np.eye(4), UNIT, MapState.LOCALIZED, 3, np.eye(4))
+    robot.stage.process(late)
+    answer = robot.send(GoalRequest(NavigationFrame.MAP, 1.0, 0.0)).answer
+    assert answer is not None and answer.refusal.startswith("not localised in a map")
 
 
 def test_the_state_is_given_each_second_while_nothing_happens(tmp_path: Path) -> None:
