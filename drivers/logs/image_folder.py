@@ -38,6 +38,7 @@ _MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 # The year 2116: two stamps differ by what fits 64 bits, and trajectories (omnid/formats/tum.py) have the same limit.
 _MAX_STAMP_NS: Final = 2**62
 _LONGEST_GAP_NS: Final = 3600 * 10**9  # Stamps of two successive images that differ by more are not those of one log.
+_SHORTEST_STEP_NS: Final = 100_000  # no camera gives 10,000 images a second
 _NS_DIGITS: Final = 16
 _SECONDS: Final = re.compile(r"\d{1,12}(?:\.(\d{1,12}))?")
 
@@ -72,7 +73,7 @@ class ImageFolder:
         self._path, self._closed = path, False
         self._files = {folder.relative_to(path).as_posix(): list(_stamped(path, folder)) for folder in folders}
         for files in self._files.values():
-            _require_no_gap(sorted(files))
+            _require_plausible(sorted(files))
         if sum(map(len, self._files.values())) > MAX_IMAGES:
             raise DriverError(f"{self.name!r} contains more than {MAX_IMAGES} images; give a part of them")
 
@@ -132,8 +133,15 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
         yield _StampedFile(stamp_ns, topic, path)
 
 
-def _require_no_gap(files: Sequence[_StampedFile]) -> None:
-    """Raise DriverError where two images that follow each other lie more than an hour apart: a question, not a log."""
+def _require_plausible(files: Sequence[_StampedFile]) -> None:
+    """Raise DriverError where images that follow each other lie more than an hour, or next to no time, apart."""
+    steps_ns = sorted(after.stamp_ns - before.stamp_ns for before, after in pairwise(files))
+    if steps_ns and 0 < steps_ns[len(steps_ns) // 2] < _SHORTEST_STEP_NS:
+        raise DriverError(
+            f"the images beside {str(files[0].path)!r} are {steps_ns[len(steps_ns) // 2] / 1000:g} us apart by their "
+            "stamps: whole numbers of 16 and more digits are nanoseconds; give those in microseconds as seconds or "
+            f"nanoseconds since 1970 in {STAMP_FILES[0]}"
+        )
     for before, after in pairwise(files):
         gap_ns = after.stamp_ns - before.stamp_ns
         if gap_ns > _LONGEST_GAP_NS:
@@ -210,6 +218,8 @@ def _float(text: str) -> float | None:
         seconds = float(text)
     except ValueError:
         return None
+    if "_" in text:  # which Python takes for a mark between digits
+        return None
     return seconds if math.isfinite(seconds) and 0 <= seconds < _MAX_STAMP_NS * 1e-9 else None
 
 
@@ -217,7 +227,8 @@ def _parse_date(text: str) -> int | None:
     """Return the stamp of a date and time such as 2011-09-26 13:02:25.951199337 (UTC)."""
     whole, _, fraction = text.partition(".")
     try:
-        seconds = int(datetime.fromisoformat(whole).replace(tzinfo=UTC).timestamp())
+        date = datetime.fromisoformat(whole)
+        seconds = int((date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp())
     except ValueError:
         return None
     if fraction and not (fraction.isascii() and fraction.isdigit()):

@@ -205,8 +205,9 @@ class Synchronise:
         self._matcher.arrive(frame)
         waiting = self._matcher.couple()
         if waiting is not None:
-            self._matcher.wait(frame)
-            return self._decoded(*waiting)
+            pair = self._decoded(*waiting)
+            self._matcher.wait(frame)  # afterwards: it may push out the oldest one that waits
+            return pair
         image: Image | None = None
         while (partner := self._matcher.partner(frame)) is not None:
             image = self._decode(frame) if image is None else image

@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 # A larger step of odom would be a jump for the readers of published poses, as REP 105 has odom continuous: it raises
 # reset_counter, or the gap stays open.
 JUMP_M, JUMP_RAD = 0.5, math.radians(30)
+# Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
+MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # m, rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,3 +120,9 @@ class GapStep:
 def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
     """Return the estimate with more inliers, the first one of two equal ones."""
     return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
+
+
+def bounded(covariance: Array) -> Array:
+    """Return a covariance (6, 6), [t; r], whose sigmas are MOST_SIGMA at most; its correlations stay."""
+    share = np.minimum(1.0, MOST_SIGMA / np.sqrt(np.maximum(np.diag(covariance), 1e-30)))
+    return np.asarray(covariance * np.outer(share, share))

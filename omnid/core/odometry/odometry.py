@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate
+from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, bounded
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
@@ -288,7 +288,7 @@ class VisualOdometry:
         after_s = self._status.time_since_fix_s
         if after_s > before_s and not facts.carried:
             sigma = np.repeat([self._untracked_mps, UNTRACKED_SPEED_SIGMA], 3)
-            self._covariance = self._covariance + np.diag(sigma**2) * (after_s**2 - before_s**2)
+            self._covariance = bounded(self._covariance + np.diag(sigma**2) * (after_s**2 - before_s**2))
         if after_s == 0:
             self._untracked_mps = UNTRACKED_SPEED_SIGMA
 

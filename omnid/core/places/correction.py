@@ -39,14 +39,19 @@ class MapCorrection:
     def __init__(self, places: PlaceMap) -> None:
         self._places = places
         self._anchor: _Anchor | None = None
+        self._is_due = False  # the newest part has a place in the map only since the next loop
         self._waiting = 0  # loops since the last optimisation
         self.rejected = 0  # loops that the graph refused
         self.factor = 1.0  # factor on odometry's covariance that the loops show
         self.optimisations = 0
 
     def forget(self) -> None:
-        """Forget the covariance in the map: odom has been continued after a gap."""
-        self._anchor = None
+        """Forget the covariance in the map: odom has been continued after a gap, or its part has joined another one.
+
+        The next loops say how well its place in the map is known, also where the map fits them, as they have put it
+        there.
+        """
+        self._anchor, self._is_due = None, True
 
     def close(self, loops: list[Link], part: list[int], fixed: frozenset[int] = frozenset()) -> None:
         """Add loops and optimise the keyframes (ids) of a connected part, the oldest first, the newest last.
@@ -56,9 +61,10 @@ class MapCorrection:
         # 1. Loops that the map fits already wait for others, so that its cost does not grow with the square of the map.
         self._places.links += loops
         self._waiting += len(loops)
-        if all(map(self._fits, loops)) and self._waiting <= LOOPS_THAT_FIT + len(part) // KEYFRAMES_PER_LOOP:
+        may_wait = self._waiting <= LOOPS_THAT_FIT + len(part) // KEYFRAMES_PER_LOOP
+        if may_wait and not self._is_due and all(map(self._fits, loops)):
             return
-        self._waiting = 0
+        self._waiting, self._is_due = 0, False
         self.optimisations += 1
         # 2. The drift that the loops show, which weighs odometry in the graph.
         among = set(part)

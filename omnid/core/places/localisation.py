@@ -23,7 +23,7 @@ from omnid.core.places.hypotheses import Hypotheses, Hypothesis, length_m
 from omnid.core.places.keyframe_id import NO_KEYFRAME
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.map_parts import MapParts
-from omnid.core.places.map_pose import MapPose, OdometryFrame
+from omnid.core.places.map_pose import UNKNOWN_PLACE, MapPose, OdometryFrame
 from omnid.core.places.place_features import NOTHING, PlaceFeatures
 from omnid.core.places.place_map import PlaceKeyframe, PlaceMap, by_odometry
 from omnid.core.places.place_search import NEAR_M, Expected, PlaceSearch
@@ -101,11 +101,10 @@ class MapLocaliser:
             # 2. Keep the keyframe, linked to the one before by odometry.
             if is_keyframe:
                 self._add(frame, small, features, tags)
-            # 3. Correct the map where several frames agree.
-            if found is not None and self._newest is not None:
+            # 3. Correct the map where several frames agree; a full one may just have dropped the recognised keyframe.
+            if found is not None and self._newest is not None and found.id in self.places.poses:
                 self._close_loop(frame, found, self._newest)
-                if not found.by_tag:
-                    self._age(found)
+                self._age(found)
         # 4. In a saved map of which nothing is recognised, the shape of the room may give the pose.
         if self._by_scan is not None and self._recognised_at is None and self._schedule.wants_scans:
             by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan, self._proposed(frame))
@@ -290,7 +289,7 @@ class MapLocaliser:
 
     def _age(self, found: Recognition) -> None:
         """Count what the search found and missed at a place that is known; what has aged leaves the map."""
-        if self._localize_only or self._state() is not MapState.LOCALIZED or found.id not in self.places.poses:
+        if found.by_tag or self._localize_only or self._state() is not MapState.LOCALIZED:
             return
         at = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3]
         self.ageing.observe(at, self.search.compared, self._path_m)
@@ -306,8 +305,8 @@ class MapLocaliser:
             return
         other = self._parts.number(found.id)
         if other != self._parts.current:
-            T_other_odom = hypothesis.T_map_odom(self.places.poses)
-            self._parts.join(other, T_other_odom @ se3.inverse(self._T_map_odom))
+            self._parts.join(other, hypothesis.T_map_odom(self.places.poses) @ se3.inverse(self._T_map_odom))
+            self.correction.forget()
         links = [one.link() for one in consistent if self._hypotheses.take(one)]
         self.correction.close(
             [link for link in links if link.a != link.b], sorted(self._parts.ids()), self._fixed.known
@@ -322,7 +321,8 @@ class MapLocaliser:
         return MapState.LOCALIZED if recent else MapState.ODOMETRY_ONLY
 
     def _pose(self, frame: OdometryFrame, state: MapState) -> MapPose:
-        covariance = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
+        is_unknown = self._recognised_at is None and bool(self._elsewhere())
+        covariance = UNKNOWN_PLACE if is_unknown else self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
         newest = self._newest
         if newest is None:
             return MapPose(self._T_map_odom, covariance, state, NO_KEYFRAME, np.eye(4))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,9 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
+
+# Covariance in a map of which nothing has been recognised, m^2 and rad^2: a kilometre, and any direction.
+UNKNOWN_PLACE: Final[Array] = np.diag([1e6] * 3 + [np.pi**2] * 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

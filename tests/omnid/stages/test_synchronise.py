@@ -221,3 +221,21 @@ def test_free_running_cameras_lose_only_images_without_a_partner(free: Synchroni
 def test_a_slower_camera_decides_how_many_pairs_there_are(free: Synchronise) -> None:
     taken = [shot("lower", index) for index in range(90)] + [shot("upper", index, 12 * MS) for index in range(0, 90, 3)]
     assert len(made(free, *sorted(taken, key=lambda frame: frame.stamp_ns))) == 30
+
+
+@pytest.mark.parametrize("data", [JPEG, b""])
+def test_a_frame_that_completes_an_older_pair_pushes_none_of_it_out(rig: Rig, data: bytes) -> None:
+    """At a start with three quick images the first ones wait until the period is known."""
+    free = Synchronise(rig, PairConfig(repeated_images="use"))
+    times_ms = {"lower": (0, 1, 2, 35, 68, 101), "upper": (10, 43, 76, 110)}
+    shots = [
+        Frame(index, 10**12 + at_ms * MS, camera, "jpeg", data if (camera, index) == ("lower", 1) else JPEG)
+        for camera, times in times_ms.items()
+        for index, at_ms in enumerate(times)
+    ]
+    made(free, *sorted(shots, key=lambda frame: frame.stamp_ns))
+    free.finish()
+    counts = free.counts
+    assert counts["pairs"] >= 1
+    assert counts["pairs"] + counts["unpaired_lower"] + counts["broken"] == len(times_ms["lower"])
+    assert counts["pairs"] + counts["unpaired_upper"] == len(times_ms["upper"])

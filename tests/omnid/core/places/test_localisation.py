@@ -161,6 +161,30 @@ def test_a_saved_map_is_extended_by_another_run_elsewhere_in_it(
     assert {k.session for k in second.places.keyframes.values()} == {0, 1}
 
 
+def test_in_a_saved_map_the_covariance_is_that_of_the_place_and_not_of_odom(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    """A run begins with the covariance 0 in odom; where that is in the map is what its first loops say."""
+    (one,) = odometry([frames[30]])
+    localiser = MapLocaliser(cameras.model, PlaceLimits(), deepcopy(out.places))
+    found = run(localiser, [replace(one, stamp_ns=k * 200_000_000) for k in range(6)])
+    sigmas_m = [float(np.sqrt(np.trace(pose.covariance[:3, :3]))) for pose in found]
+    for pose, sigma_m in zip(found, sigmas_m, strict=True):
+        assert 0.002 < sigma_m < 0.1 if pose.state is MapState.LOCALIZED else sigma_m > 1000.0
+    assert {pose.state for pose in found} == {MapState.ODOMETRY_ONLY, MapState.LOCALIZED}
+
+
+def test_a_full_map_may_drop_the_keyframe_that_was_just_recognised(
+    cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
+) -> None:
+    most = len(out.places)
+    back = slice(len(OUT), len(OUT) + 13)
+    localiser = MapLocaliser(cameras.model, PlaceLimits(max_keyframes=most, keyframe_m=0.15), deepcopy(out.places))
+    found = run(localiser, odometry(frames[back], POSES[back]))
+    assert localiser.places.dropped > 0 and len(localiser.places) == most
+    assert found[-1].state is MapState.LOCALIZED
+
+
 def test_localisation_alone_leaves_the_map_as_it_is(
     cameras: RenderedCameras, frames: list[StereoFrame], out: MapLocaliser
 ) -> None:
