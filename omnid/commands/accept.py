@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # the help does not load these
 UNIX_S: Final = 1e8
 INSTRUCTIONS: Final = """The acceptance drive
   1. Tape two marks, A and B, on the floor, 10 to 20 m apart, and measure their distance with a tape measure.
-  2. Record: `omnid record drive` (stop the daemon first), or `omnid run` with record.enabled and record.images.
+  2. Record: `omnid record drive` (stop the daemon first), or `omnid run --set record.enabled=true`.
   3. Place the robot on A, with a point of it that you can find again over the mark, and let it stand for 5 s.
   4. Drive to B, on any way, with the same point over the mark and heading as on A if you can; stand for 5 s.
      Drive back to A, and stand for 5 s. This is a round of 20 to 40 m. Drive three: A B A B A B A.

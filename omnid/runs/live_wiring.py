@@ -111,7 +111,7 @@ class LiveWiring:
         if stages.places:
             files.save_map = stages.places.want_copy
         # 4. From the bus: commands, requests, samples.
-        received = LiveCommands(session, bus, controller, files.put, self._report)
+        received = LiveCommands(session, bus, controller, files.put, self._report, stopped=files.stopped)
         received.subscribe(recorder, sensors, saver)
         # 5. Status.
         images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))

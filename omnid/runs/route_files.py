@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 from omnid.core.navigation.requests import (
     NavigationCommand,
@@ -22,6 +23,13 @@ from omnid.messages import NavigationUpdate
 from omnid.stages.routes import refusal_of_name
 
 MOST_WAITING: Final = 64  # requests, as many as may wait in front of the stage
+LONGEST_WAIT_S: Final = 5.0  # A robot that sets out later than this after the request surprises people.
+
+
+class _Waiting(NamedTuple):
+    command: NavigationCommand
+    since_s: float  # of time.monotonic
+    stops: int  # that had come before it
 
 
 class RouteFiles:
@@ -40,7 +48,8 @@ class RouteFiles:
     ) -> None:
         """pass_on: takes requests, from any thread. save_map: asks for the map to be written, which routes need."""
         self._folder, self._pass_on, self.save_map = folder, pass_on, save_map
-        self._waiting: deque[NavigationCommand] = deque()
+        self._waiting: deque[_Waiting] = deque()
+        self._stops = 0  # stops of the wheels so far
         self._taught: TaughtRoute | None = None  # the newest one that is to be written
         self._written: TaughtRoute | None = None  # the one that was written last
 
@@ -51,7 +60,11 @@ class RouteFiles:
         elif len(self._waiting) >= MOST_WAITING:
             self._pass_on(command._replace(refusal="too many requests wait for files: ask again"))
         else:
-            self._waiting.append(command)
+            self._waiting.append(_Waiting(command, time.monotonic(), self._stops))
+
+    def stopped(self) -> None:
+        """Take note of a stop of the wheels: what waits from before it begins nothing after it."""
+        self._stops += 1
 
     def process(self, update: NavigationUpdate) -> None:
         """Take the route that is to be written, if there is one."""
@@ -63,7 +76,13 @@ class RouteFiles:
             self._written = self._taught
             self._pass_on(self._stored(self._taught))
         while self._waiting:
-            self._pass_on(self._with_file(self._waiting[0]))
+            waiting = self._waiting[0]
+            command = self._with_file(waiting.command)
+            if waiting.stops != self._stops:
+                command = command._replace(void="a stop has come since: ask again")
+            elif time.monotonic() - waiting.since_s > LONGEST_WAIT_S:
+                command = command._replace(void="it waited too long for its file: check the disk, and ask again")
+            self._pass_on(command)
             self._waiting.popleft()  # now only: what comes meanwhile must not overtake it
 
     close = __call__

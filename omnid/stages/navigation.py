@@ -32,6 +32,7 @@ from omnid.core.navigation.requests import (
     RouteRequest,
     TaughtRoute,
     is_halt,
+    may_begin_motion,
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
@@ -177,6 +178,8 @@ class NavigationStage:
             raise OmnidError("a later request has ended it: ask again")
         elif not isinstance(request, RouteRequest | TaughtRoute):
             _raise_if(command.refusal)
+        if may_begin_motion(request):
+            _raise_if(command.void)
         match request:
             case NavigationVerb.CANCEL:
                 navigator.cancel("cancelled by a request")

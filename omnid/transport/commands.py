@@ -136,6 +136,7 @@ class CommandReceiver:
         }
         self.accepted = self.stops = self.arms = 0
         self.refused: Counter[str] = Counter()
+        self._touched_ns: dict[str, int] = {}  # newest stamp of a contact, by topic
 
     def receive(self, request: Request) -> Answer | None:
         """Handle one message, never raises; return the refusal, None where there is none or the target decides."""
@@ -168,13 +169,19 @@ class CommandReceiver:
         return Answer(False, text)
 
     def _touch(self, request: Request) -> None:
-        """Pass a contact on: only a Bool of False with a fresh stamp says that there is none."""
+        """Pass a contact on: only a Bool of False, with a fresh stamp that is not older than a contact's, says that
+        there is none: messages may overtake each other.
+        """
         holds = True
         try:
             _check_length(request.payload)
-            if not bool_from_cdr(request.payload):
+            newest_ns = self._touched_ns.get(request.topic, 0)
+            if bool_from_cdr(request.payload):
+                latest_ns = time.time_ns() if self._stamps.synchronised else request.sent_ns
+                self._touched_ns[request.topic] = max(newest_ns, min(request.sent_ns, latest_ns))
+            else:
                 self._stamps.check(request.topic, request.sent_ns)
-                holds = False
+                holds = request.sent_ns < newest_ns
         finally:
             self._target.touch(_CONTACTS[request.topic], holds=holds)
 

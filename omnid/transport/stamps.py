@@ -17,7 +17,10 @@ TOO_OLD, EARLY = "too old", "stamp in the future"
 NOT_RISING: Final = "stamp does not rise"
 USED_BEFORE: Final = "stamp was used before"
 MOST_ARM_STAMPS: Final = 256  # remembered, where the senders' clocks are others
-_CLOCKS: Final = 'synchronise the clocks, or set bus.command_clock = "arrival"'
+_CLOCKS: Final = (
+    "on a busy computer try again; from another machine synchronise the clocks, or set bus.command_clock = "
+    '"arrival"; controller.deadlines.command_s is the longest age'
+)
 ADVICE: Final = {
     UNSTAMPED: "fill in the stamp (ROS 2: `header: auto`; String: last word stamp=NANOSECONDS); for a plain Twist set "
     'bus.command_clock = "arrival"',

@@ -96,6 +96,14 @@ class NavigationCommand(NamedTuple):
     stamp_ns: int = 0  # Unix time by the sender's clock; 0: it has none
     id: int = 0  # id of the request; the answer has the same
     refusal: str = ""  # why it is refused already, as by a file that is missing
+    void: str = ""  # why it may begin no motion any more; empty: it may
+
+
+def may_begin_motion(request: NavigationRequest) -> bool:
+    """True if a request may begin or resume a motion."""
+    if isinstance(request, RouteRequest):
+        return request.action is RouteAction.REPEAT
+    return not is_halt(request) and not isinstance(request, TaughtRoute)
 
 
 def is_halt(request: NavigationRequest) -> bool:

@@ -21,6 +21,7 @@ from omnid.core.navigation.route import Route
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate
 from omnid.navigation_state import NavigationState
+from omnid.runs import route_files
 from omnid.runs.route_files import MOST_WAITING, RouteFiles
 from tests.omnid.stages.test_navigation import Robot
 
@@ -127,6 +128,30 @@ def test_a_halt_overtakes_what_waits_for_a_disk_and_ends_it(tmp_path: Path) -> N
     site.ask(REPEAT)
     site.files()
     assert site.work().state is NavigationState.DRIVING, "a request after the halt is granted"
+
+
+def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = Site(tmp_path)
+    site.ask(FINISH)
+    site.work()
+    site.files()
+    repeated = site.ask(REPEAT)
+    site.files.stopped()
+    site.files()
+    site.work()
+    assert "a stop has come since" in site.answers()[repeated]
+    monkeypatch.setattr(route_files, "LONGEST_WAIT_S", -1.0)
+    again = site.ask(REPEAT)
+    site.files()
+    assert site.work().state is not NavigationState.DRIVING
+    assert "waited too long" in site.answers()[again]
+    monkeypatch.undo()
+    third = site.ask(REPEAT)
+    site.files()
+    site.work()
+    assert site.answers()[third] == ""
 
 
 def test_requests_that_wait_for_a_disk_are_bounded(tmp_path: Path) -> None:

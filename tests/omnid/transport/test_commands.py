@@ -369,6 +369,18 @@ def test_only_a_false_with_a_fresh_stamp_says_that_a_contact_has_ended(topic: st
     assert not accepted.commands and not accepted.arms and not accepted.stops
 
 
+@pytest.mark.parametrize("synchronised", [True, False])
+def test_an_older_release_that_comes_after_a_contact_does_not_release_it(synchronised: bool) -> None:
+    accepted, sent_ns = AcceptedCommands(synchronised=synchronised), now_ns()
+    for payload, later_ns in ((True, 10_000_000), (False, 0), (False, 20_000_000)):
+        accepted.receive("cmd/bumper", bool_cdr(payload), "", sent_ns + later_ns - 30_000_000)
+    assert [holds for _, holds in accepted.contacts] == [True, True, False]
+    # A contact that says it comes from the future is a contact, but does not forbid all releases.
+    accepted.receive("cmd/bumper", bool_cdr(True), "", sent_ns + 10**15)
+    accepted.receive("cmd/bumper", bool_cdr(False), "", now_ns())
+    assert [holds for _, holds in accepted.contacts][-2:] == [True, not synchronised]
+
+
 def test_an_old_release_that_is_sent_again_does_not_release_where_clocks_differ() -> None:
     accepted = AcceptedCommands(synchronised=False)
     for payload, sent_ns in ((bool_cdr(False), 10), (bool_cdr(True), 11), (bool_cdr(False), 10)):

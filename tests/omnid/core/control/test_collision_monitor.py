@@ -250,7 +250,7 @@ def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: 
 @pytest.mark.parametrize("age_s", [0.1, 0.2, 0.3, 0.4, 0.5])
 @pytest.mark.parametrize("speed_mps", [0.6, -0.6, 1.5])
 def test_an_older_ring_makes_the_base_no_freer(age_s: float, speed_mps: float) -> None:
-    """What was the end of the floor in front of the base is inside its outline by now, or behind it."""
+    """The end of the floor that was in front of the base is inside its outline by now, or behind it."""
     nothing_ahead = tuple(0.0 if abs(abs(k - 179.5) - 180 * (speed_mps < 0)) < 60 else 6.0 for k in range(360))
     ranges = tuple(math.nan if free == 0.0 else math.inf for free in nothing_ahead)
     for unwatched in ((), tuple(free == 0.0 for free in nothing_ahead)):

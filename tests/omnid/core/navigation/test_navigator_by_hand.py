@@ -97,7 +97,7 @@ def test_the_way_by_odometry_alone_is_measured_along_it_and_ends_where_the_map_i
 
 
 def test_a_pose_in_the_map_counts_once() -> None:
-    """Where no more of them come, as the search for places hangs, the drive ends as without any."""
+    """The drive ends as without any where no more of them come, as the search for places hangs."""
     steps = Steps(NavigationFrame.MAP)
     old = LOCALISED._replace(stamp_ns=round(steps.now_s * 1e9))
     found = [steps.step(0.3 * k, in_map=old).state for k in range(1, 6)]
