@@ -23,7 +23,9 @@ def add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     build = actions.add_parser("build", help="build a map from logs, of one drive or of several in the same place")
     build.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first")
     build.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
-    build.add_argument("--extend", action="store_true", help="extend the map OUT.omap")
+    known = build.add_mutually_exclusive_group()
+    known.add_argument("--extend", action="store_true", help="extend the map OUT.omap")
+    known.add_argument("--replace", action="store_true", help="replace it, with all places that routes refer to")
     add_tags_option(build)
     build.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     add_workers(build, "logs at a time, whose maps are then joined; 1: each in the map of those before", 1)
@@ -46,6 +48,8 @@ def run_build(args: argparse.Namespace) -> int:
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
+    if args.output.exists() and not (args.extend or args.replace):
+        raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes it anew")
     for warning in warnings:
         print(f"omnid: warning: {warning}", file=sys.stderr)
     side_by_side = args.dask is not None or args.jobs != 1

@@ -29,6 +29,8 @@ def test_maps_built_side_by_side_are_joined_in_the_frame_of_the_first_log(
 def test_a_map_is_extended_by_logs_side_by_side(omnid: Command, scene: Path, tmp_path: Path) -> None:
     words = ("map", "build", scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "m.omap", "--quiet")
     assert omnid(*words).code == 0
+    before = (tmp_path / "m.omap").read_bytes()
+    assert "--extend adds these logs" in omnid.refused(*words) and (tmp_path / "m.omap").read_bytes() == before
     done = omnid(*words, "--extend", "--jobs", 2)
     assert done.code == 0 and "sessions     2" in done.out, done
 

@@ -96,12 +96,11 @@ def remedy(reason: str) -> str:
 class CollisionMonitor:
     """Follows rings and commands; not thread-safe. Memory and work of a tick are bounded by the ring's size."""
 
-    def __init__(self, settings: CollisionSettings, deceleration_mps2: float) -> None:
-        """deceleration_mps2: with which the base can brake."""
-        self._settings, self._deceleration = settings, deceleration_mps2
+    def __init__(self, settings: CollisionSettings, braking_mps2: float, turn_braking_radps2: float = math.inf) -> None:
+        """braking_mps2, turn_braking_radps2: with which the base can brake its speed and its turn."""
+        self._settings, self._deceleration, self._turn_deceleration = settings, braking_mps2, turn_braking_radps2
         self._outline = Outline(settings.front_m, settings.rear_m, settings.half_width_m)
-        # Where the images show nothing, no way is left ahead, but room for turns at the sides.
-        side_m = settings.half_width_m + settings.side_m + BESIDE_M
+        side_m = settings.half_width_m + settings.side_m + BESIDE_M  # room for turns where the images show nothing
         self._around = Outline(settings.front_m + settings.stop_m, settings.rear_m + settings.stop_m, side_m)
         self._stamp_ns: int | None = None
         self._points: list[Point] = []  # obstacles in the frame of the ring
@@ -188,8 +187,8 @@ class CollisionMonitor:
         moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
         speed_mps = abs(motion.velocity_mps)
         way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
-        around_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
-        reach_m = way_m + self._outline.radius_m + around_m
+        reach_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
+        reach_m += way_m + self._outline.radius_m
         # 3. What the base has driven over since the ring's images is not passed as if it were free.
         unknown = self._unknown + self._gaps, settings.unknown, UNKNOWN
         known = (self._points, STOP, BLOCKED), unknown, (self._unwatched, settings.stale, UNWATCHED)
@@ -230,6 +229,8 @@ class CollisionMonitor:
         if first_s == math.inf:
             return 1.0
         share, speed_mps = first_s / settings.time_s, abs(motion.velocity_mps)
+        turn_radps = max(abs(motion.yaw_rate_radps), TINY)
+        share = min(share, math.sqrt(2 * BRAKING_SHARE * self._turn_deceleration * first_s / turn_radps))
         if speed_mps > TURN_MPS:
             way_m = speed_mps * first_s
             share = min(share, math.sqrt(2 * BRAKING_SHARE * self._deceleration * way_m) / speed_mps)
@@ -310,7 +311,7 @@ class CollisionMonitor:
         return FREE if edge_mps <= speed_mps else Allowance(speed_mps / edge_mps, reason)
 
     def _has_forgotten(self) -> bool:
-        """Return whether motions since the ring's images are remembered no more: it is not known where they are."""
+        """Return whether motions since the ring's images are remembered no more."""
         return len(self._motions) == MOST_MOTIONS and self._motions[0][0] > (self._stamp_ns or 0)
 
     def _moved_since(self, stamp_ns: int, now_ns: int) -> Pose2:

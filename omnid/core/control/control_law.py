@@ -133,7 +133,8 @@ class ControlLaw:
         self.plausibility = Plausibility(settings.trust, settings.motion)
         self.contacts = Contacts()
         self.commands = CommandSelector(settings.sources)
-        self.collision = CollisionMonitor(settings.collision, settings.limits.deceleration_mps2)
+        limits = settings.limits
+        self.collision = CollisionMonitor(settings.collision, limits.deceleration_mps2, limits.yaw_acceleration_radps2)
         self.motion = STOP  # motion of the base now, from which the next step continues
         self.reason = IDLE  # reason of the last step
 

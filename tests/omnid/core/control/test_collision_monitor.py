@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
+from omnid.core.control.collision_geometry import Outline
 from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing, MovingPoint
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.heading_controller import Twist
@@ -272,6 +273,22 @@ def test_a_ring_from_before_all_motions_that_are_remembered_is_stale() -> None:
         monitor.follow(10 * S + tick * S // 200, Twist(0.2))
     assert monitor.step(12 * S + S // 100, Twist(0.2)) == Twist()
     assert monitor.reason == monitor_module.RING_STALE
+
+
+@pytest.mark.parametrize("braking_radps2", [0.1, 0.2, 4.0])
+def test_a_turn_slows_down_as_early_as_the_base_can_brake_it(braking_radps2: float) -> None:
+    long = replace(SETTINGS, front_m=1.0)
+    outline, monitor = Outline(1.0, long.rear_m, long.half_width_m), CollisionMonitor(long, 1.5, braking_radps2)
+    rate_radps, yaw_rad, gaps_m = 0.0, 0.0, []
+    for tick in range(600):
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        seen = -0.5 * c + 0.4 * s, 0.5 * s + 0.4 * c  # an obstacle at rest, by every ring
+        gaps_m.append(outline.gap_m(*seen))
+        monitor.set_ring(ControllerRing(10 * S + tick * S // 20, with_points(seen)))
+        allowed = monitor.step(10 * S + tick * S // 20, Twist(0.0, 1.0)).yaw_rate_radps
+        rate_radps += min(max(allowed - rate_radps, -braking_radps2 / 20), braking_radps2 / 20)
+        yaw_rad += rate_radps / 20
+    assert min(gaps_m) > 0.0 and yaw_rad > 1.0
 
 
 def test_what_is_beside_the_base_counts_as_far_as_the_settings_say() -> None:
