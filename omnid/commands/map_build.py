@@ -49,7 +49,7 @@ def run_build(args: argparse.Namespace) -> int:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
     check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
     if args.output.exists() and not (args.extend or args.replace):
-        raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes it anew")
+        raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
     for warning in warnings:
         print(f"omnid: warning: {warning}", file=sys.stderr)
     side_by_side = args.dask is not None or args.jobs != 1

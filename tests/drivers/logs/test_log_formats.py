@@ -187,6 +187,15 @@ def test_images_hours_apart_are_a_question(tmp_path: Path, step: int, apart: str
         LogReader(folder)
 
 
+def test_images_named_by_microseconds_are_not_taken_for_nanoseconds(tmp_path: Path) -> None:
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(
+        tmp_path / "images", pairs(PAIRS), lambda stamp: str(1_418_381_798_086_398 + 33_333 * numbers[stamp])
+    )
+    with pytest.raises(DriverError, match=r"1418381798086398.* are 33\.333 us apart .*microseconds"):
+        LogReader(folder)
+
+
 def test_images_less_than_an_hour_apart_are_a_log(tmp_path: Path) -> None:
     numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
     folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp: f"{3600 * numbers[stamp]:010d}")
