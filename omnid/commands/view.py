@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,7 +81,12 @@ def run(args: argparse.Namespace) -> int:
         ("the configuration that is read", args.config),
     )
     place = target_for(args.output, args.web, args.port)
-    return show_robot(config.bus, args.seconds, place) if args.log is None else _log(args, config, place)
+    if args.log is not None:
+        return _log(args, config, place)
+    code = show_robot(config.bus, args.seconds, place)
+    if code == 1:
+        print(f"omnid: no pose of {config.bus.robot} came: `omnid listen --all` shows the robots", file=sys.stderr)
+    return code
 
 
 def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
@@ -126,7 +132,6 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
 
 def _require_rerun() -> None:
     import os
-    import sys
     from importlib.util import find_spec
 
     from omnid.errors import OmnidError
