@@ -194,6 +194,8 @@ class CommandReceiver:
         if self._stamps.synchronised and arrival_ns - (unix_ns - stamp_ns) <= self._stop_ns:
             raise RefusedCommand(OLDER_THAN_STOP)
         self._stamps.accept_arm(stamp_ns)
+        if not self._stamps.synchronised:
+            self._touched_ns.clear()  # a sender whose clock began again may release, too
         self.arms += 1
         self._target.arm(ArmRequest(arrival_ns, request.id))
 

@@ -39,7 +39,7 @@ class MapCorrection:
     def __init__(self, places: PlaceMap) -> None:
         self._places = places
         self._anchor: _Anchor | None = None
-        self._is_due = False  # the newest part has a place in the map only since the next loop
+        self._is_due = False  # the next loop says how well the place of odom in the map is known
         self._waiting = 0  # loops since the last optimisation
         self.rejected = 0  # loops that the graph refused
         self.factor = 1.0  # factor on odometry's covariance that the loops show

@@ -48,7 +48,7 @@ def bilinear(
 def take_nearer(
     number: np.int32, surface: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
 ) -> int:
-    """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays; return of how many."""
+    """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays; return for how many."""
     n0, n1, n2, u0, u1, u2, v0, v1, v2 = (
         surface[0],
         surface[1],

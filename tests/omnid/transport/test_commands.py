@@ -381,6 +381,16 @@ def test_an_older_release_that_comes_after_a_contact_does_not_release_it(synchro
     assert [holds for _, holds in accepted.contacts][-2:] == [True, not synchronised]
 
 
+def test_after_an_arming_a_bumper_whose_clock_began_again_may_release() -> None:
+    accepted = AcceptedCommands(synchronised=False)
+    for payload, sent_ns in ((True, 1000), (False, 1001)):
+        accepted.receive("cmd/bumper", bool_cdr(payload), "", sent_ns)
+    accepted.receive("cmd/arm", arm())
+    assert len(accepted.arms) == 1
+    accepted.receive("cmd/bumper", bool_cdr(False), "", 5)
+    assert [holds for _, holds in accepted.contacts] == [True, False, False]
+
+
 def test_an_old_release_that_is_sent_again_does_not_release_where_clocks_differ() -> None:
     accepted = AcceptedCommands(synchronised=False)
     for payload, sent_ns in ((bool_cdr(False), 10), (bool_cdr(True), 11), (bool_cdr(False), 10)):
