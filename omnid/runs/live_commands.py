@@ -12,7 +12,6 @@ from omnid.core.control.arming import ArmAnswer
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
-from omnid.engine.flow import nothing
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import Session
@@ -24,7 +23,7 @@ from omnid.transport.navigation_commands import NavigationReceiver
 from omnid.transport.requests import Answer, Request
 from omnid.transport.stamps import StampRule
 from omnid.transport.status_names import DISARMED_BY_STOP
-from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, STOP, command_topics
+from omnid.transport.topics import ARM, MAP, MAP_TOPICS, NAVIGATION_TOPICS, SENSOR_TOPICS, command_topics
 
 Receive: TypeAlias = Callable[[Request], Answer | None]  # returns None where there is no answer, or not yet
 NO_MOTOR: Final = "the daemon runs without a motor: set motor.port, or start it with --motor"
@@ -45,14 +44,9 @@ class LiveCommands:
         controller: DriveLink | None,
         navigate: Callable[[NavigationCommand], None],
         report: Callable[[int, str], None],
-        *,
-        stopped: Callable[[], None] = nothing,
     ) -> None:
-        """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`.
-
-        stopped: called after each stop.
-        """
-        self._session, self._bus, self._controller, self._stopped = session, bus, controller, stopped
+        """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`."""
+        self._session, self._bus, self._controller = session, bus, controller
         settings, warn = session.config.controller, partial(report, logging.WARNING)
         stamps = StampRule(
             settings.deadlines.command_s, synchronised=session.config.bus.command_clock == "synchronised"
@@ -73,7 +67,6 @@ class LiveCommands:
         if self.commands:
             navigate = self.navigation.receive if PLANNER in sources else _refusing(NO_PLANNER)
             table = {topic: self.commands.receive for topic in topics} | dict.fromkeys(NAVIGATION_TOPICS, navigate)
-            table[STOP] = partial(self._stop, self.commands.receive)
             if recorder is not None:
                 record = command_recorder(recorder, self._session.now_ns, topics)
                 table = {topic: _recorded(receive, record) for topic, receive in table.items()}
@@ -90,11 +83,6 @@ class LiveCommands:
                 self._bus.answer(request.id, answer)
 
         self._bus.subscribe_commands(receive, topics, self._is_stopped)
-
-    def _stop(self, receive: Receive, request: Request) -> Answer | None:
-        answer = receive(request)
-        self._stopped()
-        return answer
 
     def _is_stopped(self) -> bool:
         """True if a stop holds."""

@@ -80,7 +80,8 @@ class LiveWiring:
         graph.sink("exposure", exposure, pairs, policy=NEWEST, depth=1)
         # 3. From pairs to poses, maps and setpoints.
         ladder, requests = LoadLadder(), RequestQueue()
-        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), requests.put)
+        halts = (lambda: controller.statistics.state.halts) if controller else (lambda: 0)
+        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), requests.put, halts=halts)
         front_end = FrontEnd(geometry, config, live_health(geometry, config, self._refined), load=lambda: ladder.level)
         live_rig = LiveRig(session, front_end, ladder, self._refined)
         sinks = self._sinks(live_rig, bus, own_time=robot.waits)
@@ -111,7 +112,7 @@ class LiveWiring:
         if stages.places:
             files.save_map = stages.places.want_copy
         # 4. From the bus: commands, requests, samples.
-        received = LiveCommands(session, bus, controller, files.put, self._report, stopped=files.stopped)
+        received = LiveCommands(session, bus, controller, files.put, self._report)
         received.subscribe(recorder, sensors, saver)
         # 5. Status.
         images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))

@@ -29,7 +29,7 @@ LONGEST_WAIT_S: Final = 5.0  # A robot that sets out later than this after the r
 class _Waiting(NamedTuple):
     command: NavigationCommand
     since_s: float  # of time.monotonic
-    stops: int  # that had come before it
+    halts: int  # stops and faults that had come before it
 
 
 class RouteFiles:
@@ -45,11 +45,14 @@ class RouteFiles:
         folder: RouteFolder,
         pass_on: Callable[[NavigationCommand], None],
         save_map: Callable[[], object] = nothing,
+        *,
+        halts: Callable[[], int] = lambda: 0,
     ) -> None:
-        """pass_on: takes requests, from any thread. save_map: asks for the map to be written, which routes need."""
-        self._folder, self._pass_on, self.save_map = folder, pass_on, save_map
+        """pass_on: takes requests, from any thread. save_map: asks for the map to be written, which routes need. halts:
+        returns how often a stop or a fault has made cmd/arm necessary; what waits from before begins nothing after it.
+        """
+        self._folder, self._pass_on, self.save_map, self._halts = folder, pass_on, save_map, halts
         self._waiting: deque[_Waiting] = deque()
-        self._stops = 0  # stops of the wheels so far
         self._taught: TaughtRoute | None = None  # the newest one that is to be written
         self._written: TaughtRoute | None = None  # the one that was written last
 
@@ -60,11 +63,7 @@ class RouteFiles:
         elif len(self._waiting) >= MOST_WAITING:
             self._pass_on(command._replace(refusal="too many requests wait for files: ask again"))
         else:
-            self._waiting.append(_Waiting(command, time.monotonic(), self._stops))
-
-    def stopped(self) -> None:
-        """Take note of a stop of the wheels: what waits from before it begins nothing after it."""
-        self._stops += 1
+            self._waiting.append(_Waiting(command, time.monotonic(), self._halts()))
 
     def process(self, update: NavigationUpdate) -> None:
         """Take the route that is to be written, if there is one."""
@@ -78,8 +77,8 @@ class RouteFiles:
         while self._waiting:
             waiting = self._waiting[0]
             command = self._with_file(waiting.command)
-            if waiting.stops != self._stops:
-                command = command._replace(void="a stop has come since: ask again")
+            if waiting.halts != self._halts():
+                command = command._replace(void="a stop or a fault has come since: ask again")
             elif time.monotonic() - waiting.since_s > LONGEST_WAIT_S:
                 command = command._replace(void="it waited too long for its file: check the disk, and ask again")
             self._pass_on(command)
