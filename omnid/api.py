@@ -203,6 +203,8 @@ class Odometry:
     def _frames(self, pairs: Iterable[tuple[InputImage, InputImage]]) -> Iterator[Frame]:
         names: tuple[Camera, Camera] = ("lower", "upper")
         for seq, pair in enumerate(pairs):
+            if isinstance(pair, np.ndarray) or len(pair) != len(names):
+                raise OmnidError("mask_images: expected pairs (lower, upper) of images, found something else")
             for name, image in zip(names, pair, strict=True):
                 grey = self._checked(name, image)
                 yield Frame(seq, seq, name, "mono8", grey, width=grey.shape[1], height=grey.shape[0])

@@ -24,7 +24,7 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.client_session import HERE, open_client
+from omnid.transport.client_session import HERE, open_client, robots_there
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
@@ -235,6 +235,11 @@ class Robot:
 
         tokens = self._session.liveliness()
         self._declared.append(tokens.declare_subscriber(f"{self.name}/alive", on_token, history=True))
+
+    @property
+    def neighbours(self) -> str:
+        """Names of the robots that are there, this one included, as a part of a sentence."""
+        return robots_there(self._session)
 
     @property
     def alive(self) -> bool:

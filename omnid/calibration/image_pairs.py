@@ -69,7 +69,7 @@ def _of_folder(folder: Path) -> PairedImages:
     if not folder.is_dir():
         raise OmnidError(
             f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
-            f"found {'a file' if folder.exists() else 'nothing'}"
+            f"found {'a file' if folder.exists() else 'no such file or folder'}"
         )
     lower, upper = (_of_side(folder, side) for side in SIDES)
     return PairedImages((lower, upper))

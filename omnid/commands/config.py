@@ -94,7 +94,11 @@ def run(args: argparse.Namespace) -> int:
         print(dump_minimal(config, ()), end="")
         for line in renamed:
             print(f"omnid: {line}", file=sys.stderr)
-        print("omnid: comments and settings with their default value are left out", file=sys.stderr)
+        print(
+            f"omnid: {args.file} is as it was; comments and settings with their default value are left out here: "
+            f"`omnid config migrate {args.file} > NEW.toml` makes a file",
+            file=sys.stderr,
+        )
         return 0
     config = load_config(args.file or args.config, args.overrides)
     if args.action == "check":

@@ -82,8 +82,10 @@ def run_tags(args: argparse.Namespace) -> int:
     rows = [_row(tags[id], tag) for id, tag in found.items()]
     if args.json:
         print_json({"tags": rows, "refused": refused})
-    else:
+    elif rows:
         print(*_tag_lines(rows), sep="\n")
+    else:
+        print(f"no tag in {args.source}")
     if args.write is not None:
         write_landmarks(
             args.write, [replace(landmark(id, tags[id].size_m, tag.T), name=tags[id].name) for id, tag in found.items()]

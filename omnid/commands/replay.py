@@ -158,18 +158,25 @@ def _print_result(result: RunResult, options: ReplayOptions, output: Output, *, 
                 "timings": dict(result.timings),
                 "warnings": result.warnings,
                 "signal": result.signal,
+                "elapsed_s": result.elapsed_s,
             },
             stream,
         )
         return
     columns = get_terminal_size().columns if stream.isatty() else 0
     print(run_summary(result.counters, result.timings.values(), columns, verbose=output.verbose), file=stream)
+    print(*folded_entry("speed", _speed(result), columns), sep="\n", file=stream)
     files = [path for _, path in options.files] + ([result.map_file] if result.map_file else [])
     if failed:
         files = [path for path in files if path.exists()]
     if files:
         name, listed = "cut short" if failed else "written", ", ".join(map(str, files))
         print("\n".join(folded_entry(name, listed, columns)), file=stream)
+
+
+def _speed(result: RunResult) -> str:
+    pairs = result.counters.pairs
+    return f"{pairs / max(1e-3, result.elapsed_s):.1f} pairs/s, in {result.elapsed_s:.1f} s"
 
 
 def _span_of(args: argparse.Namespace) -> tuple[float, float]:

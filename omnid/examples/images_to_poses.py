@@ -10,6 +10,8 @@ import cv2
 
 import omnid
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 odometry, folder = omnid.Odometry(sys.argv[1]), Path(sys.argv[2])
 for stamp_ns in sorted(int(path.stem) for path in (folder / "lower").glob("*.png")):
     lower = cv2.imread(str(folder / "lower" / f"{stamp_ns}.png"), cv2.IMREAD_GRAYSCALE)

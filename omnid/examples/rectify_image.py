@@ -10,6 +10,8 @@ from calib import se3
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig_file import read_rig
 
+if len(sys.argv) != 4:
+    sys.exit(__doc__)
 rig, image = read_rig(Path(sys.argv[1])), cv2.imread(sys.argv[2], cv2.IMREAD_GRAYSCALE)
 assert image is not None, "the image cannot be read"
 point_rig = np.array([[2.0, 0.5, 0.3]])  # m, 2 m ahead of the rig

@@ -4,6 +4,8 @@ import sys
 
 import omnid
 
+if len(sys.argv) not in (2, 3):
+    sys.exit(__doc__)
 log, *rig = sys.argv[1:]
 result = omnid.replay(log, rig=rig[0] if rig else None)
 for warning in result.warnings:

@@ -43,7 +43,7 @@ class Screen:
 def summary_line(robot: str, state: RobotState) -> str:
     """Return pose, rate, losses and latencies in one line."""
     if state.pose is None:
-        return f"{robot}: no pose yet"
+        return f"{robot}: {state.state}"
     counts = f"{state.rate_hz:.1f} Hz  missed {state.missed}"
     return f"{robot}: {state.state}  {_position(state.pose)}  {counts}  {_latencies(state)}"
 
@@ -53,7 +53,8 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
 
     Parts with a warning or an error come first, stages last: a small terminal shows what matters.
     """
-    yield f"{robot}: {state.state}  {state.rate_hz:.1f} poses/s" if state.pose is not None else f"{robot}: no pose yet"
+    rate = "" if state.pose is None else f"  {state.rate_hz:.1f} poses/s"
+    yield f"{robot}: {state.state}{rate}"
     if state.pose is not None:
         sigma = np.sqrt(np.maximum(0.0, state.pose.covariance.diagonal()))
         details = state.pose.attachment

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -125,6 +126,7 @@ class _Replay:
         self._map: Slot[MapUpdate] = Slot()
         self._drive: ReplayDrive | SimulatedWheels | None = None
         self._warnings: list[str] = []
+        self._begun_s = 0.0
 
     def run(self) -> RunResult:
         check_outputs(self._options.files, self._inputs())
@@ -155,6 +157,7 @@ class _Replay:
             if sinks.recording is not None and isinstance(sinks.recording.sink, Recorder):
                 sinks.recording.sink.final_status = result.final_status
             self._add_progress(session, reader)
+            self._begun_s = time.monotonic()
             try:
                 with session.signals(self._on_signal):
                     graph.run()
@@ -305,6 +308,7 @@ class _Replay:
             self._map_poses.T_map_rig,
             self._map_poses.states,
             results.places() if self._options.collect else None,
+            elapsed_s=time.monotonic() - self._begun_s,
         )
 
 

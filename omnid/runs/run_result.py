@@ -53,6 +53,7 @@ class RunResult:
     places: PlaceMap | None = None  # keyframes by which the places are recognised; None as above
     rig_places: RigPlaces | None = None  # the map of places that the run was given, extended
     map_file: Path | None = None  # of places, where the run has written one
+    elapsed_s: float = 0.0  # time that the stages took, without the start
 
     def __repr__(self) -> str:
         """Return one line: poses, span, length, states, map points and warnings."""

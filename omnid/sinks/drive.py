@@ -17,6 +17,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import Sink, nothing
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate
+from omnid.navigation_state import NavigationState
 from omnid.stages.lockstep_drive import controller_pose
 from omnid.stages.obstacles import controller_ring
 from omnid.transport.requests import Answer
@@ -62,23 +63,29 @@ class PlannerDrive:
         if update.setpoint is not None:
             self._link.send_setpoint(TimedSetpoint(time.monotonic_ns(), update.setpoint, PLANNER, NAVIGATION_SENDER))
         self._files.process(update)
-        state = f"{update.state}: {update.reason}" if update.reason else str(update.state)
         for answer in update.answers:
-            self._answer(answer.id, Answer(not answer.refusal, answer.refusal or granted_words(answer.request, state)))
+            words = answer.refusal or granted_words(answer.request, update.state, update.reason)
+            self._answer(answer.id, Answer(not answer.refusal, words))
 
 
-def granted_words(request: str, state: str) -> str:
-    """Return what the robot does after a request, in a word, that it has accepted; state: of the navigation."""
+def granted_words(request: str, state: NavigationState, reason: str = "") -> str:
+    """Return what the robot does after a request, in a word, that it has accepted.
+
+    state, reason: of the navigation after it.
+    """
     verb, _, name = request.partition(" ")
+    words = f"{state}: {reason}" if reason else str(state)
+    if state.is_end and state is not NavigationState.CANCELLED:
+        words = f"nothing is under way ({words})"
     return {
         "goal": "it drives to the goal",
         "path": "it drives along the path",
         "resume": "it goes on",
-        "teach": f"it records the route {name}: drive it, then finish it",
+        "teach": f"it records the route {name}: drive it, then finish it (`omnid route finish`)",
         "finish": "the route is written",
         "repeat": f"it repeats the route {name}",
         "stop": "the route has ended",
-    }.get(verb, state)
+    }.get(verb, words)
 
 
 class RingToController:

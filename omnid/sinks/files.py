@@ -22,6 +22,8 @@ from omnid.messages import MapUpdate, OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
 REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
+# Options of files of one format, and how such a file is named.
+SUFFIXES: Final = {"--cloud": ".ply", "--ply": ".ply", "--plan": ".png", "--record": ".mcap", "--mcap": ".mcap"}
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
@@ -35,6 +37,8 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         other = taken.setdefault(_identity(path), option)
         if other != option and path.exists() == path.is_file():
             raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
+        if path.suffix.lower() not in ("", SUFFIXES.get(option, path.suffix.lower())):
+            raise OmnidError(f"{option} {path}: expected a name that ends with {SUFFIXES[option]}")
 
 
 def on_stdout(outputs: Named) -> bool:

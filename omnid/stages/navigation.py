@@ -38,7 +38,7 @@ from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
-from omnid.stages.routes import KeyframeTie, Routes
+from omnid.stages.routes import KeyframeTie, Routes, refusal_while_teaching
 
 Array = NDArray[np.float64]
 NavigationInput: TypeAlias = (
@@ -211,7 +211,7 @@ class NavigationStage:
                     self._navigator.cancel("stopped by a request")
             case RouteAction.REPEAT:
                 if routes.teaching:
-                    raise OmnidError(f"the route {routes.teaching} is being taught: finish or stop it first")
+                    raise OmnidError(refusal_while_teaching(routes.teaching))
                 # The route comes first, because a request for a missing one must not ask for arming.
                 route = routes.found(request, command.refusal)
                 self._require_ready(NavigationFrame.MAP)

@@ -58,6 +58,11 @@ def refusal_of_name(name: str) -> str:
     return f"there is a route {name} already: choose another name, or replace it (`omnid route teach {name} --replace`)"
 
 
+def refusal_while_teaching(name: str) -> str:
+    """Return why nothing else can begin while a route is recorded."""
+    return f"the route {name} is being taught: `omnid route finish` writes it, `omnid route stop` drops it"
+
+
 class KeyframeTie:
     """The newest keyframe, and the pose of the base in the map as that says."""
 
@@ -93,7 +98,7 @@ class Routes:
         """
         places = self._map()
         if self._recorder is not None:
-            raise OmnidError(f"the route {self._recorder.name} is being taught: finish or stop it first")
+            raise OmnidError(refusal_while_teaching(self._recorder.name))
         if not replace and self.taught is not None and self.taught.route.name == name:
             raise OmnidError(refusal_of_name(name))
         refusal = refusal_of_map(now, math.inf)
@@ -121,7 +126,7 @@ class Routes:
         It can be repeated at once.
         """
         if self._recorder is None:
-            raise OmnidError('no route is being taught: begin with "teach NAME"')
+            raise OmnidError("no route is being taught: begin with `omnid route teach NAME`")
         if self.taught is not None:
             raise OmnidError(f"the route {self.taught.route.name} is being written: wait for its end")
         places = self._map()
@@ -149,9 +154,11 @@ class Routes:
         if refusal or request.route is None:
             raise OmnidError(refusal or f"the route {request.name} was not read")
         if not request.route.fits(places.keyframe):
+            taught_in = request.route.map_name
+            other = "built again since" if taught_in == places.name else f"and not in {places.name}"
             raise OmnidError(
-                f"the route {request.name} was taught in another map ({request.route.map_name}) than "
-                f"{places.name}: start with that map (`omnid run --map`), or teach it again"
+                f"the route {request.name} was taught in the map {taught_in}, {other}: start with the map that it was "
+                "taught in (`omnid run --map`), or teach it again"
             )
         return request.route
 

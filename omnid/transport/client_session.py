@@ -7,11 +7,15 @@ from typing import Final
 
 import zenoh
 
+from omnid.plain_text import plain
 from omnid.transport.bus_config import BusConfig, checked
+from omnid.transport.namesakes import ALIVE
 from omnid.transport.session import Unreachable, open_session
 
 HERE: Final = "tcp/127.0.0.1:7447"
 _MAX_RETRY_S: Final = 0.5
+_NAMED: Final = 5  # Most robots that a message names.
+_ALIVE_TIMEOUT_S: Final = 1.0
 
 
 def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
@@ -42,3 +46,11 @@ def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
             if time.monotonic() >= deadline_s:
                 raise
         time.sleep(min(config.retry_s, _MAX_RETRY_S))
+
+
+def robots_there(session: zenoh.Session) -> str:
+    """Return the names of the robots that this session reaches, as a part of a sentence."""
+    replies = session.liveliness().get(f"**/{ALIVE}", timeout=_ALIVE_TIMEOUT_S)
+    names = sorted(str(reply.ok.key_expr).rpartition("/")[0] for reply in replies if reply.ok is not None)
+    more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+    return plain(f"robots there: {', '.join([*names[:_NAMED], *more])}") if names else "no robot is there"

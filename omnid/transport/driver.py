@@ -10,6 +10,7 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
+from omnid.transport.client_session import robots_there
 from omnid.transport.navigation_codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
 from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TWIST, request_key
@@ -69,10 +70,7 @@ class Driver:
     def require_connected(self) -> None:
         """Return as soon as a robot subscribes to the commands. Raise OmnidError after CONNECT_S."""
         if not _happens(lambda: self.connected):
-            raise OmnidError(
-                f"no robot {self._robot!r} receives commands there: check --robot and --connect, and that "
-                "its daemon runs with a motor"
-            )
+            raise self._absent("receives commands")
 
     def twist(self, velocity_mps: float, yaw_rate_radps: float) -> None:
         """Drive with this forward speed and yaw rate (counter-clockwise)."""
@@ -119,10 +117,7 @@ class Driver:
         key = f"{self._robot}/{request_key(topic)}"
         with self._session.declare_querier(key, timeout=timeout_s, **_QUALITY) as querier:
             if not _happens(lambda: _matches(querier)):
-                raise OmnidError(
-                    f"no robot {self._robot!r} takes such requests there: check --robot and --connect, "
-                    "and that its daemon runs, with a motor where it is to drive"
-                )
+                raise self._absent("takes such requests")
             self.asked_ns = now_ns = time.time_ns()
             for reply in querier.get(payload=payload_at(now_ns), attachment=self._attachment(now_ns)):
                 if reply.ok is not None and (answer := answer_of(reply.ok.payload.to_bytes())) is not None:
@@ -141,6 +136,13 @@ class Driver:
             self._publishers[topic] = _command_publisher(self._session, f"{self._robot}/{topic}")
         publisher, attachment = self._publishers[topic], self._attachment(time.time_ns())
         publisher.put(payload, source_info=zenoh.SourceInfo(publisher.id, self._sent), attachment=attachment)
+
+    def _absent(self, does: str) -> OmnidError:
+        """Return the error that the robot does something no more, or never did."""
+        return OmnidError(
+            f"no robot {self._robot!r} {does} there ({robots_there(self._session)}): check --robot and --connect, and "
+            "that its daemon runs, with a motor where it is to drive"
+        )
 
     def _attachment(self, sent_ns: int) -> bytes:
         self._sent = (self._sent + 1) % _SEQUENCE

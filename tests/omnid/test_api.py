@@ -181,6 +181,9 @@ def test_masks_are_found_in_images(scene: Path, pairs: list[Pair]) -> None:
     assert odometry.rig.lower.mask is not None and odometry.rig.upper.mask is not None
     assert np.array_equal([odometry.process(*pair).T_odom_rig for pair in pairs], expected.T_odom_rig)
     assert omnid.Odometry(bare).rig.lower.mask is None
+    for wrong in ([pairs[0][1]], [pairs[0]]):
+        with pytest.raises(OmnidError, match="mask_images: expected pairs"):
+            omnid.Odometry(bare, mask_images=wrong)  # type: ignore[arg-type]
 
 
 def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pairs: list[Pair]) -> None:
@@ -299,7 +302,14 @@ def example(name: str, *words: object, cwd: Path) -> str:
 def test_examples_are_short() -> None:
     programs = [path for path in (ROOT / "omnid" / "examples").glob("*.py") if path.name != "__init__.py"]
     assert len(programs) >= 3
-    assert all(len(path.read_text().splitlines()) <= 20 for path in programs)
+    assert all(len(path.read_text().splitlines()) <= 22 for path in programs)
+
+
+@pytest.mark.parametrize("name", ["replay_log", "images_to_poses", "rectify_image"])
+def test_an_example_without_its_files_says_how_it_is_called(tmp_path: Path, name: str) -> None:
+    with pytest.raises(subprocess.CalledProcessError) as raised:
+        example(name, cwd=tmp_path)
+    assert f"`python -m omnid.examples.{name} " in raised.value.stderr and "Traceback" not in raised.value.stderr
 
 
 def test_example_of_a_replay(tmp_path: Path, scene: Path, result: omnid.RunResult) -> None:

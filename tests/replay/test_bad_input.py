@@ -168,6 +168,15 @@ def test_refuses_an_unwritable_output_before_the_run(omnid: Command, tmp_path: P
     assert kept.read_text() == "previous result" and list(tmp_path.iterdir()) == [kept]
 
 
+@pytest.mark.parametrize(("option", "suffix"), [("--cloud", ".ply"), ("--plan", ".png"), ("--record", ".mcap")])
+def test_a_file_is_not_named_as_one_of_another_format(
+    omnid: Command, tmp_path: Path, scene: Path, option: str, suffix: str
+) -> None:
+    error = omnid.refused("replay", scene / "log.mcap", option, tmp_path / "out.txt")
+    assert f"{option} {tmp_path / 'out.txt'}: expected a name that ends with {suffix}" in error
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_refused_run_leaves_no_files(omnid: Command, tmp_path: Path, scene: Path) -> None:
     omnid.refused("replay", scene / "log.mcap", "--tum", tmp_path / "fresh", "--record", tmp_path / "absent" / "x")
     assert list(tmp_path.iterdir()) == []

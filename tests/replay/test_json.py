@@ -22,6 +22,7 @@ def test_results_of_a_replay_as_json(omnid: Command, scene: Path, tmp_path: Path
     first = loaded(omnid, *words, "--tum", tum, "--record", a)
     assert first["counters"]["poses"] == PAIRS and first["counters"]["states"]["tracking"] == PAIRS
     assert first["timings"]["odometry"]["n"] == PAIRS and first["signal"] == 0 and len(first["warnings"]) == 1
+    assert 0 < first["elapsed_s"] < 600
     metrics = loaded(omnid, "eval", tum, scene / "truth.txt")
     assert metrics["pairs"] == PAIRS and 0 < metrics["ate_rmse_m"] < 0.05
     info = loaded(omnid, "log", "info", scene / "log.mcap", a)

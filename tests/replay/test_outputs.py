@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -47,6 +48,7 @@ def test_trajectory_and_map_are_right(omnid: Command, tmp_path: Path, scene: Pat
     tum, ply, plan = tmp_path / "est.txt", tmp_path / "map.ply", tmp_path / "plan.png"
     result = omnid.replay(scene / "log.mcap", "--tum", tum, "--cloud", ply, "--plan", plan, rig=scene / "rig.toml")
     assert (result.count("pairs"), result.count("poses"), len(rows(tum))) == (PAIRS, PAIRS, PAIRS)
+    assert re.search(r"^speed +\d+\.\d pairs/s, in \d+\.\d s$", result.out, re.MULTILINE)
     estimate, truth = read_tum(tum), read_tum(scene / "truth.txt")
     np.testing.assert_allclose(estimate.T[0], np.eye(4), atol=1e-9)
     assert np.array_equal(estimate.stamps_ns, truth.stamps_ns)

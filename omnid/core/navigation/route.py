@@ -136,7 +136,7 @@ class RouteRecorder:
         if self.length_m < SHORTEST_ROUTE_M:
             raise OmnidError(
                 f"the route {self.name} is {self.length_m:.2f} m long: expected {SHORTEST_ROUTE_M:g} m "
-                "and more: drive it, then finish"
+                "and more: drive it, then finish; `omnid route stop` drops it"
             )
         poses, speeds, keyframes, in_keyframe = zip(*self._to_its_end(), strict=True)
         stamps = dict(noted)

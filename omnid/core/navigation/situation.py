@@ -86,6 +86,11 @@ def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:
     """Return why the pose in the map cannot be used, with the remedy; empty if it can."""
     in_map = situation.in_map
     if in_map is None or in_map.state is not MapState.LOCALIZED:
+        if in_map is not None and in_map.state is MapState.ODOMETRY_ONLY:
+            return (
+                "not localised in a map: no place of it has been recognised yet: drive it a little where the map was "
+                "made (in a new map: back to where it has been), or use the frame odom"
+            )
         return (
             "not localised in a map: start it with one (`omnid run --map`) and drive it a little where the map "
             "was made, or use the frame odom"

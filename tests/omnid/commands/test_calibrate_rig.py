@@ -226,7 +226,7 @@ def bad(folder: Path, made: Path, kind: str) -> list[object]:
         ("text", "lower_09.png: expected an image"),
         ("one side", "no images upper_*"),
         ("unpaired", "no pair of images: found 3 of the lower camera, 3 of"),
-        ("missing", "found nothing"),
+        ("missing", "found no such file or folder"),
         ("one camera", "expected both --lower-camera and --upper-camera"),
         ("size of camera", "--lower-camera: expected a camera of 480x480 px like the lower images, found 640x480 px"),
         ("topic", "only a log has topics"),

@@ -120,6 +120,14 @@ def test_exit_code_is_1_without_a_pose() -> None:
     assert it.returncode == 1 and out == "omnid: no pose yet\n"
 
 
+def test_a_wrong_name_is_answered_by_those_of_the_robots_there() -> None:
+    endpoint = free_endpoint()
+    idle = contextlib.closing(Bus(BusConfig(listen=(endpoint,), robot="hall/one")))
+    with idle, listening("--connect", endpoint, "--seconds", 0.5) as it:
+        out, _ = it.communicate(timeout=DEADLINE_S)
+    assert it.returncode == 1 and out == "omnid: no pose yet (robots there: hall/one)\n"
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

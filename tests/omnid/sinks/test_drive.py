@@ -98,9 +98,17 @@ def test_a_live_pose_keeps_its_stamp(link: Any) -> None:
 
 
 def test_what_a_robot_does_is_a_sentence() -> None:
-    assert granted_words("teach dock", "idle") == "it records the route dock: drive it, then finish it"
-    assert granted_words("repeat dock", "driving") == "it repeats the route dock"
-    assert granted_words("pause", "paused: by a request") == "paused: by a request"
+    idle, driving = NavigationState.IDLE, NavigationState.DRIVING
+    assert granted_words("teach dock", idle).startswith("it records the route dock: drive it, then finish it")
+    assert granted_words("repeat dock", driving) == "it repeats the route dock"
+    assert granted_words("pause", NavigationState.PAUSED, "by a request") == "paused: by a request"
+    assert granted_words("cancel", NavigationState.CANCELLED, "by a request") == "cancelled: by a request"
+
+
+@pytest.mark.parametrize("verb", ["cancel", "pause"])
+def test_a_cancel_of_nothing_is_no_goal_that_is_reached(verb: str) -> None:
+    assert granted_words(verb, NavigationState.REACHED) == "nothing is under way (reached)"
+    assert granted_words(verb, NavigationState.FAILED, "no way") == "nothing is under way (failed: no way)"
 
 
 def test_the_answers_of_the_navigation_are_given_and_its_route_is_handed_on(link: Any) -> None:

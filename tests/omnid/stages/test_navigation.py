@@ -263,7 +263,10 @@ def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     other = Robot(tmp_path, FixedMap(stamp_ns=6))
     other.pass_on()
     update = other.send(RouteRequest(RouteAction.REPEAT, "hall"))
-    assert update.answer is not None and "taught in another map (site.omap)" in update.answer.refusal
+    assert update.answer is not None and "in the map site.omap, built again since" in update.answer.refusal
+    other.places.name = "hall.omap"
+    update = other.send(RouteRequest(RouteAction.REPEAT, "hall"))
+    assert update.answer is not None and "in the map site.omap, and not in hall.omap" in update.answer.refusal
     other.places.name = ""
     update = other.send(RouteRequest(RouteAction.TEACH, "x"))
     assert update.answer is not None and "--map FILE.omap" in update.answer.refusal

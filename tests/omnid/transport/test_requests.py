@@ -64,7 +64,7 @@ def test_a_request_without_an_answer_is_an_error() -> None:
     with (
         contextlib.closing(Bus(BusConfig(listen=(endpoint,)))),
         Robot(connect=(endpoint,)) as program,
-        pytest.raises(OmnidError, match="no robot 'omnid' takes such requests"),
+        pytest.raises(OmnidError, match=r"no robot 'omnid' takes such requests there \(robots there: omnid\)"),
     ):
         program.driver().arm()
 
