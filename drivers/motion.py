@@ -17,12 +17,13 @@ class WheelSample:
 
 @dataclass(frozen=True, slots=True)
 class GyroSample:
-    """Angular velocity about the axes of the gyro; those of the base are x forward, y left, z up."""
+    """Angular velocity about the axes of the gyro, or of the base: x forward, y left, z up."""
 
     stamp_ns: int  # of the measurement, by the clock of the images' stamps
     x_radps: float
     y_radps: float
     z_radps: float
+    of_base: bool = False  # the axes are those of the base, however the gyro is mounted
 
 
 MotionSample: TypeAlias = WheelSample | GyroSample

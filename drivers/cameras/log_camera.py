@@ -205,4 +205,5 @@ def _scaled(sample: MotionSample, stamp_ns: int, factor: float) -> MotionSample:
     """Return the sample of a log that is played faster by a factor."""
     if isinstance(sample, WheelSample):
         return WheelSample(stamp_ns, factor * sample.velocity_mps, factor * sample.yaw_rate_radps)
-    return GyroSample(stamp_ns, factor * sample.x_radps, factor * sample.y_radps, factor * sample.z_radps)
+    rates = factor * sample.x_radps, factor * sample.y_radps, factor * sample.z_radps
+    return GyroSample(stamp_ns, *rates, of_base=sample.of_base)

@@ -9,8 +9,10 @@ from __future__ import annotations
 import errno
 import math
 import struct
+import termios
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import Final
 
 import serial  # type: ignore[import-untyped]
@@ -25,6 +27,8 @@ PACKET: Final = struct.Struct("<BB4hB")
 RADPS_PER_UNIT: Final = math.radians(2000.0) / 32768
 DEFAULT_BAUD: Final = 9600
 READ_S: Final = 0.1  # longest wait for bytes, so that `close` takes effect soon
+PERIOD_SHARE: Final = 0.05  # Share of a read in the period of samples.
+LONGEST_PERIOD_S: Final = 0.2  # slowest rate of the maker that is of use, 5 Hz
 SILENT_S: Final = 2.0  # The port is opened again after this time without a packet.
 # Waits between two attempts to open the port: doubled from the first to the longest.
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.2, 5.0
@@ -61,8 +65,9 @@ class PacketReader:
 class WitMotionGyro:
     """The gyro on a serial port; its rate and baud rate are those that it was set to by its maker's program.
 
-    A sample's stamp is the time of its arrival (CLOCK_MONOTONIC). A port that is gone is opened again, but
-    no pseudo-terminal that another program has since.
+    A sample's stamp is the time of its arrival (CLOCK_MONOTONIC). Of samples that arrive together, those before the
+    last are as much earlier as samples usually are apart. What arrived before the first read is dropped: nothing tells
+    its time. A port that is gone is opened again, but no pseudo-terminal that another program has since.
     """
 
     def __init__(self, port: str, baud: int = DEFAULT_BAUD, on_event: Callable[[str], None] = lambda _: None) -> None:
@@ -82,23 +87,36 @@ class WitMotionGyro:
 
     def samples(self) -> Iterator[GyroSample]:
         """Yield the samples until `close` is called."""
+        self._discard()
         received_s, wait_s = time.monotonic(), FIRST_WAIT_S
+        least_s = PACKET.size * 10 / self._baud  # a packet takes so long
+        period_s = 0.0  # of samples, 0: not known
         while not self._closed:
             data = self._read()
-            stamp_ns = time.monotonic_ns()
+            now_ns = time.monotonic_ns()
             rates = list(self._reader.feed(data))
-            for k, rate in enumerate(rates):  # what arrives together was sent one after the other
-                behind_s = (len(rates) - 1 - k) * PACKET.size * 10 / self._baud
-                yield GyroSample(stamp_ns - round(behind_s * 1e9), *rate)
             if rates:
-                received_s, wait_s = time.monotonic(), FIRST_WAIT_S
+                # A late read has as many more samples, so that the mean over them holds.
+                mean_s = min(max(least_s, (now_ns * 1e-9 - received_s) / len(rates)), LONGEST_PERIOD_S)
+                period_s += (PERIOD_SHARE if period_s else 1.0) * (mean_s - period_s)
+            for k, rate in enumerate(rates):
+                yield GyroSample(now_ns - round((len(rates) - 1 - k) * period_s * 1e9), *rate)
+            if rates:
+                received_s, wait_s = now_ns * 1e-9, FIRST_WAIT_S
             elif time.monotonic() - received_s > SILENT_S:
                 self._reopen(wait_s)
+                self._discard()
                 received_s, wait_s = time.monotonic(), min(2 * wait_s, LONGEST_WAIT_S)
 
     def close(self) -> None:
         """End `samples`; may be called twice, from any thread."""
         self._closed = True
+
+    def _discard(self) -> None:
+        """Drop what has arrived so far."""
+        if self._port is not None:
+            with suppress(serial.SerialException, OSError, termios.error):  # the next read reports it
+                self._port.reset_input_buffer()
 
     def _read(self) -> bytes:
         if self._port is None:

@@ -113,7 +113,7 @@ class ImageFolder:
 def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
     """Yield the images of a folder with their stamps; raise DriverError where one has none."""
     topic = folder.relative_to(top).as_posix()
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    paths = sorted((path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES), key=_numbers_of)
     _require_own_files(top, paths)
     lines = _stamp_lines(folder)
     if lines is not None and len(lines) != len(paths):
@@ -131,6 +131,11 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
                 f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}"
             )
         yield _StampedFile(stamp_ns, topic, path)
+
+
+def _numbers_of(path: Path) -> list[tuple[int, str]]:
+    """Return a key that sorts names by the numbers in them: 9.png comes before 10.png."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
 
 
 def _require_plausible(files: Sequence[_StampedFile]) -> None:

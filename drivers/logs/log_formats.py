@@ -22,7 +22,8 @@ MAX_PARTS: Final = 1000
 _MAX_LISTED: Final = 8
 LOG_SUFFIXES: Final = (".mcap", ".db3", ".bag")
 # A part of a split log: name, time of its first message (of omnid's recordings and of ROS 1), number.
-_PART: Final = re.compile(r"(.+?)(?:_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?_(\d{1,9})(\.\w+)")
+_PART: Final = re.compile(r"(.+?)(_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?_(\d{1,9})(\.\w+?)(?:\.part)?")
+_WHOLE_OR_CUT: Final = (*LOG_SUFFIXES, ".mcap.part")  # A recording has the latter until it is complete.
 
 
 def open_image_log(path: str | os.PathLike[str]) -> ImageLog:
@@ -77,7 +78,7 @@ def _open_file(path: Path) -> ImageLog:
 
 def _open_folder(path: Path) -> ImageLog:
     try:
-        logs = sorted(file for file in path.iterdir() if file.suffix in LOG_SUFFIXES and file.is_file())
+        logs = logs_in(path)
     except OSError as error:
         raise DriverError(f"cannot read the folder {str(path)!r}: {error.strerror}") from error
     if len(logs) == 1:
@@ -93,17 +94,24 @@ def _open_folder(path: Path) -> ImageLog:
     )
 
 
+def logs_in(folder: Path) -> list[Path]:
+    """Return the logs in a folder by their names, one that is not complete included. Raise OSError where unreadable."""
+    return sorted(file for file in folder.iterdir() if file.name.endswith(_WHOLE_OR_CUT) and file.is_file())
+
+
 def parts_in_order(logs: list[Path]) -> list[Path]:
     """Return the parts of a split log in the order of their numbers; empty where the files are not such parts.
 
-    They have one name and numbers without a gap: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them.
+    They have one name and numbers without a gap: `bag_0.mcap`, `bag_1.mcap`, as `ros2 bag record` names them. Where
+    their names have times, these rise with the numbers: else the files are of several recordings.
     """
     found = [(_PART.fullmatch(log.name), log) for log in logs]
-    numbered = sorted((int(match[2]), log) for match, log in found if match)
-    names = {(match[1], match[3]) for match, _ in found if match}
+    numbered = sorted((int(match[3]), match[2] or "", log) for match, log in found if match)
+    names = {(match[1], match[4]) for match, _ in found if match}
     first = numbered[0][0] if numbered else 0
-    follows = [number for number, _ in numbered] == list(range(first, first + len(logs)))
-    return [log for _, log in numbered] if len(names) == 1 and follows else []
+    follows = [number for number, _, _ in numbered] == list(range(first, first + len(logs)))
+    times = [time for _, time, _ in numbered]
+    return [log for _, _, log in numbered] if len(names) == 1 and follows and times == sorted(times) else []
 
 
 def _open_parts(path: Path, parts: list[Path]) -> ImageLog:

@@ -10,6 +10,7 @@ from mcap.records import Channel, Schema
 
 from drivers.logs.mcap_records import PARSE_ERRORS, RecordError, parser
 from drivers.logs.ros_image import IMAGE_TYPES
+from drivers.logs.ros_motion import MOTION_TYPES
 
 CDR, ROS1 = "cdr", "ros1"  # message encodings
 _MAX_CHANNELS = 4096
@@ -55,8 +56,8 @@ class Catalog:
         if channel is None:
             return None
         kind, encoding = self._types.get(channel.schema_id, ""), channel.message_encoding
-        # Of ROS 1, images are all that is read.
-        known = encoding == CDR or (encoding == ROS1 and kind in IMAGE_TYPES)
+        # Of ROS 1, images and samples of motion are all that is read.
+        known = encoding == CDR or (encoding == ROS1 and kind in (*IMAGE_TYPES, *MOTION_TYPES))
         return LogTopic(channel.topic, kind if known else "", encoding != ROS1)
 
     def topics(self) -> dict[str, str]:

@@ -59,15 +59,19 @@ def parse_image(schema_name: str, message: memoryview, *, aligned: bool = True) 
 
 
 def header_stamp(members: MemberReader) -> int:
-    """Return the stamp of a std_msgs/Header [ns]."""
+    """Return the stamp of a std_msgs/Header [ns]; its frame is not used: the topic identifies the camera."""
+    return header(members)[0]
+
+
+def header(members: MemberReader) -> tuple[int, str]:
+    """Return the stamp of a std_msgs/Header [ns] and its frame."""
     if not members.aligned:
         members.number("I")  # the sequence number that a header has in ROS 1
     seconds: int = members.number("i")
     nanoseconds: int = members.number("I")
     if seconds < 0 or nanoseconds >= 10**9:
         raise FrameDecodeError(f"a message has the invalid stamp {seconds} s {nanoseconds} ns")
-    members.string()  # frame_id, which is not used: the topic identifies the camera
-    return seconds * 10**9 + nanoseconds
+    return seconds * 10**9 + nanoseconds, members.string()
 
 
 def _raw(members: MemberReader, stamp_ns: int) -> RosImage:

@@ -70,7 +70,9 @@ def choose_motion_topics(log: str, topics: Mapping[str, str], wanted: MotionTopi
     may have any name. Raises DriverError for a requested topic that does not exist or is of another type.
     """
     chosen, warnings = [], []
-    wheels = JOINT_STATE if wanted.joints else ODOMETRY
+    # omnid records the wheels of joints as an Odometry.
+    of_joints = wanted.joints and (wanted.wheels or JOINT_STATE in topics.values())
+    wheels = JOINT_STATE if of_joints else ODOMETRY
     for kind, name, knob in ((wheels, wanted.wheels, "motion.wheel_topic"), (IMU, wanted.imu, "motion.imu_topic")):
         if name:
             if topics.get(name) != kind:

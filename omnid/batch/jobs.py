@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -12,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
-from drivers.logs.log_formats import LOG_SUFFIXES, parts_in_order
+from drivers.logs.log_formats import LOG_SUFFIXES, logs_in, parts_in_order
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line
 from omnid.version import __version__
@@ -82,12 +83,13 @@ def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
 
 def _distinct(names: Iterable[str]) -> list[str]:
     """Return names of which none occurs twice: a.mcap and a.db3 are two logs."""
-    seen: dict[str, int] = {}
-    found = []
-    for name in names:
-        count = seen[name] = seen.get(name, 0) + 1
-        found.append(name if count == 1 else f"{name}-{count}")
-    return found
+    found: dict[str, None] = {}
+    given = list(names)
+    for name in given:
+        # A number that no other log has as a part of its own name.
+        numbered = (f"{name}-{count}" for count in itertools.count(2))
+        found[name if name not in found else next(each for each in numbered if each not in {*found, *given})] = None
+    return list(found)
 
 
 def _of_name(name: str) -> list[str]:
@@ -108,7 +110,7 @@ def _of_path(path: Path) -> Iterator[Path]:
     if not path.is_dir():
         yield path
         return
-    inside = sorted(file for file in path.iterdir() if file.suffix in LOG_SUFFIXES and file.is_file())
+    inside = logs_in(path)
     if len(inside) > 1 and parts_in_order(inside):
         yield path
         return

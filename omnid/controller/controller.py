@@ -121,7 +121,8 @@ class Controller:
         # 4. Times and the wheels' own motion.
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
-        wheels = None if status is None else WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps)
+        is_known = status is not None and math.isfinite(status.velocity_mps)
+        wheels = WheelSample(now_ns, status.velocity_mps, status.yaw_rate_radps) if status and is_known else None
         return TickReport(
             None if status is None else command, late_s, (done_ns - now_ns) * S_PER_NS, to_wheel_s, self.state, wheels
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Final
 
@@ -26,17 +27,21 @@ class MotionInbox:
         self._R_base_imu = R_base_imu
         self._waiting: deque[MotionSample] = deque(maxlen=MOST_WAITING)
         self.wheels = self.gyro = 0  # samples that have come
-        self.dropped = 0  # because none took them, or their stamps are far ahead
+        self.dropped = 0  # because none took them, their stamps are far ahead, or their rates are not finite
 
     def add(self, sample: MotionSample) -> None:
-        """Add a sample."""
+        """Add a sample; one whose rates are not finite is dropped, as it would make the poses so."""
+        rates = (sample.velocity_mps,) if isinstance(sample, WheelSample) else _rates(sample)
+        if not all(map(math.isfinite, rates)):
+            self.dropped += 1
+            return
         if isinstance(sample, WheelSample):
             self.wheels += 1
         else:
             self.gyro += 1
-            if self._R_base_imu is not None:
-                rates = self._R_base_imu @ (sample.x_radps, sample.y_radps, sample.z_radps)
-                sample = GyroSample(sample.stamp_ns, *rates.tolist())
+            if self._R_base_imu is not None and not sample.of_base:
+                x, y, z = (self._R_base_imu @ _rates(sample)).tolist()
+                sample = GyroSample(sample.stamp_ns, x, y, z, of_base=True)
         self.dropped += len(self._waiting) == MOST_WAITING
         self._waiting.append(sample)
 
@@ -50,3 +55,7 @@ class MotionInbox:
         self._waiting.extendleft(reversed(later))
         first = {type(sample): sample for sample in reversed(later)}
         return (*due, *(sample for sample in later if sample is first[type(sample)]))
+
+
+def _rates(sample: GyroSample) -> tuple[float, float, float]:
+    return sample.x_radps, sample.y_radps, sample.z_radps

@@ -21,6 +21,8 @@ from omnid.stages.skew import Skew
 MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera may be delivered a few periods later
 PERIOD_STEPS = 16  # recent steps between the stamps of a camera, whose median is its period
 SURE_NS = 5_000_000  # stamps so close make a pair also before the period is known
+SURE_STEPS = 3  # Steps after which the period is known ...
+FIRST_NS = 50_000_000  # ... and the largest difference of a pair before: half the period at 10 Hz.
 OTHER: dict[Camera, Camera] = {"lower": "upper", "upper": "lower"}
 
 
@@ -31,6 +33,11 @@ class Period:
         self._newest_ns: int | None = None
         self._steps: deque[int] = deque(maxlen=PERIOD_STEPS)
         self.ns: float | None = None  # median of the recent ones; None before the second image
+
+    @property
+    def is_sure(self) -> bool:
+        """True if a single pause, as at the start of a camera, cannot be taken for the period."""
+        return len(self._steps) >= SURE_STEPS
 
     def add(self, stamp_ns: int) -> None:
         """Add an image."""
@@ -47,7 +54,8 @@ class FrameMatcher:
     there is one within the tolerance: waiting for a nearer one would delay every pair by a period.
 
     tolerance_ns 0: half the period of the faster camera, so that every image of the slower one finds its nearest
-    partner whatever the phase between the cameras. Before the period is known, all but very close frames wait.
+    partner whatever the phase between the cameras. Before the period is known, all but very close frames wait; a
+    pause between the first images may be taken for it, so at first no more than FIRST_NS counts.
     """
 
     def __init__(self, tolerance_ns: int) -> None:
@@ -65,8 +73,11 @@ class FrameMatcher:
     @property
     def tolerance_ns(self) -> float:
         """Largest difference between the stamps of a pair."""
-        periods = [period.ns for period in self._periods.values() if period.ns is not None]
-        return self.fixed_ns or (min(periods) / 2 if periods else SURE_NS)
+        periods = [period for period in self._periods.values() if period.ns is not None]
+        if self.fixed_ns or not periods:
+            return self.fixed_ns or SURE_NS
+        half_ns = min(period.ns for period in periods if period.ns is not None) / 2
+        return half_ns if any(period.is_sure for period in periods) else min(half_ns, FIRST_NS)
 
     def arrive(self, frame: Frame) -> None:
         """Take note of a frame's stamp."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
-from drivers.logs.ros_motion import IMU, ODOMETRY, parse_motion
+from drivers.logs.ros_motion import BASE_FRAME, IMU, ODOMETRY, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
@@ -33,7 +33,7 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int) -> bytes:
     """Encode angular velocities about the axes of the base."""
     rates = ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps)
     message = ros.sensor_msgs__msg__Imu(
-        header_message(stamp_ns, "base_link"),
+        header_message(stamp_ns, BASE_FRAME),
         ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
         _UNKNOWN,
         rates,

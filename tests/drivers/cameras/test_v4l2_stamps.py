@@ -65,8 +65,20 @@ def test_stamps_increase_strictly(stamps: Stamps) -> None:
     first = stamps.validate(START_NS, START_NS + 10)
     earlier = stamps.validate(START_NS - 1000, START_NS + PERIOD_NS)
     at_the_same_time = stamps.validate(START_NS, START_NS + PERIOD_NS)
-    assert (first, earlier, at_the_same_time) == (START_NS, START_NS + PERIOD_NS, START_NS + PERIOD_NS + 1)
+    replaced_ns = START_NS + PERIOD_NS - 10  # the arrival less the delay of the first
+    assert (first, earlier, at_the_same_time) == (START_NS, replaced_ns, replaced_ns + 1)
     assert stamps.state.restamped == 2
+
+
+def test_an_invalid_stamp_makes_no_later_one_invalid(stamps: Stamps) -> None:
+    """Also where images arrive later than the period after their capture."""
+    delay_ns, taken = 40_000_000, [START_NS + PERIOD_NS * number for number in range(30)]
+    assert delay_ns > PERIOD_NS
+    found = [
+        stamps.validate(stamp_ns + (delay_ns + 1_000_000) * (number == 5), stamp_ns + delay_ns)
+        for number, stamp_ns in enumerate(taken)
+    ]
+    assert found == taken and stamps.state.restamped == 1
 
 
 def test_reports_each_kind_of_fault_once(stamps: Stamps) -> None:

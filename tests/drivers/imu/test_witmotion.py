@@ -6,9 +6,10 @@ import math
 import os
 import random
 import threading
+import time
 import tty
 from collections.abc import Iterator
-from itertools import islice
+from itertools import islice, pairwise
 
 import pytest
 
@@ -60,13 +61,34 @@ def test_packets_are_found_again_after_damaged_bytes() -> None:
 def test_samples_of_a_port(port: tuple[int, str]) -> None:
     device, name = port
     gyro = WitMotionGyro(name, 115_200)
-    os.write(device, b"".join(turn(k) for k in range(20)))
+    os.write(device, turn(1000))  # old: nothing tells when it was measured
+    threading.Timer(0.3, os.write, (device, b"".join(turn(k) for k in range(20)))).start()
     samples = list(islice(gyro.samples(), 20))
     gyro.close()
     assert [round(sample.z_radps / witmotion.RADPS_PER_UNIT) for sample in samples] == list(range(20))
     stamps = [sample.stamp_ns for sample in samples]
     assert stamps == sorted(stamps) and stamps[-1] - stamps[0] < 10**9
     assert list(gyro.samples()) == []
+
+
+def test_samples_that_arrive_together_are_as_far_apart_as_usual(port: tuple[int, str]) -> None:
+    device, name = port
+    gyro = WitMotionGyro(name, 115_200)
+
+    def send() -> None:
+        """Send a turn each 20 ms or somewhat later, and 20 at once in the end."""
+        for k in range(30):
+            time.sleep(0.02)
+            os.write(device, turn(k))
+        time.sleep(0.4)
+        os.write(device, b"".join(turn(30 + k) for k in range(20)))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    stamps_ns = [sample.stamp_ns for sample in islice(gyro.samples(), 50)]
+    sender.join()
+    gyro.close()
+    assert min(after - before for before, after in pairwise(stamps_ns[30:])) > 15_000_000
 
 
 def test_a_silent_port_is_opened_again_and_reported(port: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:

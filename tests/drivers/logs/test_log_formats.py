@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import sqlite3
+import struct
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -21,6 +22,8 @@ from drivers.logs.log_formats import log_info
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_info import LogState
 from drivers.logs.sqlite_bag import SqliteBag
+from drivers.logs.topic_choice import MotionTopics
+from drivers.motion import GyroSample
 from tests.drivers.logs.bags import ROS1, ros1_bytes, write_bag, write_db3
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, STORE, Entry, jpeg, pairs, write_log
 from tests.drivers.logs.repeated_pages import repeat_pages
@@ -92,13 +95,19 @@ def test_an_mcap_that_was_converted_from_ros1(tmp_path: Path) -> None:
         writer = McapWriter(file)
         writer.start("ros1", "test")
         schema = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", b"")
+        imu = writer.register_channel("/imu", "ros1", writer.register_schema("sensor_msgs/Imu", "ros1msg", b""))
         channels: dict[str, int] = {}
         for entry in pairs(PAIRS):
             if entry.topic not in channels:
                 channels[entry.topic] = writer.register_channel(entry.topic, "ros1", schema)
             writer.add_message(channels[entry.topic], entry.log_time_ns, ros1_bytes(entry), entry.log_time_ns)
+        rates = struct.pack("<IIII37d", 1, 100, 0, 0, *[0.0] * 13, 0.1, 0.2, 0.3, *[0.0] * 21)
+        writer.add_message(imu, START_NS, rates, START_NS)
         writer.finish()  # type: ignore[no-untyped-call]
     assert read(tmp_path / "log.mcap")[0] == expected(tmp_path)
+    with closing(LogReader(tmp_path / "log.mcap", motion=MotionTopics(imu="/imu"))) as reader:
+        samples = [message for message in reader.messages() if not isinstance(message, Frame)]
+    assert samples == [GyroSample(100 * 10**9, 0.1, 0.2, 0.3)]
 
 
 @pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
@@ -142,6 +151,27 @@ def test_a_cut_part_is_reported(tmp_path: Path) -> None:
     assert reader.truncated and "bag_1.mcap" in reader.warnings[0]
 
 
+def test_a_recording_that_was_not_completed_is_the_last_part(tmp_path: Path) -> None:
+    folder, entries = tmp_path / "recordings", pairs(4)
+    folder.mkdir()
+    write_log(folder / "omnid_20261122T050000Z_001.mcap", entries[:4])
+    cut = write_log(folder / "omnid_20261122T051000Z_002.mcap.part", entries[4:])
+    cut.write_bytes(cut.read_bytes()[:-500])
+    found, reader = read(folder)
+    assert len(found) > 4 and reader.truncated and "_002.mcap.part" in reader.warnings[0]
+    assert log_info(folder).state is LogState.BROKEN
+    (folder / "omnid_20261122T050000Z_001.mcap").unlink()
+    assert read(folder)[1].truncated
+
+
+def test_recordings_of_two_runs_are_not_one_log(tmp_path: Path) -> None:
+    """Of the first run the oldest files are gone, by the limit of their number."""
+    write_log(tmp_path / "omnid_20260202T023000Z_002.mcap", pairs(2))
+    write_log(tmp_path / "omnid_20260203T023000Z_001.mcap", pairs(2))
+    with pytest.raises(DriverError, match="give one file"):
+        LogReader(tmp_path)
+
+
 @pytest.mark.parametrize("names", [str, lambda stamp: f"{stamp // 10**9}.{stamp % 10**9:09d}"])
 def test_folders_of_images_with_stamps(tmp_path: Path, names: Callable[[int], str]) -> None:
     folder = write_folders(tmp_path / "images", pairs(PAIRS), names)
@@ -159,6 +189,9 @@ def test_folders_with_a_list_of_stamps(tmp_path: Path) -> None:
         stamps = [frame[2] for frame in expected(tmp_path) if frame[0] == camera]
         lines = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in stamps]
         (folder / camera / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    assert read(folder)[0] == expected(tmp_path)
+    for path in folder.glob("*/*.jpg"):  # 10 comes after 9, not after 1
+        path.rename(path.with_stem(str(int(path.stem))))
     assert read(folder)[0] == expected(tmp_path)
     (folder / "upper" / "timestamps.txt").write_text("1.0\n")
     with pytest.raises(DriverError, match="12 images, and its list of stamps 1 lines"):

@@ -8,8 +8,9 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
+from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.log_reader import LogReader
-from drivers.logs.topic_choice import choose_topics
+from drivers.logs.topic_choice import MotionTopics, choose_motion_topics, choose_topics
 from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, START_NS, Entry, pairs, text, write_log
 
 CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
@@ -113,3 +114,11 @@ def test_a_topic_that_is_not_cdr_is_no_image_topic(tmp_path: Path) -> None:
 def test_the_error_names_the_log(tmp_path: Path) -> None:
     with pytest.raises(DriverError, match=r"no image topics in '.*log\.mcap': found /chatter"):
         LogReader(write_log(tmp_path / "log.mcap", [CHATTER]))
+
+
+def test_wheels_of_joints_are_an_odometry_where_omnid_has_recorded_them() -> None:
+    wanted = MotionTopics(joints=JointWheels("left", "right", 0.1, 0.5))
+    recorded = {"/omnid/wheel_odom": "nav_msgs/msg/Odometry", "/omnid/odom": "nav_msgs/msg/Odometry"}
+    assert choose_motion_topics("log", recorded, wanted).names == {"/omnid/wheel_odom"}
+    joints = recorded | {"/joints": "sensor_msgs/msg/JointState"}
+    assert choose_motion_topics("log", joints, wanted).names == {"/joints"}

@@ -21,6 +21,8 @@ def test_finds_logs(tmp_path: Path) -> None:
     assert find_logs([str(tmp_path / "*/*.mcap"), str(tmp_path / "a/1.mcap")]) == everything[:2]
     assert [job.name for job in jobs(everything, tmp_path, BatchOptions())] == ["a-1", "a-2", "b", "c-x"]
     assert [job.name for job in jobs(["/x/a.mcap", "/x/a.db3"], tmp_path, BatchOptions())] == ["a", "a-2"]
+    alike = ["/x/run-2.mcap", "/x/run.db3", "/x/run.mcap"]
+    assert [job.name for job in jobs(alike, tmp_path, BatchOptions())] == ["run-2", "run", "run-3"]
     for missing in ("nowhere.mcap", "nowhere/*.mcap"):
         with pytest.raises(OmnidError, match="batch: no log"):
             find_logs([str(tmp_path / missing)])

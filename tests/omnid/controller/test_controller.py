@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -156,6 +157,15 @@ def test_a_stop_voids_setpoints_and_latches_until_armed(driving: Bench) -> None:
     send_both(driving)
     driving.tick()
     assert driving.last.velocity_mps > 0.0
+
+
+def test_a_velocity_that_the_wheels_do_not_know_is_no_sample_of_them(driving: Bench) -> None:
+    send = driving.wheels.send
+    driving.wheels.send = lambda command: replace(send(command), velocity_mps=math.nan)  # type: ignore[method-assign]
+    send_both(driving)
+    assert driving.controller.tick().wheels is None
+    driving.wheels.send = send  # type: ignore[method-assign]
+    assert driving.controller.tick().wheels is not None
 
 
 def test_a_stop_during_a_tick_is_not_lost(driving: Bench) -> None:

@@ -205,6 +205,14 @@ def test_free_running_cameras_make_a_pair_of_every_image(free: Synchronise, skew
     assert all(p.skew_s == pytest.approx(1e-3 * skew_ms, abs=1e-6) for p in found[10:])
 
 
+def test_a_pause_after_the_first_images_is_not_taken_for_the_period(free: Synchronise) -> None:
+    """The upper camera's first image comes 0.4 s after the lower one's, the others from 1 s on at 30 Hz."""
+    first = [shot("lower", 0), shot("upper", 12)]
+    taken = [shot(c, index, 10 * MS * (c == "upper")) for index in range(30, 40) for c in ("lower", "upper")]
+    found = made(free, *first, *sorted(taken, key=lambda frame: frame.stamp_ns))
+    assert [round(p.skew_s * 1000) for p in found] == [10] * 10 and unpaired(free) == (1, 1)
+
+
 def test_free_running_cameras_lose_only_images_without_a_partner(free: Synchronise) -> None:
     taken = [
         shot(c, index, 14 * MS * (c == "upper"))

@@ -17,7 +17,7 @@ from tests.omnid.transport.test_sensor_receiver import joint_cdr
 OFFSET_NS = 10**18
 
 
-WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5)
+WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5, of_base=True)
 
 
 @pytest.fixture

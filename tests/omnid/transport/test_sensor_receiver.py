@@ -9,12 +9,13 @@ from rosbags.typesys.stores import ros2_humble as ros
 from drivers.logs.joint_wheels import JointWheels
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.transport.codec import header_message, message_cdr
-from omnid.transport.motion_codec import JOINT_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.motion_codec import IMU_SCHEMA, JOINT_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.sensor_receiver import SensorReceiver
 from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
+from tests.drivers.logs.mcap_logs import STORE
 
 OFFSET_NS = 10**18
-WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5)
+WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5, of_base=True)
 
 
 @pytest.fixture
@@ -33,6 +34,16 @@ def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
     sensors.receive(WHEEL_ODOM, wheel_cdr(WHEELS, WHEELS.stamp_ns + OFFSET_NS))
     sensors.receive(IMU, gyro_cdr(GYRO, GYRO.stamp_ns + OFFSET_NS))
     assert taken == [WHEELS, GYRO] and not lines and not sensors.refused
+
+
+def test_an_imu_that_measures_no_rates_is_no_gyro_that_stands(lines: list[str]) -> None:
+    """By sensor_msgs/msg/Imu the first number of a covariance is -1 where nothing is measured."""
+    message = STORE.deserialize_cdr(gyro_cdr(GYRO, OFFSET_NS + 5), IMU_SCHEMA)
+    message.angular_velocity_covariance = np.array([-1.0, *[0.0] * 8])
+    taken: list[MotionSample] = []
+    sensors = receiver(taken, lines)
+    sensors.receive(IMU, bytes(STORE.serialize_cdr(message, IMU_SCHEMA)))
+    assert not taken and sensors.refused[IMU] == 1 and "no angular velocity" in lines[0]
 
 
 def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
