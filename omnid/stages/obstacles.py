@@ -61,30 +61,36 @@ class Obstacles:
 
     def process(self, odometry: OdometryUpdate) -> ObstacleRing | None:
         """Return the ring at a pair, None where it is not due."""
-        # 1. Forget the grid and the tracks where odometry has lost its relation to them.
+        # 1. Forget the grid and the tracks where odometry has begun again.
         if not self._is_due(odometry):
             return None
         self._last_ns = odometry.stamp_ns
-        if odometry.state is TrackingState.LOST or odometry.reset_counter != self._resets:
+        if odometry.reset_counter != self._resets:
             self._grid.clear()
             self._tracker.clear()
             self._resets = odometry.reset_counter
         panoramas = odometry.depth.panoramas
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
+        unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
+        if odometry.state is TrackingState.LOST:
+            # The place is not known. What is known in odom holds again when odometry finds its landmarks again.
+            self._tracker.clear()
+            return unknown
         # 2. The floor; while it is unknown, so is the ring.
         if self.floor.wants_points:
             # As they were matched: the fit leaves out by itself what is no floor.
             self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
         columns = self._columns_of(self.floor.floor, panoramas)
         if columns is None:
-            return ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
+            return unknown
         # 3. The evidence of the images without their dead and blind parts, where nothing is watched any longer.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
         # 4. The grid, its ring, and the obstacles that move.
         pose = transform(planar(T_odom_base))
-        ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched)
+        unseen = self._unwatched.directions(panoramas.tiles.unknown)
+        ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched, unseen)
         moving = self._tracker.update(odometry.stamp_ns, self._grid.viewpoint(pose), ring.arrivals)
         return ObstacleRing(
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched

@@ -36,6 +36,7 @@ ALONG_SLOPE: Final = 0.05
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
+FAR_M: Final = 5.0  # Floor that is seen so far is open; a ring may end nearer than that, and nothing is known beyond.
 UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
 MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
@@ -124,12 +125,11 @@ class CollisionMonitor:
         self._points = [
             (r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)
         ]
-        ends_m = tuple(r if math.isfinite(r) else 0.0 for r in ring.ranges_m)
-        free = ring.free_m if len(ring.free_m) == count else ends_m
-        # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer. What
-        # stands nearer than stop_m before the surface is kept clear by that.
+        free = ring.free_m if len(ring.free_m) == count else [r if math.isfinite(r) else 0.0 for r in ring.ranges_m]
+        # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer.
         has_gap = [math.isfinite(r) and r - f > self._settings.stop_m for r, f in zip(ring.ranges_m, free, strict=True)]
-        unknown = [math.isnan(r) or gap for r, gap in zip(ring.ranges_m, has_gap, strict=True)]
+        parts = zip(ring.ranges_m, free, has_gap, strict=True)
+        unknown = [gap or math.isnan(r) or (math.isinf(r) and 0.0 < f < FAR_M) for r, f, gap in parts]
         self._unknown, self._gaps, self._unwatched = [], [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)

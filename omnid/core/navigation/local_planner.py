@@ -150,8 +150,9 @@ class LocalPlanner:
         near = ways <= min(AHEAD_M, leg_left_m + CELL_M)
         room_m = _distances(path, obstacles)
         is_blocked = room_m < self._half_m + settings.clearance_m
-        leaves = is_blocked[0] and _gets_farther(room_m)  # it is there already, and drives away
-        first_m = math.inf if leaves or not is_blocked[near].any() else float(ways[np.argmax(is_blocked)])
+        if is_blocked[0] and _gets_farther(room_m):  # it is there already, and drives away
+            is_blocked[: len(ways) if is_blocked.all() else np.argmin(is_blocked)] = False
+        first_m = float(ways[np.argmax(is_blocked)]) if is_blocked[near].any() else math.inf
         if first_m == math.inf and (not self._avoiding or offset_m < BACK_ON_PATH_M):
             self._avoiding = False
             return Detour(wanted, False)

@@ -41,6 +41,7 @@ CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a co
 BAND_NOISE: Final = 0.5  # noise of the band-pass, as a share of a panorama's
 UNITS: Final = 12.0  # Units of a normalised image in one sigma.
 ZERO: Final = 128.5  # level of a normalised image where there is no texture, and half a level to round
+LEAST_SEEN: Final = 0.5  # Share of the rows of a patch that must be in view. By judgement; not measured.
 OUTLIER: Final = np.uint8(48)  # Most units by which a pixel differs; a larger difference counts as this one.
 DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 would be that of independent pixels
 BIN_ROWS: Final = 2  # Rows on either side of those in which the floor has a disparity.
@@ -77,6 +78,7 @@ class ColumnEvidence(NamedTuple):
     surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
     level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
     nearest_floor_m: float  # nearest floor that both cameras see, 0: none
+    shown: Flags  # (DIRECTIONS,) that show anything: what hides others is wide
 
 
 class _Views(NamedTuple):
@@ -129,9 +131,10 @@ class Columns:
         rows = np.arange(self._height)
         self._plane_rows = (rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)).astype(np.float32)
         self._offsets = self._made_offsets()
+        self._leave_out_cut_planes()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
-        self._tested = self._floor_bins[:, kernels.FLOOR_END] > 0
-        tested = np.flatnonzero(self._tested)
+        tested = np.flatnonzero(self._floor_bins[:, kernels.FLOOR_END])
+        self._compared = self._made_compared()
         self.nearest_floor_m = self.at_1m / (float(tested[-1]) + 1.0) if len(tested) else 0.0
 
     def evidence(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> ColumnEvidence:
@@ -145,7 +148,8 @@ class Columns:
         live = np.where(shown, np.uint8(255), np.uint8(0))
         views = _Views(one, two, _bounds(two), _bounds(self._warped(two, 1)), live)
         # 2. Each explanation against all others.
-        return ColumnEvidence(self._floor(views), self._surface(views), self._level(views), self.nearest_floor_m)
+        ratios = self._floor(views), self._surface(views), self._level(views)
+        return ColumnEvidence(*ratios, self.nearest_floor_m, ~self._unseen)
 
     def _floor(self, views: _Views) -> Floats:
         """Return the log-likelihood ratios (K, DIRECTIONS) of the floor against all other disparities."""
@@ -154,8 +158,7 @@ class Columns:
         compared = views.lower, views.upright, views.plane, views.live
         kernels.floor_evidence(*compared, self._floor_bins, OUTLIER, scale, near, self._prior, others)
         floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
-        floor[~self._tested] = np.nan
-        floor[:, self._unseen] = np.nan
+        floor[~self._compared] = np.nan
         return floor
 
     def _surface(self, views: _Views) -> Floats:
@@ -235,6 +238,25 @@ class Columns:
                 self.at_1m / (k + 0.5) < NEAR_M,
             )
         return table
+
+    def _made_compared(self) -> Flags:
+        """Return the patches (K, DIRECTIONS) of the floor that are seen: a narrow strut hides them as a wide one."""
+        found = np.zeros((self.bins, DIRECTIONS), bool)
+        for k, (first, end, *_) in enumerate(self._floor_bins):
+            if end:
+                found[k] = self._visible[first:end].mean(axis=0) >= LEAST_SEEN
+        return found
+
+    def _leave_out_cut_planes(self) -> None:
+        """Leave out patches of the floor for which a plane beside it lies beyond the panorama's last row."""
+        for k, (first, end, *_) in enumerate(self._floor_bins):
+            if not end:
+                continue
+            lowest = self._plane_rows[first:end].max() + self._offsets[:, k] + 1 > self._height - 1
+            highest = self._plane_rows[first:end].min() + self._offsets[:, k] < 0
+            self._offsets[:, k][lowest | highest] = np.nan
+            if np.isnan(self._offsets[:, k, 0]).any():
+                self._floor_bins[k] = 0
 
     def _made_offsets(self) -> Floats:
         """Return the differences of disparity of kernels.level_evidence."""

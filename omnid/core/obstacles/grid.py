@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
-from omnid.core.obstacles.column import ColumnEvidence
+from omnid.core.obstacles.column import ColumnEvidence, floor_plane
 from omnid.core.obstacles.grid_layers import (
     ABOVE,
     FLOOR,
@@ -30,6 +30,7 @@ from omnid.core.obstacles.grid_layers import (
     level_odds,
 )
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
+from omnid.core.obstacles.near_field import NearField
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor, arrivals_at
 from omnid.core.obstacles.watch import FRESH_NS, Watch
@@ -72,10 +73,6 @@ PLACE_PAIRS: Final = 18.0
 USUAL: Final = 1.0
 THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
-PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
-# Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
-# neither. Before a viewpoint 0.9 m high, what stands 0.5 m away and is higher than 0.6 m hides all of them.
-BEHIND_CELLS: Final = 7
 
 
 class ObstacleGrid:
@@ -86,6 +83,7 @@ class ObstacleGrid:
         self._at_1m, self._low_m = at_1m, settings.heights_m[0]
         self._max_range_m = min(settings.max_range_m, (MARGIN_CELLS - 2) * CELL_M)
         self._T_rect_base, self._T_base_eye, self._gap_share = np.eye(4), np.eye(4), 0.0
+        self._lean_m = np.zeros(2)
         self._azimuths = azimuths()
         self._directions = np.column_stack([np.cos(self._azimuths), np.sin(self._azimuths)])
         self.clear()
@@ -94,6 +92,8 @@ class ObstacleGrid:
         """Take T_rect_base (4, 4), from the base level on the floor to the columns, and the viewpoint's height."""
         self._T_rect_base = T_rect_base
         self._T_base_eye[:2, 3] = se3.inverse(T_rect_base)[:2, 3]
+        plane = floor_plane(T_rect_base)
+        self._lean_m = height_m * np.array([plane.a, plane.b])
         # What is lower than an obstacle may hide this share of the range.
         self._gap_share = self._low_m / max(height_m - self._low_m, self._low_m)
 
@@ -106,6 +106,7 @@ class ObstacleGrid:
         self._odds = np.empty((len(PRIOR), CELLS, CELLS), np.float32)
         self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
         self._shown = np.zeros((CELLS, CELLS), np.float32)  # mean surface of single pairs
+        self._near = NearField(CELLS, CELL_M, self._directions)
         self._watch = Watch(CELLS, CELL_M)
         self._usual, self._usual_thin = UsualFloor(CELLS), UsualFloor(CELLS)
         self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
@@ -143,8 +144,10 @@ class ObstacleGrid:
         in_view = np.isfinite(cells[FLOOR])
         lost = np.where(behind, hidden, np.minimum(hidden, 0))
         nearest = int(evidence.nearest_floor_m / CELL_M)
-        self._lose_before(lost, eye, nearest)
-        amount = self._add((rows, columns), cells, lost[rows, columns], weight, at_rest)
+        self._near.lose_before(lost, eye, nearest)
+        seen_past = self._near.seen_past(self._odds[FLOOR], self._watch, eye, nearest)
+        gone = self._near.gone((rows, columns), cells[SURFACE], in_view, seen_past, eye)
+        amount = self._add((rows, columns), cells, lost[rows, columns], gone, weight, at_rest)
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
         if stamp_ns - self._start_ns >= FRESH_NS:
@@ -152,10 +155,11 @@ class ObstacleGrid:
             visible[rows, columns] = in_view
             flooded = self._watch.spread(stamp_ns, passed_ns, self._odds[FLOOR] > FREE_ODDS, visible)
             self._odds[FLOOR][flooded] = PRIOR[FLOOR]
-        self._clear_seen_past(eye, nearest)
+        self._near.clear_seen_past(self._odds, self._watch, eye, nearest)
         i, j = int(at[1]), int(at[0])
         own = slice(i - 3, i + 4), slice(j - 3, j + 4)
         self._odds[FLOORS, *own], self._odds[VISIBLE, *own], self._shown[own] = LIMIT, PRIOR[VISIBLE], 0.0
+        self._odds[SURFACE, *own] = PRIOR[SURFACE]
         # 4. The ring.
         gaps = self._gap_share, CELL_M + self._gap_share * self._nearest_m
         nearest_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
@@ -163,12 +167,18 @@ class ObstacleGrid:
         return ring_of(self.state(), view, arrivals)
 
     def _add(
-        self, window: tuple[slice, slice], cells: Floats, lost: Floats, weight: np.float32, at_rest: np.float32
+        self,
+        window: tuple[slice, slice],
+        cells: Floats,
+        lost: Floats,
+        gone: Flags,
+        weight: np.float32,
+        at_rest: np.float32,
     ) -> Floats:
         """Add the evidence of a pair to the log-odds of a window; return the most of each cell, of floor or surface.
 
-        cells (5, N, N): evidence of the cells; lost (N, N): log-odds that visible floor loses; weight, at_rest: of the
-        pair, and the part of it by time alone.
+        cells (5, N, N): evidence of the cells; lost (N, N): log-odds that visible floor loses; gone (N, N): surfaces
+        that would be seen; weight, at_rest: of the pair, and the part of it by time alone.
         """
         floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
         odds = self._odds[:, *window]
@@ -176,8 +186,8 @@ class ObstacleGrid:
         floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
         noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
         # An obstacle that is hidden or too near to be seen remains one.
-        noise[(surface <= 0) & ~in_view & (odds[SURFACE] > TAKEN_ODDS)] = 0.0
-        self._keep_shown(surface, in_view, weight, window)
+        noise[(surface <= 0) & ~in_view & ~gone & (odds[SURFACE] > TAKEN_ODDS)] = 0.0
+        self._keep_shown(surface, in_view | (_patches(gone) > 0), weight, window)
         surface = np.minimum(surface - noise, MOST_SURFACE)
         is_surface = surface > 0
         # Where floor is usual, a single cell that shows none is noise unless all floor behind it is hidden, too.
@@ -223,7 +233,7 @@ class ObstacleGrid:
             floor,
             evidence.surface,
             level,
-            np.array([x, y, c / norm, s / norm]),
+            np.array([x, y, c / norm, s / norm, *self._lean_m]),
             self._at_1m,
             CELL_M,
             VIEW_CELLS * CELL_M,
@@ -244,9 +254,9 @@ class ObstacleGrid:
 
     def _keep_shown(self, surface: Floats, in_view: Flags, weight: np.float32, window: tuple[slice, slice]) -> None:
         """Take the surface that a pair shows into the mean of single pairs, of cells that it shows at all."""
-        taken = (self._odds[SURFACE][window] > TAKEN_ODDS).astype(np.uint8)
+        taken = self._odds[SURFACE][window] > TAKEN_ODDS
         # What a pair shows around a surface that is known is that surface.
-        known = cv2.dilate(taken, np.ones((SHOWN_CELLS, SHOWN_CELLS), np.uint8)) > 0
+        known = _patches(taken) > 0
         amount = np.where(known, np.float32(0), np.clip(surface, 0, MOST_SHOWN))
         amount = cv2.blur(amount, (SHOWN_CELLS, SHOWN_CELLS))
         changed = in_view | (amount > 0)
@@ -256,8 +266,7 @@ class ObstacleGrid:
         """Take the floor nearer than what is in view for free, up to a surface that hides the nearest floor in view."""
         y, x = np.ogrid[:CELLS, :CELLS]
         in_view = np.isfinite(evidence.floor)
-        shown = np.asarray(in_view.any(axis=0)) | ~in_view.any()
-        reach = np.where(shown, (evidence.nearest_floor_m + 2 * CELL_M) / CELL_M, 0.0)
+        reach = np.where(evidence.shown | ~in_view.any(), (evidence.nearest_floor_m + 2 * CELL_M) / CELL_M, 0.0)
         nearest = np.flatnonzero(in_view.any(axis=1))[-1:]
         stands = (evidence.floor[nearest] < -MOST_RATIO).any(axis=0) & (evidence.surface.max(axis=0) > 0)
         range_m = self._at_1m / np.maximum(evidence.surface.argmax(axis=0), 1)
@@ -266,46 +275,6 @@ class ObstacleGrid:
         turned = (math.pi - np.arctan2(y - eye[1], x - eye[0]) - yaw) / math.tau
         reach_there = reach[np.floor(turned * len(reach)).astype(np.intp) % len(reach)]
         self._odds[FLOORS, (x - eye[0]) ** 2 + (y - eye[1]) ** 2 < reach_there**2] = FREE_ODDS + 1.0
-
-    def _lose_before(self, lost: Floats, eye: Array, nearest: int) -> None:
-        """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen: as behind them.
-
-        What hides the nearest floor in view may stand anywhere before it; as the base moves, directions cross there.
-        """
-        if nearest < 2:
-            return
-        rows, columns = self._cells_along(eye, nearest + 2)
-        behind = lost[rows[:, nearest:], columns[:, nearest:]].mean(axis=1)
-        near = rows[:, : nearest - 1], columns[:, : nearest - 1]
-        # Of the directions through a cell the most hidden one counts.
-        lost[near] = -np.inf
-        np.maximum.at(lost, near, np.broadcast_to(behind[:, None], near[0].shape))
-
-    def _clear_seen_past(self, eye: Array, nearest: int) -> None:
-        """End the flood too near to be seen where something behind it is watched: a person would hide that.
-
-        Behind it is the floor in view nearest to it, or a surface, such as the walls of a corridor.
-        """
-        if not nearest or not self._watch.flooded.any():
-            return
-        steps = nearest + 2
-        rows, columns = self._cells_along(eye, nearest + BEHIND_CELLS)
-        watched = self._watch.watched[rows, columns]
-        surface = np.logical_or.accumulate(watched & (self._odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
-        floor = watched & (self._odds[FLOOR][rows, columns] > FREE_ODDS)
-        past = floor[:, nearest - 1 :].any(axis=1) | surface[:, -1]
-        past = np.logical_and.reduce([np.roll(past, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
-        chosen = past[:, None] & ~surface[:, :steps]
-        cells = rows[:, :steps][chosen], columns[:, :steps][chosen]
-        flooded = self._watch.flooded[cells] > 0
-        self._odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), self._odds[FLOORS, *cells])
-        self._watch.flooded[cells] = 0
-
-    def _cells_along(self, eye: Array, steps: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the rows and columns (SECTORS, steps) of the first cells along all directions."""
-        ways = eye + np.arange(1, steps + 1)[None, :, None] * self._directions[:, None]
-        columns, rows = np.moveaxis(np.floor(ways).astype(np.intp), -1, 0)
-        return rows, columns
 
     def _follow(self, place: Array) -> NDArray[np.int64]:
         """Move the square where the robot comes near its border; return its corner, in cells of odom."""
@@ -321,9 +290,14 @@ class ObstacleGrid:
         x, y = np.clip(shift, -CELLS, CELLS).tolist()
         gone[max(-y, 0) : CELLS - max(y, 0), max(-x, 0) : CELLS - max(x, 0)] = False
         usual = (self._usual.mean, 0), (self._usual_thin.mean, 0)
-        layers = *zip(self._odds, PRIOR, strict=True), (self._shown, 0), *usual, *self._watch.layers
+        layers = *zip(self._odds, PRIOR, strict=True), (self._shown, 0), *usual, *self._watch.layers, *self._near.layers
         for layer, unknown in layers:
             layer[:] = np.roll(layer, (-y, -x), axis=(0, 1))
             layer[gone] = unknown
         self._corner = self._corner + shift
         return self._corner
+
+
+def _patches(cells: Flags) -> Bytes:
+    """Return 1 in the patches (N, N) of the mean of single pairs around cells."""
+    return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((SHOWN_CELLS, SHOWN_CELLS), np.uint8)), np.uint8)

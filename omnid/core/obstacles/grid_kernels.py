@@ -31,7 +31,8 @@ def gather(
 
     floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
     compared.
-    origin (4,): place of the middle of cell (0, 0) in the frame of the columns, and cosine and sine of its axes there;
+    origin (6,): place of the middle of cell (0, 0) in the frame of the columns, cosine and sine of its axes there, and
+    by how much [m] a surface at the viewpoint's height appears nearer than its foot along x and y, as the rig leans;
     at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest
     obstacle, whose directions count together.
     """
@@ -65,8 +66,13 @@ def gather(
             far = math.floor(at_1m / (r + 0.5 * cell_m))
             if far > near:  # nearer than the last disparity that is compared
                 continue
-            last_surface = min(math.floor(at_1m / (r - 0.5 * cell_m) + 0.5), bins - 1)
-            first_surface = min(math.floor(at_1m / (r + 0.5 * cell_m) + 0.5), last_surface)
+            # A surface counts in the cell of its foot, whichever of its heights is seen.
+            lean = (origin[4] * x + origin[5] * y) / r
+            nearest, farthest = r - 0.5 * cell_m - max(lean, 0.0), r + 0.5 * cell_m - min(lean, 0.0)
+            last_surface = bins - 1
+            if nearest * (bins - 1) > at_1m:
+                last_surface = min(math.floor(at_1m / nearest + 0.5), bins - 1)
+            first_surface = min(math.floor(at_1m / farthest + 0.5), last_surface)
             least, sum_floor, likelihood, above, below = np.inf, 0.0, 0.0, 0.0, 0.0
             run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             for u in range(first, last + 1):
@@ -83,7 +89,8 @@ def gather(
                     for n in range(u, u + run):
                         for k in range(far, near + 1):
                             total += floor[k, (n + width) % width]
-                    if not total >= least:
+                    # One direction in which nothing can be seen makes the cell such, whichever it is.
+                    if not math.isnan(least) and not total >= least:
                         least = total
             cells[0, i, j] = least / (near - far + 1)
             patches = (last - first + 1) * (near - far + 1)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 from omnid.errors import OmnidError
 from omnid.settings import knob
+
+LEAST_HEIGHT_M: Final = 0.02  # Lower than this, the plane above the floor is the floor as matching resolves it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +35,12 @@ class RingSettings:
         low=0,
         high=10,
     )
-    max_range_m: float = knob(6.0, "longest range of an obstacle, m", low=0.5, high=50)
+    max_range_m: float = knob(
+        6.0,
+        "longest range of an obstacle, m; it must reach beyond the nearest floor that both cameras see",
+        low=1.5,
+        high=50,
+    )
     min_points: int = knob(
         6,
         "matched points that make an obstacle of the map, within 3 degrees and the noise of the range",
@@ -41,6 +49,11 @@ class RingSettings:
     )
 
     def __post_init__(self) -> None:
-        """Raise OmnidError unless the heights are in order."""
+        """Raise OmnidError unless the heights are in order, and the lowest can be told from the floor."""
+        if self.heights_m[0] < LEAST_HEIGHT_M:
+            raise OmnidError(
+                f"obstacles.ring.heights_m is {list(self.heights_m)}: expected a lower height of {LEAST_HEIGHT_M} m or "
+                "more, as nothing lower can be told from the floor"
+            )
         if self.heights_m[0] >= self.heights_m[1]:
             raise OmnidError(f"obstacles.ring.heights_m is {list(self.heights_m)}: expected the lower height first")

@@ -31,14 +31,19 @@ class Unwatched:
         pixels = np.column_stack([columns.ravel(), np.full(columns.size, cylinder.row0)])
         direction = cylinder.rays(pixels) @ T_base_rect[:3, :3].T
         places = np.array(RANGES_M)[:, None, None] * direction[:, :2] + T_base_rect[:2, 3]
-        turned = (np.arctan2(places[..., 1], places[..., 0]) + math.pi) * (SECTORS / (2 * math.pi))
-        sectors = np.floor(turned).astype(np.intp) % SECTORS
-        self._sectors = sectors.reshape(len(RANGES_M), count, SAMPLES)
+        self._sectors = _sectors_of(places).reshape(len(RANGES_M), count, SAMPLES)
+        self._directions = _sectors_of(direction).reshape(count, SAMPLES)
 
     def sectors(self, columns: Flags) -> Flags:
         """Return the sectors (SECTORS,) of columns of tiles (C,)."""
         found = np.zeros(SECTORS, bool)
         found[self._sectors[:, np.flatnonzero(columns)]] = True
+        return found
+
+    def directions(self, columns: Flags) -> Flags:
+        """Return the directions (SECTORS,) from the viewpoint, about axes parallel to the base's, of columns (C,)."""
+        found = np.zeros(SECTORS, bool)
+        found[self._directions[np.flatnonzero(columns)]] = True
         return found
 
     def spans_deg(self, columns: Flags) -> list[tuple[int, int]]:
@@ -55,8 +60,16 @@ class Unwatched:
         return [((int(begin) - 180) % 360, (int(end) + 1 - 180) % 360) for begin, end in zip(begins, ends, strict=True)]
 
 
-def without(ring: GridRing, unwatched: Flags) -> GridRing:
-    """Return the ring without what is said about unwatched sectors (SECTORS,): no range, and no free floor."""
+def _sectors_of(places: Array) -> NDArray[np.intp]:
+    turned = (np.arctan2(places[..., 1], places[..., 0]) + math.pi) * (SECTORS / (2 * math.pi))
+    return np.asarray(np.floor(turned).astype(np.intp) % SECTORS)
+
+
+def without(ring: GridRing, unwatched: Flags, unseen: Flags) -> GridRing:
+    """Return the ring without what is said about unwatched sectors (SECTORS,): no range, and no free floor.
+
+    unseen (SECTORS,): the same directions from the viewpoint, in which no floor can be hidden.
+    """
     if not unwatched.any():
         return ring
     nan = np.float32(np.nan)
@@ -64,5 +77,5 @@ def without(ring: GridRing, unwatched: Flags) -> GridRing:
         np.where(unwatched, nan, ring.ranges_m),
         np.where(unwatched, nan, ring.sigma_m),
         np.where(unwatched, np.float32(0), ring.free_m),
-        ring.arrivals._replace(ranges_m=np.where(unwatched, nan, ring.arrivals.ranges_m)),
+        ring.arrivals._replace(ranges_m=np.where(unseen, nan, ring.arrivals.ranges_m)),
     )

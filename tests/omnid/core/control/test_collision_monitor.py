@@ -182,6 +182,14 @@ def test_an_unknown_way_that_was_seen_to_be_free_is_driven_up_to_there() -> None
         assert after(wall, free=(0.4,) * 360, settings=settings) == (slowest, monitor_module.UNKNOWN)
 
 
+@pytest.mark.parametrize(("free_m", "is_free"), [(0.9, False), (1.8, False), (5.4, True)])
+def test_beyond_the_longest_range_of_a_short_ring_nothing_is_free(free_m: float, is_free: bool) -> None:
+    monitor = CollisionMonitor(CollisionSettings(), 0.8)
+    monitor.set_ring(ControllerRing(0, (math.inf,) * 360, (free_m,) * 360))
+    allowed = monitor.step(0, Twist(2.0, 0.0))
+    assert (allowed.velocity_mps == 2.0) == is_free
+
+
 def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
     """As behind a plain pole; beside a wall the floor is often seen to be free not quite as far as it."""
     for sectors, free_m, is_unknown in ((8, 0.4, True), (4, 0.4, False), (8, 2.9, False)):

@@ -230,6 +230,8 @@ def test_the_end_of_what_was_seen_counts_as_a_wall(policy: str) -> None:
         if not is_clear(settings, motion, walls):
             continue
         monitor = CollisionMonitor(settings, braking_mps2)
+        # What is not unknown is open up to the longest range.
+        free_m = tuple(f if one else 6.0 for f, one in zip(free_m, unknown, strict=True))
         monitor.set_ring(ControllerRing(S, tuple(math.nan if one else math.inf for one in unknown), free_m))
         allowed = monitor.step(S, Twist(*motion))
         found = (allowed.velocity_mps + allowed.yaw_rate_radps) / sum(motion)

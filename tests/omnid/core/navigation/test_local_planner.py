@@ -152,6 +152,15 @@ def test_a_base_that_stands_too_near_drives_away() -> None:
     assert base.run(60).state is NavigationState.REACHED
 
 
+def test_a_thing_that_the_base_leaves_hides_no_other_on_its_path() -> None:
+    path = np.column_stack([np.arange(0, 4, 0.05), np.zeros(80)])
+    beside, ahead = np.array([[-0.1, 0.3]]), np.array([[1.0, y] for y in np.linspace(-0.3, 0.3, 13)])
+    both = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), path, np.vstack([beside, ahead]), Setpoint(0.4))
+    assert both.avoiding
+    alone = LocalPlanner(SETTINGS, OUTLINE).plan(np.zeros(3), path, beside, Setpoint(0.4))
+    assert not alone.avoiding and alone.setpoint == Setpoint(0.4)
+
+
 def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     base = BaseAmongBoxes(Navigator(SETTINGS), 6)
     base.boxes = Boxes((2.8, 1.2, 3.2, 1.6))

@@ -125,7 +125,7 @@ def test_directions_cross_where_a_thin_thing_stands_that_is_too_near_to_be_seen(
         across = np.abs(away[..., 0] * to_pole[1] - away[..., 1] * to_pole[0]) / np.linalg.norm(to_pole)
         shadow = across / np.linalg.norm(away, axis=-1) < 0.02 / CELL_M / np.linalg.norm(to_pole)
         lost = np.where(shadow & ((away @ to_pole) > 0), 1.0, -1.0).astype(np.float32)
-        grid._lose_before(lost, middle + base, nearest)
+        grid._near.lose_before(lost, middle + base, nearest)
         visible = np.clip(visible - lost, LEAST_VISIBLE, PRIOR[VISIBLE_LAYER])
     hidden = visible <= 0.0
     column, row = np.floor(middle + pole).astype(int)
@@ -387,3 +387,78 @@ def test_what_is_too_near_to_be_seen_lies_about_the_viewpoint(grid: ObstacleGrid
     after(grid, bare, 30)
     after(grid, hidden, 8, first=30)
     assert not is_free(0.8 * near_m, left_m) and is_free(0.8 * near_m, 0.0)
+
+
+def test_who_has_left_a_place_too_near_to_see_its_floor_is_no_obstacle_any_longer(
+    grid: ObstacleGrid, seen: Pairs
+) -> None:
+    """All around stand people at 0.7 m, where surfaces are in view and the floor is not; then they leave."""
+    assert COLUMNS.nearest_floor_m > 0.9
+    after(grid, seen, 20)
+    ring = after(grid, evidence(stains, striped, wall_m=0.7), 30, first=20)
+    assert np.isfinite(ring.ranges_m).mean() > 0.95 and np.nanmax(ring.ranges_m) < 0.9
+    ring = after(grid, seen, 80, first=50)
+    assert np.nanmin(ring.ranges_m) > 1.5 and np.median(ring.free_m) > WALL_M - 0.5
+
+
+def test_a_low_thing_that_was_seen_from_farther_away_stays_where_nothing_shows_it(
+    grid: ObstacleGrid, seen: Pairs
+) -> None:
+    after(grid, seen, 20)
+    middle = np.round(-grid.corner_m / CELL_M).astype(int)
+    grid._odds[SURFACE, middle[1] - 4 : middle[1] + 4, middle[0] + 12 : middle[0] + 14] = 6.0  # 0.6 m ahead
+    assert after(grid, seen, 100, first=20).ranges_m[AHEAD].max() < 0.7
+
+
+@pytest.mark.parametrize("strut_deg", [4.0, 8.0])
+def test_masked_struts_of_a_base_that_turns_are_no_person_who_comes(grid: ObstacleGrid, strut_deg: float) -> None:
+    visible = VISIBLE.copy()
+    azimuths_deg = np.degrees(np.pi - (np.arange(CYLINDER.width) + 0.5) / CYLINDER.focal_px)
+    for strut in (40.0, 160.0, -80.0):
+        visible[:, np.abs((azimuths_deg - strut + 180) % 360 - 180) < strut_deg / 2] = False
+    columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), SETTINGS.heights_m, (NEAREST_M, 6.0), visible)
+    tracker, found, moving = MovingTracker(), 0, 0
+    for n in range(30):
+        yaw = 0.08 * max(n - 14, 0)
+        c, s = np.cos(yaw), np.sin(yaw)
+        views = panoramas(
+            lambda x, y, c=c, s=s: stains(c * x - s * y, s * x + c * y),  # type: ignore[misc]
+            3.0,
+            lambda azimuth, height, yaw=yaw: striped(azimuth + yaw, height),  # type: ignore[misc]
+            seed=n,
+        )
+        pose = se3.transform(se3.exp(np.array([0, 0, 0, 0, 0, yaw]))[:3, :3], [0.0, 0.0, 0.0])
+        ring = grid.update(n * PERIOD_NS, pose, columns.evidence(*views))
+        found += int(np.isfinite(ring.arrivals.ranges_m).sum())
+        moving += len(tracker.update(n * PERIOD_NS, grid.viewpoint(pose), ring.arrivals))
+    assert (found, moving) == (0, 0)
+    assert (ring.free_m > 1.0).mean() > 0.95
+
+
+@pytest.mark.parametrize("low_m", [0.06, 0.15, 0.3])
+def test_no_plane_beside_the_floor_is_compared_beyond_the_last_row(low_m: float) -> None:
+    columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (low_m, 1.7), (NEAREST_M, 6.0), VISIBLE)
+    compared = np.flatnonzero(columns._floor_bins[:, 1])
+    assert len(compared) > 10
+    for k in compared:
+        first, end = columns._floor_bins[k, :2]
+        rows = np.add.outer(columns._plane_rows[first:end], columns._offsets[:, k].ravel())
+        assert not np.isnan(columns._offsets[:, k, 0]).any()
+        assert np.nanmin(rows) >= 0 and np.floor(np.nanmax(rows)) + 1 < CYLINDER.height
+
+
+def test_a_surface_stands_no_farther_than_its_foot_where_the_rig_leans_away(grid: ObstacleGrid) -> None:
+    """The rig leans to the front by 8 degrees: at eye level, a wall behind appears 0.13 m too far."""
+    k = round(COLUMNS.at_1m / 1.5)
+    nothing = np.full((COLUMNS.bins, DIRECTIONS), np.nan, np.float32)
+    surface = np.zeros_like(nothing)
+    surface[k] = 5.0
+    shown = ColumnEvidence(nothing, surface, np.zeros((2, *surface.shape), np.float32), 0.0, np.ones(DIRECTIONS, bool))
+    upright = after(grid, [shown], 30).ranges_m
+    leaning = ObstacleGrid(COLUMNS.at_1m, SETTINGS)
+    T_base_rect = se3.transform(se3.exp(np.array([0, 0, 0, 0, np.radians(8), 0]))[:3, :3], [0.0, 0.0, HEIGHT_M])
+    leaning.set_floor(se3.inverse(T_base_rect), HEIGHT_M)
+    ring = after(leaning, [shown], 30)
+    behind = np.r_[:10, SECTORS - 10 : SECTORS]
+    assert np.median(upright[behind]) == pytest.approx(1.5, abs=0.1)
+    assert np.median(ring.ranges_m[behind]) < np.median(upright[behind]) - 0.08

@@ -52,8 +52,15 @@ def test_unwatched_sectors_have_neither_range_nor_free_floor() -> None:
     ranges = np.full(SECTORS, 2.0, np.float32)
     seen = GridRing(ranges, 0.1 * ranges, ranges, Arrivals(ranges, 0.1 * ranges, np.zeros(SECTORS, bool)))
     where = np.arange(SECTORS) < 90
-    found = without(seen, where)
+    unseen = np.roll(where, 5)  # from the viewpoint
+    found = without(seen, where, unseen)
     assert np.isnan(found.ranges_m[:90]).all() and not found.free_m[:90].any()
-    assert np.isnan(found.arrivals.ranges_m[:90]).all() and (found.arrivals.ranges_m[90:] == 2.0).all()
+    assert (np.isnan(found.arrivals.ranges_m) == unseen).all() and (found.arrivals.ranges_m[~unseen] == 2.0).all()
     assert (found.ranges_m[90:] == 2.0).all() and (found.free_m[90:] == 2.0).all()
-    assert without(seen, np.zeros(SECTORS, bool)) is seen
+    assert without(seen, np.zeros(SECTORS, bool), unseen) is seen
+
+
+def test_directions_from_the_viewpoint_are_those_of_the_columns_wherever_it_lies() -> None:
+    found = Unwatched(CYLINDER, se3.transform(np.eye(3), [0.6, 0.3, 0.9])).directions(AHEAD)
+    assert (found == Unwatched(CYLINDER, np.eye(4)).directions(AHEAD)).all()
+    assert np.flatnonzero(found).min() in (161, 162) and np.flatnonzero(found).max() in (197, 198)
