@@ -448,7 +448,7 @@ def test_no_plane_beside_the_floor_is_compared_beyond_the_last_row(low_m: float)
 
 
 def test_a_surface_stands_no_farther_than_its_foot_where_the_rig_leans_away(grid: ObstacleGrid) -> None:
-    """The rig leans to the front by 8 degrees: by its foot, what is seen behind at eye level would be 0.13 m farther."""
+    """The rig leans to the front by 8 degrees: what is seen behind at eye level would be 0.13 m farther by its foot."""
     k = round(COLUMNS.at_1m / 1.5)
     nothing = np.full((COLUMNS.bins, DIRECTIONS), np.nan, np.float32)
     surface = np.zeros_like(nothing)
