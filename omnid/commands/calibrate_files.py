@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -137,7 +138,11 @@ def _kalibr(args: argparse.Namespace) -> Rig:
             "holds its transforms"
         )
     check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
-    return import_kalibr(args.camchain, args.lower, args.upper)
+    return import_kalibr(args.camchain, args.lower, args.upper, _warn)
+
+
+def _warn(line: str) -> None:
+    print(f"omnid: warning: {line}", file=sys.stderr)
 
 
 def _ocam(args: argparse.Namespace) -> Rig:
@@ -188,9 +193,11 @@ def describe(rig: Rig) -> str:
     lower, upper = (
         _describe(mounted, topic) for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True)
     )
+    delay_ms = 1e3 * rig.times.upper_delay_s
+    late = f"upper exposed {delay_ms:+.1f} ms against its stamps, " if delay_ms else ""
     return (
         f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
-        f"{rotation_deg:.2f} deg, {height_of(rig)}"
+        f"{rotation_deg:.2f} deg, {late}{height_of(rig)}"
     )
 
 

@@ -39,6 +39,19 @@ def test_imports_and_exports_kalibr_files(omni_rig: Rig, tmp_path: Path, capsys:
     assert read_rig(tmp_path / "swapped.toml").lower.camera == omni_rig.upper.camera
 
 
+def test_says_what_an_import_takes_from_the_imu(
+    omni_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = export_kalibr(omni_rig).replace("cam0:", "cam0:\n  timeshift_cam_imu: 0.002")
+    text = text.replace("cam1:", "cam1:\n  timeshift_cam_imu: 0.005").replace("lower/", "a/").replace("upper/", "b/")
+    (tmp_path / "k.yaml").write_text(text)
+    assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
+    printed = capsys.readouterr()
+    assert "upper exposed +3.0 ms against its stamps" in printed.out
+    assert f"omnid: warning: {tmp_path / 'k.yaml'}: lower is cam0 by z of the IMU" in printed.err
+    assert read_rig(tmp_path / "rig.toml").times.upper_delay_s == pytest.approx(0.003)
+
+
 def test_the_line_says_how_far_a_lens_sees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A rectified camera of 1241x376 px reaches 42 degrees to its corners, not the 15 to its upper edge."""
     cameras = "".join(
