@@ -25,8 +25,6 @@ from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.names import sees_directly
-from calib.models.ocam import OcamCamera
-from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
@@ -204,7 +202,7 @@ def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
     """Raise OmnidError if known cameras are not those of the images."""
     if cameras is None:
         return
-    if _is_mirror(cameras[0]) != _is_mirror(cameras[1]):
+    if sees_directly(cameras[0].camera) != sees_directly(cameras[1].camera):
         raise OmnidError(
             "calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
             "calibrate both with the same --view"
@@ -216,13 +214,6 @@ def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
                 f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
                 f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera"
             )
-
-
-def _is_mirror(file: CameraFile) -> bool:
-    camera = file.camera
-    if isinstance(camera, UnifiedCamera):
-        return camera.focal[0] * camera.focal[1] < 0
-    return isinstance(camera, OcamCamera) and camera.view == "mirror"
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:

@@ -13,8 +13,8 @@ import numpy as np
 from calib import se3
 from calib.equirectangular_file import import_helvipad, stacked_rig
 from calib.kalibr import export_kalibr, import_kalibr
-from calib.models.camera import field_of_view, whole_image
-from calib.models.names import model_name, sees_directly
+from calib.models.camera import field_of_view
+from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
 from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig
@@ -204,7 +204,6 @@ def describe(rig: Rig) -> str:
 def _describe(mounted: MountedCamera, topic: str) -> str:
     camera = mounted.camera
     model = f"ocam {camera.view}" if isinstance(camera, OcamCamera) else model_name(camera)
-    mask = whole_image(camera) if mounted.mask is None and sees_directly(camera) else mounted.visible
-    nearest, farthest = np.rad2deg(field_of_view(camera, mask))
+    nearest, farthest = np.rad2deg(field_of_view(camera, mounted.visible))
     seen = f"{model} {camera.size[0]}x{camera.size[1]}, {nearest:.0f} to {farthest:.0f} deg from its axis"
     return seen + (f" ({topic})" if topic else "")
