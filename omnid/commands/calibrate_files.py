@@ -17,7 +17,7 @@ from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
 from calib.ocam_file import export_ocam, import_ocam
-from calib.rig import MountedCamera, Rig
+from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
 from omnid.commands.height_option import add_height, height_of, with_height
@@ -182,7 +182,9 @@ def _export_ocam(rig: Rig, path: Path) -> list[Path]:
 def _left_out(rig: Rig) -> str:
     masks = rig.lower.mask is not None or rig.upper.mask is not None
     left = ["masks"] * masks + ["T_base_rig"] * (not np.array_equal(rig.T_base_rig, np.eye(4)))
-    left += ["covariance"] * (rig.covariance is not None)
+    left += ["covariance"] * (rig.covariance is not None) + ["[times]"] * (rig.times != ShutterTimes())
+    if isinstance(rig.lower.camera, OcamCamera):
+        left.append(f"view (`calibrate import` with --view {rig.lower.camera.view})")
     return f"; left out, because the format does not support it: {', '.join(left)}" if left else ""
 
 

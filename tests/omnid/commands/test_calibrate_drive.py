@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,6 +54,24 @@ def test_exchanged_cameras_are_refused(scene: Path, tmp_path: Path, capsys: pyte
         scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--lower", upper, "--upper", lower
     )
     assert code == 2 and len(capsys.readouterr().err.splitlines()) < 6
+    assert not (tmp_path / "rig.toml").exists()
+
+
+@pytest.mark.parametrize("height", [(), ("--height-m", "0.9")])
+def test_a_rig_that_fits_as_well_as_any_is_kept(
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    height: tuple[str, ...],
+) -> None:
+    as_good = SimpleNamespace(adjustment=SimpleNamespace(sigma_px=0.2), first_sigma_px=0.2)
+    monkeypatch.setattr("omnid.calibration.drive.calibrate_drive", lambda *_: as_good)
+    monkeypatch.setattr("omnid.commands.calibrate_drive.describe", lambda _: [])
+    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", *height)
+    printed = capsys.readouterr().out
+    assert code == 1 and "fits these drives as well as any rig: nothing was written" in printed
+    assert ("--height-m 0.9 was not applied" in printed) == bool(height)
     assert not (tmp_path / "rig.toml").exists()
 
 
