@@ -40,6 +40,12 @@ def test_an_accepted_drive_and_its_page(tmp_path: Path, capsys: pytest.CaptureFi
     assert "Acceptance drive: Accepted" in html and html.count("<tr>") == 4 and "<svg" in html
 
 
+def test_a_trajectory_may_be_a_tum_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path).rename(tmp_path / "est.tum")
+    assert accept(path, "--distance-m", DISTANCE_M) == 0
+    assert "over 3 rounds" in capsys.readouterr().out
+
+
 def test_a_drive_that_is_too_long_is_not_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "accept.html"
     assert accept(written(tmp_path, 1.02), "--distance-m", DISTANCE_M, "--json", "-o", page) == 1
