@@ -75,6 +75,19 @@ def test_times_of_keys_are_unix_times(
     assert [visit["x_m"] for visit in by_file] == pytest.approx([visit["x_m"] for visit in by_times], abs=1e-3)
 
 
+def test_marks_already_taken_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = tmp_path / "marks.txt"
+    keys.touch()
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n\n"))
+    assert accept("--keys", keys) == 0
+    taken = keys.read_text()
+    assert accept("--keys", keys) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert keys.read_text() == taken and f"--keys {keys}: expected a new file" in error and "another name" in error
+
+
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
