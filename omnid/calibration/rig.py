@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -88,19 +89,19 @@ class RigResult:
             + (f", good for {GOOD_PART:.1%} of length" if self.drives and self.drives.length_part <= GOOD_PART else "")
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write the rig.toml, and masks with struts to PNGs in the same folder."""
-        write_rig(path, self.rig)
+        write_rig(Path(path), self.rig)
 
-    def save_report(self, path: Path) -> None:
+    def save_report(self, path: str | PathLike[str]) -> None:
         """Write an HTML page with residuals, coverage and panoramas."""
         one_image = self.images.one_image
         rig = self.rig if one_image is None else one_image.of_areas(self.rig)
-        write_file(path, rig_report_html(self.calibration, self.images, rig).encode())
+        write_file(Path(path), rig_report_html(self.calibration, self.images, rig).encode())
 
 
 def calibrate_rig(
-    source: Path,
+    source: str | PathLike[str],
     board: AnyBoard,
     *,
     topics: tuple[str | None, str | None] = (None, None),
@@ -123,7 +124,7 @@ def calibrate_rig(
     CalibError where the images do not suffice.
     """
     # 1. Read the images.
-    images = _read(source, topics, areas, cameras)
+    images = _read(Path(source), topics, areas, cameras)
     _require_sizes(images, cameras)
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)

@@ -12,7 +12,7 @@ import pytest
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from omnid import replay
+from omnid import OmnidError, calibrate_drive, replay
 from omnid.cli import main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
@@ -28,6 +28,12 @@ def test_a_short_drive_is_refused(scene: Path, tmp_path: Path, capsys: pytest.Ca
     code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
     assert code == 2 and "take a longer drive" in capsys.readouterr().err
     assert not (tmp_path / "rig.toml").exists()
+
+
+def test_logs_and_the_rig_may_be_names_of_files(scene: Path) -> None:
+    for logs in (str(scene / "log.mcap"), [str(scene / "log.mcap")], [scene / "log.mcap"]):
+        with pytest.raises(OmnidError, match="take a longer drive"):
+            calibrate_drive(logs, str(scene / "rig.toml"))
 
 
 @pytest.mark.parametrize(
