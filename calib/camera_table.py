@@ -240,6 +240,8 @@ def number_text(value: float) -> str:
 
 
 def string_text(text: str) -> str:
-    """Return a string as TOML text."""
+    """Return a string as TOML text; CalibError for a file's name with bytes that are no UTF-8, as TOML holds none."""
+    if any("\ud800" <= c <= "\udfff" for c in text):
+        raise CalibError(f"a calibration file holds UTF-8 text, found {text!a}: give the file another name")
     escaped = text.replace("\\", "\\\\").replace('"', '\\"')
     return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'

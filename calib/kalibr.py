@@ -1,13 +1,15 @@
 """Kalibr's `camchain.yaml`, read and written: T_cam_imu is taken for T_cam_rig. The model omni is written.
 
-Kalibr: p_cam = T_cam_imu @ p_imu and p_cam1 = T_cn_cnm1 @ p_cam0; omni intrinsics are [xi, fu, fv, pu, pv].
+Kalibr: p_cam = T_cam_imu @ p_imu, p_cam1 = T_cn_cnm1 @ p_cam0 and t_imu = t_cam + timeshift_cam_imu; omni intrinsics
+are [xi, fu, fv, pu, pv].
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.lens import lens_camera
 from calib.models.names import model_name
 from calib.models.unified import UnifiedCamera
-from calib.rig import MountedCamera, Rig
+from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_frame import rig_between
 from calib.validation import ValidatedTable, decode, read_bytes
 
@@ -30,27 +32,66 @@ MAX_DISAGREEMENT_M = 1e-3
 MAX_DISAGREEMENT_RAD = np.deg2rad(0.1)
 # Least difference in height by which the lower camera is identified: less may be rounding, as above.
 MIN_HEIGHT_M = 1e-3
+# Largest angle of the baseline from z of the rig: no rig leans so far, but the axes of an IMU may be others.
+MAX_LEAN_RAD = np.deg2rad(30)
+MIN_DELAY_S = 0.5e-3  # between two cameras: less is no different from none, as for `omnid calibrate drive`
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}
 
 
-def import_kalibr(path: Path, lower: str = "", upper: str = "") -> Rig:
+def _silent(line: str) -> None:
+    """Report nothing."""
+
+
+def import_kalibr(path: Path, lower: str = "", upper: str = "", warn: Callable[[str], None] = _silent) -> Rig:
     """Read the rig of a Kalibr file; lower and upper: names of cameras (cam0), instead of topic or height."""
-    return parse_kalibr(read_bytes(path, MAX_BYTES), str(path), lower, upper)
+    return parse_kalibr(read_bytes(path, MAX_BYTES), str(path), lower, upper, warn)
 
 
-def parse_kalibr(text: str | bytes, name: str = "camchain.yaml", lower: str = "", upper: str = "") -> Rig:
-    """Parse the rig of a Kalibr file's text."""
+def parse_kalibr(
+    text: str | bytes,
+    name: str = "camchain.yaml",
+    lower: str = "",
+    upper: str = "",
+    warn: Callable[[str], None] = _silent,
+) -> Rig:
+    """Parse the rig of a Kalibr file's text; warn: takes lines about axes of the IMU that may not be a rig's."""
     file = ValidatedTable(load_yaml(text, name), name)
     cameras = {key: file.table(key) for key in _camera_names(file)}
     poses, has_rig_frame = _chain(cameras)
-    low, up = _lower_and_upper(file, (lower, upper), poses if has_rig_frame else {})
+    low, up = _lower_and_upper(file, (lower, upper), poses if has_rig_frame else {}, warn)
     models = [_camera(cameras[key]) for key in (low, up)]
     topics = (_topic(cameras[low]), _topic(cameras[up]))
     if not {low, up} <= poses.keys():
         raise CalibError(f"{name}: no transform between {low} and {up}; expected T_cam_imu of both, or T_cn_cnm1")
-    if not has_rig_frame:
-        return rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)
-    return Rig(MountedCamera(models[0], poses[low]), MountedCamera(models[1], poses[up]), topics=topics)
+    if has_rig_frame:
+        rig = Rig(MountedCamera(models[0], poses[low]), MountedCamera(models[1], poses[up]), topics=topics)
+        _warn_of_lean(rig, name, warn)
+    else:
+        rig = rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)
+    return replace(rig, times=_times(cameras[low], cameras[up]))
+
+
+def _warn_of_lean(rig: Rig, name: str, warn: Callable[[str], None]) -> None:
+    """Warn of a baseline that does not point up in the axes of the IMU."""
+    x, y, z = rig.upper.viewpoint - rig.lower.viewpoint
+    lean_rad = np.arctan2(np.hypot(x, y), z)
+    if lean_rad > MAX_LEAN_RAD:
+        warn(
+            f"{name}: expected the upper camera along z of the IMU, whose axes become those of the rig, found it "
+            f"{np.rad2deg(lean_rad):.0f} deg off: remove T_cam_imu, so that T_cn_cnm1 counts, or add T_base_rig to "
+            "the rig"
+        )
+
+
+def _times(lower: ValidatedTable, upper: ValidatedTable) -> ShutterTimes:
+    """Return the delay of the upper camera: the difference of both cameras' shifts against the IMU's clock."""
+    if not (lower.has("timeshift_cam_imu") and upper.has("timeshift_cam_imu")):
+        return ShutterTimes()
+    delay_s = upper.number("timeshift_cam_imu") - lower.number("timeshift_cam_imu")
+    try:
+        return ShutterTimes(delay_s) if abs(delay_s) >= MIN_DELAY_S else ShutterTimes()
+    except CalibError as error:
+        raise CalibError(f"{upper.file}: timeshift_cam_imu: {error}") from error
 
 
 def load_yaml(text: str | bytes, name: str) -> Mapping[object, object]:
@@ -104,7 +145,9 @@ def _require_consistency(table: ValidatedTable, by_imu: Array, by_chain: Array) 
         )
 
 
-def _lower_and_upper(file: ValidatedTable, named: tuple[str, str], poses: dict[str, Array]) -> tuple[str, str]:
+def _lower_and_upper(
+    file: ValidatedTable, named: tuple[str, str], poses: dict[str, Array], warn: Callable[[str], None]
+) -> tuple[str, str]:
     """Return the names of the lower and the upper camera: as named, else by topic, else by height in the rig frame."""
     names = _camera_names(file)
     for name in filter(None, named):
@@ -116,7 +159,7 @@ def _lower_and_upper(file: ValidatedTable, named: tuple[str, str], poses: dict[s
         other = [name for name in names if name not in named]
         pair = named[0] or other[0], named[1] or other[0]
     else:
-        pair = _by_topic(file, names) or _by_height(file, names, poses)
+        pair = _by_topic(file, names) or _by_height(file, names, poses, warn)
     if pair[0] == pair[1]:
         raise CalibError(f"{file.file}: lower and upper must be two cameras, found {pair[0]} for both")
     return pair
@@ -130,14 +173,18 @@ def _by_topic(file: ValidatedTable, names: list[str]) -> tuple[str, str] | None:
     return (names[0], names[1]) if low[0] > low[1] else (names[1], names[0])
 
 
-def _by_height(file: ValidatedTable, names: list[str], poses: dict[str, Array]) -> tuple[str, str]:
+def _by_height(
+    file: ValidatedTable, names: list[str], poses: dict[str, Array], warn: Callable[[str], None]
+) -> tuple[str, str]:
     heights = [float(se3.inverse(poses[name])[2, 3]) for name in names if name in poses]
     if len(heights) < 2 or abs(heights[0] - heights[1]) < MIN_HEIGHT_M:
         raise CalibError(
             f"{file.file}: neither topics nor heights identify the lower camera; name it, "
             f"--lower {names[0]} or --lower {names[1]}"
         )
-    return (names[0], names[1]) if heights[0] < heights[1] else (names[1], names[0])
+    low, up = (names[0], names[1]) if heights[0] < heights[1] else (names[1], names[0])
+    warn(f"{file.file}: lower is {low} by z of the IMU, which must point up; if it does not, give --lower {up}")
+    return low, up
 
 
 def _topic(table: ValidatedTable) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
+from calib.models.names import model_name
 from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
 from calib.rig import Rig
 from calib.rig_frame import rig_between
@@ -92,7 +93,10 @@ def _size(line: _Line) -> tuple[int, int]:
 def export_ocam(camera: OmniCamera) -> str:
     """Return the text of a calib_results.txt, with an inverse polynomial for programs that need one."""
     if not isinstance(camera, OcamCamera):
-        raise CalibError("export: calib_results.txt holds ocam cameras, found an omni camera; use --format kalibr")
+        raise CalibError(
+            f"export: calib_results.txt holds ocam cameras, found one of the model {model_name(camera)}; "
+            "use --format kalibr for an omni camera"
+        )
     if any(camera.tangential) or any(camera.astigmatism) or any(camera.wavefront):
         raise CalibError(
             "export: calib_results.txt cannot hold the terms p1, p2, s1, s2, wavefront of this camera; "

@@ -8,8 +8,8 @@ import numpy as np
 
 from calib import se3
 from calib.errors import CalibError
-from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask, whole_image
-from calib.models.names import is_lens
+from calib.models.camera import Array, Mask, OmniCamera
+from calib.models.names import visible_part
 from calib.rig_covariance import RigCovariance
 
 MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
@@ -50,9 +50,7 @@ class MountedCamera:
     @property
     def visible(self) -> Mask:
         """Return the mask; if none is known, the whole image of a lens, and the largest disc in that of a mirror."""
-        if self.mask is not None:
-            return self.mask
-        return whole_image(self.camera) if is_lens(self.camera) else inscribed_mask(self.camera)
+        return self.mask if self.mask is not None else visible_part(self.camera)
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,12 +79,13 @@ def _mounted(table: ValidatedTable, folder: Path | None, transform: str) -> Moun
 
 def write_rig(path: Path, rig: Rig) -> None:
     """Write `rig.toml`, and mask images in the same folder as `<stem>.lower.png` and `<stem>.upper.png`."""
-    images: dict[str, str] = {}
-    for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True):
-        if mounted.mask is not None and mounted.mask.image is not None:
-            images[side] = f"{path.stem}.{side}.png"
-            write_file(path.with_name(images[side]), png(mounted.mask.image))
-    write_file(path, rig_toml(rig, images).encode())
+    masks = {side: mounted.mask for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)}
+    painted = {side: mask.image for side, mask in masks.items() if mask is not None and mask.image is not None}
+    images = {side: f"{path.stem}.{side}.png" for side in painted}
+    text = rig_toml(rig, images).encode()
+    for side, image in painted.items():
+        write_file(path.with_name(images[side]), png(image))
+    write_file(path, text)
 
 
 def write_file(path: Path, data: bytes) -> None:

@@ -8,9 +8,9 @@
     odometry = omnid.Odometry("rig.toml")                 # images in, poses out
     pose = odometry.process(stamp_ns, lower, upper)       # grey images (H, W) uint8 -> OdometryUpdate
 
-    found = omnid.calibrate_rig(Path("boards/"), omnid.Board(6, 7, 0.03))   # also calibrate_camera, calibrate_drive
+    found = omnid.calibrate_rig("boards/", omnid.Board(6, 7, 0.03))   # also calibrate_camera, calibrate_drive
     print(found)
-    found.save(Path("rig.toml"))
+    found.save("rig.toml")
 
 The geometry (camera models, rigs, panoramas) is the package `calib`, a client of a running daemon is `omnid.client`.
 `omnid/examples` has a program for each. Names are imported when they are first used: `import omnid` loads no numpy.

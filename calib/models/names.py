@@ -1,8 +1,8 @@
-"""Names of the camera models, in files and for people."""
+"""Names of the camera models, in files and for people; which of them see directly, and how much of their images."""
 
 from __future__ import annotations
 
-from calib.models.camera import OmniCamera
+from calib.models.camera import Mask, OmniCamera, inscribed_mask, whole_image
 from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
 from calib.models.ocam import OcamCamera
@@ -22,13 +22,15 @@ def model_name(camera: OmniCamera) -> str:
     return "equidistant" if isinstance(camera, EquidistantCamera) else "omni"
 
 
-def is_lens(camera: OmniCamera) -> bool:
-    """True for a camera that sees the world directly: its image has no hub and need not have a rim."""
-    if isinstance(camera, UnifiedCamera):
-        return camera.xi == 0
-    return isinstance(camera, (DoubleSphereCamera, ExtendedUnifiedCamera, EquidistantCamera, EquirectangularCamera))
-
-
 def sees_directly(camera: OmniCamera) -> bool:
-    """True for a camera without a mirror, of whichever model."""
-    return is_lens(camera) or (isinstance(camera, OcamCamera) and camera.view == "direct")
+    """True for a camera without a mirror, of whichever model: its image has no hub and need not have a rim."""
+    if isinstance(camera, OcamCamera):
+        return camera.view == "direct"
+    if isinstance(camera, UnifiedCamera):
+        return camera.xi == 0 or camera.focal[0] * camera.focal[1] > 0  # a mirror flips its image
+    return True
+
+
+def visible_part(camera: OmniCamera) -> Mask:
+    """Return the mask if none is known: the whole image of a lens, and the largest disc in that of a mirror."""
+    return whole_image(camera) if sees_directly(camera) else inscribed_mask(camera)

@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models import wavefront as wavefronts
@@ -185,7 +186,9 @@ class OcamCamera:
         scale = rho / np.where(r > 0, r, 1.0)
         x, y = points[:, 0] * scale, points[:, 1] * scale
         if self._is_distorted:
-            x, y = self._distort(x, y)
+            bent_x, bent_y = self._distort(x, y)
+            is_unfolded = self._is_unfolded(x, y)
+            x, y = np.where(is_unfolded, bent_x, np.nan), np.where(is_unfolded, bent_y, np.nan)
         c, d, e = self.affine
         row, column = self.center_row_column
         return np.column_stack([e * x + y + column, c * x + d * y + row])
@@ -206,22 +209,34 @@ class OcamCamera:
 
     def _undistort(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Invert the tangential and astigmatic terms by Newton steps; NaN for points without convergence."""
-        (p1, p2), (s1, s2) = self.tangential, self.astigmatism
         ideal_x, ideal_y = x.copy(), y.copy()
         with np.errstate(all="ignore"):
             for _ in range(TANGENTIAL_STEPS):
                 distorted_x, distorted_y = self._distort(ideal_x, ideal_y)
                 error_x, error_y = distorted_x - x, distorted_y - y
-                xx2, xy2, yy2 = ideal_x * ideal_x, ideal_x * ideal_y, ideal_y * ideal_y
-                xx = 1 + 2 * p1 * ideal_y + 6 * p2 * ideal_x + 12 * (s1 * xx2 + s2 * xy2)
-                xy = 2 * p1 * ideal_x + 2 * p2 * ideal_y + 6 * s2 * (xx2 + yy2)
-                yy = 1 + 6 * p1 * ideal_y + 2 * p2 * ideal_x + 12 * (s2 * xy2 - s1 * yy2)
+                xx, xy, yy = self._jacobian(ideal_x, ideal_y)
                 determinant = xx * yy - xy * xy
                 ideal_x = ideal_x - (yy * error_x - xy * error_y) / determinant
                 ideal_y = ideal_y - (xx * error_y - xy * error_x) / determinant
             distorted_x, distorted_y = self._distort(ideal_x, ideal_y)
             converged = np.hypot(distorted_x - x, distorted_y - y) < TANGENTIAL_TOLERANCE_PX
-        return np.where(converged, ideal_x, np.nan), np.where(converged, ideal_y, np.nan)
+            found = converged & self._is_unfolded(ideal_x, ideal_y)
+        return np.where(found, ideal_x, np.nan), np.where(found, ideal_y, np.nan)
+
+    def _is_unfolded(self, x: Array, y: Array) -> NDArray[np.bool_]:
+        """True (N,) up to where the terms turn back, to pixels of other rays: their symmetric Jacobian is positive."""
+        xx, xy, yy = self._jacobian(x, y)
+        return np.asarray((xx > 0) & (xx * yy > xy * xy))
+
+    def _jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
+        """Return xx, xy, yy, each (N,), of the Jacobian [xx xy; xy yy] of the tangential and astigmatic terms."""
+        (p1, p2), (s1, s2) = self.tangential, self.astigmatism
+        xx2, xy2, yy2 = x * x, x * y, y * y
+        return (
+            1 + 2 * p1 * y + 6 * p2 * x + 12 * (s1 * xx2 + s2 * xy2),
+            2 * p1 * x + 2 * p2 * y + 6 * s2 * (xx2 + yy2),
+            1 + 6 * p1 * y + 2 * p2 * x + 12 * (s2 * xy2 - s1 * yy2),
+        )
 
     @property
     def _sign(self) -> float:

@@ -2,7 +2,7 @@
 
 A unit ray (x, y, z) is projected from a point xi above the sphere's centre, m = (x, y) / (z + xi), then distorted and
 scaled: u = fu * mx + pu, v = fv * my + pv. xi = 0 is the pinhole, xi = 1 the parabolic mirror under an orthographic
-camera. fu < 0 is the mirror's flip.
+camera. fu < 0 is the mirror's flip. Points beyond the radius at which the distortion turns back have no image.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.models.camera import Array
@@ -49,6 +50,7 @@ class UnifiedCamera:
         edge = -self.xi if self.xi <= 1 else -1 / self.xi
         scale = np.where(z > edge, norm * (z + self.xi), np.nan)
         m = points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]
+        m[~self._is_unfolded(m)] = np.nan
         return np.asarray(self._distort(m) * self.focal + self.center)
 
     def lift(self, pixels: Array) -> Array:
@@ -77,11 +79,24 @@ class UnifiedCamera:
         with np.errstate(all="ignore"):
             for _ in range(UNDISTORT_STEPS):
                 m -= self._newton_step(m, distorted)
-            bad = ~(np.abs(self._distort(m) - distorted).max(axis=1) < UNDISTORT_TOLERANCE)
-        m[bad] = np.nan
+            found = np.abs(self._distort(m) - distorted).max(axis=1) < UNDISTORT_TOLERANCE
+            m[~(found & self._is_unfolded(m))] = np.nan
         return m
 
-    def _newton_step(self, m: Array, target: Array) -> Array:
+    def _is_unfolded(self, m: Array) -> NDArray[np.bool_]:
+        """True (N,) for m up to where the distortion turns back: beyond, it gives the pixels of other rays again."""
+        if not any(self.distortion):
+            return np.ones(len(m), bool)
+        k1, k2, _, _ = self.distortion
+        # The slope 1 + 3 k1 r^2 + 5 k2 r^4 of the radius has its first root at the larger 1 / r^2 of two.
+        square = 9 * k1 * k1 - 20 * k2
+        turning = (np.sqrt(square) - 3 * k1) / 2 if square >= 0 else 0.0
+        # p1 and p2 move the turn: the Jacobian is symmetric, and positive definite up to there.
+        a, b, d = self._jacobian(m)
+        return np.asarray(((m**2).sum(axis=1) * turning < 1) & (a > 0) & (a * d > b * b))
+
+    def _jacobian(self, m: Array) -> tuple[Array, Array, Array]:
+        """Return a, b, d, each (N,), of the Jacobian [a b; b d] of the distortion."""
         k1, k2, p1, p2 = self.distortion
         x, y = m.T
         r2 = x * x + y * y
@@ -89,6 +104,10 @@ class UnifiedCamera:
         a = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
         b = slope * x * y + 2 * p1 * x + 2 * p2 * y
         d = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+        return a, b, d
+
+    def _newton_step(self, m: Array, target: Array) -> Array:
+        a, b, d = self._jacobian(m)
         ex, ey = (self._distort(m) - target).T
         determinant = a * d - b * b
         return np.asarray(np.column_stack([d * ex - b * ey, a * ey - b * ex]) / determinant[:, None])

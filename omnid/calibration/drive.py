@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.models.ocam import has_wavefront
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import RigCovariance
+from calib.rig_file import read_rig
 from omnid.calibration.drive_observations import Drives, Topics, collect
 from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
 from omnid.calibration.drive_start import straightened, with_masks
@@ -110,25 +112,30 @@ class DriveCalibration:
 
 
 def calibrate_drive(
-    logs: Sequence[Path], rig: Rig, topics: Topics = (None, None), progress: Progress = silent
+    logs: Sequence[str | PathLike[str]],
+    rig: str | PathLike[str] | Rig,
+    topics: Topics = (None, None),
+    progress: Progress = silent,
 ) -> DriveCalibration:
     """Return the rig that fits drives best, near the one given; OmnidError or CalibError where they do not suffice.
 
-    topics: of the lower and the upper camera. progress receives one line for each round.
+    logs: one name of a file, or several. topics: of the lower and the upper camera. progress receives one line for each
+    round.
     """
-    config = Config()
+    paths = [Path(log) for log in ([logs] if isinstance(logs, str) else logs)]
+    rig, config = rig if isinstance(rig, Rig) else read_rig(Path(rig)), Config()
     # 1. Find the rims of the mirrors, and start with tangential terms and times of exposure. Wavefronts are parameters
     #    if boards have shown them: a drive alone shows them as well, but the central cameras that remain measured the
     #    lengths of other drives less well.
-    before = with_masks(logs[0], rig, topics)
+    before = with_masks(paths[0], rig, topics)
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, distortion, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
-    steps = straightened(logs[0], parameters, topics, config, progress)
+    steps = straightened(paths[0], parameters, topics, config, progress)
     require_same_rig(parameters, steps, tracked=False)
     # 3. Track and adjust in rounds, until lengths change no more.
-    found, drives = _in_rounds(logs, (parameters, steps), topics, config, progress)
+    found, drives = _in_rounds(paths, (parameters, steps), topics, config, progress)
     # 4. Choose the distortion terms by landmarks held out, and the times of exposure that differ from none.
     scores = tuple(_score(found, drives, terms, waves) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():

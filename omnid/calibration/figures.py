@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.fit.boards.bundle import BundleResult
-from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask
+from calib.models.camera import Array, Mask, OmniCamera, field_of_view
+from calib.models.names import visible_part
 
 Image = NDArray[np.uint8]
 # Factor by which residuals are drawn longer.
@@ -56,7 +57,7 @@ def panorama_image(image: Image, camera: OmniCamera, mask: Mask | None) -> Image
 
     The largest angle is on top. Straight lines along the ray of the centre are straight columns.
     """
-    near, far = field_of_view(camera, mask or inscribed_mask(camera))
+    near, far = field_of_view(camera, mask or visible_part(camera))
     near = max(near, math.radians(MIN_PANORAMA_ANGLE_DEG))
     scale = PANORAMA_WIDTH / (2 * math.pi)
     rows = np.linspace(far, near, max(MIN_PANORAMA_HEIGHT, int((far - near) * scale)))

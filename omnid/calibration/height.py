@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from contextlib import closing
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Final
 
 from calib import se3
 from calib.rig import Rig
-from calib.rig_file import write_rig
+from calib.rig_file import read_rig, write_rig
 from omnid.calibration.drive_observations import Topics
 from omnid.calibration.drive_start import with_masks
 from omnid.calibration.image_pairs import open_log
@@ -55,16 +56,19 @@ class HeightCalibration:
             f"baseline is wrong: {1e3 * self.rig.baseline_m:.1f} mm in the rig, {baseline_mm:.1f} mm would fit"
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write the rig.toml."""
-        write_rig(path, self.rig)
+        write_rig(Path(path), self.rig)
 
 
-def calibrate_height(log: Path, rig: Rig, topics: Topics = (None, None)) -> HeightCalibration:
+def calibrate_height(
+    log: str | PathLike[str], rig: str | PathLike[str] | Rig, topics: Topics = (None, None)
+) -> HeightCalibration:
     """Return height and tilt of a rig by pairs spread over a log; OmnidError where they do not show the floor.
 
     topics: of the lower and the upper camera. The tilt is against z of the base as the rig states it.
     """
+    log, rig = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig))
     with closing(open_log(log, topics, rig)) as reader:
         pairs = read_rig_pairs(reader, rig)
     config = Config()

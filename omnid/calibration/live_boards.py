@@ -18,6 +18,7 @@ from omnid.calibration.board_search import AnyBoard
 from omnid.calibration.coverage import NEEDED_PAIRS, NEW_VIEW_PART, STILL_PART, CameraCoverage, moved
 from omnid.calibration.image_pairs import SIDES
 from omnid.calibration.images import Image, middle_px
+from omnid.errors import OmnidError
 
 MOST_PAIRS: Final = 200
 Views = tuple[BoardView | None, BoardView | None]
@@ -113,12 +114,22 @@ class LiveBoards:
         if not self._brightest:
             self._brightest = [image.copy() for image in images]
             self.coverage = CameraCoverage(_whole(images[0])), CameraCoverage(_whole(images[1]))
+        for name, before, image in zip(SIDES, self._brightest, images, strict=True):
+            if image.shape != before.shape:
+                raise OmnidError(
+                    f"{name} camera: expected images of {_size(before)} px as the first ones, found {_size(image)} px; "
+                    "set the size of the camera, or name another folder"
+                )
         for side, image in enumerate(images):
             if self._rims[side] is None:
                 np.maximum(self._brightest[side], image, out=self._brightest[side])
                 found = self._rims[side] = find_rim(self._brightest[side], middle_px(image))
                 if found is not None:
                     self._covered()[side].rim = found
+
+
+def _size(image: Image) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
 
 
 def _whole(image: Image) -> Mask:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,6 @@ from calib.masks.rim import find_rim
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
 from calib.models.names import sees_directly
-from calib.models.ocam import OcamCamera
-from calib.models.unified import UnifiedCamera
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import rig_between
@@ -90,19 +89,19 @@ class RigResult:
             + (f", good for {GOOD_PART:.1%} of length" if self.drives and self.drives.length_part <= GOOD_PART else "")
         )
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | PathLike[str]) -> None:
         """Write the rig.toml, and masks with struts to PNGs in the same folder."""
-        write_rig(path, self.rig)
+        write_rig(Path(path), self.rig)
 
-    def save_report(self, path: Path) -> None:
+    def save_report(self, path: str | PathLike[str]) -> None:
         """Write an HTML page with residuals, coverage and panoramas."""
         one_image = self.images.one_image
         rig = self.rig if one_image is None else one_image.of_areas(self.rig)
-        write_file(path, rig_report_html(self.calibration, self.images, rig).encode())
+        write_file(Path(path), rig_report_html(self.calibration, self.images, rig).encode())
 
 
 def calibrate_rig(
-    source: Path,
+    source: str | PathLike[str],
     board: AnyBoard,
     *,
     topics: tuple[str | None, str | None] = (None, None),
@@ -125,7 +124,7 @@ def calibrate_rig(
     CalibError where the images do not suffice.
     """
     # 1. Read the images.
-    images = _read(source, topics, areas, cameras)
+    images = _read(Path(source), topics, areas, cameras)
     _require_sizes(images, cameras)
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
@@ -204,7 +203,7 @@ def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
     """Raise OmnidError if known cameras are not those of the images."""
     if cameras is None:
         return
-    if _is_mirror(cameras[0]) != _is_mirror(cameras[1]):
+    if sees_directly(cameras[0].camera) != sees_directly(cameras[1].camera):
         raise OmnidError(
             "calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
             "calibrate both with the same --view"
@@ -216,13 +215,6 @@ def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
                 f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
                 f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera"
             )
-
-
-def _is_mirror(file: CameraFile) -> bool:
-    camera = file.camera
-    if isinstance(camera, UnifiedCamera):
-        return camera.focal[0] * camera.focal[1] < 0
-    return isinstance(camera, OcamCamera) and camera.view == "mirror"
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:

@@ -40,7 +40,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=Path,
         nargs="?",
         metavar="LOG|TUM",
-        help="a log with images, which is replayed, or a trajectory T_odom_rig (.txt); none: print what to do",
+        help="a log with images, which is replayed, or a trajectory T_odom_rig (.txt, .tum); none: print what to do",
     )
     parser.add_argument("--distance-m", type=float, metavar="M", help="the distance of the marks by tape measure")
     parser.add_argument(
@@ -108,7 +108,7 @@ def _read(args: argparse.Namespace) -> _Drive:
 
     no_map = np.zeros((0, 3), np.float32)
     T_rig_base = se3.inverse(read_rig(args.rig).T_base_rig) if args.rig else np.eye(4)
-    if args.log.suffix == ".txt":
+    if args.log.suffix in (".txt", ".tum"):
         read = read_tum(args.log)
         return _Drive(Trajectory(read.stamps_ns, read.T @ T_rig_base), None, no_map, 0)
     from omnid.config import load_config
@@ -209,9 +209,11 @@ def _number(word: str) -> float | None:
 
 
 def _write_keys(path: Path, keys: TextIO | Iterable[str]) -> int:
-    """Write the Unix time of each line that is entered, as soon as it is."""
+    """Write the Unix time of each line that is entered, as soon as it is; refuse to replace times that are there."""
     from omnid.errors import OmnidError
 
+    if path.is_file() and path.stat().st_size:
+        raise OmnidError(f"--keys {path}: expected a new file, found one of marks already taken; give another name")
     print("press Enter each time the point of the robot is over a mark: A, B, A, ...; Ctrl-D ends", file=sys.stderr)
     count = 0
     try:

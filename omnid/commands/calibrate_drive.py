@@ -53,7 +53,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 
 
 def run(args: argparse.Namespace) -> int:
-    """Return 0: the rig was written, or it is as good as the drives can make it, which is said."""
+    """Return 0 if a rig was written, and 1 if none fits the drives better than the one to start from."""
     from omnid.calibration.drive import calibrate_drive
     from omnid.engine.kernel_cache import prepare_kernels
 
@@ -64,7 +64,9 @@ def run(args: argparse.Namespace) -> int:
     print("\n".join(describe(found)))
     if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px and not args.distance_m:
         print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig: nothing was written")
-        return 0
+        if args.height_m is not None:
+            print(f"--height-m {args.height_m:g} was not applied: state it in T_base_rig of the rig.toml")
+        return 1
     rig = found.rig
     if args.distance_m:
         rig = found.at_distance(args.distance_m)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,11 @@ import numpy as np
 from calib import se3
 from calib.equirectangular_file import import_helvipad, stacked_rig
 from calib.kalibr import export_kalibr, import_kalibr
-from calib.models.camera import field_of_view, whole_image
-from calib.models.names import model_name, sees_directly
+from calib.models.camera import field_of_view
+from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
 from calib.ocam_file import export_ocam, import_ocam
-from calib.rig import MountedCamera, Rig
+from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
 from omnid.commands.height_option import add_height, height_of, with_height
@@ -137,7 +138,11 @@ def _kalibr(args: argparse.Namespace) -> Rig:
             "holds its transforms"
         )
     check_outputs([("--output", args.output)], [("the file that is read", args.camchain)])
-    return import_kalibr(args.camchain, args.lower, args.upper)
+    return import_kalibr(args.camchain, args.lower, args.upper, _warn)
+
+
+def _warn(line: str) -> None:
+    print(f"omnid: warning: {line}", file=sys.stderr)
 
 
 def _ocam(args: argparse.Namespace) -> Rig:
@@ -177,7 +182,9 @@ def _export_ocam(rig: Rig, path: Path) -> list[Path]:
 def _left_out(rig: Rig) -> str:
     masks = rig.lower.mask is not None or rig.upper.mask is not None
     left = ["masks"] * masks + ["T_base_rig"] * (not np.array_equal(rig.T_base_rig, np.eye(4)))
-    left += ["covariance"] * (rig.covariance is not None)
+    left += ["covariance"] * (rig.covariance is not None) + ["[times]"] * (rig.times != ShutterTimes())
+    if isinstance(rig.lower.camera, OcamCamera):
+        left.append(f"view (`calibrate import` with --view {rig.lower.camera.view})")
     return f"; left out, because the format does not support it: {', '.join(left)}" if left else ""
 
 
@@ -188,16 +195,17 @@ def describe(rig: Rig) -> str:
     lower, upper = (
         _describe(mounted, topic) for mounted, topic in zip((rig.lower, rig.upper), rig.topics, strict=True)
     )
+    delay_ms = 1e3 * rig.times.upper_delay_s
+    late = f"upper exposed {delay_ms:+.1f} ms against its stamps, " if delay_ms else ""
     return (
         f"lower {lower}, upper {upper}, baseline {rig.baseline_m * 1e3:.1f} mm, upper rotated by "
-        f"{rotation_deg:.2f} deg, {height_of(rig)}"
+        f"{rotation_deg:.2f} deg, {late}{height_of(rig)}"
     )
 
 
 def _describe(mounted: MountedCamera, topic: str) -> str:
     camera = mounted.camera
     model = f"ocam {camera.view}" if isinstance(camera, OcamCamera) else model_name(camera)
-    mask = whole_image(camera) if mounted.mask is None and sees_directly(camera) else mounted.visible
-    nearest, farthest = np.rad2deg(field_of_view(camera, mask))
+    nearest, farthest = np.rad2deg(field_of_view(camera, mounted.visible))
     seen = f"{model} {camera.size[0]}x{camera.size[1]}, {nearest:.0f} to {farthest:.0f} deg from its axis"
     return seen + (f" ({topic})" if topic else "")

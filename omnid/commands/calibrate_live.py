@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     """Take the pairs that are in the folder, which is made if it is missing; return the highest number of an image."""
-    from omnid.calibration.image_pairs import read_pairs
+    from omnid.calibration.image_pairs import SIDES, read_pairs
     from omnid.errors import OmnidError
 
     if folder is None:
@@ -96,13 +96,13 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OmnidError(f"{folder}: {error.strerror}; name a folder that can be made") from error
-    if not any(folder.glob("lower_*")):
-        return 0
-    pairs = read_pairs(folder)
-    for name in pairs.names:
-        if all(name in side for side in pairs.sides):
-            boards.process((pairs.sides[0][name], pairs.sides[1][name]), need_still=False)
-    return max((int(name) for name in pairs.names if name.isascii() and name.isdigit()), default=0)
+    lower, upper = ({path.stem.removeprefix(f"{side}_") for path in folder.glob(f"{side}_*")} for side in SIDES)
+    if lower & upper:  # half a pair is left where it was killed between two files
+        pairs = read_pairs(folder)
+        for name in pairs.names:
+            if all(name in side for side in pairs.sides):
+                boards.process((pairs.sides[0][name], pairs.sides[1][name]), need_still=False)
+    return max((int(name) for name in lower | upper if name.isascii() and name.isdigit()), default=0)
 
 
 def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:

@@ -34,7 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         choices=("origin", "rigid", "scale"),
         help="the first pose "
         "(default), as evo's --align_origin; rigid: all positions, as its --align; scale: these and "
-        "the estimate's scale, as its --align --correct_scale",
+        "the estimate's scale, which is printed, as its --align --correct_scale",
     )
     parser.add_argument(
         "--score",

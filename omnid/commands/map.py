@@ -11,6 +11,7 @@ from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.listen import add_robot, config_of
 from omnid.commands.map_build import add_build
+from omnid.commands.map_option import add_replace, require_replace
 from omnid.commands.map_summary import described
 from omnid.commands.map_tags import add_align, add_tags
 
@@ -35,6 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first stays"
     )
     merge.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
+    add_replace(merge)
     merge.set_defaults(run=run_merge)
     add_tags(actions)
     add_align(actions)
@@ -122,7 +124,11 @@ def run_merge(args: argparse.Namespace) -> int:
 
     if len(args.maps) < 2:
         raise OmnidError("map merge: expected two maps or more")
+    for number, path in enumerate(args.maps):
+        if path.exists() and any(other.exists() and path.samefile(other) for other in args.maps[:number]):
+            raise OmnidError(f"map merge: expected maps of several drives, found {path} twice: name each once")
     check_outputs([("-o", args.output)], [])
+    require_replace("map merge", args, args.maps)
     places, rig = read_places(args.maps[0])
     for path in args.maps[1:]:
         other, other_rig = read_places(path)
@@ -158,8 +164,10 @@ def run_export(args: argparse.Namespace) -> int:
         raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
     if not 0.005 <= args.cell <= 10:
         raise OmnidError(f"--cell {args.cell:g}: expected an edge of 0.005 to 10 m")
+    inputs = [("the map that is read", args.map)]
+    check_outputs(outputs, inputs)  # before the image of a grid is named: a folder, as ".", can have no other end
     images = [("--grid's image", args.grid.with_suffix(".pgm"))] if args.grid else []
-    check_outputs([*outputs, *images], [("the map that is read", args.map)])
+    check_outputs([*outputs, *images], inputs)
     places, rig = read_places(args.map)
     if args.grid:
         if not any(np.isfinite(keyframe.scan).any() for keyframe in places.keyframes.values()):

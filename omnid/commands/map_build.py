@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
-from omnid.commands.map_option import add_tags_option, tag_settings
+from omnid.commands.map_option import add_replace, add_tags_option, tag_settings
 from omnid.commands.map_summary import described
 from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
 
@@ -25,7 +25,7 @@ def add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
     build.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
     known = build.add_mutually_exclusive_group()
     known.add_argument("--extend", action="store_true", help="extend the map OUT.omap")
-    known.add_argument("--replace", action="store_true", help="replace it, with all places that routes refer to")
+    add_replace(known)
     add_tags_option(build)
     build.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
     add_workers(build, "logs at a time, whose maps are then joined; 1: each in the map of those before", 1)

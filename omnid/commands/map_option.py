@@ -1,8 +1,10 @@
-"""The options --map, --localize-only and --tags of `omnid run` and `omnid replay`."""
+"""The options --map, --localize-only and --tags of `omnid run` and `omnid replay`; --replace of commands that write
+a map."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -29,6 +31,21 @@ def add_tags_option(parser: argparse._ActionsContainer) -> None:
         metavar="TAGS.toml",
         help="AprilTags (36h11) that are to be landmarks of the map, with names, numbers and sizes; the map keeps them",
     )
+
+
+def add_replace(parser: argparse._ActionsContainer) -> None:
+    """Add --replace."""
+    parser.add_argument("--replace", action="store_true", help="replace it, with all places that routes refer to")
+
+
+def require_replace(command: str, args: argparse.Namespace, maps: Sequence[Path]) -> None:
+    """Raise OmnidError for an output that exists, unless it is one of the maps that are read or --replace is given."""
+    from omnid.errors import OmnidError
+
+    output: Path = args.output
+    is_read = any(path.exists() and output.exists() and path.samefile(output) for path in maps)
+    if output.exists() and not (is_read or args.replace):
+        raise OmnidError(f"{command}: {output} exists: --replace makes a new one")
 
 
 def tag_settings(args: argparse.Namespace) -> list[str]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
-from omnid.commands.map_option import add_map, map_settings
+from omnid.commands.map_option import add_map, add_replace, map_settings, require_replace
 
 if TYPE_CHECKING:
     from omnid.core.places.map_tags import MapTag
@@ -67,6 +67,7 @@ def add_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
         "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one",
     )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
+    add_replace(parser)
     parser.set_defaults(run=run_align)
 
 
@@ -177,6 +178,7 @@ def run_align(args: argparse.Namespace) -> int:
 
     given = [] if args.seen is None else [("--seen", args.seen)]
     check_outputs([("-o", args.output)], [*given, ("--known", args.known)])
+    require_replace("map align", args, [args.map])
     known = read_landmarks(args.known)
     places, rig = read_places(args.map)
     if args.seen is not None:

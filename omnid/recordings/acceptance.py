@@ -29,6 +29,8 @@ STAND_RAD: Final = math.radians(2.0)
 STAND_S: Final = 2.0
 # A place is a mark if it is nearer to it than this part of the marks' distance: far above any error of odometry.
 NEAR_PART: Final = 0.2
+# Stands in a row on one mark are nearer: no robot is placed worse by eye, and a wait on the way is farther.
+ONE_PLACE_M: Final = 0.3
 # Error of a robot that is placed on a mark by eye, of the two placings of a length or a return.
 PLACING_M: Final = 0.01
 # Headings are compared if the robot is on the mark as it was the first time, turned by less than this.
@@ -96,7 +98,8 @@ class Acceptance:
 def visits_by_standing(path: Trajectory, distance_m: float) -> list[Visit]:
     """Return the visits of the marks at which the robot rested; A is where it rested first.
 
-    Places far from both marks are left out, as the robot may wait. Raises OmnidError where no round is found.
+    Places far from both marks are left out, as the robot may wait. Raises OmnidError where no round is found, and
+    where a wait may be taken for a mark: two stands apart that may both be one mark.
     """
     found = list[Visit]()
     for time_s, T in _stands(path):
@@ -109,6 +112,7 @@ def visits_by_standing(path: Trajectory, distance_m: float) -> list[Visit]:
                 continue
         # Of several stands on one mark the last one counts for the first A, the first one for all others.
         if found and mark == found[-1].mark:
+            _require_one_place(found[-1], time_s, T)
             if len(found) == 1:
                 found[0] = Visit(mark, time_s, T)
             continue
@@ -120,6 +124,15 @@ def visits_by_standing(path: Trajectory, distance_m: float) -> list[Visit]:
             f"{places}; check --distance-m, or give the times of the marks: --marks 12.5 60 110"
         )
     return found
+
+
+def _require_one_place(visit: Visit, time_s: float, T: Array) -> None:
+    apart_m = _distance_m(visit.T, T)
+    if apart_m > ONE_PLACE_M:
+        raise OmnidError(
+            f"expected one place of mark {visit.mark}, found stands {apart_m:.2f} m apart, at {visit.time_s:.1f} and "
+            f"{time_s:.1f} s; give the times of the marks: --marks 12.5 60 110"
+        )
 
 
 def visits_at_times(path: Trajectory, times_s: Sequence[float]) -> list[Visit]:

@@ -35,6 +35,7 @@ class Metrics:
     heading_rmse_rad: float  # yaw of R_truth^T R_estimate
     heading_max_rad: float
     heading_end_rad: float  # signed, positive: the estimate is rotated too far left
+    scale: float  # factor of the estimate's positions by the alignment "scale"; otherwise 1
 
     def __str__(self) -> str:
         """Return aligned lines for a terminal, in m, mm, per cent and degrees."""
@@ -51,6 +52,7 @@ class Metrics:
             ("position error (ATE)", position),
             ("heading error", heading),
             ("step error (RPE)", f"rmse {_mm(self.rpe_translation_rmse_m)}, {_deg(self.rpe_rotation_rmse_rad)}"),
+            *([("scale", f"estimate times {self.scale:.5f}")] if self.scale != 1.0 else []),
         ]
         return "\n".join(f"{name:<21} {value}" for name, value in rows)
 
@@ -63,8 +65,10 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     Each estimate is associated with the truth nearest in time within the tolerance; of two estimates with the same
     truth, the nearer one. Raise OmnidError for fewer than two associated poses.
     """
+    if alignment not in ALIGNMENTS:
+        raise OmnidError(f"an alignment {', '.join(ALIGNMENTS)} was expected, {alignment!r} found")
     T_estimate, T_true = associated(estimate, truth, tolerance_s)
-    return _metrics(aligned(T_estimate, T_true, alignment), T_true, len(T_true) / truth.stamps_ns.size)
+    return _metrics(*aligned(T_estimate, T_true, alignment), T_true, len(T_true) / truth.stamps_ns.size)
 
 
 def associated(
@@ -120,7 +124,7 @@ def _span(trajectory: Trajectory) -> str:
     return f"spans {stamps_ns[0] / 1e9:.3f} to {stamps_ns[-1] / 1e9:.3f} s" if stamps_ns.size else "holds no pose"
 
 
-def _metrics(T_est: NDArray[np.float64], T_true: NDArray[np.float64], coverage: float) -> Metrics:
+def _metrics(T_est: NDArray[np.float64], scale: float, T_true: NDArray[np.float64], coverage: float) -> Metrics:
     """Return metrics of poses (N, 4, 4), row by row at the same time and in the same world."""
     position_m = np.linalg.norm(T_est[:, :3, 3] - T_true[:, :3, 3], axis=1)
     heading_rad = se3.yaw(se3.inverse(T_true) @ T_est)
@@ -140,6 +144,7 @@ def _metrics(T_est: NDArray[np.float64], T_true: NDArray[np.float64], coverage: 
         heading_rmse_rad=_rms(heading_rad),
         heading_max_rad=float(np.abs(heading_rad).max()),
         heading_end_rad=float(heading_rad[-1]),
+        scale=scale,
     )
 
 
@@ -156,15 +161,15 @@ def _rms(values: NDArray[np.float64]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:
-    """Return the estimates (N, 4, 4) in the world of the truth, row by row at the same times.
+def aligned(T_est: Array, T_true: Array, alignment: str) -> tuple[Array, float]:
+    """Return the estimates (N, 4, 4) in the world of the truth, row by row at the same times, and their scale.
 
     alignment: "origin": the first poses agree; "rigid": the positions agree best (least squares); "scale": these after
     the estimate is scaled as well. Raise OmnidError for a path that is straight or shorter than three poses, which
     determines no rotation.
     """
     if alignment == "origin":
-        return np.asarray(T_true[0] @ se3.inverse(T_est[0]) @ T_est)
+        return np.asarray(T_true[0] @ se3.inverse(T_est[0]) @ T_est), 1.0
     estimate, truth = T_est[:, :3, 3], T_true[:, :3, 3]
     middle_est, middle_true = estimate.mean(axis=0), truth.mean(axis=0)
     covariance = (truth - middle_true).T @ (estimate - middle_est) / len(truth)
@@ -180,4 +185,4 @@ def aligned(T_est: Array, T_true: Array, alignment: str) -> Array:
     T = T_est.copy()
     T[:, :3, :3] = R @ T_est[:, :3, :3]
     T[:, :3, 3] = scale * (estimate - middle_est) @ R.T + middle_true
-    return T
+    return T, scale

@@ -63,7 +63,7 @@ class Session:
         for name, camera in (("lower", rig.lower), ("upper", rig.upper)):
             if camera.mask is None and not sees_directly(camera.camera):
                 self.warn(
-                    f"no mirror rim was found in the first images of the {name} camera: the whole image is used; "
+                    f"no mirror rim was found in the first images of the {name} camera: the largest disc is used; "
                     f"the mask can be given in the rig's file under [{name}.mask]"
                 )
         found = geometry(rig, self.config.panorama)

@@ -43,7 +43,7 @@ class Geometry:
 
 
 def geometry(rig: Rig, config: PanoramaConfig) -> Geometry:
-    """Return the geometry of a rig; of a camera without a mask the whole image is used."""
+    """Return the geometry of a rig; a camera without a mask shows what MountedCamera.visible says."""
     return Geometry(rig, fit_cylinder(rig, config.width_px, config.elevation_deg, config.scale))
 
 

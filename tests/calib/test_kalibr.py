@@ -162,6 +162,58 @@ def test_height_is_that_of_the_viewpoint() -> None:
     assert parse_kalibr(chain((high, low), None)).lower.viewpoint[2] == pytest.approx(0.5)
 
 
+def warnings_of(text: str, **names: str) -> list[str]:
+    lines: list[str] = []
+    parse_kalibr(text, "c.yaml", warn=lines.append, **names)
+    return lines
+
+
+def test_says_that_only_z_of_the_imu_tells_the_lower_camera() -> None:
+    text = chain(BOTH, None)
+    (line,) = warnings_of(text)
+    assert line == "c.yaml: lower is cam0 by z of the IMU, which must point up; if it does not, give --lower cam1"
+    assert warnings_of(text, lower="cam0") == warnings_of(chain(BOTH, None, NAMED)) == []
+
+
+@pytest.mark.parametrize(
+    ("R_imu_rig", "off"),
+    [
+        (np.eye(3), None),
+        (se3.rotation_exp(np.array([0.5, 0.0, 0.0])), None),  # 29 degrees
+        (se3.rotation_exp(np.array([0.0, 0.55, 0.0])), "32 deg off"),
+        (np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]), "90 deg off"),  # z forward
+        (np.diag([1.0, -1.0, -1.0]), "180 deg off"),  # z down
+    ],
+)
+def test_warns_of_axes_of_an_imu_that_no_rig_has(R_imu_rig: Array, off: str | None) -> None:
+    T_rig_imu = se3.transform(R_imu_rig.T, np.zeros(3))
+    T_upper_rig = se3.transform(np.eye(3), (0.0, 0.0, -0.2))
+    lines = warnings_of(chain((T_rig_imu, T_upper_rig @ T_rig_imu), None, NAMED))
+    assert not lines if off is None else (len(lines) == 1 and off in lines[0] and "remove T_cam_imu" in lines[0])
+
+
+@pytest.mark.parametrize(
+    ("shifts", "delay_s"),
+    [((0.01, 0.04), 0.03), ((0.04, 0.01), -0.03), ((0.01, 0.0104), 0.0), ((None, 0.04), 0.0), ((None, None), 0.0)],
+)
+def test_the_shifts_of_both_clocks_are_the_delay_of_the_upper_camera(
+    shifts: tuple[float | None, float | None], delay_s: float
+) -> None:
+    """Kalibr: t_imu = t_cam + shift. The camera of the larger shift was exposed later than its equal stamp says."""
+    text = chain(BOTH, None, NAMED)
+    for index, shift in enumerate(shifts):
+        text = text.replace(f"cam{index}:", f"cam{index}:" + (f"\n  timeshift_cam_imu: {shift}" if shift else ""))
+    assert parse_kalibr(text).times.upper_delay_s == pytest.approx(delay_s, abs=1e-12)
+    swapped = parse_kalibr(text, lower="cam1")
+    assert swapped.times.upper_delay_s == pytest.approx(-delay_s, abs=1e-12)
+
+
+def test_refuses_a_delay_that_no_cameras_have() -> None:
+    text = chain(BOTH, None, NAMED).replace("cam0:", "cam0:\n  timeshift_cam_imu: 0.0")
+    with pytest.raises(CalibError, match=r"c.yaml: timeshift_cam_imu: times of exposure: .*found 1.7e\+09"):
+        parse_kalibr(text.replace("cam1:", "cam1:\n  timeshift_cam_imu: 1.7e9"), "c.yaml")
+
+
 def test_writes_small_numbers_for_yaml_1_1(omni_rig: Rig) -> None:
     camera = UnifiedCamera(1.0, (-2e2, 2e2), (3e2, 3e2), (600, 600), (1e-07, -2.5e-08, 0.0, 1e22))
     text = export_kalibr(replace(omni_rig, lower=replace(omni_rig.lower, camera=camera)))

@@ -78,7 +78,7 @@ def test_refuses_to_export_tangential_terms(ocam_rig: Rig) -> None:
 
 
 def test_refuses_to_export_an_omni_camera(omni_rig: Rig) -> None:
-    with pytest.raises(CalibError, match="found an omni camera; use --format kalibr"):
+    with pytest.raises(CalibError, match="found one of the model omni; use --format kalibr"):
         export_ocam(omni_rig.lower.camera)
 
 

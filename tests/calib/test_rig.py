@@ -14,7 +14,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from calib import se3
 from calib.kalibr import import_kalibr
-from calib.models.camera import Array, Mask
+from calib.models.camera import Array, Mask, OmniCamera
+from calib.models.lens import DoubleSphereCamera
+from calib.models.names import sees_directly
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
@@ -155,6 +157,28 @@ def test_remap_tables_equal_the_projection(rig: Rig) -> None:
         point = viewpoint + np.array([distance * np.cos(azimuth), distance * np.sin(azimuth), z])
         pixel = mounted.camera.project(se3.apply(mounted.T_cam_rig @ se3.inverse(rig.T_rect_rig), point))
         np.testing.assert_allclose([maps[0][row, column + 16], maps[1][row, column + 16]], pixel[0], rtol=0, atol=1e-3)
+
+
+OCAM = OcamCamera((-300.0, 0, 1.4e-3, -1.6e-6, 4e-9), (240.0, 376.0), (1.0, 0.0, 0.0), (752, 480))
+
+
+@pytest.mark.parametrize(
+    ("camera", "is_lens"),
+    [
+        (OCAM, False),
+        (replace(OCAM, view="direct"), True),
+        (UnifiedCamera(1.5, (900.0, 900.0), (376.0, 240.0), (752, 480)), True),
+        (UnifiedCamera(1.5, (-900.0, 900.0), (376.0, 240.0), (752, 480)), False),
+        (UnifiedCamera(0.0, (900.0, 900.0), (376.0, 240.0), (752, 480)), True),
+        (DoubleSphereCamera(-0.2, 0.6, (300.0, 300.0), (376.0, 240.0), (752, 480)), True),
+    ],
+)
+def test_without_a_mask_a_lens_sees_to_the_corners_and_a_mirror_in_the_largest_disc(
+    camera: OmniCamera, is_lens: bool
+) -> None:
+    corner, edge = np.array([[1.0, 1.0]]), np.array([[376.0, 1.0]])
+    seen = MountedCamera(camera, np.eye(4)).visible
+    assert seen.contains(edge).all() and seen.contains(corner).all() == is_lens == sees_directly(camera)
 
 
 def test_masked_hub_is_not_visible_in_the_panorama(omni_rig: Rig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,6 +51,16 @@ def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
         again = parse_rig(rig_toml(found))
         np.testing.assert_array_equal(again.upper.T_cam_rig, found.upper.T_cam_rig)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["rig.toml", "rig.upper.png"][: 1 + masks]
+
+
+def test_refuses_a_mask_image_whose_name_is_no_text(omni_rig: Rig, tmp_path: Path) -> None:
+    """Without painted masks the rig's file names no other file."""
+    path = Path(os.fsdecode(os.fsencode(tmp_path) + b"/x\xff.toml"))
+    with pytest.raises(CalibError, match=r"UTF-8 text, found 'x\\udcff.upper.png': give the file another name"):
+        write_rig(path, with_masks(omni_rig))
+    assert not list(tmp_path.iterdir())
+    write_rig(path, omni_rig)
+    assert_same(read_rig(path).upper, omni_rig.upper)
 
 
 def test_a_pose_on_the_robot_that_is_not_stated_is_left_out_and_one_without_a_height_states_none(rig: Rig) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -137,7 +138,8 @@ def test_maps_of_one_place_are_merged_and_of_two_places_refused(
     error = omnid.refused("map", "merge", omap, away, "-o", tmp_path / "both.omap")
     assert "shares no place" in error and not (tmp_path / "both.omap").exists()
     before = len(read_places(omap)[0])
-    result = omnid("map", "merge", omap, later, omap, "-o", tmp_path / "both.omap")
+    same = shutil.copy(omap, tmp_path / "same.omap")
+    result = omnid("map", "merge", omap, later, same, "-o", tmp_path / "both.omap")
     assert result.code == 0 and "sessions     3" in result.out and f"keyframes    {3 * before - 1}," in result.out
     merged, _ = read_places(tmp_path / "both.omap")
     np.testing.assert_allclose(merged.poses[before], merged.poses[1], atol=0.005)
@@ -239,7 +241,7 @@ def test_commands_read_the_compiled_functions_instead_of_compiling_them_again(
     scene: Path, omap: Path, tmp_path: Path, command: str
 ) -> None:
     words = {
-        "merge": ["map", "merge", omap, omap, "-o", tmp_path / "both.omap"],
+        "merge": ["map", "merge", omap, shutil.copy(omap, tmp_path / "same.omap"), "-o", tmp_path / "both.omap"],
         "check": ["calibrate", "check", scene / "log.mcap", "--rig", scene / "rig.toml"],
     }[command]
     program = "import sys; sys.modules['numba'] = None; from omnid.cli import main; sys.exit(main(sys.argv[1:]))"

@@ -35,6 +35,14 @@ CAMERAS: dict[str, OmniCamera] = {
     "equirectangular": EquirectangularCamera((200.0, 190.0), (380.0, 120.0), (768, 300)),
     "ocam turning": OcamCamera((-100.0, 0, 1e-3, 0, -1e-8), (300.0, 310.0), (1.0, 0.0, 0.0), (600, 600)),
 }
+# Distortions that turn back within the image.
+TURNING: dict[str, OmniCamera] = {
+    "omni once": UnifiedCamera(0.0, (460.0, 460.0), (376.0, 240.0), (752, 480), (-0.3, 0.0, 0.0, 0.0)),
+    "omni twice": UnifiedCamera(0.9, (-420.0, 420.0), (376.0, 240.0), (752, 480), (-0.3, 0.03, 0.02, -0.03)),
+    "ocam sideways": OcamCamera(
+        (-180.0, 0, 1.4e-3, 0, 2e-9), (384.0, 384.0), (1.001, 1e-4, -1e-4), (768, 768), "mirror", (3e-4, -2e-4)
+    ),
+}
 
 
 @pytest.fixture(params=CAMERAS)
@@ -65,6 +73,22 @@ def test_lift_inverts_project(camera: OmniCamera) -> None:
     seen = (pixels >= 0).all(axis=1) & (pixels <= (width, height)).all(axis=1)
     assert seen.sum() > 150
     np.testing.assert_allclose(camera.lift(pixels)[seen], rays[seen], rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", TURNING)
+def test_no_pixel_is_that_of_two_rays(name: str) -> None:
+    camera = TURNING[name]
+    rays = np.random.default_rng(2).normal(size=(5000, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    pixels = camera.project(rays)
+    seen = (pixels >= 0).all(axis=1) & (pixels <= camera.size).all(axis=1)
+    found, rays = camera.lift(pixels[seen]), rays[seen]
+    at_the_turn = np.isnan(found).any(axis=1)  # where Newton steps hardly converge
+    assert len(rays) > 500 and at_the_turn.mean() < 0.01
+    np.testing.assert_allclose(found[~at_the_turn], rays[~at_the_turn], rtol=0, atol=1e-5)
+    lifted = camera.lift(pixels_of(camera))
+    lifted = lifted[np.isfinite(lifted).all(axis=1)]
+    assert np.isfinite(camera.project(lifted)).all() and len(lifted) > 500
 
 
 @pytest.mark.parametrize(("view", "sign"), [("mirror", 1.0), ("direct", -1.0)])

@@ -22,7 +22,7 @@ HEIGHT_M = 1.2  # of rendered rigs: tests/simulation/paths.py
 
 @pytest.fixture(scope="module")
 def found(scene: Path) -> HeightCalibration:
-    return omnid.calibrate_height(scene / "log.mcap", read_rig(scene / "rig.toml"))
+    return omnid.calibrate_height(str(scene / "log.mcap"), scene / "rig.toml")
 
 
 def test_the_height_is_found_within_its_sigma(found: HeightCalibration) -> None:

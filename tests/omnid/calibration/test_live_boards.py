@@ -64,6 +64,29 @@ def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
     assert again.out == "" and "3 pairs, not enough yet" in again.err and len(list(kept.iterdir())) == 6
 
 
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_live_goes_on_after_half_a_pair(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], side: str
+) -> None:
+    omnid, kept, half = Command(capsys), tmp_path / "kept", f"{side}_001.png"
+    kept.mkdir()
+    before = (folder / f"{side}_00.png").read_bytes()
+    (kept / half).write_bytes(before)
+    again = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
+    assert again.code == 1 and "3 pairs, not enough yet" in again.err
+    assert (kept / half).read_bytes() == before and len(list(kept.iterdir())) == 7
+
+
+def test_live_refuses_images_of_another_size(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in folder.iterdir():
+        if path.stem.startswith("upper_"):
+            cv2.imwrite(str(tmp_path / path.name), image(folder, path.stem)[:600, :500])
+        elif path.stem.startswith("lower_"):
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    error = Command(capsys).refused("calibrate", "live", tmp_path, "--log", folder, *OPTIONS)
+    assert "upper camera: expected images of 500x600 px as the first ones, found 640x640 px; " in error
+
+
 def test_wrong_use_of_live_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     omnid = Command(capsys)
     assert "name a folder" in omnid.refused("calibrate", "live", *OPTIONS)

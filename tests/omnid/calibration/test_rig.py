@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def found(folder: Path) -> RigResult:
     """Calibrate the transform between two known cameras."""
     cameras = read_camera(folder / "lower.toml"), read_camera(folder / "upper.toml")
-    return omnid.calibrate_rig(folder, BOARD, cameras=cameras, expected_baseline_m=0.184)
+    return omnid.calibrate_rig(str(folder), BOARD, cameras=cameras, expected_baseline_m=0.184)
 
 
 def test_the_result_prints_itself_in_one_line(found: RigResult) -> None:
@@ -39,7 +39,7 @@ def test_what_limits_the_result_is_named(found: RigResult) -> None:
 
 
 def test_what_is_saved_is_the_rig(found: RigResult, tmp_path: Path) -> None:
-    found.save(tmp_path / "rig.toml")
+    found.save(str(tmp_path / "rig.toml"))
     read = read_rig(tmp_path / "rig.toml")
     assert read.lower.camera == TRUTH.lower.camera and read.covariance is not None
     assert turn_off_deg(read) < 0.03

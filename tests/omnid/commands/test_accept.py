@@ -40,6 +40,12 @@ def test_an_accepted_drive_and_its_page(tmp_path: Path, capsys: pytest.CaptureFi
     assert "Acceptance drive: Accepted" in html and html.count("<tr>") == 4 and "<svg" in html
 
 
+def test_a_trajectory_may_be_a_tum_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = written(tmp_path).rename(tmp_path / "est.tum")
+    assert accept(path, "--distance-m", DISTANCE_M) == 0
+    assert "over 3 rounds" in capsys.readouterr().out
+
+
 def test_a_drive_that_is_too_long_is_not_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "accept.html"
     assert accept(written(tmp_path, 1.02), "--distance-m", DISTANCE_M, "--json", "-o", page) == 1
@@ -67,6 +73,19 @@ def test_times_of_keys_are_unix_times(
     by_times = json.loads(capsys.readouterr().out)["drives"]["odometry"]["visits"]
     assert [visit["mark"] for visit in by_file] == ["A", "B", "A"]
     assert [visit["x_m"] for visit in by_file] == pytest.approx([visit["x_m"] for visit in by_times], abs=1e-3)
+
+
+def test_marks_already_taken_are_kept(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keys = tmp_path / "marks.txt"
+    keys.touch()
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n\n"))
+    assert accept("--keys", keys) == 0
+    taken = keys.read_text()
+    assert accept("--keys", keys) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert keys.read_text() == taken and f"--keys {keys}: expected a new file" in error and "another name" in error
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.kalibr import export_kalibr
+from calib.models.lens import DoubleSphereCamera
 from calib.ocam_file import export_ocam
-from calib.rig import Rig
+from calib.rig import Rig, ShutterTimes
 from calib.rig_file import read_rig, write_rig
 from omnid.commands import calibrate
 from omnid.errors import OmnidError
@@ -37,6 +39,19 @@ def test_imports_and_exports_kalibr_files(omni_rig: Rig, tmp_path: Path, capsys:
     assert (tmp_path / "again.toml").read_text() == (tmp_path / "rig.toml").read_text()
     assert omnid("import", tmp_path / "k.yaml", "--lower", "cam1", "-o", tmp_path / "swapped.toml") == 0
     assert read_rig(tmp_path / "swapped.toml").lower.camera == omni_rig.upper.camera
+
+
+def test_says_what_an_import_takes_from_the_imu(
+    omni_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = export_kalibr(omni_rig).replace("cam0:", "cam0:\n  timeshift_cam_imu: 0.002")
+    text = text.replace("cam1:", "cam1:\n  timeshift_cam_imu: 0.005").replace("lower/", "a/").replace("upper/", "b/")
+    (tmp_path / "k.yaml").write_text(text)
+    assert omnid("import", tmp_path / "k.yaml", "-o", tmp_path / "rig.toml") == 0
+    printed = capsys.readouterr()
+    assert "upper exposed +3.0 ms against its stamps" in printed.out
+    assert f"omnid: warning: {tmp_path / 'k.yaml'}: lower is cam0 by z of the IMU" in printed.err
+    assert read_rig(tmp_path / "rig.toml").times.upper_delay_s == pytest.approx(0.003)
 
 
 def test_the_line_says_how_far_a_lens_sees(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -80,6 +95,29 @@ def test_imports_and_exports_ocam_files(ocam_rig: Rig, tmp_path: Path, capsys: p
     (tmp_path / "folder").mkdir()
     assert omnid("export", tmp_path / "rig.toml", "--format", "ocam", "-o", tmp_path / "folder") == 0
     assert (tmp_path / "folder" / "calib_results.upper.txt").read_text() == export_ocam(ocam_rig.upper.camera)
+
+
+def test_an_export_names_all_that_it_leaves_out(
+    omni_rig: Rig, ocam_rig: Rig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = ShutterTimes(upper_delay_s=0.01)
+    direct = replace(ocam_rig.lower, camera=replace(ocam_rig.lower.camera, view="direct"))  # type: ignore[call-overload]
+    write_rig(tmp_path / "omni.toml", replace(omni_rig, times=late))
+    write_rig(tmp_path / "ocam.toml", replace(ocam_rig, times=late, lower=direct))
+    assert omnid("export", tmp_path / "omni.toml", "--format", "kalibr", "-o", tmp_path / "k.yaml") == 0
+    printed = capsys.readouterr().out
+    assert "left out, because the format does not support it: " in printed and "[times]" in printed
+    assert "view" not in printed
+    assert omnid("export", tmp_path / "ocam.toml", "--format", "ocam", "-o", tmp_path / "o") == 0
+    assert "[times], view (`calibrate import` with --view direct)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("form", ["ocam", "kalibr"])
+def test_an_export_that_no_format_holds_names_the_model(omni_rig: Rig, tmp_path: Path, form: str) -> None:
+    lens = DoubleSphereCamera(-0.2, 0.6, (300.0, 300.0), (384.0, 385.0), (768, 770))
+    write_rig(tmp_path / "ds.toml", replace(omni_rig, lower=replace(omni_rig.lower, camera=lens)))
+    with pytest.raises(CalibError, match="found one of the model ds"):
+        omnid("export", tmp_path / "ds.toml", "--format", form, "-o", tmp_path / "o")
 
 
 def test_invalid_requests_fail_before_files_are_written(omni_rig: Rig, ocam_rig: Rig, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import pytest
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from omnid import replay
+from omnid import OmnidError, calibrate_drive, replay
 from omnid.cli import main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
@@ -27,6 +28,12 @@ def test_a_short_drive_is_refused(scene: Path, tmp_path: Path, capsys: pytest.Ca
     code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
     assert code == 2 and "take a longer drive" in capsys.readouterr().err
     assert not (tmp_path / "rig.toml").exists()
+
+
+def test_logs_and_the_rig_may_be_names_of_files(scene: Path) -> None:
+    for logs in (str(scene / "log.mcap"), [str(scene / "log.mcap")], [scene / "log.mcap"]):
+        with pytest.raises(OmnidError, match="take a longer drive"):
+            calibrate_drive(logs, str(scene / "rig.toml"))
 
 
 @pytest.mark.parametrize(
@@ -53,6 +60,24 @@ def test_exchanged_cameras_are_refused(scene: Path, tmp_path: Path, capsys: pyte
         scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", "--lower", upper, "--upper", lower
     )
     assert code == 2 and len(capsys.readouterr().err.splitlines()) < 6
+    assert not (tmp_path / "rig.toml").exists()
+
+
+@pytest.mark.parametrize("height", [(), ("--height-m", "0.9")])
+def test_a_rig_that_fits_as_well_as_any_is_kept(
+    scene: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    height: tuple[str, ...],
+) -> None:
+    as_good = SimpleNamespace(adjustment=SimpleNamespace(sigma_px=0.2), first_sigma_px=0.2)
+    monkeypatch.setattr("omnid.calibration.drive.calibrate_drive", lambda *_: as_good)
+    monkeypatch.setattr("omnid.commands.calibrate_drive.describe", lambda _: [])
+    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", *height)
+    printed = capsys.readouterr().out
+    assert code == 1 and "fits these drives as well as any rig: nothing was written" in printed
+    assert ("--height-m 0.9 was not applied" in printed) == bool(height)
     assert not (tmp_path / "rig.toml").exists()
 
 

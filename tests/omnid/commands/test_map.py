@@ -71,6 +71,8 @@ def test_align_moves_a_map_into_the_axes_of_a_plan(omap: Path, capsys: pytest.Ca
     seen.write_text(SEEN)
     plan.write_text(SEEN.replace("tag.5", "tag.dock").replace("[1, 2,", "[11, 2,").replace("= 0\n", "= 90\n"))
     assert main(words) == 0 and "tag 5 (dock): 0 mm from its place on the plan" in capsys.readouterr().out
+    assert main(words) == 2 and f"map align: {out} exists: --replace makes a new one" in capsys.readouterr().err
+    words.append("--replace")
     before, after = (base_poses(*read_places(path)) for path in (omap, out))
     np.testing.assert_allclose(after[:, 0, 3], 11 - (before[:, 1, 3] - 2), atol=1e-9)
     np.testing.assert_allclose(after[:, 1, 3], 2 + before[:, 0, 3] - 1, atol=1e-9)
@@ -84,6 +86,27 @@ def test_align_moves_a_map_into_the_axes_of_a_plan(omap: Path, capsys: pytest.Ca
         assert main(words) == 2
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1
+
+
+def test_align_may_write_the_map_that_it_reads(omap: Path) -> None:
+    plan = omap.parent / "plan.toml"
+    plan.write_text(SEEN)
+    assert main(["map", "align", str(omap), "--seen", str(plan), "--known", str(plan), "-o", str(omap)]) == 0
+
+
+def test_merge_replaces_no_other_map_and_joins_none_with_itself(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other, taken, link = (omap.parent / name for name in ("b.omap", "taken.omap", "link.omap"))
+    write_places(other, some_places(12, features=20), RIG)
+    taken.write_bytes(b"of another building")
+    link.symlink_to(omap)
+    for maps, message in (
+        ((omap, other), f"map merge: {taken} exists: --replace makes a new one"),
+        ((omap, other, link), f"map merge: expected maps of several drives, found {link} twice"),
+    ):
+        assert main(["map", "merge", *map(str, maps), "-o", str(taken)]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+    assert taken.read_bytes() == b"of another building"
 
 
 def test_export_writes_what_is_asked_for_and_names_it(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,6 +141,7 @@ def test_export_writes_what_is_asked_for_and_names_it(omap: Path, capsys: pytest
     [
         ([], "nothing to write"),
         (["--grid", "{}/a.png"], "expected a name that ends in .yaml"),
+        (["--grid", "."], "--grid .: expected a file to write, found a folder"),
         (["--ply", "{}/a.omap"], "this is the map that is read as well"),
         (["--ply", "{}/none/a.ply"], "there is no folder"),
         (["--ply", "{}/a.ply", "--cell", "0"], "expected an edge of 0.005 to 10 m"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -86,3 +87,26 @@ def test_times_that_are_none_are_refused(times_s: list[float]) -> None:
 def test_a_wrong_distance_finds_no_round_and_says_what_it_found() -> None:
     with pytest.raises(OmnidError, match=r"found A at .* s; check --distance-m"):
         visits_by_standing(drive(), 5.0)
+
+
+def with_stops(*stops_m: float) -> Trajectory:
+    """Return a straight path from 0 that stands at 0 and at each of the places."""
+    x = [np.zeros(STAND)]
+    for start, end in pairwise((0.0, *stops_m)):
+        x += [np.linspace(start, end, int(abs(end - start) / SPEED_M) + 1), np.full(STAND, end)]
+    way = np.concatenate(x)
+    return Trajectory(np.arange(len(way)) * (10**9 // HZ), planar_poses(np.column_stack([way, 0 * way]), 0 * way))
+
+
+@pytest.mark.parametrize(
+    ("stops_m", "mark"),
+    [((10.5, 12.0, 0.0), "B"), ((12.0, 11.0, 0.0), "B"), ((12.0, 2.0, 0.0), "A"), ((1.0, 12.0, 0.0), "A")],
+)
+def test_a_wait_near_a_mark_is_not_taken_for_it(stops_m: tuple[float, ...], mark: str) -> None:
+    with pytest.raises(OmnidError, match=rf"one place of mark {mark}, found stands .* s; give the times .*--marks"):
+        visits_by_standing(with_stops(*stops_m), DISTANCE_M)
+
+
+def test_a_robot_that_is_placed_twice_is_on_one_mark() -> None:
+    visits = visits_by_standing(with_stops(0.1, 12.1, 12.0, 0.1), DISTANCE_M)
+    assert [round(float(visit.T[0, 3]), 3) for visit in visits] == [0.1, 12.1, 0.1]

@@ -121,6 +121,12 @@ def test_too_few_poses_names_both_ranges() -> None:
         evaluate(trajectory([], np.empty((0, 4, 4))), truth)
 
 
+@pytest.mark.parametrize("alignment", ["Origin", "sim3", ""])
+def test_refuses_an_unknown_alignment(alignment: str) -> None:
+    with pytest.raises(OmnidError, match=f"an alignment origin, rigid, scale was expected, '{alignment}' found"):
+        evaluate(spline(), spline(), alignment=alignment)
+
+
 def test_all_positions_are_aligned_where_that_is_asked_for() -> None:
     truth = spline()
     motion = se3.exp([4.0, -2.0, 1.0, 0.3, -0.2, 2.5])
@@ -135,6 +141,8 @@ def test_all_positions_are_aligned_where_that_is_asked_for() -> None:
     scaled = evaluate(small, truth, alignment="scale")
     assert scaled.ate_max_m < 1e-9 and scaled.length_error_ratio == pytest.approx(0.0, abs=1e-9)
     assert scaled.heading_max_rad < 1e-6
+    assert scaled.scale == pytest.approx(1 / 0.9) and "scale                 estimate times 1.11111" in str(scaled)
+    assert rigid.scale == 1.0 and "estimate times" not in str(rigid)
     for alignment in ("rigid", "scale"):
         with pytest.raises(OmnidError, match="lie on a line"):
             evaluate(straight(11, 0.1), straight(11, 0.1), alignment=alignment)
