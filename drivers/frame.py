@@ -69,7 +69,8 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
 
     Colours are converted with OpenCV's weights; of mono16 the upper byte is kept, of yuyv, uyvy and nv12 the luma.
     An EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises FrameDecodeError for
-    an image that is truncated, malformed or of an unknown encoding, or of whose restart markers some were lost.
+    an image that is truncated, malformed or of an unknown encoding, or of whose restart markers some were lost;
+    a JPEG without such markers that has lost a part in its middle passes, as decoders fill it up.
     """
     try:
         image = _decompress(frame) if frame.encoding in _START_MARKER else _unpack(frame)

@@ -8,7 +8,7 @@ from typing import Final
 from omnid.errors import OmnidError
 from omnid.settings import knob
 
-LEAST_HEIGHT_M: Final = 0.02  # Lower than this, the plane above the floor is the floor as matching resolves it.
+LEAST_HEIGHT_M: Final = 0.02  # A plane so little above the floor is the floor, because matching tells no more apart.
 
 
 @dataclass(frozen=True, slots=True)
