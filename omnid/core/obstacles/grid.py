@@ -7,6 +7,7 @@ it, and taken where a surface is more likely than not. README.md has the equatio
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, Final
 
 import cv2
@@ -145,8 +146,8 @@ class ObstacleGrid:
         lost = np.where(behind, hidden, np.minimum(hidden, 0))
         nearest = int(evidence.nearest_floor_m / CELL_M)
         self._near.lose_before(lost, eye, nearest)
-        seen_past = self._near.seen_past(self._odds[FLOOR], self._watch, eye, nearest)
-        gone = self._near.gone((rows, columns), cells[SURFACE], in_view, seen_past, eye)
+        past = partial(self._near.seen_past, self._odds[FLOOR], self._watch, eye, max(nearest, 1))
+        gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
         amount = self._add((rows, columns), cells, lost[rows, columns], gone, weight, at_rest)
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
@@ -187,7 +188,7 @@ class ObstacleGrid:
         noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
         # An obstacle that is hidden or too near to be seen remains one.
         noise[(surface <= 0) & ~in_view & ~gone & (odds[SURFACE] > TAKEN_ODDS)] = 0.0
-        self._keep_shown(surface, in_view | (_patches(gone) > 0), weight, window)
+        self._keep_shown(surface, in_view | (_patches(gone) > 0) if gone.any() else in_view, weight, window)
         surface = np.minimum(surface - noise, MOST_SURFACE)
         is_surface = surface > 0
         # Where floor is usual, a single cell that shows none is noise unless all floor behind it is hidden, too.

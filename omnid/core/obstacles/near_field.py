@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -54,26 +55,44 @@ class NearField:
         lost[near] = -np.inf
         np.maximum.at(lost, near, np.broadcast_to(behind[:, None], near[0].shape))
 
-    def gone(self, window: tuple[slice, slice], surface: Floats, in_view: Flags, seen_past: Flags, eye: Array) -> Flags:
+    def gone(
+        self,
+        window: tuple[slice, slice],
+        surface: Floats,
+        in_view: Flags,
+        past: Callable[[], Flags],
+        eye: Array,
+        nearest: int,
+    ) -> Flags:
         """Return the cells of a window in which a surface would be in view, shows nothing, and hides nothing.
 
         The lower end of the view falls with the range: what was seen from somewhere is seen from all places that are
         not nearer. So what is low and was seen from farther away stays. surface, in_view: of the window, evidence of a
-        pair, and where floor can be seen; seen_past (H, W): cells behind which floor is seen.
+        pair, and where floor can be seen; past: returns the cells (H, W) behind which floor is seen.
         """
-        range_m = self._cell_m * np.hypot(self._x[window] - eye[0], self._y[window] - eye[1])
-        seen_m = self._seen_m[window]
-        np.minimum(seen_m, range_m, out=seen_m, where=(surface >= SEEN_SURFACE) & ~in_view)
-        return np.asarray((surface <= 0) & ~in_view & (range_m >= seen_m - self._cell_m) & seen_past[window])
+        found = np.zeros(surface.shape, bool)
+        begin = np.floor(eye).astype(int) - nearest
+        rows, columns = (
+            slice(max(at, side.start), min(at + 2 * nearest + 1, side.stop))
+            for at, side in zip(begin[::-1].tolist(), window, strict=True)
+        )
+        near = tuple(slice(a.start - b.start, a.stop - b.start) for a, b in zip((rows, columns), window, strict=True))
+        out_of_view, shown = ~in_view[near], surface[near]
+        range_m = self._cell_m * np.hypot(self._x[rows, columns] - eye[0], self._y[rows, columns] - eye[1])
+        seen_m = self._seen_m[rows, columns]
+        np.minimum(seen_m, range_m, out=seen_m, where=(shown >= SEEN_SURFACE) & out_of_view)
+        would_show = (shown <= 0) & out_of_view & (range_m >= seen_m - self._cell_m)
+        if would_show.any():
+            found[near] = would_show & past()[rows, columns]
+        return found
 
     def seen_past(self, floor_odds: Floats, watch: Watch, eye: Array, nearest: int) -> Flags:
         """Return the cells (H, W) behind which the nearest floor in view is watched, in some sectors side by side."""
         found = np.zeros(floor_odds.shape, bool)
-        if nearest >= 2:
-            rows, columns = self._cells_along(eye, nearest + BEHIND_CELLS)
-            far = rows[:, nearest - 1 :], columns[:, nearest - 1 :]
-            past = _side_by_side(np.any(watch.watched[far] & (floor_odds[far] > FREE_ODDS), axis=1))
-            found[rows[past, :nearest], columns[past, :nearest]] = True
+        rows, columns = self._cells_along(eye, nearest + BEHIND_CELLS)
+        far = rows[:, nearest - 1 :], columns[:, nearest - 1 :]
+        past = _side_by_side(np.any(watch.watched[far] & (floor_odds[far] > FREE_ODDS), axis=1))
+        found[rows[past, :nearest], columns[past, :nearest]] = True
         return found
 
     def clear_seen_past(self, odds: Floats, watch: Watch, eye: Array, nearest: int) -> None:
