@@ -66,7 +66,7 @@ class Obstacles:
             return None
         self._last_ns = odometry.stamp_ns
         if odometry.reset_counter != self._resets:
-            self._grid.clear()
+            self._grid.begin_again()
             self._tracker.clear()
             self._resets = odometry.reset_counter
         panoramas = odometry.depth.panoramas

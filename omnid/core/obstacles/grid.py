@@ -103,7 +103,7 @@ class ObstacleGrid:
         return np.asarray(T_odom_base @ self._T_base_eye)
 
     def clear(self) -> None:
-        """Forget everything: the pose has lost its relation to the past."""
+        """Forget everything."""
         self._odds = np.empty((len(PRIOR), CELLS, CELLS), np.float32)
         self._odds[:] = np.array(PRIOR, np.float32)[:, None, None]
         self._shown = np.zeros((CELLS, CELLS), np.float32)  # mean surface of single pairs
@@ -115,6 +115,21 @@ class ObstacleGrid:
         self._nearest_m = 0.0  # range of the floor in view at the start
         self._place_m: Array | None = None  # of the last pair
         self._last_ns: int | None = None
+
+    def begin_again(self) -> None:
+        """Forget what is known, as the way since then is not, but for what stands nearer than the floor in view.
+
+        No pair would show that again, and a base whose odometry is lost stops, so that it is still about there.
+        """
+        surface, corner, place_m, nearest_m = self._odds[SURFACE], self._corner, self._place_m, self._nearest_m
+        self.clear()
+        if corner is None or place_m is None:
+            return
+        y, x = np.ogrid[:CELLS, :CELLS]
+        middle = place_m / CELL_M - corner - 0.5
+        near = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 < (nearest_m / CELL_M) ** 2
+        kept = near & (surface > TAKEN_ODDS)
+        self._odds[SURFACE][kept], self._corner = surface[kept], corner
 
     def update(self, stamp_ns: int, T_odom_base: Array, evidence: ColumnEvidence) -> GridRing:
         """Add the evidence of a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""

@@ -126,7 +126,8 @@ def test_what_is_known_is_known_again_when_odometry_has_found_its_place_again() 
             assert np.isnan(ring.ranges_m).all() and not ring.free_m.any()
     assert ranges_m == pytest.approx([0.43, np.nan, 0.43], abs=0.03, nan_ok=True)
     begun_again = stage.process(at_rest(23, pairs[0], TrackingState.TRACKING, resets=1))
-    assert begun_again is not None and not begun_again.ranges_m[180] < 1.0
+    assert begun_again is not None and begun_again.ranges_m[180] == pytest.approx(0.43, abs=0.03)
+    assert np.isfinite(ring.ranges_m[:90]).all() and not np.isfinite(begun_again.ranges_m[:90]).any()
 
 
 @pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
