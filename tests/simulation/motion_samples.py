@@ -52,5 +52,5 @@ def motion_samples(
         )
     for stamp_ns, rates in at(errors.gyro_period_s, errors.gyro_offset_s):
         turn = rates[3:] + errors.bias_radps + rng.normal(0, errors.gyro_sigma_radps, 3)
-        found.append(GyroSample(stamp_ns, *turn.tolist()))
+        found.append(GyroSample(stamp_ns, *turn.tolist(), of_base=True))
     return sorted(found, key=lambda sample: sample.stamp_ns)

@@ -40,7 +40,12 @@ class MotionSensorSettings:
     )
     right_joint: str = knob("", "name of the right one; radius and track are those of motor.drive")
     imu_topic: str = knob("", "topic of a log with sensor_msgs/msg/Imu; empty: the only one")
-    imu_roll_deg: float = knob(0.0, "orientation of the IMU on the base: roll about x, deg", low=-360, high=360)
+    imu_roll_deg: float = knob(
+        0.0,
+        "orientation of the IMU on the base: roll about x, deg; not applied to messages in the frame base_link",
+        low=-360,
+        high=360,
+    )
     imu_pitch_deg: float = knob(0.0, "... then pitch about y, deg", low=-360, high=360)
     imu_yaw_deg: float = knob(0.0, "... then yaw about z, deg", low=-360, high=360)
 
