@@ -21,7 +21,7 @@ from calib.bounded_yaml import MAX_BYTES, parse_yaml
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import lens_camera
-from calib.models.names import model_name
+from calib.models.names import model_name, sees_directly
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_frame import rig_between
@@ -60,6 +60,7 @@ def parse_kalibr(
     poses, has_rig_frame = _chain(cameras)
     low, up = _lower_and_upper(file, (lower, upper), poses if has_rig_frame else {}, warn)
     models = [_camera(cameras[key]) for key in (low, up)]
+    _warn_of_lens(models, name, warn)
     topics = (_topic(cameras[low]), _topic(cameras[up]))
     if not {low, up} <= poses.keys():
         raise CalibError(f"{name}: no transform between {low} and {up}; expected T_cam_imu of both, or T_cn_cnm1")
@@ -69,6 +70,15 @@ def parse_kalibr(
     else:
         rig = rig_between(models[0], models[1], poses[low] @ se3.inverse(poses[up]), topics)
     return replace(rig, times=_times(cameras[low], cameras[up]))
+
+
+def _warn_of_lens(models: list[OmniCamera], name: str, warn: Callable[[str], None]) -> None:
+    """Warn of cameras that may be mirrors whose images were flipped: nothing in the file tells them from lenses."""
+    if any(isinstance(camera, UnifiedCamera) and camera.xi > 0 and sees_directly(camera) for camera in models):
+        warn(
+            f"{name}: its omni cameras count as lenses, by their focal lengths; if these are mirrors whose images were "
+            "flipped, give them masks in the rig.toml"
+        )
 
 
 def _warn_of_lean(rig: Rig, name: str, warn: Callable[[str], None]) -> None:

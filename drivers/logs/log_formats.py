@@ -11,6 +11,7 @@ from typing import Final
 
 from drivers.errors import DriverError
 from drivers.logs import ros1_bag, sqlite_bag
+from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
 from drivers.logs.image_log import ImageLog, LogDamage, LoggedImage, LoggedMotion, images_of
 from drivers.logs.mcap_image_log import McapImageLog
@@ -95,8 +96,14 @@ def _open_folder(path: Path) -> ImageLog:
 
 
 def logs_in(folder: Path) -> list[Path]:
-    """Return the logs in a folder by their names, one that is not complete included. Raise OSError where unreadable."""
-    return sorted(file for file in folder.iterdir() if file.name.endswith(_WHOLE_OR_CUT) and file.is_file())
+    """Return the logs in a folder by their names. Raise OSError where it is unreadable.
+
+    A recording that was cut is one of them, unless it was recovered, or is being written.
+    """
+    found = sorted(file for file in folder.iterdir() if file.name.endswith(_WHOLE_OR_CUT) and file.is_file())
+    return [
+        file for file in found if file.suffix in LOG_SUFFIXES or not (file.with_suffix("").exists() or is_locked(file))
+    ]
 
 
 def parts_in_order(logs: list[Path]) -> list[Path]:

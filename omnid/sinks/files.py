@@ -24,6 +24,7 @@ Named: TypeAlias = Sequence[tuple[str, Path]]
 REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
 # Options of files of one format, and how such a file is named.
 SUFFIXES: Final = {"--cloud": ".ply", "--ply": ".ply", "--plan": ".png", "--record": ".mcap", "--mcap": ".mcap"}
+FORMATS: Final = {*SUFFIXES.values(), ".txt", ".tum", ".csv", ".json", ".jpg", ".pdf", ".pcd", ".db3", ".bag", ".toml"}
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
@@ -37,7 +38,7 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         other = taken.setdefault(_identity(path), option)
         if other != option and path.exists() == path.is_file():
             raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
-        if path.suffix.lower() not in ("", SUFFIXES.get(option, path.suffix.lower())):
+        if path.suffix.lower() in FORMATS - {SUFFIXES.get(option, path.suffix.lower())}:
             raise OmnidError(f"{option} {path}: expected a name that ends with {SUFFIXES[option]}")
 
 

@@ -22,7 +22,7 @@ MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera 
 PERIOD_STEPS = 16  # recent steps between the stamps of a camera, whose median is its period
 SURE_NS = 5_000_000  # stamps so close make a pair also before the period is known
 SURE_STEPS = 3  # Steps after which the period is known ...
-FIRST_NS = 50_000_000  # ... and the largest difference of a pair before: half the period at 10 Hz.
+FIRST_NS = 100_000_000  # ... and the largest difference of a pair before: half the period at 5 Hz.
 OTHER: dict[Camera, Camera] = {"lower": "upper", "upper": "lower"}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -173,6 +174,15 @@ def test_says_that_only_z_of_the_imu_tells_the_lower_camera() -> None:
     (line,) = warnings_of(text)
     assert line == "c.yaml: lower is cam0 by z of the IMU, which must point up; if it does not, give --lower cam1"
     assert warnings_of(text, lower="cam0") == warnings_of(chain(BOTH, None, NAMED)) == []
+
+
+def test_says_that_omni_cameras_without_a_flip_count_as_lenses() -> None:
+    """A mirror whose images were flipped before they were calibrated has such focal lengths, too."""
+    mirrors = chain(BOTH, None, NAMED)
+    lenses = re.sub(r"(intrinsics: \[[\d.]+, )-", r"\1", mirrors)
+    assert lenses != mirrors and warnings_of(mirrors) == []
+    (line,) = warnings_of(lenses)
+    assert "count as lenses" in line and "give them masks" in line
 
 
 @pytest.mark.parametrize(

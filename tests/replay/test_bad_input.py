@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from omnid.sinks.files import check_outputs
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import Entry, text, write_log
 from tests.replay.command import Command, rows
@@ -175,6 +176,11 @@ def test_a_file_is_not_named_as_one_of_another_format(
     error = omnid.refused("replay", scene / "log.mcap", option, tmp_path / "out.txt")
     assert f"{option} {tmp_path / 'out.txt'}: expected a name that ends with {suffix}" in error
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["drive_1.5mps", "run.2026-10-07", "out.MCAP", "out"])
+def test_other_names_are_the_users(tmp_path: Path, name: str) -> None:
+    check_outputs([("--record", tmp_path / name)], [])
 
 
 def test_a_refused_run_leaves_no_files(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -23,6 +23,7 @@ from omnid.core.obstacles.grid_layers import (
     FLOOR,
     FLOORS,
     FREE_ODDS,
+    FREE_SHOWN,
     PRIOR,
     SURFACE,
     TAKEN_ODDS,
@@ -113,6 +114,7 @@ class ObstacleGrid:
         self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
         self._start_ns: int | None = None
         self._nearest_m = 0.0  # range of the floor in view at the start
+        self._eye_m = np.zeros(2)  # viewpoint of the last pair
         self._place_m: Array | None = None  # of the last pair
         self._last_ns: int | None = None
 
@@ -121,22 +123,21 @@ class ObstacleGrid:
 
         No pair would show that again, and a base whose odometry is lost stops, so that it is still about there.
         """
-        surface, corner, place_m, nearest_m = self._odds[SURFACE], self._corner, self._place_m, self._nearest_m
-        self.clear()
-        if corner is None or place_m is None:
+        if self._start_ns is None or self._corner is None:  # nothing has been added since the last time
             return
-        y, x = np.ogrid[:CELLS, :CELLS]
-        middle = place_m / CELL_M - corner - 0.5
-        near = (x - middle[0]) ** 2 + (y - middle[1]) ** 2 < (nearest_m / CELL_M) ** 2
-        kept = near & (surface > TAKEN_ODDS)
+        surface, corner, near = self._odds[SURFACE], self._corner, self._near
+        kept = near.within(self._eye_m / CELL_M - corner, self._nearest_m / CELL_M) & (surface > TAKEN_ODDS)
+        self.clear()
         self._odds[SURFACE][kept], self._corner = surface[kept], corner
+        self._near.keep(near, kept)
 
     def update(self, stamp_ns: int, T_odom_base: Array, evidence: ColumnEvidence) -> GridRing:
         """Add the evidence of a pair, whose base has the planar pose T_odom_base (4, 4); return what is known."""
         place = T_odom_base[:2, 3] / CELL_M
         corner = self._follow(place)
         at = np.floor(place).astype(np.int64) - corner
-        eye = self.viewpoint(T_odom_base)[:2, 3] / CELL_M - corner
+        self._eye_m = self.viewpoint(T_odom_base)[:2, 3]
+        eye = self._eye_m / CELL_M - corner
         rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
         if self._start_ns is None:
             # The robot is where nothing else can be: the floor too near to be seen counts until it is reached.
@@ -164,6 +165,7 @@ class ObstacleGrid:
         past = partial(self._near.seen_past, self._odds[FLOOR], self._watch, eye, max(nearest, 1))
         gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
         amount = self._add((rows, columns), cells, lost[rows, columns], gone, weight, at_rest)
+        self._near.forget((self._odds[SURFACE] <= PRIOR[SURFACE]) & (self._shown <= FREE_SHOWN))
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
         if stamp_ns - self._start_ns >= FRESH_NS:

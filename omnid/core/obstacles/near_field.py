@@ -40,6 +40,18 @@ class NearField:
         """The layers (cells, cells), and what each holds where nothing is known."""
         return ((self._seen_m, np.inf),)
 
+    def within(self, eye: Array, radius: float) -> Flags:
+        """Return the cells (cells, cells) within a radius of the viewpoint, both in cells."""
+        return np.asarray(np.hypot(self._x - eye[0], self._y - eye[1]) < radius)
+
+    def keep(self, before: NearField, kept: Flags) -> None:
+        """Take over from how near surfaces were seen, in cells (cells, cells)."""
+        self._seen_m[kept] = before._seen_m[kept]
+
+    def forget(self, bare: Flags) -> None:
+        """Forget from how near surfaces were seen, in cells (cells, cells) that show none: others may come there."""
+        self._seen_m[bare] = np.inf
+
     def lose_before(self, lost: Floats, eye: Array, nearest: int) -> None:
         """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen: as behind them.
 

@@ -81,6 +81,24 @@ def test_an_invalid_stamp_makes_no_later_one_invalid(stamps: Stamps) -> None:
     assert found == taken and stamps.state.restamped == 1
 
 
+def test_images_of_a_clock_that_fell_back_are_dated_by_their_arrival_for_good(stamps: Stamps) -> None:
+    found = []
+    for number in range(300):
+        taken_ns = START_NS + PERIOD_NS * number
+        kernel_ns = taken_ns - 3 * 10**9 * (number >= 30)
+        found.append(stamps.validate(kernel_ns, taken_ns + DELAY_NS) - taken_ns)
+    assert found == [0] * 300 and stamps.state.restamped == 270
+
+
+def test_one_late_image_is_not_the_usual_delay(stamps: Stamps) -> None:
+    for number in range(5):
+        stamps.validate(START_NS + PERIOD_NS * number, START_NS + PERIOD_NS * number + DELAY_NS)
+    late_ns = START_NS + PERIOD_NS * 5
+    assert stamps.validate(late_ns, late_ns + 3 * 10**9) == late_ns
+    now_ns = late_ns + 4 * 10**9
+    assert stamps.validate(now_ns + 1_000_000, now_ns) == now_ns - DELAY_NS
+
+
 def test_reports_each_kind_of_fault_once(stamps: Stamps) -> None:
     for i in range(100):
         stamps.validate(START_NS * (1 + i), START_NS + i, flags=0)

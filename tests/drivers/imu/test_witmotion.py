@@ -89,6 +89,25 @@ def test_samples_that_arrive_together_are_as_far_apart_as_usual(port: tuple[int,
     sender.join()
     gyro.close()
     assert min(after - before for before, after in pairwise(stamps_ns[30:])) > 15_000_000
+    assert stamps_ns == sorted(stamps_ns)
+
+
+def test_samples_after_a_pause_are_not_earlier_than_those_before_it(port: tuple[int, str]) -> None:
+    device, name = port
+    gyro = WitMotionGyro(name, 115_200)
+
+    def send() -> None:
+        """Send three turns each 30 ms, and nothing for a second in between."""
+        for k in range(30):
+            time.sleep(1.0 if k == 10 else 0.03)
+            os.write(device, turn(k) + turn(k) + turn(k))
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    stamps_ns = [sample.stamp_ns for sample in islice(gyro.samples(), 90)]
+    sender.join()
+    gyro.close()
+    assert stamps_ns == sorted(stamps_ns)
 
 
 def test_a_silent_port_is_opened_again_and_reported(port: tuple[int, str], monkeypatch: pytest.MonkeyPatch) -> None:

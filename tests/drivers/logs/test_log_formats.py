@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import sqlite3
@@ -18,7 +19,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
-from drivers.logs.log_formats import log_info
+from drivers.logs.log_formats import log_info, logs_in
 from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_info import LogState
 from drivers.logs.sqlite_bag import SqliteBag
@@ -162,6 +163,17 @@ def test_a_recording_that_was_not_completed_is_the_last_part(tmp_path: Path) -> 
     assert log_info(folder).state is LogState.BROKEN
     (folder / "omnid_20261122T050000Z_001.mcap").unlink()
     assert read(folder)[1].truncated
+
+
+def test_a_recording_that_was_recovered_or_is_written_is_not_read_twice_or_at_all(tmp_path: Path) -> None:
+    entries = pairs(4)
+    write_log(tmp_path / "omnid_20261122T050000Z_001.mcap", entries[:4])
+    cut = write_log(tmp_path / "omnid_20261122T051000Z_002.mcap.part", entries[4:])
+    with cut.open("rb") as writer:
+        fcntl.flock(writer.fileno(), fcntl.LOCK_EX)
+        assert [log.name for log in logs_in(tmp_path)] == ["omnid_20261122T050000Z_001.mcap"]
+    write_log(cut.with_suffix(""), entries[4:])
+    assert len(logs_in(tmp_path)) == 2 and not read(tmp_path)[1].truncated
 
 
 def test_recordings_of_two_runs_are_not_one_log(tmp_path: Path) -> None:

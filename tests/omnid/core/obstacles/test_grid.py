@@ -401,13 +401,47 @@ def test_who_has_left_a_place_too_near_to_see_its_floor_is_no_obstacle_any_longe
     assert np.nanmin(ring.ranges_m) > 1.5 and np.median(ring.free_m) > WALL_M - 0.5
 
 
+def put_low_box(grid: ObstacleGrid, ahead_m: float = 0.65) -> None:
+    """Make the grid know a low box, as from farther away."""
+    middle, ahead = np.round(-grid.corner_m / CELL_M).astype(int), round(ahead_m / CELL_M)
+    grid._odds[SURFACE, middle[1] - 4 : middle[1] + 4, middle[0] + ahead : middle[0] + ahead + 2] = 6.0
+
+
+@pytest.mark.parametrize("people_before", [False, True])
 def test_a_low_thing_that_was_seen_from_farther_away_stays_where_nothing_shows_it(
-    grid: ObstacleGrid, seen: Pairs
+    grid: ObstacleGrid, seen: Pairs, people_before: bool
 ) -> None:
     after(grid, seen, 20)
-    middle = np.round(-grid.corner_m / CELL_M).astype(int)
-    grid._odds[SURFACE, middle[1] - 4 : middle[1] + 4, middle[0] + 12 : middle[0] + 14] = 6.0  # 0.6 m ahead
-    assert after(grid, seen, 100, first=20).ranges_m[AHEAD].max() < 0.7
+    if people_before:
+        after(grid, evidence(stains, striped, wall_m=0.7), 30, first=20)
+        after(grid, seen, 150, first=50)
+    put_low_box(grid)
+    assert after(grid, seen, 100, first=200).ranges_m[AHEAD].max() < 0.75
+
+
+def test_odometry_that_begins_again_twice_forgets_nothing_near(grid: ObstacleGrid, seen: Pairs) -> None:
+    after(grid, seen, 20)
+    put_low_box(grid)
+    grid.begin_again()
+    grid.begin_again()
+    assert after(grid, seen, 30, first=20).ranges_m[AHEAD].max() < 0.75
+
+
+def test_near_is_so_of_the_cameras_when_odometry_begins_again(seen: Pairs) -> None:
+    """Cameras 0.4 m ahead of the base's origin: what stands 1.1 m ahead of that is 0.7 m from them."""
+    grid = ObstacleGrid(COLUMNS.at_1m, SETTINGS)
+    grid.set_floor(se3.inverse(se3.transform(np.eye(3), [0.4, 0.0, HEIGHT_M])), HEIGHT_M)
+    after(grid, seen, 20)
+    put_low_box(grid, 1.1)
+    grid.begin_again()
+    assert after(grid, seen, 30, first=20).ranges_m[AHEAD].max() < 1.2
+
+
+def test_who_stood_near_when_odometry_began_again_and_leaves_is_no_obstacle(grid: ObstacleGrid, seen: Pairs) -> None:
+    after(grid, seen, 20)
+    after(grid, evidence(stains, striped, wall_m=0.7), 30, first=20)
+    grid.begin_again()
+    assert np.nanmin(after(grid, seen, 150, first=50).ranges_m) > 1.5
 
 
 @pytest.mark.parametrize("strut_deg", [4.0, 8.0])
