@@ -23,6 +23,7 @@ def test_finds_logs(tmp_path: Path) -> None:
     assert [job.name for job in jobs(["/x/a.mcap", "/x/a.db3"], tmp_path, BatchOptions())] == ["a", "a-2"]
     alike = ["/x/run-2.mcap", "/x/run.db3", "/x/run.mcap"]
     assert [job.name for job in jobs(alike, tmp_path, BatchOptions())] == ["run-2", "run", "run-3"]
+    assert [job.name for job in jobs(alike[::-1], tmp_path, BatchOptions())] == ["run", "run-3", "run-2"]
     for missing in ("nowhere.mcap", "nowhere/*.mcap"):
         with pytest.raises(OmnidError, match="batch: no log"):
             find_logs([str(tmp_path / missing)])
