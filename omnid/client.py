@@ -237,7 +237,7 @@ class Robot:
         self._declared.append(tokens.declare_subscriber(f"{self.name}/alive", on_token, history=True))
 
     @property
-    def neighbours(self) -> str:
+    def robots_there(self) -> str:
         """Names of the robots that are there, this one included, as a part of a sentence."""
         return robots_there(self._session)
 

@@ -97,10 +97,9 @@ class WitMotionGyro:
             rates = list(self._reader.feed(data))
             apart_s = 0.0
             if rates:
-                # A late read has as many more samples, so that the mean over them holds; one after a pause does not.
+                # A late read has as many more samples, so that the mean over them holds; after a pause it is too large.
                 mean_s = min(max(least_s, (now_ns * 1e-9 - received_s) / len(rates)), LONGEST_PERIOD_S)
-                if not period_s or mean_s < 2 * period_s:
-                    period_s += (PERIOD_SHARE if period_s else 1.0) * (mean_s - period_s)
+                period_s += (PERIOD_SHARE if period_s else 1.0) * (mean_s - period_s)
                 apart_s = min(period_s, mean_s)  # so that none is earlier than those of the read before
             for k, rate in enumerate(rates):
                 yield GyroSample(now_ns - round((len(rates) - 1 - k) * apart_s * 1e9), *rate)

@@ -100,7 +100,7 @@ def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[W
     robot.kept_messages(inbox.put, KEPT)
     robot.on_message(inbox.put)
     robot.on_alive(state.set_alive)
-    state.neighbours = robot.neighbours
+    state.robots_there = robot.robots_there
     next_s = time.monotonic() + SHOW_PERIOD_S
     while (now_s := time.monotonic()) < end_s:
         message = inbox.get(min(next_s, end_s) - now_s)

@@ -61,7 +61,7 @@ class RobotState:
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
-        self.neighbours = ""  # robots that were there when the connection was made, as a part of a sentence
+        self.robots_there = ""  # robots that were there when the connection was made, as a part of a sentence
         self.poses = self.missed = self.broken = 0
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
@@ -125,7 +125,7 @@ class RobotState:
     def state(self) -> str:
         """Tracking state of the newest pose, or the time since it and whether the daemon is still there."""
         if self.pose is None:
-            return f"no pose yet ({self.neighbours})" if self.neighbours and not self.alive else "no pose yet"
+            return f"no pose yet ({self.robots_there})" if self.robots_there and not self.alive else "no pose yet"
         if self.time_since_pose_s > NO_POSE_S:
             gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
             return f"no pose for {self.time_since_pose_s:.0f} s{gone}"
