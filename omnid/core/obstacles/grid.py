@@ -162,7 +162,7 @@ class ObstacleGrid:
         lost = np.where(behind, hidden, np.minimum(hidden, 0))
         nearest = int(evidence.nearest_floor_m / CELL_M)
         self._near.lose_before(lost, eye, nearest)
-        past = partial(self._near.seen_past, self._odds[FLOOR], self._watch, eye, max(nearest, 1))
+        past = partial(self._near.seen_past, self._odds, self._watch, eye, max(nearest, 1))
         gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
         amount = self._add((rows, columns), cells, lost[rows, columns], gone, weight, at_rest)
         self._near.forget((self._odds[SURFACE] <= PRIOR[SURFACE]) & (self._shown <= FREE_SHOWN))

@@ -8,13 +8,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.obstacles import near_field_kernels as kernels
 from omnid.core.obstacles.grid_layers import FLOOR, FLOORS, FREE_ODDS, SURFACE, TAKEN_ODDS
-from omnid.core.obstacles.watch import Watch
+from omnid.core.obstacles.watch import LEAST_FRESH, Watch
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Indices = NDArray[np.intp]
 
 PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
 # Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
@@ -56,16 +56,11 @@ class NearField:
         """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen: as behind them.
 
         What hides the nearest floor in view may stand anywhere before it; as the base moves, directions cross there.
-        eye (2,): viewpoint in cells; nearest: range of the nearest floor in view in cells.
+        Of the directions through a cell the most hidden one counts. eye (2,): viewpoint in cells; nearest: range of the
+        nearest floor in view in cells.
         """
-        if nearest < 2:
-            return
-        rows, columns = self._cells_along(eye, nearest + 2)
-        behind = lost[rows[:, nearest:], columns[:, nearest:]].mean(axis=1)
-        near = rows[:, : nearest - 1], columns[:, : nearest - 1]
-        # Of the directions through a cell the most hidden one counts.
-        lost[near] = -np.inf
-        np.maximum.at(lost, near, np.broadcast_to(behind[:, None], near[0].shape))
+        if nearest >= 2:
+            kernels.lose_before(eye, self._directions, nearest, lost)
 
     def gone(
         self,
@@ -98,14 +93,13 @@ class NearField:
             found[near] = would_show & past()[rows, columns]
         return found
 
-    def seen_past(self, floor_odds: Floats, watch: Watch, eye: Array, nearest: int) -> Flags:
-        """Return the cells (H, W) behind which the nearest floor in view is watched, in some sectors side by side."""
-        found = np.zeros(floor_odds.shape, bool)
-        rows, columns = self._cells_along(eye, nearest + BEHIND_CELLS)
-        far = rows[:, nearest - 1 :], columns[:, nearest - 1 :]
-        past = _side_by_side(np.any(watch.watched[far] & (floor_odds[far] > FREE_ODDS), axis=1))
-        found[rows[past, :nearest], columns[past, :nearest]] = True
-        return found
+    def seen_past(self, odds: Floats, watch: Watch, eye: Array, nearest: int) -> Flags:
+        """Return the cells (H, W) behind which the nearest floor in view is watched, in some sectors side by side.
+
+        odds (5, H, W): log-odds of all layers.
+        """
+        floor_behind, _ = self._view_past(odds, watch, eye, nearest)
+        return self._marked(eye, np.where(_side_by_side(floor_behind), nearest, 0))
 
     def clear_seen_past(self, odds: Floats, watch: Watch, eye: Array, nearest: int) -> None:
         """End the flood too near to be seen where something behind it is watched: a person would hide that.
@@ -114,23 +108,26 @@ class NearField:
         """
         if not nearest or not watch.flooded.any():
             return
-        steps = nearest + 2
-        rows, columns = self._cells_along(eye, nearest + BEHIND_CELLS)
-        watched = watch.watched[rows, columns]
-        surface = np.logical_or.accumulate(watched & (odds[SURFACE][rows, columns] > TAKEN_ODDS), axis=1)
-        floor = watched & (odds[FLOOR][rows, columns] > FREE_ODDS)
-        past = _side_by_side(floor[:, nearest - 1 :].any(axis=1) | surface[:, -1])
-        chosen = past[:, None] & ~surface[:, :steps]
-        cells = rows[:, :steps][chosen], columns[:, :steps][chosen]
-        flooded = watch.flooded[cells] > 0
-        odds[FLOORS, *cells] = np.where(flooded, np.float32(FREE_ODDS + 1), odds[FLOORS, *cells])
-        watch.flooded[cells] = 0
+        floor_behind, clear = self._view_past(odds, watch, eye, nearest)
+        past = _side_by_side(floor_behind | (clear < nearest + BEHIND_CELLS))
+        ended = self._marked(eye, np.where(past, np.minimum(clear, nearest + 2), 0)) & (watch.flooded > 0)
+        odds[FLOORS, ended] = FREE_ODDS + 1
+        watch.flooded[ended] = 0
 
-    def _cells_along(self, eye: Array, steps: int) -> tuple[Indices, Indices]:
-        """Return the rows and columns (SECTORS, steps) of the first cells along all directions."""
-        ways = eye + np.arange(1, steps + 1)[None, :, None] * self._directions[:, None]
-        columns, rows = np.moveaxis(np.floor(ways).astype(np.intp), -1, 0)
-        return rows, columns
+    def _view_past(self, odds: Floats, watch: Watch, eye: Array, nearest: int) -> tuple[Flags, NDArray[np.int32]]:
+        """Return where (SECTORS,) floor is watched behind the nearest in view; the cells before a watched surface."""
+        floor_behind, clear = np.empty(len(self._directions), np.uint8), np.empty(len(self._directions), np.int32)
+        ways = np.array([nearest, nearest + BEHIND_CELLS])
+        least = np.array([LEAST_FRESH, FREE_ODDS, TAKEN_ODDS], np.float32)
+        layers = odds[FLOOR], odds[SURFACE], watch.evidence
+        kernels.view_past(*layers, eye, self._directions, ways, least, floor_behind, clear)
+        return floor_behind > 0, clear
+
+    def _marked(self, eye: Array, ways: NDArray[np.integer[Any]]) -> Flags:
+        """Return the cells (H, W) within ways (SECTORS,) [cells] along the directions."""
+        cells = np.zeros(self._seen_m.shape, np.uint8)
+        kernels.mark(eye, self._directions, ways.astype(np.int32), cells)
+        return cells.view(np.bool_)
 
 
 def _side_by_side(flags: Flags) -> Flags:
