@@ -42,7 +42,8 @@ def test_floor_and_surfaces_that_are_watched_are_seen_along_a_direction(surface_
     floor, surface, evidence = (np.zeros((SIDE, SIDE), np.float32) for _ in range(3))
     floor[ahead(4)], evidence[ahead(4)] = 2.0, 1.0
     if surface_at is not None:
-        surface[ahead(surface_at)], evidence[ahead(surface_at)] = 1.0, 1.0
+        for step in (surface_at, 9):  # the first one counts
+            surface[ahead(step)], evidence[ahead(step)] = 1.0, 1.0
     behind, ends = np.empty(3, np.uint8), np.empty(3, np.int32)
     ways, least = np.array([4, 9]), np.array([0.4, 1.5, 0.0], np.float32)
     kernels.view_past(floor, surface, evidence, EYE, DIRECTIONS, ways, least, behind, ends)
