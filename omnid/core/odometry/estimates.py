@@ -112,6 +112,11 @@ class GapStep:
         return bool(np.linalg.norm(self.xi[3:]) > JUMP_RAD)
 
     @property
+    def is_jump(self) -> bool:
+        """True if it leads to another place or heading."""
+        return self.is_far or self.is_turned
+
+    @property
     def covariance(self) -> Array:
         """The step as a covariance (6, 6) of the predicted pose."""
         return np.outer(self.xi, self.xi)

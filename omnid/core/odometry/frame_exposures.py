@@ -85,6 +85,10 @@ class FrameExposures:
         """Note that a frame started the map; where its velocity matters, the map starts again with the next pose."""
         self._first = None if frame.times.is_at_once else frame
 
+    def forget_first(self) -> None:
+        """Keep the map as it was started: a pose was refused, so that the next one is no step from its first frame."""
+        self._first = None
+
     def start_again(
         self,
         frame: StereoFrame,

@@ -63,8 +63,9 @@ class VisualOdometry:
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
+        self._T_at_fix = self._T_odom_rect  # the pose when the map was in view last
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
-        self._status, self._resets = TrackingStatus(), 0
+        self._status = TrackingStatus()
         self._untracked_mps = UNTRACKED_SPEED_SIGMA
         self._doubt: Doubt | None = None  # other motions that may have been made in place of the chosen ones
         self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
@@ -114,14 +115,12 @@ class VisualOdometry:
             known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
             refused = self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
             return replace(refused, refused_mps=too_fast_mps)
-        self._resets += gap.is_turned  # odom has another heading than it was published with
-
         estimate = self._exposures.start_again(
             frame, usable, estimate, dt_s, request=self._request, tracked=self._search.tracked
         )
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
-        self._accept(frame, estimate, dt_s)
+        self._accept(frame, estimate, dt_s, turned=gap.is_turned)
         new = estimate.pixels[self._map.store.table.anchor[estimate.landmarks] == self._added]
         self._added = None
         exposure = self._exposures.predicted(frame, dt_s)
@@ -194,8 +193,8 @@ class VisualOdometry:
         smallest = self._limits.min_inliers
         return len(corners(frame.lower, usable, COUNTED_CORNERS * smallest)) >= TEXTURED_CORNERS * smallest
 
-    def _accept(self, frame: StereoFrame, estimate: PoseEstimate, dt_s: float) -> None:
-        """Update the filter and set the pose; after a break the filter starts from standstill."""
+    def _accept(self, frame: StereoFrame, estimate: PoseEstimate, dt_s: float, *, turned: bool) -> None:
+        """Update the filter, from standstill after a break, and set the pose; turned: its heading is a jump of odom."""
         at_previous: RigVelocity | None = None
         if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
@@ -211,7 +210,8 @@ class VisualOdometry:
         self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
-        self._advance(FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=self._in_doubt))
+        facts = FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=self._in_doubt, turned=turned)
+        self._advance(facts)
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
     @property
@@ -226,16 +226,13 @@ class VisualOdometry:
 
         elsewhere: distance of the recognised from the predicted pose; None: it was not recognised elsewhere.
         """
-        carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and elsewhere is None
-        self._advance(
-            FrameFacts(
-                FrameOutcome.REFUSED,
-                dt_s,
-                textured=self._is_textured(frame, usable),
-                elsewhere=elsewhere is not None,
-                carried=carried,
-            )
-        )
+        known = elsewhere is not None
+        self._exposures.forget_first()
+        carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and not known
+        textured = self._is_textured(frame, usable)
+        stayed = not GapStep.between(self._T_at_fix, self._T_odom_rect).is_jump
+        facts = FrameFacts(FrameOutcome.REFUSED, dt_s, textured=textured, elsewhere=known, carried=carried)
+        self._advance(replace(facts, stayed=stayed))
         if not self._status.restart:
             return self._result(0, 0, exposure=self._exposures.now(frame))
         self._map.clear()
@@ -243,13 +240,10 @@ class VisualOdometry:
         self._relocaliser.clear()
         if elsewhere is not None:
             self._covariance = self._covariance + elsewhere.covariance
-        if not carried:
+        if self._status.unknown_motion:
             self._motion.reset()
-            self._resets += 1
-        known = elsewhere is not None
-        return self._start_map(
-            frame, usable, FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known, carried=carried)
-        )
+        facts = FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known, carried=carried)
+        return self._start_map(frame, usable, facts)
 
     def _start_without_map(self, frame: StereoFrame, usable: Flags, dt_s: float) -> OdometryEstimate:
         """Start a map where there is none, after the motion that wheels and gyro measured."""
@@ -283,14 +277,18 @@ class VisualOdometry:
 
     def _advance(self, facts: FrameFacts) -> None:
         """Advance the tracking state; while it has no fix the covariance grows as under an unknown steady velocity."""
-        before_s = self._status.time_since_fix_s
+        before_s, was_known = self._status.time_since_fix_s, not self._status.unknown_motion
         self._status = next_status(self._status, facts, self._limits)
         after_s = self._status.time_since_fix_s
-        if after_s > before_s and not facts.carried:
+        if facts.carried and was_known and self._status.unknown_motion:
+            before_s = 0.0  # What carried the pose is contradicted now, and has measured nothing since the last fix.
+        elif facts.carried:
+            before_s = after_s
+        if after_s > before_s:
             sigma = np.repeat([self._untracked_mps, UNTRACKED_SPEED_SIGMA], 3)
             self._covariance = bounded(self._covariance + np.diag(sigma**2) * (after_s**2 - before_s**2))
         if after_s == 0:
-            self._untracked_mps = UNTRACKED_SPEED_SIGMA
+            self._untracked_mps, self._T_at_fix = UNTRACKED_SPEED_SIGMA, self._T_odom_rect
 
     def _update_map(
         self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure
@@ -321,7 +319,7 @@ class VisualOdometry:
             self._motion.velocity,
             self._motion.velocity_covariance,
             self._status.state,
-            self._resets,
+            self._status.resets,
             tracked,
             inliers,
             features or Features(),

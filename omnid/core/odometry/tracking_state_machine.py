@@ -2,7 +2,7 @@
 
 NOT_STARTED ----------------------------------------------> LOST
 STARTED, ACCEPTED ----------------------------------------> TRACKING
-STARTED again after an unknown motion --------------------> DEGRADED
+STARTED again after an unknown motion --------------------> DEGRADED, and the reset counter rises
 ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
 ACCEPTED with a runner-up that is nearly as likely -----------> DEGRADED
 REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
@@ -10,6 +10,10 @@ REFUSED from then on -------------------------------------> LOST, and the map is
                                                             restart_after textured frames matched nothing,
                                                             or one was recognised elsewhere
 REFUSED, carried on by wheels and gyro -------------------> DEGRADED, and the map is started again likewise
+
+The motion since the last fix is unknown from the first frame on to which wheels and gyro carried nothing, or that was
+recognised elsewhere. It is unknown, too, where a map is started again although they say that the base has hardly
+moved: the old map would be in view, so the base was carried away, or its wheels and gyro are wrong.
 """
 
 from __future__ import annotations
@@ -40,7 +44,9 @@ class FrameFacts:
     runner_up: bool = False  # another motion explains the images nearly as well
     textured: bool = True  # the frame has enough corners for a map
     elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
+    turned: bool = False  # an accepted pose has another heading than was published
     carried: bool = False  # wheels and gyro carry the pose on
+    stayed: bool = False  # the pose has hardly changed since the last fix
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,31 +58,51 @@ class TrackingStatus:
     unmatched_frames: int = 0  # textured frames refused after lost_after others, since the last accepted one
     time_since_fix_s: float = 0.0  # since the last accepted frame
     restart: bool = False  # the map is to be started again at this frame
+    has_begun: bool = False  # a map was started once
+    unknown_motion: bool = False  # nothing measured the whole motion since the last fix
+    resets: int = 0  # times that odom has lost its relation to what was published
 
 
 def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits) -> TrackingStatus:
     """Return the status after a frame."""
     time_since_fix_s = status.time_since_fix_s + facts.dt_s
+    unknown_motion = status.unknown_motion or (status.has_begun and not facts.carried)
 
     if facts.outcome is FrameOutcome.STARTED:
         # A map that takes the place of a lost one says nothing about the motion between the two.
-        unknown_motion = status.refused_frames > 0 and not (facts.carried or facts.elsewhere)
-        return TrackingStatus(TrackingState.DEGRADED if unknown_motion else TrackingState.TRACKING)
-
-    if facts.outcome is FrameOutcome.NOT_STARTED:
-        state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST
-        return TrackingStatus(state, time_since_fix_s=time_since_fix_s)
+        state = TrackingState.DEGRADED if unknown_motion and not facts.elsewhere else TrackingState.TRACKING
+        return TrackingStatus(state, has_begun=True, resets=status.resets + unknown_motion)
 
     if facts.outcome is FrameOutcome.ACCEPTED:
         few_inliers = facts.inliers < limits.good_inliers
         after_gap = status.refused_frames > 0 or facts.dt_s > limits.max_gap_s
         is_doubtful = few_inliers or after_gap or facts.runner_up
-        return TrackingStatus(TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING)
+        state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
+        return TrackingStatus(state, has_begun=True, resets=status.resets + facts.turned)
 
-    refused_frames = status.refused_frames + 1
-    if refused_frames < limits.lost_after:
-        return TrackingStatus(TrackingState.DEGRADED, refused_frames, status.unmatched_frames, time_since_fix_s)
-    unmatched_frames = status.unmatched_frames + int(facts.textured)
-    restart = facts.elsewhere or unmatched_frames >= limits.restart_after
     state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST
-    return TrackingStatus(state, refused_frames, unmatched_frames, time_since_fix_s, restart)
+    if facts.outcome is FrameOutcome.NOT_STARTED:
+        return TrackingStatus(
+            state,
+            time_since_fix_s=time_since_fix_s,
+            has_begun=status.has_begun,
+            unknown_motion=unknown_motion,
+            resets=status.resets,
+        )
+
+    refused_frames, unmatched_frames, restart = status.refused_frames + 1, status.unmatched_frames, False
+    if refused_frames < limits.lost_after:
+        state = TrackingState.DEGRADED
+    else:
+        unmatched_frames += int(facts.textured)
+        restart = facts.elsewhere or unmatched_frames >= limits.restart_after
+    return TrackingStatus(
+        state,
+        refused_frames,
+        unmatched_frames,
+        time_since_fix_s,
+        restart,
+        has_begun=True,
+        unknown_motion=unknown_motion or (restart and facts.stayed),
+        resets=status.resets,
+    )

@@ -12,10 +12,17 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
-from omnid.config import Config
+from drivers.motion import WheelSample
+from omnid.config import Config, load_config
 from omnid.core.rig.rig_health import RigContradictedError
+from omnid.messages import FramePair
 from omnid.runs.replay import ReplayOptions, run_log
-from tests.simulation import build, write_log
+from omnid.simulation.rendering.rigs import make_rig
+from omnid.stages.front_end import FrontEnd
+from omnid.stages.geometry import geometry
+from omnid.tracking_state import TrackingState
+from tests.simulation import MountedSensor, Sensor, build, corridor, render_grey, write_log
+from tests.simulation.paths import planar_poses
 from tests.simulation.readout import Readout
 from tests.simulation.rigs import with_upper_rotated
 
@@ -70,3 +77,30 @@ def test_images_with_both_stamps_give_the_poses_of_a_replay(skewed: tuple[Path, 
         odometry.process(lower.stamp_ns + 1, *images, upper_stamp_ns=lower.stamp_ns // 1000)
     with pytest.raises(omnid.OmnidError, match="upper_stamp_ns: expected an integer"):
         odometry.process(lower.stamp_ns + 1, *images, upper_stamp_ns=0.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("dark_pairs", [1, 3])
+def test_darkness_after_the_first_pair_costs_nothing(dark_pairs: int) -> None:
+    """The map is made again with the first step only where no pair between was refused: wheels carry the pose there."""
+    rig, scene, period_ns, skew_s, speed_mps = make_rig(size=256), corridor(3), 100_000_000, 0.02, 0.5
+    config = load_config(None, ["rig.check=off"])
+    front_end = FrontEnd(geometry(rig, config.panorama), config)
+    rng = np.random.default_rng(0)
+    mounted = rig.lower, rig.upper
+    sensors = [MountedSensor.of(Sensor(), one.visible, one.camera.size) for one in mounted]
+    for number in range(dark_pairs + 3):
+        stamp_ns = 10**9 + number * period_ns
+        along_m = speed_mps * (number * period_ns * 1e-9 + np.array([0.0, skew_s]))
+        poses = planar_poses(np.column_stack([along_m, np.zeros(2)]), np.zeros(2))
+        images = [
+            sensor.expose(render_grey(scene, one, pose), rng)
+            for sensor, one, pose in zip(sensors, mounted, poses, strict=True)
+        ]
+        if 1 <= number <= dark_pairs:
+            images = [np.zeros_like(image) for image in images]
+        wheels = tuple(WheelSample(stamp_ns + k * period_ns // 5, speed_mps, 0.0) for k in range(-9, 2))
+        update = front_end.process(FramePair(number, stamp_ns, *images, skew_s, wheels))
+        front_end.poses.after()
+    assert update.state is TrackingState.TRACKING and update.reset_counter == 0
+    assert abs(update.T_odom_rig[0, 3] - along_m[0]) < 3e-3
+    assert np.sqrt(update.covariance[0, 0]) < 0.01

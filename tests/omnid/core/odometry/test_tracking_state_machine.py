@@ -17,11 +17,24 @@ TRACKING, DEGRADED, LOST = TrackingState.TRACKING, TrackingState.DEGRADED, Track
 STARTED, NOT_STARTED, ACCEPTED, REFUSED = FrameOutcome
 
 FIRST = TrackingStatus()
-FIX = TrackingStatus(TRACKING)
-REFUSED_ONCE = TrackingStatus(DEGRADED, 1, 0, DT_S)
-REFUSED_TWICE = TrackingStatus(DEGRADED, 2, 0, 2 * DT_S)
-DARK = TrackingStatus(LOST, 3, 0, 3 * DT_S)
-UNMATCHED = TrackingStatus(LOST, 4, 1, 4 * DT_S)
+FIX = TrackingStatus(TRACKING, has_begun=True)
+ROUGH = replace(FIX, state=DEGRADED)
+
+
+def refused(state: TrackingState, frames: int, unmatched: int = 0, **facts: bool) -> TrackingStatus:
+    """Return the status after frames that were refused, over which nothing measured the motion where facts say so."""
+    status = TrackingStatus(state, frames, unmatched, frames * DT_S, has_begun=True, unknown_motion=True)
+    return replace(status, **facts)
+
+
+REFUSED_ONCE, REFUSED_TWICE = refused(DEGRADED, 1), refused(DEGRADED, 2)
+DARK, UNMATCHED = refused(LOST, 3), refused(LOST, 4, 1)
+BEGINS_AGAIN = refused(LOST, 5, 2, restart=True)
+CARRIED = refused(DEGRADED, 4, 1, unknown_motion=False)
+CARRIED_AND_BEGINS_AGAIN = refused(DEGRADED, 5, 2, restart=True, unknown_motion=False)
+WITHOUT_MAP = replace(FIX, state=LOST, time_since_fix_s=5 * DT_S, unknown_motion=True)
+CARRIED_WITHOUT_MAP = replace(WITHOUT_MAP, state=DEGRADED, unknown_motion=False)
+ONE_RESET = replace(FIX, resets=1)
 
 TRANSITIONS = [
     # before, frame, after
@@ -30,32 +43,45 @@ TRANSITIONS = [
     (TrackingStatus(LOST, 0, 0, DT_S), FrameFacts(NOT_STARTED, DT_S), TrackingStatus(LOST, 0, 0, 2 * DT_S)),
     (TrackingStatus(LOST, 0, 0, DT_S), FrameFacts(STARTED, DT_S), FIX),
     (FIX, FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
-    (FIX, FrameFacts(ACCEPTED, DT_S, inliers=49), TrackingStatus(DEGRADED)),
-    (TrackingStatus(DEGRADED), FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
+    (FIX, FrameFacts(ACCEPTED, DT_S, inliers=49), ROUGH),
+    (ROUGH, FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
     (FIX, FrameFacts(ACCEPTED, 0.5, inliers=50), FIX),
-    (FIX, FrameFacts(ACCEPTED, 0.75, inliers=50), TrackingStatus(DEGRADED)),
+    (FIX, FrameFacts(ACCEPTED, 0.75, inliers=50), ROUGH),
     (FIX, FrameFacts(REFUSED, DT_S), REFUSED_ONCE),
-    (REFUSED_ONCE, FrameFacts(ACCEPTED, DT_S, inliers=200), TrackingStatus(DEGRADED)),
+    (REFUSED_ONCE, FrameFacts(ACCEPTED, DT_S, inliers=200), ROUGH),
+    (REFUSED_ONCE, FrameFacts(ACCEPTED, DT_S, inliers=200, turned=True), replace(ROUGH, resets=1)),
     (REFUSED_ONCE, FrameFacts(REFUSED, DT_S), REFUSED_TWICE),
     (REFUSED_TWICE, FrameFacts(REFUSED, DT_S, textured=False), DARK),
-    (DARK, FrameFacts(REFUSED, DT_S, textured=False), TrackingStatus(LOST, 4, 0, 4 * DT_S)),
+    (DARK, FrameFacts(REFUSED, DT_S, textured=False), refused(LOST, 4)),
     (DARK, FrameFacts(REFUSED, DT_S), UNMATCHED),
-    (UNMATCHED, FrameFacts(REFUSED, DT_S, textured=False), TrackingStatus(LOST, 5, 1, 5 * DT_S)),
-    (UNMATCHED, FrameFacts(REFUSED, DT_S), TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True)),
+    (UNMATCHED, FrameFacts(REFUSED, DT_S, textured=False), refused(LOST, 5, 1)),
+    (UNMATCHED, FrameFacts(REFUSED, DT_S), BEGINS_AGAIN),
     (REFUSED_ONCE, FrameFacts(REFUSED, DT_S, elsewhere=True), REFUSED_TWICE),
     (DARK, FrameFacts(REFUSED, DT_S, elsewhere=True), replace(UNMATCHED, restart=True)),
-    (UNMATCHED, FrameFacts(ACCEPTED, DT_S, inliers=200), TrackingStatus(DEGRADED)),
+    (UNMATCHED, FrameFacts(ACCEPTED, DT_S, inliers=200), ROUGH),
+    # Wheels and gyro carry the pose on; the motion is known only where they do so from the last fix on.
+    (FIX, FrameFacts(REFUSED, DT_S, carried=True), refused(DEGRADED, 1, unknown_motion=False)),
     (REFUSED_TWICE, FrameFacts(REFUSED, DT_S, textured=False, carried=True), replace(DARK, state=DEGRADED)),
-    (UNMATCHED, FrameFacts(REFUSED, DT_S, carried=True), TrackingStatus(DEGRADED, 5, 2, 5 * DT_S, restart=True)),
-    (FIX, FrameFacts(NOT_STARTED, DT_S, carried=True), TrackingStatus(DEGRADED, 0, 0, DT_S)),
-    (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0), TrackingStatus(DEGRADED)),
-    (TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0, elsewhere=True), FIX),
-    (TrackingStatus(DEGRADED, 5, 2, 5 * DT_S, restart=True), FrameFacts(STARTED, 0.0, carried=True), FIX),
+    (CARRIED, FrameFacts(REFUSED, DT_S, carried=True), CARRIED_AND_BEGINS_AGAIN),
+    (UNMATCHED, FrameFacts(REFUSED, DT_S, carried=True), replace(BEGINS_AGAIN, state=DEGRADED)),
+    # They say that it has hardly moved, and the images that the map is not in view.
+    (CARRIED, FrameFacts(REFUSED, DT_S, carried=True, stayed=True), replace(BEGINS_AGAIN, state=DEGRADED)),
     (
-        TrackingStatus(LOST, 5, 2, 5 * DT_S, restart=True),
-        FrameFacts(NOT_STARTED, 0.0),
-        TrackingStatus(LOST, 0, 0, 5 * DT_S),
+        CARRIED,
+        FrameFacts(REFUSED, DT_S, textured=False, carried=True, stayed=True),
+        refused(DEGRADED, 5, 1, unknown_motion=False),
     ),
+    # The map is started again.
+    (BEGINS_AGAIN, FrameFacts(STARTED, 0.0), replace(ROUGH, resets=1)),
+    (BEGINS_AGAIN, FrameFacts(STARTED, 0.0, elsewhere=True), ONE_RESET),
+    (replace(BEGINS_AGAIN, resets=3), FrameFacts(STARTED, 0.0), replace(ROUGH, resets=4)),
+    (CARRIED_AND_BEGINS_AGAIN, FrameFacts(STARTED, 0.0, carried=True), FIX),
+    (BEGINS_AGAIN, FrameFacts(NOT_STARTED, 0.0), WITHOUT_MAP),
+    (CARRIED_AND_BEGINS_AGAIN, FrameFacts(NOT_STARTED, 0.0, carried=True), CARRIED_WITHOUT_MAP),
+    (CARRIED_WITHOUT_MAP, FrameFacts(STARTED, DT_S, carried=True), FIX),
+    (CARRIED_WITHOUT_MAP, FrameFacts(STARTED, DT_S), replace(ROUGH, resets=1)),
+    (WITHOUT_MAP, FrameFacts(STARTED, DT_S, carried=True), replace(ROUGH, resets=1)),
+    (WITHOUT_MAP, FrameFacts(NOT_STARTED, 0.0, carried=True), replace(WITHOUT_MAP, state=DEGRADED)),
 ]
 
 
@@ -66,5 +92,5 @@ def test_transition(before: TrackingStatus, facts: FrameFacts, after: TrackingSt
 
 def test_the_first_refused_frame_is_lost_where_one_is_enough() -> None:
     limits = OdometryLimits(lost_after=1, restart_after=1)
-    assert next_status(FIX, FrameFacts(REFUSED, DT_S, textured=False), limits) == TrackingStatus(LOST, 1, 0, DT_S)
+    assert next_status(FIX, FrameFacts(REFUSED, DT_S, textured=False), limits) == refused(LOST, 1)
     assert next_status(FIX, FrameFacts(REFUSED, DT_S), limits).restart
