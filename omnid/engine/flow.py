@@ -33,6 +33,8 @@ class Stage(Protocol[In_contra, Out_co]):
     """A step of the flow; may also have `finish() -> Iterable[Out]` for the results left at the end.
 
     And `after() -> None`, called after the result of each message was passed on: for work that no reader waits for.
+    And `merge(older: In, newer: In) -> In`, which returns what takes the place of two messages where its inbox drops
+    the older one: for a part of a message that must not be lost. It is called in the writer's thread.
     """
 
     def process(self, message: In_contra, /) -> Out_co | None:
@@ -94,6 +96,11 @@ def nothing(*_: object) -> None:
     """Do nothing: used in place of a method that a stage does not have."""
 
 
+def newest(_: object, newer: object) -> object:
+    """Return the newer one of two messages: used in place of the `merge` that a stage does not have."""
+    return newer
+
+
 class Node:
     """A stage or a sink with its counters and its output stream."""
 
@@ -104,6 +111,7 @@ class Node:
         self._process: Callable[[object], object | None] = getattr(work, "process", nothing)
         self._after: Callable[[], object] = getattr(work, "after", nothing)
         self._finish: Callable[[], Iterable[object] | None] = getattr(work, "finish", nothing)
+        self.merge: Callable[[Any, Any], object] = getattr(work, "merge", newest)
 
     def handle(self, message: object, passed_on: Callable[[], object] = nothing) -> None:
         """Process the message, pass its result on, and let the stage do what it has left to do.

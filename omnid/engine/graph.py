@@ -191,7 +191,8 @@ class Graph:
             raise OmnidError(f"'{node.name}': expected inputs and a depth above 0, found {len(inputs)} and {depth}")
         readers: list[Reader] = [Direct(node, len(inputs), self._succeeds, self._finish)] * len(inputs)
         if self._threaded:
-            inbox = self._inboxes[node.name] = StageInbox(node.stats, len(inputs), depth, policy, self._in_flight)
+            inbox = StageInbox(node.stats, len(inputs), depth, policy, self._in_flight, node.merge)
+            self._inboxes[node.name] = inbox
             self._thread(node.name, self._run_node, node, inbox)
             readers = [Port(inbox, writer) for writer in range(len(inputs))]
         for stream, reader in zip(inputs, readers, strict=True):

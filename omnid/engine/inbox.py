@@ -6,8 +6,9 @@ import math
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 
-from omnid.engine.flow import END, LOSSLESS, NEWEST, Policy
+from omnid.engine.flow import END, LOSSLESS, NEWEST, Policy, newest
 from omnid.engine.telemetry import StageStats
 
 NOTABLE_S = 1e-3  # shorter work after a result was passed on is ignored
@@ -42,9 +43,20 @@ class StageInbox:
     of two cameras takes the place of the other one's image.
     """
 
-    def __init__(self, stats: StageStats, writers: int, depth: int, policy: Policy, in_flight: InFlight) -> None:
-        """in_flight: the count of the graph, in which a message is until its reader asks for the next one."""
-        self._in_flight, self._has_taken = in_flight, False
+    def __init__(
+        self,
+        stats: StageStats,
+        writers: int,
+        depth: int,
+        policy: Policy,
+        in_flight: InFlight,
+        merge: Callable[[object, object], object] = newest,
+    ) -> None:
+        """in_flight: the count of the graph, in which a message is until its reader asks for the next one.
+
+        merge: returns what takes the place of a dropped message and the writer's next one.
+        """
+        self._in_flight, self._has_taken, self._merge = in_flight, False, merge
         self._stats, self._writers, self._depth, self._policy = stats, writers, depth, policy
         self._capacity = depth * writers
         self._messages: deque[tuple[int, object]] = deque()  # messages with the number of the writer
@@ -71,18 +83,26 @@ class StageInbox:
                 self._stats.dropped += 1
                 return
             if self._policy is NEWEST:
-                self._make_room(writer)
+                message = self._make_room(writer, message)
             self._messages.append((writer, message))
             self._in_flight.add(1)
             self._stats.busy_since_ns = self._stats.busy_since_ns or time.monotonic_ns()
             self._changed.notify_all()
 
-    def _make_room(self, writer: int) -> None:
+    def _make_room(self, writer: int, message: object) -> object:
+        """Drop the oldest message of a writer if need be; return the message that is to be added."""
         own = [k for k, (other, _) in enumerate(self._messages) if other == writer]
-        if len(own) >= self._depth:
-            del self._messages[own[0]]
-            self._in_flight.add(-1)
-            self._stats.dropped += 1
+        if len(own) < self._depth:
+            return message
+        oldest = self._messages[own[0]][1]
+        if len(own) > 1:
+            self._messages[own[1]] = writer, self._merge(oldest, self._messages[own[1]][1])
+        else:
+            message = self._merge(oldest, message)
+        del self._messages[own[0]]
+        self._in_flight.add(-1)
+        self._stats.dropped += 1
+        return message
 
     def get(self) -> object:
         """Return the next message, END after the last one; wait for it."""

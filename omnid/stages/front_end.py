@@ -12,6 +12,7 @@ from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dense_stereo import DenseStereo
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
+from omnid.stages.motion_inbox import MOST_WAITING
 from omnid.stages.odometry import OdometryStage
 from omnid.tracking_state import TrackingState
 
@@ -63,6 +64,11 @@ class CheckedOdometry:
         if is_contradicted and update.state is TrackingState.TRACKING:
             return replace(update, state=TrackingState.DEGRADED)
         return update
+
+    @staticmethod
+    def merge(older: Panoramas, newer: Panoramas) -> Panoramas:
+        """Return the newer pair with the samples of both, where the older one is dropped: its step is that of both."""
+        return replace(newer, motion=(*older.motion, *newer.motion)[-MOST_WAITING:])
 
     def after(self) -> None:
         """Make the keyframe of the last pair, whose pose was passed on, if there is to be one."""

@@ -620,6 +620,44 @@ def test_of_two_writers_each_drops_its_own_oldest_message() -> None:
     assert {4, 104} <= set(out.got)
 
 
+class Held:
+    """Holds the first message until all were sent; of dropped messages it keeps the parts."""
+
+    def __init__(self, all_sent: threading.Event) -> None:
+        self._all_sent = all_sent
+
+    def process(self, parts: tuple[int, ...]) -> tuple[int, ...]:
+        assert self._all_sent.wait(LONG_S)
+        return parts
+
+    def merge(self, older: tuple[int, ...], newer: tuple[int, ...]) -> tuple[int, ...]:
+        return older + newer
+
+
+@pytest.mark.parametrize("depth", [1, 3])
+def test_parts_of_dropped_messages_go_along_with_the_next_one_of_their_writer(depth: int) -> None:
+    graph, out, all_sent = Graph(policy=NEWEST, depth=depth), Collect(), threading.Event()
+    sent = [threading.Event(), threading.Event()]
+
+    def parts(first: int, done: threading.Event) -> Iterator[tuple[int, ...]]:
+        yield from ((number,) for number in range(first, first + 20))
+        done.set()
+        if all(event.is_set() for event in sent):
+            all_sent.set()
+
+    streams = [
+        graph.source(name, partial(parts, first, done)) for name, first, done in zip("ab", (0, 100), sent, strict=True)
+    ]
+    graph.sink("out", out, graph.stage("held", Held(all_sent), *streams), policy=LOSSLESS)
+    graph.run()
+    found = [number for message in out.got for number in message]
+    assert len(out.got) <= 2 * depth + 1 and graph.telemetry.of("held").dropped == 40 - len(out.got)
+    for first in (0, 100):  # nothing is lost, twice or mixed, and the newest messages are whole by themselves
+        assert [number for number in found if number // 100 == first // 100] == list(range(first, first + 20))
+        assert depth == 1 or (first + 19,) in out.got
+    assert all(len({number // 100 for number in message}) == 1 for message in out.got)
+
+
 class Recorded:
     """Passes numbers on after an optional wait, and keeps what it was given."""
 
