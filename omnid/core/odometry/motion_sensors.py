@@ -115,7 +115,7 @@ class MotionSensors:
         if wheels is not None and self._stands(start_s, end_s):
             return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
         # 3. Wheels whose turn differs from that of the gyro slip.
-        disagree = wheels is not None and gyro is not None and self._disagree(wheels[0], gyro[0], dt_s)
+        disagree = wheels is not None and gyro is not None and self._disagree(wheels, gyro, dt_s)
         self._disagreements = self._disagreements + 1 if disagree else 0
         if self._disagreements >= SLIPPING:
             wheels = None
@@ -143,18 +143,21 @@ class MotionSensors:
             slopes[3:], slopes[3:, BIAS] = 0.0, -dt_s * np.eye(3)
         return self._in_rect(twist, sigma, slopes, complete=wheels is not None and sigma[5] < UNKNOWN_RAD)
 
-    def _disagree(self, wheels: Array, gyro: Array, dt_s: float) -> bool:
-        """True if wheels and gyro measure turns in a step that differ by more than their errors: a wheel slips."""
-        turn = wheels[1]
+    def _disagree(self, wheels: tuple[Array, Array], gyro: tuple[Array, Array], dt_s: float) -> bool:
+        """True if wheels and gyro measure turns in a step that differ by more than their errors: a wheel slips.
+
+        wheels, gyro: their amounts in the step, and the change of their rates; see RateHistory.integral.
+        """
+        turn, turned = wheels[0][1], gyro[0][2]
         if not math.isfinite(turn):
             return False
         H = np.zeros(len(START))
         H[TURN], H[BIAS.stop - 1] = turn, dt_s
-        difference = self.values[TURN] * turn - (gyro[2] - self.values[BIAS][2] * dt_s)
+        difference = self.values[TURN] * turn - (turned - self.values[BIAS][2] * dt_s)
         of_wheels = self._noise_factors[TURN] * ((TURN_SHARE * turn) ** 2 + WHEEL_RAD**2)
         variance = of_wheels + GYRO_RADPS_SQRT_S**2 * dt_s + H @ self._filter.P @ H
         # The offsets of both clocks are not known exactly either: a turn begins in one before it does in the other.
-        variance += (self.sigmas[WHEEL_OFFSET] ** 2 + self.sigmas[GYRO_OFFSET] ** 2) * (gyro[2] / dt_s) ** 2
+        variance += (self.sigmas[WHEEL_OFFSET] * wheels[1][1]) ** 2 + (self.sigmas[GYRO_OFFSET] * gyro[1][2]) ** 2
         return bool(difference**2 > OUTLIER_SIGMA**2 * variance)
 
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:

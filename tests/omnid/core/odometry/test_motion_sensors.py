@@ -204,6 +204,25 @@ def test_a_wheel_that_slips_in_the_dark_is_noticed_by_the_gyro() -> None:
         moving += seconds
 
 
+@pytest.mark.parametrize("of_gyro", [True, False])
+@pytest.mark.parametrize("period_s", [0.1, 1 / 30])
+def test_a_steady_turn_of_one_sensor_alone_is_noticed_before_clocks_are_learned(period_s: float, of_gyro: bool) -> None:
+    """A base that is turned by hand, or wheels that turn on the spot: an offset of clocks does not explain it."""
+    sensors = MotionSensors(T_RECT_BASE)
+    times_s = np.arange(0.0, 3.0, GYRO_S)
+    turns, of_wheels = np.where(times_s < 1.0, 0.0, 1.0), np.zeros_like(times_s)
+    rates = (of_wheels, turns) if of_gyro else (turns, of_wheels)
+    stamps_ns = [START_NS + round(t_s * 1e9) for t_s in times_s]
+    sensors.add([WheelSample(at, 0.2, rate) for at, rate in zip(stamps_ns, rates[0].tolist(), strict=True)])
+    sensors.add([GyroSample(at, 0.0, 0.0, rate) for at, rate in zip(stamps_ns, rates[1].tolist(), strict=True)])
+    ends_s = np.arange(0.5, 2.9, period_s)
+    found = [
+        sensors.between(START_NS + round((end_s - period_s) * 1e9), START_NS + round(end_s * 1e9)) for end_s in ends_s
+    ]
+    trusted = np.array([one is not None and one.is_complete for one in found])
+    assert trusted[ends_s < 1.0].all() and not trusted[ends_s > 1.0 + 3 * period_s].any()
+
+
 def test_wheels_that_do_not_tell_their_turn_need_a_gyro() -> None:
     """As those of controllers that hold a heading by themselves."""
     for gyro in (True, False):
