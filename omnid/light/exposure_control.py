@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Final
 
@@ -19,6 +19,7 @@ from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import EXPOSURE, Key
 
 PERIOD_SHARE: Final = 0.9  # Longest exposure by the images' period: the rest reads the image out.
+MOST_STEPS: Final = 16  # Most steps between pairs of which the period is the first quartile.
 AFTER_PERIODS: Final = 1.5  # from a pair to the request: both cameras then carry it out after the same pair
 FLICKER_US: Final[Mapping[str, float]] = {"50": 1e6 / 100, "60": 1e6 / 120}  # lamps shine twice a period of the mains
 DARK_GREY, WHITE_GREY = 25.0, 230.0  # means beyond which images of cameras that regulate themselves are reported
@@ -48,13 +49,14 @@ class ExposureControl:
         self._law: ExposureLaw | None = None
         self._levels: tuple[GreyLevels, GreyLevels] | None = None  # of the newest measured pair
         self._next_ns: float = -float("inf")
-        self._newest_ns, self._period_ns = 0, float("inf")  # of the pairs: the smallest step, since some are skipped
+        self._newest_ns = 0  # stamp of the newest pair
+        self._steps_ns: deque[int] = deque(maxlen=MOST_STEPS)  # between pairs
 
     def process(self, pair: FramePair) -> None:
         """Measure a pair if it is due, and make a request where the law takes a step."""
         # 1. Measure the pair where it is due.
         if self._newest_ns and pair.stamp_ns > self._newest_ns:
-            self._period_ns = min(self._period_ns, float(pair.stamp_ns - self._newest_ns))
+            self._steps_ns.append(pair.stamp_ns - self._newest_ns)
         self._newest_ns = pair.stamp_ns
         if pair.stamp_ns < self._next_ns:
             return
@@ -62,7 +64,7 @@ class ExposureControl:
         levels = self._area.levels(pair)
         self._levels = levels
         # 2. Leave it to the cameras where it cannot be regulated.
-        if self._left_to_cameras or not math.isfinite(self._period_ns):
+        if self._left_to_cameras or not self._steps_ns:
             return
         if any(exposure.problem for exposure in self._exposures):
             self._give_back(pair.stamp_ns)
@@ -72,7 +74,8 @@ class ExposureControl:
             self._law = self._started()
             self._request(self._law.setting, pair.stamp_ns)
             return
-        wanted = self._law.step(*levels, pair.stamp_ns)
+        bounded = self._law.bound(self._limit_us)
+        wanted = self._law.step(*levels, pair.stamp_ns) or bounded
         if wanted is not None:
             self._request(wanted, pair.stamp_ns)
         if self._law.state == "no answer":
@@ -105,9 +108,19 @@ class ExposureControl:
             return "too bright", f"too bright; {self._left_to_cameras}"
         return "regulated", self._left_to_cameras or "regulated"
 
+    @property
+    def _period_ns(self) -> float:
+        """Period of the images: the first quartile of the last steps, as pairs are skipped, and stamps may burst."""
+        return float(sorted(self._steps_ns)[len(self._steps_ns) // 4])
+
+    @property
+    def _limit_us(self) -> float:
+        """Limit of the exposure time: longer ones would make the images come more slowly."""
+        return min(self._config.exposure_limit_ms / UNIT_MS, PERIOD_SHARE * self._period_ns * 1e-3)
+
     def _started(self) -> ExposureLaw:
         """Return the law, which starts with what the lower camera has now."""
-        limit_us = min(self._config.exposure_limit_ms / UNIT_MS, PERIOD_SHARE * self._period_ns * 1e-3)
+        limit_us = self._limit_us
         start = self._exposures[0].in_force or ExposureSetting(int(limit_us))
         return ExposureLaw(_ranges(self._exposures), start, limit_us, FLICKER_US.get(self._config.power_line, 0.0))
 

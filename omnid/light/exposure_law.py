@@ -20,6 +20,7 @@ TARGET, LEAST_MEAN, BRIGHT, SATURATED = 100.0, 60.0, 235.0, 250.0
 SATURATED_FACTOR: Final = 0.7  # The exposure is multiplied by this while bright spots are saturated.
 # No step for wanted factors between these: a step by one of them may not bring about the other one.
 LEAST_DOWN, LEAST_UP = 0.77, 1.4
+NEW_LIMIT: Final = 0.1  # Change of the limit of the exposure time from which it is taken: stamps have jitter.
 LARGEST_FACTOR: Final = 2.0  # Largest factor of a step.
 VERY_BRIGHT: Final = 0.6  # If the factor is smaller, the exposure is lowered at once, together with the gain.
 GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
@@ -55,8 +56,7 @@ class ExposureLaw:
         A longer exposure is a multiple of flicker_us, so that all images get the same light.
         """
         self._gains, self._flicker_us = ranges.gain, flicker_us
-        low = ranges.exposure_us.low
-        self._times = ValueRange(low, max(low, min(ranges.exposure_us.high, int(limit_us))), ranges.exposure_us.step)
+        self._of_camera, self._limit_us = ranges.exposure_us, limit_us
         self.setting = ExposureSetting(self._time(start.exposure_us), self._start_gain(start))
         self.state: ExposureState = "regulated"
         self.steps = 0
@@ -65,6 +65,22 @@ class ExposureLaw:
         self._gain_step = 0 if self._gains is None else max(self._gains.step, self._gain_range // GAIN_STEPS)
         self._before: tuple[int, float] | None = None  # direction of the exposure time and mean, of the step before
         self._deaf = 0
+
+    @property
+    def _times(self) -> ValueRange:
+        """The exposure times within the limit."""
+        low = self._of_camera.low
+        return ValueRange(low, max(low, min(self._of_camera.high, int(self._limit_us))), self._of_camera.step)
+
+    def bound(self, limit_us: float) -> ExposureSetting | None:
+        """Take another limit of the exposure time where it differs much; return the setting if that changes it."""
+        if abs(limit_us - self._limit_us) <= NEW_LIMIT * self._limit_us:
+            return None
+        self._limit_us = limit_us
+        if self.setting.exposure_us <= self._times.high:
+            return None
+        self.setting = ExposureSetting(self._time(limit_us), self.setting.gain)
+        return self.setting
 
     def step(self, lower: GreyLevels, upper: GreyLevels, stamp_ns: int) -> ExposureSetting | None:
         """Return the setting from now on; None where it stays. The levels are those of images at the stamp."""

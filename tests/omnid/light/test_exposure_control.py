@@ -49,13 +49,14 @@ class Robot:
             for name, one in zip(names, ranges, strict=True)
         }
         self.control = ExposureControl(area, config or CamerasConfig(), self.cameras)
-        self.pairs = 0
+        self.pairs, self.stamp_ns = 0, 0
         self.unequal = 0  # pairs of images with different exposures
 
-    def drive(self, seconds: float) -> DiagnosticStatus:
-        for _ in range(round(seconds * 1e9 / PERIOD_NS)):
+    def drive(self, seconds: float, period_ns: int = PERIOD_NS) -> DiagnosticStatus:
+        for _ in range(round(seconds * 1e9 / period_ns)):
             self.pairs += 1
-            stamp_ns = self.pairs * PERIOD_NS
+            self.stamp_ns += period_ns
+            stamp_ns = self.stamp_ns
             settings = [
                 ExposureSetting(5000, 0) if state.exposure is None else state.exposure.in_force
                 for state in self.cameras.values()
@@ -91,6 +92,23 @@ def test_both_cameras_get_the_same_values_between_two_pairs(area: UsefulArea) ->
 def test_the_exposure_stays_below_the_period_of_the_images(area: UsefulArea) -> None:
     status = Robot(area, 0.01, CamerasConfig(exposure_limit_ms=500.0)).drive(15.0)
     assert float(status.values["exposure_ms"]) == pytest.approx(45.0)
+
+
+def test_two_stamps_close_to_each_other_do_not_limit_the_exposure(area: UsefulArea) -> None:
+    """A driver hands out at the start what it had buffered."""
+    robot = Robot(area, 0.03)
+    for seconds in (15.0, 0.5):
+        robot.drive(0.006, period_ns=3_000_000)
+        assert float(robot.drive(seconds).values["exposure_ms"]) == 20.0
+
+
+def test_the_exposure_is_shortened_where_images_come_faster_than_at_first(area: UsefulArea) -> None:
+    """Pairs are skipped while a computer is busy; images as long as two periods would come at half the rate."""
+    robot = Robot(area, 0.01, CamerasConfig(exposure_limit_ms=500.0))
+    assert float(robot.drive(15.0, period_ns=2 * PERIOD_NS).values["exposure_ms"]) == pytest.approx(90.0)
+    assert float(robot.drive(1.0).values["exposure_ms"]) == pytest.approx(45.0)
+    in_force = {state.exposure and state.exposure.in_force for state in robot.cameras.values()}
+    assert robot.unequal == 0 and [found.exposure_us for found in in_force if found] == [45_000]
 
 
 def test_says_when_it_is_too_dark_or_too_bright_and_what_to_do(area: UsefulArea) -> None:
