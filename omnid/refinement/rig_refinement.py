@@ -11,6 +11,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import IO, Final
 
 import numpy as np
@@ -127,8 +128,12 @@ class RigRefinement:
         if window.keyframes >= self._settings.refine_keyframes:
             drives = window.drives(update.T_odom_rig)
             request = RefinementRequest(self._place.rig, drives.state, drives.observations, self._has_delay)
-            self._child = _Estimate(request)
             self._window, self._next_ns = None, update.stamp_ns + self._settings.refine_s * 1e9
+            try:
+                self._child = _Estimate(request)
+            except OSError as error:  # no room in the temporary folder, no more processes: the run goes on without
+                self._windows, self._failed = self._windows + 1, self._failed + 1
+                self._reason = f"the estimate cannot start: {error}"
 
     def _take_answer(self) -> None:
         """Take the result of the estimate if it has ended, or end it if it takes too long."""
@@ -230,18 +235,20 @@ class _Estimate:
     def __init__(self, request: RefinementRequest) -> None:
         self._started_s = time.monotonic()
         environment = python_environment(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-        self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 (closed when the answer is read)
-        with tempfile.TemporaryFile() as file:
-            pickle.dump(request, file)
-            file.seek(0)
-            self._process = subprocess.Popen(
-                python("-m", PROCESS),
-                stdin=file,
-                stdout=self._out,
-                stderr=subprocess.DEVNULL,
-                env=environment,
-                start_new_session=True,
-            )
+        with ExitStack() as opened:
+            self._out: IO[bytes] = opened.enter_context(tempfile.TemporaryFile())
+            with tempfile.TemporaryFile() as file:
+                pickle.dump(request, file)
+                file.seek(0)
+                self._process = subprocess.Popen(
+                    python("-m", PROCESS),
+                    stdin=file,
+                    stdout=self._out,
+                    stderr=subprocess.DEVNULL,
+                    env=environment,
+                    start_new_session=True,
+                )
+            opened.pop_all()  # `_out` is closed when the answer is read.
 
     def answer(self) -> RigChange | str | None:
         """Return the result, or the reason of none; None while it works."""

@@ -165,7 +165,10 @@ class _Replay:
                 if not session.statistics.poses or isinstance(error, RigContradictedError):
                     raise
                 raise RunFailedError(str(error), self._result(session, result)) from error
-            extended = run_places.finish()  # first: it may warn
+            try:
+                extended = run_places.finish()  # before the result is made: it may warn
+            except OmnidError as error:
+                raise RunFailedError(str(error), self._result(session, result)) from error
             return replace(self._result(session, result), rig_places=extended, map_file=run_places.written)
 
     def _inputs(self) -> list[tuple[str, Path]]:

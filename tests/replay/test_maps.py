@@ -14,11 +14,14 @@ import numpy as np
 import pytest
 
 from calib.rig_file import read_rig, write_rig
+from omnid.api import replay
 from omnid.client import Robot
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
+from omnid.runs.run_result import RunFailedError
 from omnid.tracking_state import MapState
 from omnid.transport.status_names import Key
+from tests.conftest import PAIRS
 from tests.replay.command import Command
 from tests.replay.live import Daemon, Operator, answers, command_line, free_port, started, wait_until
 from tests.simulation.rigs import with_upper_rotated
@@ -221,6 +224,21 @@ def test_a_live_run_extends_its_map_now_and_then_and_at_its_end(scene: Path, oma
         code, err = daemon.end()
         assert code == 0 and "Traceback" not in err, err
     assert sessions(omap) == {0, 1, 2}
+
+
+def test_a_replay_whose_map_cannot_be_written_keeps_its_poses(scene: Path, tmp_path: Path) -> None:
+    """The folder of the map is removed while the log is replayed."""
+    folder = tmp_path / "maps"
+    folder.mkdir()
+
+    def progress(done: int, expected: int | None) -> None:
+        if done and folder.exists():
+            folder.rmdir()
+
+    settings = [f"places.map={folder / 'm.omap'}"]
+    with pytest.raises(RunFailedError, match="cannot write the map") as failed:
+        replay(scene / "log.mcap", scene / "rig.toml", overrides=settings, progress=progress)
+    assert len(failed.value.result.stamps_ns) == PAIRS
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from omnid.errors import OmnidError
 from omnid.settings import knob
 
 
@@ -44,3 +45,11 @@ class OdometryLimits:
     bridge_sigma_m: float = knob(
         0.15, "uncertainty of the position that ends that, standard deviation, m", low=0.001, high=10
     )
+
+    def __post_init__(self) -> None:
+        """Raise OmnidError unless a keyframe may have more landmarks than a pose needs."""
+        if self.min_inliers >= self.features:
+            raise OmnidError(
+                f"odometry.min_inliers is {self.min_inliers}: expected less than odometry.features, {self.features}, "
+                "as no pose has more inliers than a keyframe has landmarks"
+            )

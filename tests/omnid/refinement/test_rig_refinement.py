@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
@@ -149,6 +150,16 @@ def test_a_gap_begins_a_new_window_and_a_running_estimate_is_ended(rooms: Path) 
     process = busy._child._process
     busy.close()
     assert process.returncode is not None and busy.report().values["windows"] == "0"
+
+
+def test_a_run_goes_on_where_no_estimate_can_be_started(
+    rooms: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    refinement, poses = refined(rooms, read_rig(rooms / "rig.toml"))
+    values = refinement.report().values
+    assert values["windows"] == values["windows_without_result"] == "1"
+    assert "cannot start" in values["window_problem"] and len(poses) > 15
 
 
 def disturbed(truth: Rig) -> Rig:
