@@ -33,6 +33,7 @@ from omnid.settings import parse
 from omnid.settings_dump import dump
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
+from omnid.stages.repeated_images import RepeatedImages
 from omnid.stages.skew import Skew
 
 FilePath: TypeAlias = str | PathLike[str]
@@ -133,6 +134,8 @@ class Odometry:
         self._pairs = 0
         self._skew = Skew()
         self._stamp_ns: int | None = None
+        self._earlier = {"lower": RepeatedImages(), "upper": RepeatedImages()}
+        self._use_repeated = settings.pair.repeated_images == "use"
 
     def process(
         self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None = None
@@ -148,15 +151,32 @@ class Odometry:
         (H, W) uint8. Points and disparities are those of the method `depth`.
 
         Raises OmnidError for an image of another type or size than the rig's, for a stamp that is not later than the
-        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. Also
-        raises it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says
-        otherwise.
+        previous one, and for stamps of a pair that are MAX_SKEW_S or more apart; such a pair changes nothing. So does
+        a pair with an image that repeats an earlier one to the last pixel, unless pair.repeated_images is "use": a
+        replay drops it, as a camera that is frozen shows no motion. Its images count as earlier ones, too. Also raises
+        it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says otherwise.
         """
         stamp_ns = self._later_stamp_ns(stamp_ns)
         images = (self._checked("lower", lower), self._checked("upper", upper))
-        pair = FramePair(self._pairs, stamp_ns, *images, self._skew_s(stamp_ns, upper_stamp_ns))
+        skew_ns = self._checked_skew_ns(stamp_ns, upper_stamp_ns)
+        self._refuse_repeated(images)
+        if skew_ns is not None:
+            self._skew.add(skew_ns)
+        skew_s = 0.0 if skew_ns is None else self._skew.exposure_ns * 1e-9
+        pair = FramePair(self._pairs, stamp_ns, *images, skew_s)
         self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
         return self._front_end.process(pair)
+
+    def _refuse_repeated(self, images: tuple[GreyImage, GreyImage]) -> None:
+        """Raise OmnidError where a camera delivers an image again."""
+        # The caller may read the next images into the same arrays.
+        pairs = zip(self._earlier.items(), images, strict=True)
+        found = [name for (name, earlier), image in pairs if earlier.add(image.copy())]
+        if found and not self._use_repeated:
+            raise OmnidError(
+                f"the image of the {' and the '.join(found)} camera is an earlier one, to the last pixel: leave such "
+                'pairs out, as a frozen camera shows no motion, or set pair.repeated_images="use"'
+            )
 
     def depth(self, pose: OdometryUpdate) -> DensePoints:
         """Return the dense depth of a pair that `process` has given the pose of; it is computed the first time.
@@ -166,18 +186,17 @@ class Odometry:
         """
         return self._front_end.dense.of(pose.depth)
 
-    def _skew_s(self, stamp_ns: int, upper_stamp_ns: int | None) -> float:
-        """Return the time from the lower to the upper exposure."""
+    def _checked_skew_ns(self, stamp_ns: int, upper_stamp_ns: int | None) -> int | None:
+        """Return the time from the lower to the upper stamp; None: both images were exposed at once."""
         if upper_stamp_ns is None:
-            return 0.0
+            return None
         skew_ns = _nanoseconds("upper_stamp_ns", upper_stamp_ns) - stamp_ns
         if abs(skew_ns) >= MAX_SKEW_S * 1e9:
             raise OmnidError(
                 f"upper_stamp_ns: expected a stamp less than {MAX_SKEW_S:g} s from stamp_ns, {stamp_ns}, "
                 f"found {upper_stamp_ns}: give both in nanoseconds of one clock"
             )
-        self._skew.add(skew_ns)
-        return self._skew.exposure_ns * 1e-9
+        return skew_ns
 
     def _later_stamp_ns(self, stamp_ns: int) -> int:
         stamp_ns = _nanoseconds("stamp_ns", stamp_ns)

@@ -208,6 +208,31 @@ def test_wrong_images_and_stamps_are_refused_and_change_nothing(scene: Path, pai
     assert np.array_equal(odometry.process(*pairs[1]).T_odom_rig, whole.process(*pairs[1]).T_odom_rig)
 
 
+def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(scene: Path, pairs: list[Pair]) -> None:
+    """A replay drops it: of a camera that is frozen the pose would stand still with a sigma of a millimetre."""
+    odometry, whole, used = (
+        omnid.Odometry(scene / "rig.toml", overrides=[f'pair.repeated_images="{policy}"'])
+        for policy in ("drop", "drop", "use")
+    )
+    buffers = [np.empty_like(image) for image in pairs[0][1:]]  # a program may read all images into the same arrays
+    for number, (stamp_ns, *images) in enumerate(pairs[:4]):
+        for buffer, image in zip(buffers, images, strict=True):
+            buffer[:] = image
+        pose, expected = odometry.process(stamp_ns, *buffers), whole.process(stamp_ns, *images)
+        assert np.array_equal(pose.T_odom_rig, expected.T_odom_rig)
+        used.process(stamp_ns, *images)
+        for lower, upper, found in (
+            (*images, "lower and the upper camera"),
+            (images[0], images[1] ^ np.uint8(number + 1), "the lower camera"),
+        ):
+            with pytest.raises(OmnidError, match=f"image of the {found.removeprefix('the ')} is an earlier one"):
+                odometry.process(stamp_ns + 1, lower, upper)
+        used.process(stamp_ns + 1, *images)
+    for buffer in buffers:
+        buffer[1, 1] ^= 1
+    odometry.process(stamp_ns + 1, *buffers)
+
+
 def test_exchanged_images_are_refused(scene: Path, pairs: list[Pair]) -> None:
     odometry = omnid.Odometry(scene / "rig.toml")
     with pytest.raises(OmnidError, match="the other way round"):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners, nearby_disparity
-from omnid.core.odometry.estimates import OdometryEstimate
+from omnid.core.odometry.estimates import OdometryEstimate, bounded
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.paper.registration import Registration, consensus, register
 from omnid.core.odometry.stereo_frame import StereoFrame
@@ -75,6 +75,10 @@ class PaperOdometry:
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
         self._reference: Reference | None = None
         self._most_inliers = 0
+        self._untracked_s, self._resets = (
+            0.0,
+            0,
+        )  # time since the last pose that was tracked, gaps after which it went on
 
     def complete(self) -> None:
         """Do nothing: `process` leaves nothing to do."""
@@ -111,7 +115,10 @@ class PaperOdometry:
         self._most_inliers = max(self._most_inliers, inliers)
         if not self._keeps_reference or inliers < KEYFRAME_RATIO * self._most_inliers:
             self._set_reference(frame)
-        return self._result(TrackingState.TRACKING, len(X_a), inliers)
+        # The motion in a gap is not known: odom goes on from another place.
+        state = TrackingState.DEGRADED if self._untracked_s else TrackingState.TRACKING
+        self._resets, self._untracked_s = self._resets + bool(self._untracked_s), 0.0
+        return self._result(state, len(X_a), inliers)
 
     def _set_reference(self, frame: StereoFrame) -> None:
         """Measure the following motions against a frame whose pose is the current one."""
@@ -142,9 +149,14 @@ class PaperOdometry:
         self._covariance = _moved_covariance(reference.covariance, T_ref_curr) + motion.covariance
 
     def _refuse(self, frame: StereoFrame, dt_s: float, counts: tuple[int, int]) -> OdometryEstimate:
-        """Keep the pose and let its covariance grow: the paper does not treat this case. counts: tracked, inliers."""
+        """Keep the pose: the paper does not treat this case. counts: tracked, inliers.
+
+        Its covariance grows as under an unknown steady velocity.
+        """
         self._filter.reset()
-        self._covariance = self._covariance + (UNTRACKED_SPEED_SIGMA * dt_s) ** 2 * np.eye(6)
+        before_s, self._untracked_s = self._untracked_s, self._untracked_s + dt_s
+        growth = UNTRACKED_SPEED_SIGMA**2 * (self._untracked_s**2 - before_s**2)
+        self._covariance = bounded(self._covariance + growth * np.eye(6))
         self._set_reference(frame)
         return self._result(TrackingState.LOST, *counts)
 
@@ -155,7 +167,7 @@ class PaperOdometry:
             self._filter.velocity,
             self._filter.velocity_covariance,
             state,
-            0,
+            self._resets,
             tracked,
             inliers,
         )

@@ -8,7 +8,13 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.paper.paper_odometry import FEATURES, PaperOdometry, refine, turned_track
+from omnid.core.odometry.paper.paper_odometry import (
+    FEATURES,
+    UNTRACKED_SPEED_SIGMA,
+    PaperOdometry,
+    refine,
+    turned_track,
+)
 from omnid.core.odometry.paper.registration import Registration
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
@@ -132,8 +138,12 @@ def test_darkness_is_lost_and_keeps_the_pose(cameras: RenderedCameras, frames: l
         assert estimate.state == TrackingState.LOST
         np.testing.assert_array_equal(estimate.T_odom_rect, before.T_odom_rect)
     assert np.trace(out.covariance) > np.trace(into.covariance) > np.trace(before.covariance)
+    # The motion in the gap is not known: odom goes on from another place, which its sigma says.
     again = odometry.process(frames[2], 0.1)
-    assert again.state == TrackingState.TRACKING
+    assert (again.state, again.resets) == (TrackingState.DEGRADED, 1)
+    np.testing.assert_allclose(np.sqrt(again.covariance[0, 0]), UNTRACKED_SPEED_SIGMA * 0.2, rtol=0.05)
+    after = odometry.process(frames[3], 0.1)
+    assert (after.state, after.resets) == (TrackingState.TRACKING, 1)
     moved = se3.inverse(out.T_odom_rect) @ again.T_odom_rect
     assert motion_errors(moved, se3.inverse(PATH[1]) @ PATH[2])[0] < 0.02
 
