@@ -228,9 +228,10 @@ def test_an_image_that_repeats_an_earlier_one_is_refused_and_changes_nothing(sce
             with pytest.raises(OmnidError, match=f"image of the {found.removeprefix('the ')} is an earlier one"):
                 odometry.process(stamp_ns + 1, lower, upper)
         used.process(stamp_ns + 1, *images)
-    for buffer in buffers:
-        buffer[1, 1] ^= 1
-    odometry.process(stamp_ns + 1, *buffers)
+    for later_ns in (1, 2):
+        for buffer in buffers:
+            buffer[1, later_ns] ^= 1
+        odometry.process(stamp_ns + later_ns, *buffers)
 
 
 def test_exchanged_images_are_refused(scene: Path, pairs: list[Pair]) -> None:
