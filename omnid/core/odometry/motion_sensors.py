@@ -36,6 +36,8 @@ GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not
 TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
 CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
 STILL_M, STILL_RAD = 1e-4, 5e-5  # Motion of a base at rest. By judgement; not measured.
+# m/s^2 and rad/s^2: sigmas of the change of the rates where the samples of the end of a step have not come yet.
+NOT_YET_MPS2, NOT_YET_RADPS2 = 1.0, 2.0  # By judgement; not measured.
 # m/s and rad/s, without the bias, below which they are at rest. By judgement; not measured.
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
 STILL_BEFORE_S = 0.2  # The sensors must have been at rest this long before the step, so that none swings on.
@@ -127,8 +129,9 @@ class MotionSensors:
             distance, turn = wheels[0]
             twist[0], slopes[0, DISTANCE] = self.values[DISTANCE] * distance, distance
             rough = math.sqrt(self._noise_factors[DISTANCE])
+            missing_s = self._wheels.missing_s(end_s - self.values[WHEEL_OFFSET])
             sigma[:5] = (
-                rough * math.hypot(DISTANCE_SHARE * distance, WHEEL_M),
+                math.hypot(rough * math.hypot(DISTANCE_SHARE * distance, WHEEL_M), NOT_YET_MPS2 * missing_s**2 / 2),
                 math.hypot(SIDE_SHARE * distance, SIDE_M),
                 HEIGHT_M,
                 TILT_RAD,
@@ -136,10 +139,12 @@ class MotionSensors:
             )
             if math.isfinite(turn):
                 twist[5], slopes[5, TURN] = self.values[TURN] * turn, turn
-                sigma[5] = math.sqrt(self._noise_factors[TURN]) * math.hypot(TURN_SHARE * turn, WHEEL_RAD)
+                of_wheels = math.sqrt(self._noise_factors[TURN]) * math.hypot(TURN_SHARE * turn, WHEEL_RAD)
+                sigma[5] = math.hypot(of_wheels, NOT_YET_RADPS2 * missing_s**2 / 2)
         if gyro is not None:
             twist[3:] = gyro[0] - self.values[BIAS] * dt_s
-            sigma[3:] = GYRO_RADPS_SQRT_S * math.sqrt(dt_s)
+            missing_s = self._gyro.missing_s(end_s - self.values[GYRO_OFFSET])
+            sigma[3:] = math.hypot(GYRO_RADPS_SQRT_S * math.sqrt(dt_s), NOT_YET_RADPS2 * missing_s**2 / 2)
             slopes[3:], slopes[3:, BIAS] = 0.0, -dt_s * np.eye(3)
         return self._in_rect(twist, sigma, slopes, complete=wheels is not None and sigma[5] < UNKNOWN_RAD)
 

@@ -46,6 +46,10 @@ class RateHistory:
         total = ((rates[1:] + rates[:-1]) / 2 * np.diff(times)[:, None]).sum(axis=0)
         return total, rates[-1] - rates[0]
 
+    def missing_s(self, end_s: float) -> float:
+        """Return the time before the end of an interval over which `integral` holds the rates of the last sample."""
+        return max(0.0, end_s - float(self._times[-1])) if len(self._times) else 0.0
+
     def largest(self, start_s: float, end_s: float, zero: Array) -> Array | None:
         """Return the largest differences (size,) of the rates in an interval from zero (size,); None if empty."""
         inner = self._rates[(self._times >= start_s) & (self._times <= end_s)] - zero

@@ -223,6 +223,18 @@ def test_a_steady_turn_of_one_sensor_alone_is_noticed_before_clocks_are_learned(
     assert trusted[ends_s < 1.0].all() and not trusted[ends_s > 1.0 + 3 * period_s].any()
 
 
+def test_samples_that_have_not_come_yet_are_an_error_of_the_step() -> None:
+    """They may show that the base sets out: 1 m/s^2 for 0.1 s is 5 mm."""
+    sensors = MotionSensors(np.eye(4))
+    sensors.add([WheelSample(START_NS + k * 20_000_000, 0.5, 0.0) for k in range(101)])
+    sigma_m = [
+        np.sqrt(sensed.noise[0, 0])
+        for end_s in (2.0, 2.05, 2.1)
+        if (sensed := sensors.between(START_NS + round((end_s - PAIR_S) * 1e9), START_NS + round(end_s * 1e9)))
+    ]
+    assert sigma_m[0] < 1e-3 < sigma_m[1] < 2e-3 and sigma_m[2] > 5e-3
+
+
 def test_wheels_that_do_not_tell_their_turn_need_a_gyro() -> None:
     """As those of controllers that hold a heading by themselves."""
     for gyro in (True, False):
