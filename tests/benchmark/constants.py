@@ -17,6 +17,7 @@ import tokenize
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -125,11 +126,13 @@ class Comments:
     """The comments of a file by line."""
 
     def __init__(self, text: str) -> None:
-        self._lines = text.splitlines()
-        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-        self._of = {
-            token.start[0]: token.string.lstrip("# ").strip() for token in tokens if token.type == tokenize.COMMENT
-        }
+        self._text, self._lines = text, text.splitlines()
+
+    @cached_property
+    def _of(self) -> dict[int, str]:
+        """The comments; only files with constants are tokenized for them."""
+        tokens = tokenize.generate_tokens(io.StringIO(self._text).readline)
+        return {token.start[0]: token.string.lstrip("# ").strip() for token in tokens if token.type == tokenize.COMMENT}
 
     def at(self, first: int, last: int) -> str:
         """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason
