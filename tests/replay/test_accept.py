@@ -19,7 +19,7 @@ STAND = 22
 def test_a_round_of_a_rendered_log(omnid: Command, tmp_path: Path) -> None:
     there = paths.spline_path(3, 33, 0.05, sway_m=0.05)
     # It starts and stops gently, as a robot does.
-    along = np.rint(16 * (1 - np.cos(np.linspace(0, np.pi, 40)))).astype(int)
+    along = np.rint(16 * (1 - np.cos(np.linspace(0, np.pi, 30)))).astype(int)
     steps = [*[0] * STAND, *along.tolist(), *[32] * STAND, *along[::-1].tolist(), *[0] * STAND]
     rig, scene = mild_rig(3, 256), corridor(3)
 
