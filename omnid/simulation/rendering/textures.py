@@ -31,8 +31,7 @@ def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float 
         cells = (int(width / coarsest_px) + 2, int(height / coarsest_px) + 2)
         grid = rng.standard_normal(cells[::-1]).astype(np.float32)
         octave = cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
-        octave *= weight
-        total += octave
+        total += np.multiply(octave, weight, out=octave)
         coarsest_px, weight = coarsest_px / 2, weight * persistence
     mean, sigma = total.mean(), max(float(total.std()), 1e-6)
     total -= mean
