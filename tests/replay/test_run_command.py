@@ -105,7 +105,7 @@ def expect_poses_of_the_scene(operator: Operator, course: Path) -> None:
 
 
 def test_a_camera_fails_and_recovers(tmp_path: Path, course: Path) -> None:
-    words = (*patient(), "--set", "controller.deadlines.pose_s=2", "--pace", "0.5")
+    words = (*patient(), "--set", "controller.deadlines.pose_s=2")
     with robot(course, tmp_path, *words, module="tests.replay.faulty") as (daemon, operator, base):
         operator.drive()
         wait_until(lambda: base.drives, "motion")
