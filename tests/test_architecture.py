@@ -105,6 +105,7 @@ def room_of_file(path: Path, root: Path) -> str:
     return ".".join(parts if len(parts) == 2 and parts[1] != "__init__" else parts[:-1])
 
 
+@cache
 def room_of_module(module: str, root: Path) -> str | None:
     """Return the room that an imported name lies in; None for what is not ours."""
     parts = module.split(".")
@@ -139,12 +140,23 @@ def _import_statements(text: str) -> tuple[tuple[int, str | None, tuple[str, ...
     The result is kept by text: each test reads all files, and parsing them takes seconds.
     """
     found: list[tuple[int, str | None, tuple[str, ...]]] = []
-    for node in ast.walk(ast.parse(text)):
+    for node in _statements(ast.parse(text)):
         if isinstance(node, ast.Import):
             found.append((0, None, tuple(alias.name for alias in node.names)))
         elif isinstance(node, ast.ImportFrom):
             found.append((node.level, node.module, tuple(alias.name for alias in node.names)))
     return tuple(found)
+
+
+def _statements(tree: ast.Module) -> Iterator[ast.AST]:
+    """Yield all statements, handlers and cases of a file, without the expressions in them, which are most of it."""
+    waiting: list[ast.AST] = [tree]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        for part in ("body", "orelse", "finalbody", "handlers", "cases"):
+            below = getattr(node, part, ())
+            waiting += below if isinstance(below, list) else ()
 
 
 def measured_arrows(root: Path) -> dict[str, set[str]]:

@@ -17,6 +17,7 @@ import tokenize
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Final
 
@@ -114,7 +115,7 @@ def constants(root: Path = ROOT) -> list[Constant]:
 def constants_of(text: str, path: str) -> list[Constant]:
     """Return the constants of one file."""
     comments, tree = Comments(text), ast.parse(text)
-    found = [constant for node in tree.body for constant in _assigned(node, comments, text, path)]
+    found = [constant for node in tree.body for constant in _assigned(node, comments, path)]
     for node in tree.body:
         if isinstance(node, ast.ClassDef):
             found += [knob for part in node.body for knob in _knob(part, comments, path)]
@@ -122,14 +123,23 @@ def constants_of(text: str, path: str) -> list[Constant]:
 
 
 class Comments:
-    """The comments of a file by line."""
+    """The lines of a file, and its comments by line."""
 
     def __init__(self, text: str) -> None:
-        self._lines = text.splitlines()
-        tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-        self._of = {
-            token.start[0]: token.string.lstrip("# ").strip() for token in tokens if token.type == tokenize.COMMENT
-        }
+        self._text, self._lines = text, text.splitlines()
+
+    @cached_property
+    def _of(self) -> dict[int, str]:
+        """The comments; only files with constants are tokenized for them."""
+        tokens = tokenize.generate_tokens(io.StringIO(self._text).readline)
+        return {token.start[0]: token.string.lstrip("# ").strip() for token in tokens if token.type == tokenize.COMMENT}
+
+    def source_of(self, part: ast.expr) -> str:
+        """Return the source of an expression in one line; ast.get_source_segment would split the whole file again."""
+        rows = [line.encode() for line in self._lines[part.lineno - 1 : part.end_lineno]]
+        rows[-1] = rows[-1][: part.end_col_offset]
+        rows[0] = rows[0][part.col_offset :]
+        return " ".join(b" ".join(rows).decode().split())
 
     def at(self, first: int, last: int) -> str:
         """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason
@@ -167,7 +177,7 @@ def _is_neutral(value: ast.expr) -> bool:
     return ast.unparse(value.func) in ("np.eye", "np.zeros") or (len(numbers) > 0 and {*numbers} <= {0, 1})
 
 
-def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Iterator[Constant]:
+def _assigned(node: ast.stmt, comments: Comments, path: str) -> Iterator[Constant]:
     """Yield the constants of a module-level assignment; a tuple of names has one value each."""
     if isinstance(node, ast.Assign) and len(node.targets) == 1:
         target, value = node.targets[0], node.value
@@ -181,7 +191,7 @@ def _assigned(node: ast.stmt, comments: Comments, text: str, path: str) -> Itera
         return
     for name, part in zip(names, parts, strict=True):
         if isinstance(name, ast.Name) and name.id.strip("_").isupper() and has_number(part):
-            shown = " ".join((ast.get_source_segment(text, part) or "").split())
+            shown = comments.source_of(part)
             yield Constant(path, node.lineno, name.id, shown, comments.at(node.lineno, node.end_lineno or node.lineno))
 
 

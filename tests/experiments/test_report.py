@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 from typing import Any
@@ -129,14 +130,18 @@ def test_map_errors_are_distances_from_the_true_surfaces() -> None:
     assert 0.02 < exact["completeness"] < 0.3  # one wall of many
 
 
-def test_a_report_uses_existing_results_and_measures_nothing_twice(tmp_path: Path) -> None:
-    shutil.copytree(SMALL / "brick_s1", tmp_path / "logs" / "brick_s1")
+def test_a_report_uses_existing_results_and_measures_what_is_missing(tmp_path: Path, wall: dict[str, Any]) -> None:
+    for name in ("brick_s1", "turns_s1"):
+        shutil.copytree(SMALL / name, tmp_path / "logs" / name)
+    data = tmp_path / "results" / "data"
+    data.mkdir(parents=True)
+    existing = json.dumps({**about(Experiment.read(SMALL / "brick_s1")), "seed": 7, "values": wall})
+    (data / "wall_brick_s1.json").write_text(existing)
     report(tmp_path / "logs", tmp_path / "results")
-    data = tmp_path / "results" / "data" / "wall_brick_s1.json"
-    assert data.exists() and (tmp_path / "results" / "brick.png").stat().st_size > 10_000
-    data.write_text(data.read_text().replace('"seed":1', '"seed":7'))
-    report(tmp_path / "logs", tmp_path / "results")
-    assert '"seed":7' in data.read_text()
+    assert (data / "wall_brick_s1.json").read_text() == existing, "nothing is measured twice"
+    assert len(json.loads((data / "turns_turns_s1.json").read_text())["values"]["turns"]) > 3
+    for name in ("brick", "turns"):
+        assert (tmp_path / "results" / f"{name}.png").stat().st_size > 10_000
 
 
 def test_the_committed_report_is_made_of_the_committed_numbers() -> None:

@@ -153,12 +153,15 @@ def failures(name: str, folder: Path, count: int, seed: int) -> list[str]:
     return found
 
 
-def limited_main(name: str, folder: str, count: str, seed: str) -> int:
-    """Attack one parser in this process, whose memory is limited; print the failures and the largest memory."""
+def limited_main(names: str, folder: str, count: str, seed: str) -> int:
+    """Attack parsers in this process, whose memory is limited; print the failures and the largest memory.
+
+    names: one, or several with commas between them.
+    """
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
     signal.signal(signal.SIGALRM, too_long)
     with np.errstate(all="ignore"):
-        found = failures(name, Path(folder), int(count), int(seed))
+        found = [line for name in names.split(",") for line in failures(name, Path(folder), int(count), int(seed))]
     status = Path("/proc/self/status").read_text()  # not ru_maxrss, which contains the parent of this process
     print(int(status.split("VmHWM:")[1].split()[0]) // 1024)
     for line in found:
@@ -167,7 +170,7 @@ def limited_main(name: str, folder: str, count: str, seed: str) -> int:
 
 
 def attack(name: str, folder: Path, count: int, seed: int) -> tuple[int, list[str]]:
-    """Attack one parser in a process of its own; return its largest memory [MB] and the failures."""
+    """Attack parsers, as limited_main, in a process of its own; return its largest memory [MB] and the failures."""
     command = [sys.executable, "-m", __name__, name, str(folder), str(count), str(seed)]
     done = subprocess.run(
         command,

@@ -24,9 +24,8 @@ def test_mutations_are_repeatable_and_differ() -> None:
     assert len(set(once)) > 190 and data not in once
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_mutated_files_give_a_result_or_one_line(short: Path, name: str) -> None:
-    memory_mb, found = attack(name, short, 60, seed=7)
+def test_mutated_files_give_a_result_or_one_line(short: Path) -> None:
+    memory_mb, found = attack(",".join(FORMATS), short, 60, seed=7)
     assert found == [] and 0 < memory_mb < 400
 
 

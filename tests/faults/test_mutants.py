@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import pytest
 
 from tests.faults.mutants import ROOT, TESTS, Mutant, all_mutants, in_order, mutants_of
@@ -48,4 +50,4 @@ def test_those_that_differ_only_at_a_limit_are_tried_last() -> None:
 
 @pytest.mark.parametrize("folder", TESTS)
 def test_there_are_mutants_of_the_code_that_moves_the_wheels(folder: str) -> None:
-    assert len(list(all_mutants([folder]))) > 3
+    assert len(list(islice(all_mutants([folder]), 4))) == 4

@@ -1,4 +1,4 @@
-"""`omnid arm` and `omnid stop` from a second process: a robot in front of a sender that never pauses."""
+"""`omnid arm` and `omnid stop` from another process than the daemon: a robot in front of a sender that never pauses."""
 
 from __future__ import annotations
 
@@ -15,20 +15,24 @@ import pytest
 from omnid.client import Robot
 from omnid.core.control.command_sources import LOWER_PRIORITY, OPERATOR, OTHER_SENDER, PLANNER
 from omnid.core.control.safety_rules import FAILED
+from tests.replay.command import Command
 from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, patient, robot, wait_until
 
-MANUAL = patient("controller.arming=manual", "controller.deadlines.command_s=8", "controller.sources.hold_s=8")
+# At half the speed of the log: the tests look at what is commanded.
+MANUAL = (
+    *patient("controller.arming=manual", "controller.deadlines.command_s=8", "controller.sources.hold_s=8"),
+    "--pace",
+    "0.5",
+)
 WATCH_S = 0.5  # during which nothing may move
 HUNG_S = 4.0  # until the queues of subscribers that do not read are full; after 10 s zenoh drops them
 TIMEOUT_STOP_S = float(re.findall(r"^TimeoutStopSec=(\d+)$", (ROOT / "systemd/omnid.service").read_text(), re.M)[0])
 
 
-def omnid(daemon: Daemon, command: str, *words: str) -> tuple[int, str]:
-    """Run a command on this robot; return the exit code and its output."""
-    line = [sys.executable, "-m", "omnid", command, "--connect", f"tcp/127.0.0.1:{daemon.port}", *words]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, cwd=ROOT, check=False)
-    assert "Traceback" not in done.stderr
-    return done.returncode, done.stdout + done.stderr
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Return the command line as a function."""
+    return Command(capsys)
 
 
 def expect_stand(operator: Operator, base: Base) -> None:
@@ -40,7 +44,12 @@ def expect_stand(operator: Operator, base: Base) -> None:
     assert not base.line.moved_since(since_s)
 
 
-def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, course: Path) -> None:
+def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, course: Path, command: Command) -> None:
+    def omnid(daemon: Daemon, word: str) -> tuple[int, str]:
+        """Run a command on this robot; return the exit code and its output."""
+        code, out, err = command(word, "--connect", f"tcp/127.0.0.1:{daemon.port}")
+        return code, out + err
+
     with robot(course, tmp_path, *MANUAL) as (daemon, operator, base):
         operator.drive(0.3)
         expect_stand(operator, base)

@@ -35,14 +35,21 @@ def test_refuses_exchanged_cameras(omnid: Command, scene: Path) -> None:
         assert "the other way round" in wrong.err and "--lower" in wrong.err
 
 
+@pytest.fixture(scope="module")
+def fast(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a log of two pinhole cameras at 10 m/s."""
+    folder = tmp_path_factory.mktemp("fast")
+    rig = lens_rig(lens("pinhole", 60, (320, 240)), baseline_m=0.5)
+    write_drive(folder, rig, spline_path(1, 16, 1.0, sway_m=0.1), corridor(1, 30.0), seed=1)
+    return folder
+
+
 @pytest.mark.parametrize("limit_mps", [5, 20])
-def test_a_drive_faster_than_the_limit_is_named(omnid: Command, tmp_path: Path, limit_mps: int) -> None:
+def test_a_drive_faster_than_the_limit_is_named(omnid: Command, fast: Path, limit_mps: int) -> None:
     """At 10 m/s and 10 Hz poses are refused: the warning names the speed and the limit, and none after the first one is
     called tracking while nothing moves."""
-    rig = lens_rig(lens("pinhole", 60, (320, 240)), baseline_m=0.5)
-    write_drive(tmp_path, rig, spline_path(1, 16, 1.0, sway_m=0.1), corridor(1, 60.0), seed=1)
     words = ("--set", f"odometry.limits.max_speed_mps={limit_mps}", "--set", "places.enabled=false", "--inline")
-    done = omnid.replay(tmp_path / "log.mcap", *words, rig=tmp_path / "rig.toml")
+    done = omnid.replay(fast / "log.mcap", *words, rig=fast / "rig.toml")
     states = re.search(r"states +tracking ([0-9.]+)%", done.out)
     assert states
     if limit_mps == 5:

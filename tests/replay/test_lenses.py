@@ -54,7 +54,7 @@ def sector(tmp_path_factory: pytest.TempPathFactory) -> Path:
         lens_rig(lens("pinhole", 90, (480, 360)), heading_deg=-173.0),
         T_base_rig=se3.transform(np.eye(3), [0.0, 0.0, 0.6]),
     )
-    poses = paths.spline_path(5, 40, 0.05, sway_m=0.02)  # what was seen before stays in view
+    poses = paths.spline_path(5, 26, 0.05, sway_m=0.02)  # what was seen before stays in view
     poses[:, 2, 3] = 0.6
     write_log(folder, rig, poses, corridor(5), seed=5)
     return folder

@@ -191,7 +191,8 @@ def test_build_refuses_what_it_cannot_do(omnid: Command, scene: Path, tmp_path: 
 def running(scene: Path, omap: Path, *words: object) -> Iterator[tuple[Daemon, Operator]]:
     """Yield a daemon on the images of the scene, localised in the map."""
     port = free_port()
-    command = command_line(scene, port, None, "--map", omap, "--set", "places.save_s=1", *words)
+    settings = ("--set", "places.save_s=1", "--set", "obstacles.enabled=false")
+    command = command_line(scene, port, None, "--map", omap, *settings, *words)
     with started(command, port) as daemon:
         wait_until(lambda: answers(port) or not daemon.alive, "the bus")
         assert daemon.alive, daemon.process.communicate()[1]

@@ -41,6 +41,6 @@ def test_two_walls_misaligned(omnid: Command, tmp_path: Path) -> None:
 
 
 def test_the_papers_method(omnid: Command, tmp_path: Path) -> None:
-    """The first third of the log: its matching takes ten times as long as that of the other method."""
-    found = measured(omnid, tmp_path, "two_walls", "--method", "paper", "--seconds", "3.5")
-    assert found.pairs >= 33 and found.ate_rmse_m < 0.1
+    """The first fifth of the log, a metre: its matching takes ten times as long as that of the other method."""
+    found = measured(omnid, tmp_path, "two_walls", "--method", "paper", "--seconds", "2.05")
+    assert found.pairs >= 20 and found.ate_rmse_m < 0.06

@@ -14,7 +14,7 @@ from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from tests.replay.command import Command
 from tests.simulation import corridor, paths, render_grey, tum
 
-PAIRS, START_NS, PERIOD_NS, BASELINE_M, SEED = 16, 1_706_000_000 * 10**9, 100_000_000, 0.191, 2
+PAIRS, START_NS, PERIOD_NS, BASELINE_M, SEED = 8, 1_706_000_000 * 10**9, 100_000_000, 0.191, 2
 SIZE = (1920, 512)
 
 

@@ -22,7 +22,7 @@ AT_START = np.array([0.9, 0.9, 0.1])  # m: the tag's middle in the rig frame of 
 def tagged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short drive past a tag."""
     folder = tmp_path_factory.mktemp("tagged")
-    run = build("two_walls", seed=3, size=384, pairs=8)
+    run = build("two_walls", seed=3, size=384, pairs=5)
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     square = cv2.aruco.generateImageMarker(family, 5, 320)
     image = cv2.copyMakeBorder(square, 80, 80, 80, 80, cv2.BORDER_CONSTANT, value=255)

@@ -14,7 +14,7 @@ from pathlib import Path
 from tests.replay.live import PATIENCE_S, ROOT, patient, robot, wait_until
 
 UP = b"\x1b[A"
-MANUAL = patient("controller.arming=manual")
+MANUAL = (*patient("controller.arming=manual"), "--pace", "0.5")  # what is seen matters little
 
 
 @contextmanager

@@ -213,7 +213,7 @@ def test_wheels_that_contradict_the_cameras_are_reported(
 def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, scene: Path, tmp_path: Path) -> None:
     for name, source in (("log.mcap", log), ("rig.toml", scene / "rig.toml")):
         shutil.copy(source, tmp_path / name)
-    with robot(tmp_path, tmp_path) as (daemon, operator, _):
+    with robot(tmp_path, tmp_path, "--set", "obstacles.enabled=false") as (daemon, operator, _):
         wait_until(lambda: float(operator.values("wheels and gyro").get("gyro_samples", 0)) > 150, "samples")
         values = operator.values("wheels and gyro")
         # The gyro of the log measures twice as often as its wheels; the motor's reports would come besides.

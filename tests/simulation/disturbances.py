@@ -77,6 +77,9 @@ class DisturbedCamera:
         names: Collection[Disturbance], number: int, mask: Mask, size: tuple[int, int], seed: int
     ) -> DisturbedCamera:
         """Return the disturbances of a camera with that mask and image size (width, height)."""
+        if not names:  # the images of most logs, whose maps would take longer than some of the images
+            nothing = np.zeros((0, 0), np.float32)
+            return DisturbedCamera(frozenset(), number, seed, nothing, nothing, (0, 0), nothing)
         rng = np.random.default_rng([seed, number, 31])
         width, height = size
         u, v = np.meshgrid(np.arange(width) - mask.center[0], np.arange(height) - mask.center[1])

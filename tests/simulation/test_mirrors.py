@@ -49,7 +49,7 @@ def test_a_rendered_spot_near_a_tilted_camera_equals_the_projection() -> None:
     edge_u, edge_v = np.array([0.012, -0.024, 0.0]), np.array([0.01, 0.005, -0.025])
     spot = Rectangle(middle - (edge_u + edge_v) / 2, edge_u, edge_v, np.full((8, 8), 255, np.uint8))
     mounted = MountedCamera(camera, np.eye(4), Mask(camera.center, 0.0, 92.0))
-    image = render(Scene((spot,)), mounted, np.eye(4), 8).astype(float)
+    image = render(Scene((spot,)), mounted, np.eye(4), 4).astype(float)
     rows, columns = np.indices(image.shape)
     centroid = np.array([(columns * image).sum(), (rows * image).sum()]) / image.sum()
     grid = spot.points(np.stack(np.meshgrid(*2 * [np.linspace(0.05, 0.95, 10)]), axis=-1).reshape(-1, 2))

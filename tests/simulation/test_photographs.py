@@ -49,7 +49,7 @@ def test_posters_keep_their_form_and_are_parts_of_photographs(scene: Scene) -> N
     posters = [(before, now) for before, now in faces if before.name.startswith("poster")]
     assert all(now.texture.shape == before.texture.shape for before, now in posters)
     shown = posters[0][1].texture
-    assert max(_likeness(photographed(name), shown) for name in POSTERS) > 0.9
+    assert any(_likeness(photographed(name), shown) > 0.9 for name in POSTERS)
 
 
 def _likeness(photograph: np.ndarray, part: np.ndarray) -> float:

@@ -148,6 +148,12 @@ def long_runs(flags: Sequence[bool], least: int) -> list[int]:
     return found
 
 
+@lru_cache(maxsize=4)
+def sector_edges_m(outline: Outline, count: int) -> tuple[float, ...]:
+    """Return the distance of the edge from the origin in the middle of each sector of a ring."""
+    return tuple(outline.edge_m(azimuth) for azimuth, _, _ in sector_directions(count))
+
+
 @lru_cache(maxsize=2)
 def sector_directions(count: int) -> tuple[tuple[float, float, float], ...]:
     """Return the azimuth of the middle of each sector of a ring, its cosine and its sine."""

@@ -20,6 +20,7 @@ from omnid.core.control.collision_geometry import (
     driven_over,
     long_runs,
     sector_directions,
+    sector_edges_m,
     within_reach,
 )
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
@@ -120,8 +121,7 @@ class CollisionMonitor:
         if (self._stamp_ns is not None and ring.stamp_ns < self._stamp_ns) or not ring.ranges_m:
             return
         self._stamp_ns, self._moving = ring.stamp_ns, ring.moving[:MOST_MOVING]
-        count = len(ring.ranges_m)
-        directions = sector_directions(count)
+        count, directions = len(ring.ranges_m), sector_directions(len(ring.ranges_m))
         self._points = [
             (r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)
         ]
@@ -133,11 +133,11 @@ class CollisionMonitor:
         self._unknown, self._gaps, self._unwatched = [], [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
+        edges_m, around_m = sector_edges_m(self._outline, count), sector_edges_m(self._around, count)
         for k in long_runs(unknown, UNKNOWN_SECTORS):
-            azimuth, c, s = directions[k]
-            begins_m = self._around.edge_m(azimuth) if unwatched[k] else max(free[k], self._outline.edge_m(azimuth))
+            begins_m = around_m[k] if unwatched[k] else max(free[k], edges_m[k])
             ends = self._unwatched if unwatched[k] else self._gaps if has_gap[k] else self._unknown
-            ends.append((begins_m * c, begins_m * s))
+            ends.append((begins_m * directions[k][1], begins_m * directions[k][2]))
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc.

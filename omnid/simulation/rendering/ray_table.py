@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.models.camera import Array
+from calib.models.camera import Array, OmniCamera
 from calib.rig import MountedCamera
 
 Floats = NDArray[np.float32]
@@ -79,28 +79,41 @@ def _origins(mounted: MountedCamera, supersample: int, index: NDArray[np.int64])
     camera = mounted.camera
     if not isinstance(camera, NonCentralCamera):
         return np.zeros((3, 1), np.float32)
-    origins = [camera.rays(pixels)[0] for pixels in _sample_pixels(mounted, supersample)]
+    origins = [camera.rays(pixels)[0] for pixels in _sample_pixels(camera.size, supersample)]
     return np.ascontiguousarray(np.concatenate(origins)[index].T, np.float32)
 
 
-def _sample_pixels(mounted: MountedCamera, supersample: int) -> list[Array]:
+def _sample_pixels(size: tuple[int, int], supersample: int) -> list[Array]:
     """Return the pixels (N, 2) of all samples, row by row, in chunks of about RAY_CHUNK."""
-    width, height = mounted.camera.size
+    width, height = size
     u = (np.arange(width * supersample) + 0.5) / supersample - 0.5
     v = (np.arange(height * supersample) + 0.5) / supersample - 0.5
     pixels = np.column_stack([np.tile(u, len(v)), np.repeat(v, len(u))])
     return np.array_split(pixels, -(-len(pixels) // RAY_CHUNK))
 
 
+_last_lifted: list[tuple[OmniCamera, int, tuple[Floats, Floats]]] = []  # at most one
+
+
 def _lift_grid(mounted: MountedCamera, supersample: int) -> tuple[Floats, Floats]:
     """Return rays (N, 3), NaN outside the mask, and the angle between neighbours (N,) of every sample, row by row."""
-    width, height = mounted.camera.size
-    chunks = _sample_pixels(mounted, supersample)
-    pixels, rays = np.concatenate(chunks), np.concatenate([mounted.camera.lift(chunk) for chunk in chunks])
+    rays, spacing = _lifted(mounted.camera, supersample)
+    pixels = np.concatenate(_sample_pixels(mounted.camera.size, supersample))
+    return np.where(mounted.visible.contains(pixels)[:, None], rays, np.float32(np.nan)), spacing
+
+
+def _lifted(camera: OmniCamera, supersample: int) -> tuple[Floats, Floats]:
+    """Return rays and spacing of every sample without a mask; computed once for the equal lenses of a rig."""
+    for kept, samples, lifted in _last_lifted:
+        if samples == supersample and kept == camera:
+            return lifted
+    width, height = camera.size
+    rays = np.concatenate([camera.lift(chunk) for chunk in _sample_pixels(camera.size, supersample)])
     grid = rays.reshape(height * supersample, width * supersample, 3)
     solid_angle = np.linalg.norm(np.cross(np.gradient(grid, axis=0), np.gradient(grid, axis=1)), axis=2)
-    rays[~mounted.visible.contains(pixels)] = np.nan
-    return rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
+    lifted = rays.astype(np.float32), np.sqrt(solid_angle).astype(np.float32).ravel()
+    _last_lifted[:] = [(camera, supersample, lifted)]
+    return lifted
 
 
 def _cones(rays: Floats, starts: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -35,6 +35,8 @@ class Sensor:
 
 def fittings(sensor: Sensor, mask: Mask, size: tuple[int, int]) -> Floats:
     """Return the part (H, W) of each pixel that struts and hub hide, 0 to 1; they are fixed to the camera."""
+    if not sensor.hub and not sensor.strut_angles_deg:
+        return np.zeros(size[::-1], np.float32)
     width, height = size
     fine = (np.arange(width * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[0]
     x, y = np.meshgrid(fine, (np.arange(height * EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5 - mask.center[1])

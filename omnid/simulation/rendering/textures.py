@@ -19,7 +19,8 @@ Painter = Callable[[Random, Size, float], Texture]
 
 
 def _grey(values: Array | NDArray[np.float32]) -> Texture:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+    rounded = np.rint(values)
+    return np.clip(rounded, 0, 255, out=rounded).astype(np.uint8)
 
 
 def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float = 0.6) -> NDArray[np.float32]:
@@ -29,9 +30,13 @@ def value_noise(rng: Random, size: Size, coarsest_px: float, persistence: float 
     while coarsest_px >= 2:
         cells = (int(width / coarsest_px) + 2, int(height / coarsest_px) + 2)
         grid = rng.standard_normal(cells[::-1]).astype(np.float32)
-        total += weight * cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
+        octave = cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC)
+        total += np.multiply(octave, weight, out=octave)
         coarsest_px, weight = coarsest_px / 2, weight * persistence
-    return np.asarray((total - total.mean()) / max(float(total.std()), 1e-6), np.float32)
+    mean, sigma = total.mean(), max(float(total.std()), 1e-6)
+    total -= mean
+    total /= sigma
+    return total
 
 
 def brick(rng: Random, size: Size, px_per_m: float) -> Texture:

@@ -29,7 +29,8 @@ from omnid.core.control.motion_monitor import AGREE, WITNESSES, Witness
 from omnid.core.control.velocity_limits import STOP
 from tests.omnid.controller.bench import LIMITS, PERIOD_NS, PERIOD_S, SETTINGS
 
-TICKS = 30_000
+TICKS = 6_000
+PHASE = 40  # ticks with the same motor, images and calm
 MANY_TICKS = 1_000_000
 DEADLINES = SETTINGS.deadlines
 HOLD_NS = round(SETTINGS.sources.hold_s * 1e9)
@@ -182,11 +183,11 @@ class Walk:
         """Return the number of ticks by reason."""
         rng = self.rng
         for tick in range(ticks):
-            if tick % 100 == 0:
+            if tick % PHASE == 0:
                 self.calm = self.rng.random() < 0.7
                 usual, self.steady = self.chance(0.7, 0.4), rng.random() < 0.5
                 oddity, self.witness = USUAL if usual else rng.choice(ODDITIES), AGREE
-                if usual and rng.random() < 0.2:
+                if usual and rng.random() < 0.4:
                     self.witness = Witness(rng.choice(WITNESSES), "", rng.random() < 0.7)
                 self.motor.number, self.motor.battery_v, self.motor.wheels_mps, self.seen_mps, self.sigma_mps = oddity
             if tick % 25 == 0:
@@ -386,7 +387,7 @@ def walk(seed: int, mode: str, ticks: int) -> None:
 
 @pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
 def test_nothing_moves_without_arm_and_a_live_command_of_the_owner(mode: str) -> None:
-    walk(1, mode, TICKS // 2)
+    walk(1, mode, TICKS)
 
 
 @pytest.mark.slow
