@@ -50,7 +50,8 @@ class UnifiedCamera:
         edge = -self.xi if self.xi <= 1 else -1 / self.xi
         scale = np.where(z > edge, norm * (z + self.xi), np.nan)
         m = points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]
-        m[~self._is_unfolded(m)] = np.nan
+        if any(self.distortion):
+            m[~self._is_unfolded(m)] = np.nan
         return np.asarray(self._distort(m) * self.focal + self.center)
 
     def lift(self, pixels: Array) -> Array:
