@@ -26,6 +26,8 @@ LENS = UnifiedCamera(1.4, (330.0, 331.5), MASK.center, SIZE)
 OCAM = OcamCamera((-131.6, 0.0, 1.9e-3, 9e-8, -6e-10), (380.9, 394.2), (0.998, 2e-4, 2e-4), SIZE)
 DIRECT = OcamCamera((-190.0, 0.0, 1.2e-3, -2e-7, 4e-10), (380.9, 394.2), (1.001, -3e-4, -3e-4), SIZE, "direct")
 
+EXACT_VIEWS = 6  # with exact corners as good as more
+
 
 def seen_by(camera: OmniCamera, count: int = 10, noise_px: float = 0.0, seed: int = 0) -> list[BoardView]:
     axis = camera.lift(np.array([camera.center]))[0]
@@ -59,7 +61,7 @@ def turned_apart_rad(one: OmniCamera, other: OmniCamera) -> float:
 
 @pytest.mark.parametrize("truth", [OCAM, DIRECT])
 def test_recovers_the_ocam_camera_from_exact_corners(truth: OcamCamera) -> None:
-    found = fit_camera(seen_by(truth), BOARD, SIZE, "ocam", truth.view).camera
+    found = fit_camera(seen_by(truth, EXACT_VIEWS), BOARD, SIZE, "ocam", truth.view).camera
     assert isinstance(found, OcamCamera) and found.view == truth.view
     assert found.center_row_column == pytest.approx(truth.center_row_column, abs=1e-3)
     assert found.affine == pytest.approx(truth.affine, abs=1e-6)
@@ -69,7 +71,7 @@ def test_recovers_the_ocam_camera_from_exact_corners(truth: OcamCamera) -> None:
 
 @pytest.mark.parametrize(("truth", "view"), [(OMNI, "mirror"), (BENT, "mirror"), (LENS, "direct"), (PINHOLE, "direct")])
 def test_recovers_the_omni_camera_from_exact_corners(truth: UnifiedCamera, view: View) -> None:
-    found = fit_camera(seen_by(truth), BOARD, SIZE, "omni", view).camera
+    found = fit_camera(seen_by(truth, EXACT_VIEWS), BOARD, SIZE, "omni", view).camera
     assert isinstance(found, UnifiedCamera)
     assert found.xi == pytest.approx(truth.xi, abs=1e-3)
     assert found.focal == pytest.approx(truth.focal, rel=1e-3)
@@ -120,7 +122,7 @@ def test_rejects_outlier_views_by_name() -> None:
 
 
 def test_hidden_corners_have_no_effect() -> None:
-    views = seen_by(OMNI)
+    views = seen_by(OMNI, EXACT_VIEWS)
     holed = [
         replace(view, pixels=np.where(np.arange(42)[:, None] % 9 == k % 9, np.nan, view.pixels))
         for k, view in enumerate(views)
@@ -143,8 +145,8 @@ def test_refuses_too_few_views() -> None:
     views = seen_by(OMNI)
     with pytest.raises(CalibError, match="expected at least 4 views of the board, found 3; take more"):
         fit_camera(views[:3], BOARD, SIZE)
-    with pytest.raises(CalibError, match="expected at least 4 consistent views, found 3; left out view6"):
-        fit_camera([views[0], views[4], spoilt(views)[6], views[8]], BOARD, SIZE)
+    with pytest.raises(CalibError, match="expected at least 4 consistent views, found 3; left out view2"):
+        fit_camera([views[0], views[4], spoilt(views)[2], views[8]], BOARD, SIZE)
 
 
 def test_warns_of_views_on_one_side_only() -> None:
