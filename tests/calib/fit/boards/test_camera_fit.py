@@ -26,8 +26,6 @@ LENS = UnifiedCamera(1.4, (330.0, 331.5), MASK.center, SIZE)
 OCAM = OcamCamera((-131.6, 0.0, 1.9e-3, 9e-8, -6e-10), (380.9, 394.2), (0.998, 2e-4, 2e-4), SIZE)
 DIRECT = OcamCamera((-190.0, 0.0, 1.2e-3, -2e-7, 4e-10), (380.9, 394.2), (1.001, -3e-4, -3e-4), SIZE, "direct")
 
-EXACT_VIEWS = 6  # with exact corners as good as more
-
 
 def seen_by(camera: OmniCamera, count: int = 10, noise_px: float = 0.0, seed: int = 0) -> list[BoardView]:
     axis = camera.lift(np.array([camera.center]))[0]
@@ -61,7 +59,7 @@ def turned_apart_rad(one: OmniCamera, other: OmniCamera) -> float:
 
 @pytest.mark.parametrize("truth", [OCAM, DIRECT])
 def test_recovers_the_ocam_camera_from_exact_corners(truth: OcamCamera) -> None:
-    found = fit_camera(seen_by(truth, EXACT_VIEWS), BOARD, SIZE, "ocam", truth.view).camera
+    found = fit_camera(seen_by(truth), BOARD, SIZE, "ocam", truth.view).camera
     assert isinstance(found, OcamCamera) and found.view == truth.view
     assert found.center_row_column == pytest.approx(truth.center_row_column, abs=1e-3)
     assert found.affine == pytest.approx(truth.affine, abs=1e-6)
@@ -71,7 +69,7 @@ def test_recovers_the_ocam_camera_from_exact_corners(truth: OcamCamera) -> None:
 
 @pytest.mark.parametrize(("truth", "view"), [(OMNI, "mirror"), (BENT, "mirror"), (LENS, "direct"), (PINHOLE, "direct")])
 def test_recovers_the_omni_camera_from_exact_corners(truth: UnifiedCamera, view: View) -> None:
-    found = fit_camera(seen_by(truth, EXACT_VIEWS), BOARD, SIZE, "omni", view).camera
+    found = fit_camera(seen_by(truth), BOARD, SIZE, "omni", view).camera
     assert isinstance(found, UnifiedCamera)
     assert found.xi == pytest.approx(truth.xi, abs=1e-3)
     assert found.focal == pytest.approx(truth.focal, rel=1e-3)
@@ -122,12 +120,12 @@ def test_rejects_outlier_views_by_name() -> None:
 
 
 def test_hidden_corners_have_no_effect() -> None:
-    views = seen_by(OMNI, EXACT_VIEWS)
+    views = seen_by(OCAM)
     holed = [
         replace(view, pixels=np.where(np.arange(42)[:, None] % 9 == k % 9, np.nan, view.pixels))
         for k, view in enumerate(views)
     ]
-    assert turned_apart_rad(fit_camera(holed, BOARD, SIZE, "omni").camera, OMNI) < 1e-5
+    assert turned_apart_rad(fit_camera(holed, BOARD, SIZE).camera, OCAM) < 1e-5
 
 
 @pytest.mark.slow
