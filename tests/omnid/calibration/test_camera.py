@@ -28,12 +28,12 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> CameraResult:
     renderer = BoardRenderer.of(BOARD, CAMERA, MASK)
     for seed, T in enumerate(board_poses_around_camera(CAMERA, BOARD, MASK, VIEWS, distance_m=(0.14, 0.25))):
         cv2.imwrite(str(folder / f"p{seed}.png"), renderer.render_board(T, seed=seed).image)
-    return omnid.calibrate_camera([str(folder)], BOARD, model="omni", progress=lines.append)
+    return omnid.calibrate_camera([str(folder)], BOARD, model="ocam", progress=lines.append)
 
 
 def test_the_result_prints_itself_in_one_line(found: CameraResult) -> None:
     line = str(found)
-    assert line.startswith("model omni, 360x362, centre 178.") and line.endswith(f"corners of {VIEWS} views")
+    assert line.startswith("model ocam, 360x362, centre 178.") and line.endswith(f"corners of {VIEWS} views")
     assert "\n" not in line and not found.is_misfit and found.mask is None
 
 

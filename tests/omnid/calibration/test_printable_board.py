@@ -18,12 +18,12 @@ DPI = 254.0  # 10 px a millimetre
 PX_PER_MM = DPI / 25.4
 
 
-def printed(tmp_path: Path, *options: object, dpi: float = DPI) -> tuple[NDArray[np.uint8], str]:
+def printed(tmp_path: Path, *options: object) -> tuple[NDArray[np.uint8], str]:
     """The page as grey pixels, and its text."""
     path = tmp_path / "board.pdf"
     assert main(["calibrate", "board", *map(str, options), "-o", str(path)]) == 0
     page = pypdfium2.PdfDocument(path)[0]
-    image = page.render(scale=dpi / 72, grayscale=True).to_numpy()
+    image = page.render(scale=DPI / 72, grayscale=True).to_numpy()
     return np.ascontiguousarray(image.reshape(image.shape[:2])), page.get_textpage().get_text_range()
 
 
@@ -63,13 +63,13 @@ def test_a_checkerboard_is_true_to_scale(tmp_path: Path) -> None:
 def test_markers_are_read_and_true_to_scale(
     tmp_path: Path, options: tuple[object, ...], family: int, border: int, count: int, side_mm: float
 ) -> None:
-    image, _ = printed(tmp_path, *options, dpi=DPI / 2)
+    image, _ = printed(tmp_path, *options)
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(family), parameters)
     corners, ids, _ = detector.detectMarkers(image)
     assert sorted(ids.ravel().tolist()) == list(range(count))
-    sides = [np.linalg.norm(np.diff(four[0], axis=0), axis=1) / (PX_PER_MM / 2) for four in corners]
+    sides = [np.linalg.norm(np.diff(four[0], axis=0), axis=1) / PX_PER_MM for four in corners]
     assert np.abs(np.array(sides) - side_mm).max() < 0.3
 
 

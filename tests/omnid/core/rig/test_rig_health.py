@@ -132,8 +132,9 @@ def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) 
 
 def test_few_places_give_no_finding_however_often(true: tuple[RigHealth, Collector]) -> None:
     places = true[1][::3]
-    assert monitor_after(true, places[: MIN_PLACES - 1] * 8).finding is None
-    found = monitor_after(true, places[:MIN_PLACES] * 6).finding
+    assert 4 * (MIN_PLACES - 1) > VIEWS
+    assert monitor_after(true, places[: MIN_PLACES - 1] * 4).finding is None
+    found = monitor_after(true, places[:MIN_PLACES] * 3).finding
     assert found is not None and found.state is RigState.FITS and found.tried <= MIN_PLACES * POINTS
 
 
@@ -203,7 +204,7 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
     ):
         health = started(true, first[:4])
         begun = health.state
-        for number, one in enumerate(later):
+        for number, one in enumerate(later[:VIEWS]):
             health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
     assert rig_status(health, None).level == 2 and "exchange" in rig_status(health, None).message
