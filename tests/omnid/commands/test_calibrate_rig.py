@@ -267,9 +267,8 @@ def test_detects_a_wrong_square_by_the_baseline(
 def test_suggests_the_right_number_of_corners(
     folder: Path, four: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for path in four.glob("*_0[0-3].png"):
-        if path.name.endswith(("_00.png", "_01.png")):
-            shutil.copy(path, tmp_path)
+    for path in four.glob("*_00.png"):
+        shutil.copy(path, tmp_path)
     assert run(tmp_path, "-o", tmp_path / "rig.toml", *given(folder), corners="8x5") == 2
     assert "try --corners 6x7" in capsys.readouterr().err
 

@@ -65,6 +65,3 @@ def test_one_camera_finds_the_shape_and_selects_its_model_with_it() -> None:
     found = with_print_shape(flat, "mirror").calibration
     np.testing.assert_allclose(found.shape.bends_m, BENT.bends_m, atol=2e-4)
     assert found.fit.mean_px < flat.calibration.fit.mean_px
-    straight = [lower for view in views_of(AS_DRAWN, count=9) if (lower := view.seen[0])]
-    flat = select_calibration(straight, ODD, LOWER.size, "omni")
-    assert with_print_shape(flat, "mirror") is flat
