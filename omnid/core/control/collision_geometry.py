@@ -26,9 +26,15 @@ class Outline(NamedTuple):
     rear_m: float
     half_width_m: float
 
-    def contains(self, x_m: float, y_m: float) -> bool:
-        """True for a point inside."""
-        return -self.rear_m <= x_m <= self.front_m and abs(y_m) <= self.half_width_m
+    def parted(self, points: Iterable[Point]) -> tuple[list[Point], list[Point]]:
+        """Return the points inside, also those at the edge, and the others."""
+        behind_m, front_m, half_width_m = -self.rear_m, self.front_m, self.half_width_m
+        inside: list[Point] = []
+        outside: list[Point] = []
+        for point in points:
+            is_inside = behind_m <= point[0] <= front_m and abs(point[1]) <= half_width_m
+            (inside if is_inside else outside).append(point)
+        return inside, outside
 
     def gap_m(self, x_m: float, y_m: float) -> float:
         """Return the distance of a point from the outline, 0 inside."""
@@ -114,8 +120,8 @@ def _crossings(outline: Outline, radius_m: float, rho2: float) -> list[tuple[flo
 
 def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point]:
     """Return the points within reach of a pose, in its axes."""
-    reach2 = reach_m * reach_m
-    return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])
+    (px, py), reach2 = pose[:2], reach_m * reach_m
+    return seen_from(pose, [(x, y) for x, y in points if (x - px) * (x - px) + (y - py) * (y - py) <= reach2])
 
 
 def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps: float) -> bool:

@@ -85,9 +85,9 @@ def true(rooms: Path) -> tuple[RigHealth, Collector]:
 
 @pytest.fixture(scope="module")
 def turned(rooms: Path) -> Turned:
-    """Return the drives of turned rigs, each of which runs once."""
+    """Return the drives of turned rigs, up to their finding, each of which runs once."""
     right = read_rig(rooms / "rig.toml")
-    return cache(lambda turn_deg: monitored(rooms, with_upper_rotated(right, turn_deg)))
+    return cache(lambda turn_deg: monitored(rooms, with_upper_rotated(right, turn_deg), VIEWS))
 
 
 def monitor_after(
