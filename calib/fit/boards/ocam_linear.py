@@ -45,7 +45,7 @@ def powers(degree: int) -> Array:
 
 def solve_linear(observed: Observations, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
     """Find the camera and poses of least ray error, with a search over the centre; size (width, height) [px]."""
-    pixels, points = observed.pixels, observed.points
+    pixels, points = np.asarray(observed.pixels, float), np.asarray(observed.points, float)
     return _solved((pixels.tobytes(), len(pixels)), points.tobytes(), size, degree, view)
 
 
