@@ -20,8 +20,7 @@ from calib.boards.board_shape import (
     FEW_CORNERS,
     grid_irregularity,
     has_checker_pattern,
-    is_bounded_board,
-    is_complete_board,
+    outline,
     prediction_spread,
 )
 from calib.boards.corner_candidates import BLUR_PX, Grey, describe_corners, find_corners, smoothed
@@ -203,7 +202,7 @@ def _detection(image: Image, blurred: Grey, linked: tuple[Grid, list[Grid]], boa
     good = _without_outliers(blurred, refined)
     if np.isfinite(good[..., 0]).mean() < MIN_GOOD or not has_checker_pattern(blurred, good):
         return None
-    return _Detection(good, is_complete_board(blurred, refined), is_bounded_board(blurred, refined))
+    return _Detection(good, *outline(blurred, refined))
 
 
 def _without_outliers(blurred: Grey, corners: Array) -> Array:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array
@@ -36,26 +38,39 @@ def local_mapping(corners: Array, j: int, i: int, without: bool = False) -> Arra
     corners (rows, columns, 2), NaN if unknown; without=True excludes the corner itself. None if too few are known.
     """
     rows, columns = corners.shape[:2]
-    y, x = np.mgrid[
-        max(0, j - NEIGHBOURS) : min(rows, j + NEIGHBOURS + 1),
-        max(0, i - NEIGHBOURS) : min(columns, i + NEIGHBOURS + 1),
-    ]
-    near = corners[y, x].reshape(-1, 2)
-    x, y = (x - i).ravel().astype(float), (y - j).ravel().astype(float)
-    known = np.isfinite(near[:, 0]) & ((x != 0) | (y != 0) | (not without))
-    if known.sum() < MIN_NEIGHBOURS:
+    first, left = max(0, j - NEIGHBOURS), max(0, i - NEIGHBOURS)
+    last, right = min(rows, j + NEIGHBOURS + 1), min(columns, i + NEIGHBOURS + 1)
+    near = corners[first:last, left:right].reshape(-1, 2)
+    terms, share, is_other = _neighbours((first - j, last - j), (left - i, right - i))
+    known = np.isfinite(near[:, 0])
+    if without:
+        known &= is_other
+    if np.count_nonzero(known) < MIN_NEIGHBOURS:
         return None
-    weight = (np.exp(-(x * x + y * y) / WEIGHT_WIDTH) * known)[:, None]
-    A = quadratic_terms(x, y) * weight
+    weight = (share * known)[:, None]
+    A = terms * weight
     coefficients, _, rank, _ = np.linalg.lstsq(A, np.nan_to_num(near) * weight, rcond=1e-6)
     if not without:
         coefficients[0] = corners[j, i]
     return np.asarray(coefficients) if rank == 6 else None
 
 
+@cache
+def _neighbours(rows: tuple[int, int], columns: tuple[int, int]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return monomials (N, 6), weight (N,) and whether it is another corner (N,), of the neighbours of a corner.
+
+    rows, columns: the first and the end of the range of neighbours, relative to the corner.
+    """
+    y, x = (part.ravel().astype(float) for part in np.mgrid[slice(*rows), slice(*columns)])
+    return quadratic_terms(x, y), np.exp(-(x * x + y * y) / WEIGHT_WIDTH), (x != 0) | (y != 0)
+
+
 def quadratic_terms(x: Array, y: Array) -> Array:
     """Return the monomials 1, x, y, x^2, xy, y^2 (..., 6)."""
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    terms = np.empty((*x.shape, 6))
+    terms[..., 0], terms[..., 1], terms[..., 2] = 1.0, x, y
+    terms[..., 3], terms[..., 4], terms[..., 5] = x * x, x * y, y * y
+    return terms
 
 
 def grid_irregularity(corners: Array) -> Array:
@@ -115,18 +130,15 @@ def has_checker_pattern(image: Grey, corners: Array) -> bool:
     return bool(alternate >= least and np.nanmedian(spread) < most * abs(usual))
 
 
-def is_complete_board(image: Grey, corners: Array) -> bool:
-    """True if one ring of squares surrounds the corners (rows, columns, 2), and none follows it.
+def outline(image: Grey, corners: Array) -> tuple[bool, bool]:
+    """Return whether corners (rows, columns, 2) are a complete and a bounded board.
 
-    Brickwork and chequered floors continue beyond that ring.
+    Complete: one ring of squares surrounds them, and none follows it; brickwork and chequered floors continue beyond
+    that ring. Bounded: no second ring surrounds them; the first may be hidden.
     """
     around, beyond = _outer_steps(image, corners)
-    return _fraction_above(around, MIN_STEP) >= MIN_AROUND and not _goes_on(beyond)
-
-
-def is_bounded_board(image: Grey, corners: Array) -> bool:
-    """True if no second ring of squares surrounds the corners (rows, columns, 2); the first may be hidden."""
-    return not _goes_on(_outer_steps(image, corners)[1])
+    is_bounded = not _goes_on(beyond)
+    return is_bounded and _fraction_above(around, MIN_STEP) >= MIN_AROUND, is_bounded
 
 
 def _goes_on(beyond: Sequence[Sequence[Array]]) -> bool:

@@ -44,14 +44,16 @@ class UnifiedCamera:
 
     def project(self, points: Array) -> Array:
         """Return pixels (N, 2) of points (N, 3); NaN beyond the projection's edge. Mei and Rives 2007, eq. (1), (4)."""
-        norm = np.linalg.norm(points, axis=1)
+        norm = np.sqrt(np.add.reduce(points * points, axis=1))
         z = points[:, 2] / np.where(norm > 0, norm, np.nan)
         # Beyond this plane two rays would have the same pixel (xi > 1), or the denominator changes sign (xi <= 1).
         edge = -self.xi if self.xi <= 1 else -1 / self.xi
         scale = np.where(z > edge, norm * (z + self.xi), np.nan)
         m = points[:, :2] / np.where(scale > MIN_SCALE, scale, np.nan)[:, None]
-        m[~self._is_unfolded(m)] = np.nan
-        return np.asarray(self._distort(m) * self.focal + self.center)
+        distorted = self._distort(m)
+        if any(self.distortion):
+            distorted[~self._is_unfolded(m)] = np.nan
+        return np.asarray(distorted * self.focal + self.center)
 
     def lift(self, pixels: Array) -> Array:
         """Return unit rays (N, 3) of pixels (N, 2); NaN outside the sphere's image. Mei and Rives 2007, eq. (5)."""

@@ -23,9 +23,9 @@ STEP_DEG, CORNERS_DEG = 3.75, 3.0
 @pytest.mark.parametrize(
     ("model", "field_deg", "size"),
     [
-        ("pinhole", 30, (640, 480)),
+        ("pinhole", 30, (320, 240)),
         ("pinhole", 90, (640, 360)),
-        ("equidistant", 60, (640, 480)),
+        ("equidistant", 60, (320, 240)),
         ("equidistant", 150, (640, 120)),
         ("ds", 120, (640, 240)),
         ("eucm", 120, (640, 240)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,7 +56,12 @@ class DriveProblem:
 
     def cast(self, steps: Array, camera: Indices, points: Array) -> Array:
         """Return pixels (M, 2) of points (M, 3) in the rig frame after steps (P,) of the parameters."""
-        return project(self.parameters.at(steps), camera, points, self.parameters.wavefronts_at(steps))
+        return self.caster(steps, camera)(points)
+
+    def caster(self, steps: Array, camera: Indices) -> Callable[[Array], Array]:
+        """Return the projection of points (M, 3) in the rig frame to pixels (M, 2), after steps (P,)."""
+        rig, waves = self.parameters.at(steps), self.parameters.wavefronts_at(steps)
+        return lambda points: project(rig, camera, points, waves)
 
     def in_rig(self, state: DriveState, steps: Array) -> Array:
         """Return the landmark (M, 3) of each observation in the rig frame at the time of its exposure."""
@@ -161,12 +167,8 @@ class DriveProblem:
 
     def _by_point(self, steps: Array, points: Array) -> Array:
         """Return the derivative (M, 2, 3) of the pixels by the points in the rig frame."""
-        camera, reach = self.observations.camera, STEP * np.linalg.norm(points, axis=1, keepdims=True)
-        columns = [
-            (self.cast(steps, camera, points + reach * axis) - self.cast(steps, camera, points - reach * axis))
-            / (2 * reach)
-            for axis in np.eye(3)
-        ]
+        cast, reach = self.caster(steps, self.observations.camera), STEP * np.linalg.norm(points, axis=1, keepdims=True)
+        columns = [(cast(points + reach * axis) - cast(points - reach * axis)) / (2 * reach) for axis in np.eye(3)]
         return np.asarray(np.nan_to_num(np.stack(columns, axis=-1)))
 
     def _by_steps(self, state: DriveState) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,8 @@ class RigParameters:
     upper: CameraParameterisation
     times: tuple[str, ...] = ()  # of TIME_UNITS
     waves: tuple[str, ...] = ()  # all of WAVE_NAMES, or none
+    # The rig after the last turn (5,), which all steps of the cameras about one state share.
+    _turned: dict[bytes, Rig] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @staticmethod
     def about(
@@ -109,7 +111,11 @@ class RigParameters:
         """Return the rig after steps (P,). Raise CalibError where they lead to parameters that no camera has."""
         first, second = len(self.lower.names), len(self.lower.names) + len(self.upper.names)
         turn = steps[second : second + len(TRANSFORM_NAMES)] * ANGLE_UNIT_RAD
-        rig = self.rig.with_upper_moved(turn[:3], turn[3:])
+        rig = self._turned.get(turn.tobytes())
+        if rig is None:
+            rig = self.rig.with_upper_moved(turn[:3], turn[3:])
+            self._turned.clear()
+            self._turned[turn.tobytes()] = rig
         cameras = [
             _with_wavefront(own.camera_at(part), wavefront)
             for own, part, wavefront in zip(

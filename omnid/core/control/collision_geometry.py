@@ -15,6 +15,7 @@ from omnid.core.control.heading_controller import Twist
 
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
 STRAIGHT_RADPS: Final = 1e-3
+SPARE_M: Final = 0.1  # Added to a reach beyond which nothing can lie, so that rounding does not count.
 TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
 
 
@@ -25,9 +26,15 @@ class Outline(NamedTuple):
     rear_m: float
     half_width_m: float
 
-    def contains(self, x_m: float, y_m: float) -> bool:
-        """True for a point inside."""
-        return -self.rear_m <= x_m <= self.front_m and abs(y_m) <= self.half_width_m
+    def parted(self, points: Iterable[Point]) -> tuple[list[Point], list[Point]]:
+        """Return the points inside, also those at the edge, and the others."""
+        behind_m, front_m, half_width_m = -self.rear_m, self.front_m, self.half_width_m
+        inside: list[Point] = []
+        outside: list[Point] = []
+        for point in points:
+            is_inside = behind_m <= point[0] <= front_m and abs(point[1]) <= half_width_m
+            (inside if is_inside else outside).append(point)
+        return inside, outside
 
     def gap_m(self, x_m: float, y_m: float) -> float:
         """Return the distance of a point from the outline, 0 inside."""
@@ -113,8 +120,8 @@ def _crossings(outline: Outline, radius_m: float, rho2: float) -> list[tuple[flo
 
 def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point]:
     """Return the points within reach of a pose, in its axes."""
-    reach2 = reach_m * reach_m
-    return seen_from(pose, [(x, y) for x, y in points if (x - pose.x_m) ** 2 + (y - pose.y_m) ** 2 <= reach2])
+    (px, py), reach2 = pose[:2], reach_m * reach_m
+    return seen_from(pose, [(x, y) for x, y in points if (x - px) * (x - px) + (y - py) * (y - py) <= reach2])
 
 
 def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps: float) -> bool:
@@ -125,7 +132,8 @@ def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps
     side = math.copysign(1.0, velocity_mps)
     edge_m = outline.front_m if side > 0.0 else outline.rear_m
     way_m = math.hypot(pose.x_m, pose.y_m)
-    ahead = [(x, y) for x, y in points if side * x >= edge_m - TINY]
+    reach2 = (edge_m + outline.half_width_m + 2 * way_m + SPARE_M) ** 2  # what is farther away was not driven over
+    ahead = [(x, y) for x, y in points if side * x >= edge_m - TINY and x * x + y * y <= reach2]
     return any(
         edge_m - way_m <= side * x < edge_m and abs(y) <= outline.half_width_m for x, y in seen_from(pose, ahead)
     )

@@ -219,12 +219,9 @@ class CollisionMonitor:
         """Return the share before points; slope: those in the stop polygon count where the way to them is steeper."""
         settings, least_mps = self._settings, max(slope * abs(motion.velocity_mps), TINY)
         stop = self._stop_polygon(motion)
-        outside = []
-        for x, y in points:
-            if not stop.contains(x, y):
-                outside.append((x, y))
-            elif self._outline.approach_mps(x, y, motion) > least_mps:
-                return 0.0
+        inside, outside = stop.parted(points)
+        if any(self._outline.approach_mps(x, y, motion) > least_mps for x, y in inside):
+            return 0.0
         first_s = contact_s(stop, motion, outside)
         if first_s == math.inf:
             return 1.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.boards.board_shape import is_complete_board
+from calib.boards.board_shape import outline
 
 
 def chequers(columns: int, rows: int, margin_px: int) -> NDArray[np.uint8]:
@@ -23,4 +23,4 @@ def test_distinguishes_a_board_from_a_chequered_floor(columns: int, rows: int, m
     """Check 6x5 corners in a board of that size, in larger boards, in a floor, and in a smaller board."""
     corner = 12.0 * (1 + (columns > 8) + (rows > 8)) + margin_px - 0.5
     grid = np.stack(np.meshgrid(corner + 12 * np.arange(6), corner + 12 * np.arange(5)), axis=-1)
-    assert is_complete_board(chequers(columns, rows, margin_px).astype(np.float32), grid) is whole
+    assert outline(chequers(columns, rows, margin_px).astype(np.float32), grid)[0] is whole

@@ -14,12 +14,13 @@ from omnid.monitor.screen import fitted
 from tests.omnid.commands.test_calibrate_rig import BOARD, render_pairs, rig_of
 from tests.replay.command import Command
 
+PAIRS = 2  # of different places
 OPTIONS = ("--corners", "7x6", "--square-mm", "30")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return render_pairs(rig_of(640), tmp_path_factory.mktemp("pairs"), 3)
+    return render_pairs(rig_of(640), tmp_path_factory.mktemp("pairs"), PAIRS)
 
 
 def image(folder: Path, name: str) -> np.ndarray[tuple[int, int], np.dtype[np.uint8]]:
@@ -56,12 +57,12 @@ def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
 ) -> None:
     omnid, kept = Command(capsys), tmp_path / "kept"
     first = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert first.code == 1 and "3 pairs, not enough yet: 12 more positions" in first.err
+    assert first.code == 1 and f"{PAIRS} pairs, not enough yet: {15 - PAIRS} more positions" in first.err
     assert first.out.splitlines()[0].startswith("1: 14 more positions; both cameras: ")
-    assert sorted(path.name for path in kept.iterdir())[::3] == ["lower_001.png", "upper_001.png"]
-    np.testing.assert_array_equal(image(kept, "upper_003"), image(folder, "upper_02"))
+    assert sorted(path.name for path in kept.iterdir())[::PAIRS] == ["lower_001.png", "upper_001.png"]
+    np.testing.assert_array_equal(image(kept, "upper_002"), image(folder, "upper_01"))
     again = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert again.out == "" and "3 pairs, not enough yet" in again.err and len(list(kept.iterdir())) == 6
+    assert again.out == "" and f"{PAIRS} pairs, not enough yet" in again.err and len(list(kept.iterdir())) == 2 * PAIRS
 
 
 @pytest.mark.parametrize("side", ["lower", "upper"])
@@ -73,8 +74,8 @@ def test_live_goes_on_after_half_a_pair(
     before = (folder / f"{side}_00.png").read_bytes()
     (kept / half).write_bytes(before)
     again = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert again.code == 1 and "3 pairs, not enough yet" in again.err
-    assert (kept / half).read_bytes() == before and len(list(kept.iterdir())) == 7
+    assert again.code == 1 and f"{PAIRS} pairs, not enough yet" in again.err
+    assert (kept / half).read_bytes() == before and len(list(kept.iterdir())) == 2 * PAIRS + 1
 
 
 def test_live_refuses_images_of_another_size(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,7 +21,7 @@ PX_PER_MM = DPI / 25.4
 def printed(tmp_path: Path, *options: object) -> tuple[NDArray[np.uint8], str]:
     """The page as grey pixels, and its text."""
     path = tmp_path / "board.pdf"
-    subprocess.run([sys.executable, "-m", "omnid", "calibrate", "board", *map(str, options), "-o", path], check=True)
+    assert main(["calibrate", "board", *map(str, options), "-o", str(path)]) == 0
     page = pypdfium2.PdfDocument(path)[0]
     image = page.render(scale=DPI / 72, grayscale=True).to_numpy()
     return np.ascontiguousarray(image.reshape(image.shape[:2])), page.get_textpage().get_text_range()
@@ -74,6 +74,7 @@ def test_markers_are_read_and_true_to_scale(
 
 
 def test_a_board_that_does_not_fit_names_a_paper_that_does(tmp_path: Path) -> None:
+    """Run the program as its users do."""
     command = [
         sys.executable,
         "-m",

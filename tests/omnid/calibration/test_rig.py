@@ -9,7 +9,7 @@ import pytest
 import omnid
 from calib.camera_file import read_camera
 from calib.rig_file import read_rig
-from omnid.calibration.rig import RigResult
+from omnid.calibration.rig import RigResult, _check_baseline
 from omnid.errors import OmnidError
 from tests.omnid.commands.test_calibrate_rig import BOARD, TRUTH, render_pairs, turn_off_deg
 
@@ -45,7 +45,7 @@ def test_what_is_saved_is_the_rig(found: RigResult, tmp_path: Path) -> None:
     assert turn_off_deg(read) < 0.03
 
 
-def test_a_baseline_far_from_the_expected_one_is_refused(folder: Path) -> None:
-    cameras = read_camera(folder / "lower.toml"), read_camera(folder / "upper.toml")
+def test_a_baseline_far_from_the_expected_one_is_refused(found: RigResult) -> None:
+    """The command refuses it as well, in test_calibrate_rig.py."""
     with pytest.raises(OmnidError, match=r"--square-mm .* would explain it"):
-        omnid.calibrate_rig(folder, BOARD, cameras=cameras, expected_baseline_m=0.21)
+        _check_baseline(found.calibration, BOARD, 0.21)

@@ -21,14 +21,15 @@ from tests.simulation.boards import BoardRenderer, board_poses_around_camera
 BOARD = Board(6, 5, 0.03)
 CAMERA = UnifiedCamera(0.9, (-110.0, 110.5), (178.3, 181.1), (360, 362))
 MASK = Mask(CAMERA.center, 30.0, 172.0)
+VIEWS = 6
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Render eight images of a board on all sides."""
+    """Render six images of a board on all sides."""
     made = tmp_path_factory.mktemp("images")
     renderer = BoardRenderer.of(BOARD, CAMERA, MASK)
-    for seed, T in enumerate(board_poses_around_camera(CAMERA, BOARD, MASK, 8, distance_m=(0.14, 0.25))):
+    for seed, T in enumerate(board_poses_around_camera(CAMERA, BOARD, MASK, VIEWS, distance_m=(0.14, 0.25))):
         cv2.imwrite(str(made / f"p{seed}.png"), renderer.render_board(T, seed=seed).image)
     return made
 
@@ -41,7 +42,7 @@ def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path, capsys: pyt
     out, report, mask = (tmp_path / name for name in ("camera.toml", "report.html", "mask.png"))
     assert run(folder, "-o", out, "--report", report, "--mask", mask) == 0
     line = capsys.readouterr().out
-    assert line.count("\n") == 1 and "of 8 views" in line and "mean reprojection error 0.0" in line
+    assert line.count("\n") == 1 and f"of {VIEWS} views" in line and "mean reprojection error 0.0" in line
     assert "model omni" in line and "MISFIT" not in line
     read = read_camera(out)
     assert isinstance(read.camera, UnifiedCamera)
@@ -49,8 +50,8 @@ def test_writes_camera_report_and_mask(folder: Path, tmp_path: Path, capsys: pyt
     assert read.mask is not None and read.mask.outer_px == pytest.approx(MASK.outer_px, abs=3)
     assert read.mask.inner_px == pytest.approx(MASK.inner_px, abs=4)
     page = report.read_text()
-    assert page.count("data:image/jpeg;base64,") == 10 and "://" not in page
-    assert all(f"p{number}.png" in page for number in range(8)) and "standard deviation" in page
+    assert page.count("data:image/jpeg;base64,") == VIEWS + 2 and "://" not in page
+    assert all(f"p{number}.png" in page for number in range(VIEWS)) and "standard deviation" in page
 
 
 @pytest.mark.slow
@@ -61,7 +62,7 @@ def test_calibrates_an_omni_camera_by_a_pattern_with_a_blank_image(
         shutil.copy(path, tmp_path)
     cv2.imwrite(str(tmp_path / "p9.png"), np.full((362, 360), 90, np.uint8))
     assert run(f"{tmp_path}/p*.png", "--model", "omni", "-o", tmp_path / "camera.toml") == 0
-    assert "of 8 views" in capsys.readouterr().out
+    assert f"of {VIEWS} views" in capsys.readouterr().out
     camera = read_camera(tmp_path / "camera.toml").camera
     assert isinstance(camera, UnifiedCamera) and camera.focal == pytest.approx(CAMERA.focal, rel=2e-3)
 
@@ -88,7 +89,7 @@ def test_calibrates_by_a_log_and_requires_the_topic(
     assert run(tmp_path / "log.mcap", "-o", tmp_path / "camera.toml") == 2
     assert "expected --topic, to select the camera, found image topics /lower, /upper" in capsys.readouterr().err
     assert run(tmp_path / "log.mcap", "--topic", "/upper", "--model", "omni", "-o", tmp_path / "camera.toml") == 0
-    assert "of 8 views" in capsys.readouterr().out
+    assert f"of {VIEWS} views" in capsys.readouterr().out
     assert read_camera(tmp_path / "camera.toml").camera.center == pytest.approx(CAMERA.center, abs=0.3)
 
 

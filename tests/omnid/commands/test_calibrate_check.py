@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from omnid.cli import main
 from omnid.config import PanoramaConfig
 from omnid.core.rig.rig_state import RigState
 from omnid.messages import FramePair
+from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 from tests.simulation.readout import Readout
 from tests.simulation.rigs import with_upper_rotated
@@ -25,14 +27,26 @@ from tests.simulation.rigs import with_upper_rotated
 Turn = tuple[float, float, float]
 
 
+PAIRS = 12  # the error of a turn is a third of what tests allow
+
+
 @pytest.fixture(scope="module")
-def pairs(scene: Path) -> list[FramePair]:
-    rig = read_rig(scene / "rig.toml")
-    return read_rig_pairs(open_log(scene / "log.mcap", (None, None), rig), rig)
+def drive(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with the log of the first half of the scene, and its rig.toml."""
+    folder = tmp_path_factory.mktemp("drive")
+    save(folder / "log.mcap", (image for image in images(scene / "log.mcap") if image.pair < PAIRS))
+    shutil.copy(scene / "rig.toml", folder)
+    return folder
 
 
-def check_rotated(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
-    return check_rig(pairs, with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg), PanoramaConfig())
+@pytest.fixture(scope="module")
+def pairs(drive: Path) -> list[FramePair]:
+    rig = read_rig(drive / "rig.toml")
+    return read_rig_pairs(open_log(drive / "log.mcap", (None, None), rig), rig)
+
+
+def check_rotated(drive: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
+    return check_rig(pairs, with_upper_rotated(read_rig(drive / "rig.toml"), turn_deg), PanoramaConfig())
 
 
 def test_images_that_are_not_synchronous_make_pairs(tmp_path: Path) -> None:
@@ -60,46 +74,46 @@ def test_motion_between_the_exposures_is_no_drift_to_correct(
     assert "calibrate drive" in capsys.readouterr().err and not (tmp_path / "new.toml").exists()
 
 
-def test_reports_a_good_rig(scene: Path, pairs: list[FramePair]) -> None:
-    found = check_rotated(scene, pairs, (0, 0, 0))
+def test_reports_a_good_rig(drive: Path, pairs: list[FramePair]) -> None:
+    found = check_rotated(drive, pairs, (0, 0, 0))
     assert found.state is RigState.FITS and found.finding.state is RigState.FITS and found.finding.turn_deg < 0.05
     assert abs(found.finding.offset_px) < 0.03 and found.finding.left_px < 0.15 and None not in found.rims
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5), (0, 0, -0.5)])
-def test_measures_half_a_degree_about_every_axis(scene: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
-    found = check_rotated(scene, pairs, turn_deg).finding
+def test_measures_half_a_degree_about_every_axis(drive: Path, pairs: list[FramePair], turn_deg: Turn) -> None:
+    found = check_rotated(drive, pairs, turn_deg).finding
     assert found.state is RigState.DRIFTED and found.drift is not None
     assert np.rad2deg(found.drift.turn) == pytest.approx(turn_deg, abs=0.05)
 
 
-def test_rotation_about_the_vertical_is_constant_and_a_tilt_a_wave(scene: Path, pairs: list[FramePair]) -> None:
-    turned, tilted = (check_rotated(scene, pairs, turn).finding for turn in ((0.0, 0.0, 2.0), (0.0, 2.0, 0.0)))
+def test_rotation_about_the_vertical_is_constant_and_a_tilt_a_wave(drive: Path, pairs: list[FramePair]) -> None:
+    turned, tilted = (check_rotated(drive, pairs, turn).finding for turn in ((0.0, 0.0, 2.0), (0.0, 2.0, 0.0)))
     medians = [np.array([median for _, median, count in found.by_azimuth if count > 10]) for found in (turned, tilted)]
     assert medians[0].min() > 1.5 and np.ptp(medians[0]) < 0.5
     assert medians[1].min() < -0.2 and medians[1].max() > 0.2
 
 
-def test_measures_many_degrees(scene: Path, pairs: list[FramePair]) -> None:
-    found = check_rotated(scene, pairs, (0.0, 0.0, 11.0)).finding
+def test_measures_many_degrees(drive: Path, pairs: list[FramePair]) -> None:
+    found = check_rotated(drive, pairs, (0.0, 0.0, 11.0)).finding
     assert found.state is RigState.BROKEN and found.turn_deg == pytest.approx(11.0, abs=0.1)
 
 
-def test_reports_large_errors_as_broken(scene: Path, pairs: list[FramePair]) -> None:
-    assert check_rotated(scene, pairs, (0, 3.0, 0)).finding.state is RigState.BROKEN
+def test_reports_large_errors_as_broken(drive: Path, pairs: list[FramePair]) -> None:
+    assert check_rotated(drive, pairs, (0, 3.0, 0)).finding.state is RigState.BROKEN
     exchanged = [replace(pair, lower=pair.upper, upper=pair.lower) for pair in pairs]
-    assert check_rotated(scene, exchanged, (0, 0, 0)).state is not RigState.FITS
+    assert check_rotated(drive, exchanged, (0, 0, 0)).state is not RigState.FITS
 
 
 def run(*words: object) -> int:
     return main(["calibrate", "check", *map(str, words)])
 
 
-def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log, wrong, right = scene / "log.mcap", tmp_path / "wrong.toml", tmp_path / "right.toml"
-    truth = read_rig(scene / "rig.toml")
+def test_command_reports_and_corrects_a_drift(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, wrong, right = drive / "log.mcap", tmp_path / "wrong.toml", tmp_path / "right.toml"
+    truth = read_rig(drive / "rig.toml")
     write_rig(wrong, with_upper_rotated(truth, (0.6, -0.4, 1.5)))
-    assert run(log, "--rig", scene / "rig.toml") == 0
+    assert run(log, "--rig", drive / "rig.toml") == 0
     assert capsys.readouterr().out.startswith("fits: ")
     assert run(log, "--rig", wrong, "--refine", "-o", right) == 1
     output = capsys.readouterr().out
@@ -114,26 +128,26 @@ def test_command_reports_and_corrects_a_drift(scene: Path, tmp_path: Path, capsy
 
 
 def test_recommends_recalibration_for_a_shifted_centre(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = read_rig(scene / "rig.toml")
+    rig = read_rig(drive / "rig.toml")
     camera = rig.upper.camera
     assert isinstance(camera, UnifiedCamera)
     off = replace(camera, center=(camera.center[0] + 2.0, camera.center[1]))
     write_rig(tmp_path / "rig.toml", replace(rig, upper=replace(rig.upper, camera=off)))
-    assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
+    assert run(drive / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
     assert "calibrate again with a board" in capsys.readouterr().out
 
 
-def test_reports_a_mask_beyond_the_rim(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = read_rig(scene / "rig.toml")
+def test_reports_a_mask_beyond_the_rim(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = read_rig(drive / "rig.toml")
     assert rig.lower.mask is not None
     u, v = rig.lower.mask.center
     write_rig(
         tmp_path / "rig.toml",
         replace(rig, lower=replace(rig.lower, mask=Mask((u + 9, v), 0.0, rig.lower.mask.outer_px))),
     )
-    assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
+    assert run(drive / "log.mcap", "--rig", tmp_path / "rig.toml") == 1
     output = capsys.readouterr().out
     assert output.startswith("drifted: ") and "lower rim: centre moved by -9.0" in output and "upper rim" in output
 
@@ -149,23 +163,23 @@ def test_reports_a_mask_beyond_the_rim(scene: Path, tmp_path: Path, capsys: pyte
     ],
 )
 def test_invalid_input_is_one_line(
-    scene: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    drive: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(scene / "log.mcap", *words) == 2
+    assert run(drive / "log.mcap", *words) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line
 
 
 def test_images_of_another_size_are_a_one_line_error(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
+    text = (drive / "rig.toml").read_text().replace("size = [256, 256]", "size = [300, 256]")
     (tmp_path / "rig.toml").write_text(text)
-    assert run(scene / "log.mcap", "--rig", tmp_path / "rig.toml") == 2
+    assert run(drive / "log.mcap", "--rig", tmp_path / "rig.toml") == 2
     assert "images are 256x256 px, the rig's are 300x256" in capsys.readouterr().err
 
 
-def test_dark_log_is_unknown(scene: Path, pairs: list[FramePair]) -> None:
+def test_dark_log_is_unknown(drive: Path, pairs: list[FramePair]) -> None:
     dark = [replace(pair, lower=np.zeros_like(pair.lower), upper=np.zeros_like(pair.upper)) for pair in pairs]
-    found = check_rotated(scene, dark, (0, 0, 0))
+    found = check_rotated(drive, dark, (0, 0, 0))
     assert found.finding.state is RigState.UNCHECKED and found.rims == (None, None)

@@ -16,22 +16,32 @@ from omnid import OmnidError, calibrate_drive, replay
 from omnid.cli import main
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
+from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 from tests.simulation.rigs import with_real_mirrors
+
+
+@pytest.fixture(scope="module")
+def short(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a log of the first six pairs of the scene, of which a refusal takes a second."""
+    path = tmp_path_factory.mktemp("short") / "log.mcap"
+    save(path, (image for image in images(scene / "log.mcap") if image.pair < 6))
+    return path
 
 
 def calibrate(*words: object) -> int:
     return main(["calibrate", "drive", *map(str, words)])
 
 
-def test_a_short_drive_is_refused(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
+def test_a_short_drive_is_refused(scene: Path, short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = calibrate(short, "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
     assert code == 2 and "take a longer drive" in capsys.readouterr().err
     assert not (tmp_path / "rig.toml").exists()
 
 
-def test_logs_and_the_rig_may_be_names_of_files(scene: Path) -> None:
-    for logs in (str(scene / "log.mcap"), [str(scene / "log.mcap")], [scene / "log.mcap"]):
+def test_logs_and_the_rig_may_be_names_of_files(scene: Path, short: Path) -> None:
+    """The command gives a list of paths."""
+    for logs in (str(short), [str(short)]):
         with pytest.raises(OmnidError, match="take a longer drive"):
             calibrate_drive(logs, str(scene / "rig.toml"))
 

@@ -120,12 +120,12 @@ def test_rejects_outlier_views_by_name() -> None:
 
 
 def test_hidden_corners_have_no_effect() -> None:
-    views = seen_by(OMNI)
+    views = seen_by(OCAM)
     holed = [
         replace(view, pixels=np.where(np.arange(42)[:, None] % 9 == k % 9, np.nan, view.pixels))
         for k, view in enumerate(views)
     ]
-    assert turned_apart_rad(fit_camera(holed, BOARD, SIZE, "omni").camera, OMNI) < 1e-5
+    assert turned_apart_rad(fit_camera(holed, BOARD, SIZE).camera, OCAM) < 1e-5
 
 
 @pytest.mark.slow
@@ -143,8 +143,8 @@ def test_refuses_too_few_views() -> None:
     views = seen_by(OMNI)
     with pytest.raises(CalibError, match="expected at least 4 views of the board, found 3; take more"):
         fit_camera(views[:3], BOARD, SIZE)
-    with pytest.raises(CalibError, match="expected at least 4 consistent views, found 3; left out view6"):
-        fit_camera([views[0], views[4], spoilt(views)[6], views[8]], BOARD, SIZE)
+    with pytest.raises(CalibError, match="expected at least 4 consistent views, found 3; left out view2"):
+        fit_camera([views[0], views[4], spoilt(views)[2], views[8]], BOARD, SIZE)
 
 
 def test_warns_of_views_on_one_side_only() -> None:

@@ -8,7 +8,7 @@ import pytest
 from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.fit.boards.camera_fit import observations
-from calib.fit.boards.camera_selection import MODELS, camera_structure, select_calibration
+from calib.fit.boards.camera_selection import MODELS, camera_structure, select_calibration, with_print_shape
 from calib.fit.boards.cross_validation import held_out_error_px
 from calib.models.camera import Mask
 from calib.models.ocam import OcamCamera
@@ -55,6 +55,8 @@ def test_the_tangential_model_describes_a_tilted_camera() -> None:
 
 def test_held_out_error_of_the_right_model_is_near_the_noise() -> None:
     seen = views(NOMINAL, 8)
-    found = select_calibration(seen, BOARD, SIZE, "omni").calibration
+    selected = select_calibration(seen, BOARD, SIZE, "omni")
+    found = selected.calibration
     held_out_px = held_out_error_px(found.camera, found.fit.T_cam_board, observations(found.views, BOARD))
     assert found.fit.mean_px < held_out_px < 0.05 * np.sqrt(np.pi / 2) * 1.2
+    assert with_print_shape(selected, "mirror") is selected, "the board is as drawn"

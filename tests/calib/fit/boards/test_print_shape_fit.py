@@ -46,8 +46,9 @@ def test_a_rig_finds_the_shape_and_fits_to_its_noise(shape: PrintShape) -> None:
     assert max(off(found)) < 0.2 * max(off(flat))
 
 
-def test_flat_boards_stay_flat_and_their_rigs_the_same() -> None:
-    for seed in range(8):
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 8), marks=pytest.mark.slow)])
+def test_flat_boards_stay_flat_and_their_rigs_the_same(seeds: range) -> None:
+    for seed in seeds:
         flat = fit_rig(views_of(AS_DRAWN, seed), ODD, (LOWER, UPPER))
         assert rig_print_shape(flat, refined=True) == AS_DRAWN == flat.shape
 
@@ -64,6 +65,3 @@ def test_one_camera_finds_the_shape_and_selects_its_model_with_it() -> None:
     found = with_print_shape(flat, "mirror").calibration
     np.testing.assert_allclose(found.shape.bends_m, BENT.bends_m, atol=2e-4)
     assert found.fit.mean_px < flat.calibration.fit.mean_px
-    straight = [lower for view in views_of(AS_DRAWN, count=9) if (lower := view.seen[0])]
-    flat = select_calibration(straight, ODD, LOWER.size, "omni")
-    assert with_print_shape(flat, "mirror") is flat

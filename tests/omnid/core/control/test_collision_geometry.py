@@ -76,7 +76,7 @@ def test_a_motion_approaches_a_point_or_leaves_it() -> None:
             continue
         nearer = outline.is_approached(point.real, point.imag, motion)
         assert nearer == (speed_mps > 0.0), (outline, motion, point)
-        counts[outline.contains(point.real, point.imag), nearer] += 1
+        counts[bool(outline.parted([(point.real, point.imag)])[0]), nearer] += 1
     assert min(counts.values()) > 100
     assert not OUTLINE.is_approached(0.0, 0.26, Twist(0.1)), "along an edge is not nearer"
 
@@ -100,6 +100,7 @@ def test_the_edge_the_gap_and_the_farthest_corner_are_those_of_the_rectangle() -
         point = rng.uniform(0.0, 2.0) * ray
         depth_m = float(swept_outline.depth_m(outline, point))
         assert outline.gap_m(point.real, point.imag) == pytest.approx(max(depth_m, 0.0))
-        assert outline.contains(point.real, point.imag) == (depth_m <= 0.0)
+        inside, outside = outline.parted([(point.real, point.imag)])
+        assert (len(inside), len(outside)) == ((1, 0) if depth_m <= 0.0 else (0, 1))
         corner_m = max(abs(complex(x, outline.half_width_m)) for x in (outline.front_m, outline.rear_m))
         assert outline.radius_m == pytest.approx(corner_m)

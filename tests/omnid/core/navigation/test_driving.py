@@ -24,17 +24,18 @@ def to_goal(base: DrivenBase, x: float, y: float, heading: float | None) -> None
 
 
 @pytest.mark.parametrize(
-    ("goal", "seeds"),
+    ("goal", "first"),
     [
-        ((10.0, 0.0, 0.0), range(4)),
-        ((3.0, 2.0, math.pi / 2), range(4, 8)),
-        ((-2.0, -1.0, 0.3), range(8, 12)),
-        ((0.0, 0.0, math.pi), range(12, 14)),
-        ((0.06, 0.03, 0.0), range(14, 18)),
+        ((10.0, 0.0, 0.0), 0),
+        ((3.0, 2.0, math.pi / 2), 4),
+        ((-2.0, -1.0, 0.3), 8),
+        ((0.0, 0.0, math.pi), 12),
+        ((0.06, 0.03, 0.0), 14),
     ],
 )
-def test_reaches_goals_within_3_cm_and_1_degree(goal: tuple[float, float, float], seeds: range) -> None:
-    for seed in seeds:
+@pytest.mark.parametrize("seeds", [range(2), pytest.param(range(2, 4), marks=pytest.mark.slow)])
+def test_reaches_goals_within_3_cm_and_1_degree(goal: tuple[float, float, float], first: int, seeds: range) -> None:
+    for seed in (first + more for more in seeds):
         base = DrivenBase(Navigator(NavigationSettings()), seed)
         to_goal(base, *goal)
         assert base.run(90).state is NavigationState.REACHED

@@ -149,7 +149,7 @@ def test_goes_back_only_as_far_as_it_is_free() -> None:
     base = BaseAmongOthers(
         (*CORRIDOR, person(3.0, 0.0)), lambda base: person(behind_m, 0.0) if base.t_s > 10.0 else None, 5
     )
-    base.run(60, lambda _: base.t_s > 50)
+    base.run(60, lambda _: base.t_s > 35)
     later = [float(sample.pose[0]) for sample in base.samples if sample.t_s > 10.0]
     assert min(later) > behind_m + 0.2 + 0.2, "outline of both"
     assert max(later) - min(later) > 0.15, "it did go back a little"
@@ -157,7 +157,7 @@ def test_goes_back_only_as_far_as_it_is_free() -> None:
 
 def test_stays_where_it_is_blocked_if_that_is_wanted() -> None:
     base = BaseAmongOthers((*CORRIDOR, person(3.0, 0.0)), lambda _: None, 6, NavigationSettings(give_way_m=0.0))
-    base.run(60, lambda _: base.t_s > 50)
+    base.run(60, lambda _: base.t_s > 30)
     assert not base.began_to_give_way() and base.states[-1] is NavigationState.BLOCKED
 
 

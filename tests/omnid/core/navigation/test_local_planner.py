@@ -120,7 +120,7 @@ def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
 def test_waits_where_there_is_no_way_and_says_so(boxes: Boxes) -> None:
     base = drive(boxes, 1)
     base.run(90, lambda answer: answer.state is NavigationState.BLOCKED)
-    for _ in range(40):
+    for _ in range(15):
         answer = base.run(2, lambda _: True, rest_s=1.0)
     assert answer.state is NavigationState.BLOCKED and answer.reason.endswith(WAITS)
     assert 0.05 < clearance_m(base) < 1.0

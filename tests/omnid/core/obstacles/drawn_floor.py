@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -61,14 +62,22 @@ def panoramas(
     """
     rng = np.random.default_rng(seed)
     lower, upper = (
-        _drawn(height + drop_m, floor, wall_m, wall, pole, rng) for height in (HEIGHT_M, HEIGHT_M + BASELINE_M)
+        _exposed(_drawn(height + drop_m, floor, wall_m, wall, pole), rng)
+        for height in (HEIGHT_M, HEIGHT_M + BASELINE_M)
     )
     return lower, upper
 
 
-def _drawn(
-    height_m: float, floor: Pattern, wall_m: float, wall: Pattern, pole: Pole | None, rng: np.random.Generator
-) -> PaddedPanorama:
+def _exposed(grey: np.ndarray, rng: np.random.Generator) -> PaddedPanorama:
+    """Return grey levels with noise."""
+    image = grey + rng.normal(0.0, 1.0, grey.shape)
+    padded = np.pad(np.clip(np.rint(image), 0, 255).astype(np.uint8), ((0, 0), (PAD_PX, PAD_PX)), mode="wrap")
+    return PaddedPanorama(padded, PAD_PX, noise_grey=1.0)
+
+
+@lru_cache(maxsize=16)  # most pairs differ in their noise only
+def _drawn(height_m: float, floor: Pattern, wall_m: float, wall: Pattern, pole: Pole | None) -> np.ndarray:
+    """Return the grey levels of a panorama without noise."""
     columns, rows = np.meshgrid(np.arange(CYLINDER.width), np.arange(CYLINDER.height))
     rays = CYLINDER.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float))
     with np.errstate(divide="ignore"):
@@ -80,6 +89,4 @@ def _drawn(
     if pole is not None:
         hidden = (np.abs(azimuth) < pole.width_m / pole.range_m / 2) & (r > pole.range_m)
         grey = np.where(hidden, pole.grey, grey)
-    image = grey.reshape(columns.shape) + rng.normal(0.0, 1.0, columns.shape)
-    padded = np.pad(np.clip(np.rint(image), 0, 255).astype(np.uint8), ((0, 0), (PAD_PX, PAD_PX)), mode="wrap")
-    return PaddedPanorama(padded, PAD_PX, noise_grey=1.0)
+    return np.asarray(grey.reshape(columns.shape))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
+from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
@@ -41,6 +44,7 @@ SEEDS = range(5)  # of the noise: pairs from one place differ by it
 Pairs = list[ColumnEvidence]
 
 
+@cache  # many tests see the same room
 def evidence(
     floor: Pattern, wall: Pattern, drop_m: float = 0.0, wall_m: float = WALL_M, pole: Pole | None = None
 ) -> Pairs:
@@ -444,16 +448,12 @@ def test_who_stood_near_when_odometry_began_again_and_leaves_is_no_obstacle(grid
     assert np.nanmin(after(grid, seen, 150, first=50).ranges_m) > 1.5
 
 
-@pytest.mark.parametrize("strut_deg", [4.0, 8.0])
-def test_masked_struts_of_a_base_that_turns_are_no_person_who_comes(grid: ObstacleGrid, strut_deg: float) -> None:
-    visible = VISIBLE.copy()
-    azimuths_deg = np.degrees(np.pi - (np.arange(CYLINDER.width) + 0.5) / CYLINDER.focal_px)
-    for strut in (40.0, 160.0, -80.0):
-        visible[:, np.abs((azimuths_deg - strut + 180) % 360 - 180) < strut_deg / 2] = False
-    columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), SETTINGS.heights_m, (NEAREST_M, 6.0), visible)
-    tracker, found, moving = MovingTracker(), 0, 0
-    for n in range(30):
-        yaw = 0.08 * max(n - 14, 0)
+@pytest.fixture(scope="module")
+def turning() -> list[tuple[float, tuple[PaddedPanorama, PaddedPanorama]]]:
+    """Return the yaw [rad] and the panoramas of a base that stands, and then turns on the spot."""
+    made = [(0.0, panoramas(stains, 3.0, striped, seed=n)) for n in range(15)]
+    for n in range(15, 30):
+        yaw = 0.08 * (n - 14)
         c, s = np.cos(yaw), np.sin(yaw)
         views = panoramas(
             lambda x, y, c=c, s=s: stains(c * x - s * y, s * x + c * y),  # type: ignore[misc]
@@ -461,6 +461,21 @@ def test_masked_struts_of_a_base_that_turns_are_no_person_who_comes(grid: Obstac
             lambda azimuth, height, yaw=yaw: striped(azimuth + yaw, height),  # type: ignore[misc]
             seed=n,
         )
+        made.append((yaw, views))
+    return made
+
+
+@pytest.mark.parametrize("strut_deg", [4.0, 8.0])
+def test_masked_struts_of_a_base_that_turns_are_no_person_who_comes(
+    grid: ObstacleGrid, turning: list[tuple[float, tuple[PaddedPanorama, PaddedPanorama]]], strut_deg: float
+) -> None:
+    visible = VISIBLE.copy()
+    azimuths_deg = np.degrees(np.pi - (np.arange(CYLINDER.width) + 0.5) / CYLINDER.focal_px)
+    for strut in (40.0, 160.0, -80.0):
+        visible[:, np.abs((azimuths_deg - strut + 180) % 360 - 180) < strut_deg / 2] = False
+    columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), SETTINGS.heights_m, (NEAREST_M, 6.0), visible)
+    tracker, found, moving = MovingTracker(), 0, 0
+    for n, (yaw, views) in enumerate(turning):
         pose = se3.transform(se3.exp(np.array([0, 0, 0, 0, 0, yaw]))[:3, :3], [0.0, 0.0, 0.0])
         ring = grid.update(n * PERIOD_NS, pose, columns.evidence(*views))
         found += int(np.isfinite(ring.arrivals.ranges_m).sum())

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,8 @@ from tests.simulation import build, write_log
 from tests.simulation.readout import PERIOD_NS
 from tests.simulation.rigs import with_upper_rotated
 
+# Runs the drive of a rig whose upper camera is turned by degrees about x, y and z.
+Turned = Callable[[tuple[float, float, float]], tuple[RigHealth, "Collector"]]
 SECONDS = 10**9
 PERIOD_S = 5.0
 
@@ -60,11 +64,12 @@ class Collector(list[Panoramas]):
         self.append(panoramas)
 
 
-def monitored(folder: Path, rig: Rig) -> tuple[RigHealth, Collector]:
-    """Run a log through the stages; return the monitor and the panoramas."""
+def monitored(folder: Path, rig: Rig, most: int | None = None) -> tuple[RigHealth, Collector]:
+    """Run a log, or at most so many of its pairs, through the stages; return the monitor and the panoramas."""
     place, config, graph = geometry(rig, PanoramaConfig()), PanoramaConfig(), Graph(threaded=False)
     monitor, kept = RigHealth(place.cylinder, "off", PERIOD_NS / SECONDS), Collector()
-    frames = graph.source("log", LogReader(folder / "log.mcap").frames)
+    reader = LogReader(folder / "log.mcap")
+    frames = graph.source("log", lambda: islice(reader.frames(), None if most is None else 2 * most))
     pairs = graph.stage("pair", Synchronise(rig, PairConfig()), frames)
     panoramas = graph.stage("dewarp", Dewarp(place, config), pairs)
     graph.sink("rig", Driver(monitor), panoramas, policy=NEWEST, depth=1)
@@ -76,6 +81,13 @@ def monitored(folder: Path, rig: Rig) -> tuple[RigHealth, Collector]:
 @pytest.fixture(scope="module")
 def true(rooms: Path) -> tuple[RigHealth, Collector]:
     return monitored(rooms, read_rig(rooms / "rig.toml"))
+
+
+@pytest.fixture(scope="module")
+def turned(rooms: Path) -> Turned:
+    """Return the drives of turned rigs, up to their finding, each of which runs once."""
+    right = read_rig(rooms / "rig.toml")
+    return cache(lambda turn_deg: monitored(rooms, with_upper_rotated(right, turn_deg), VIEWS))
 
 
 def monitor_after(
@@ -99,16 +111,16 @@ def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
 
 
 @pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
-def test_half_a_degree_is_a_warning(rooms: Path, turn_deg: tuple[float, float, float]) -> None:
-    monitor, _ = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), turn_deg))
+def test_half_a_degree_is_a_warning(turned: Turned, turn_deg: tuple[float, float, float]) -> None:
+    monitor, _ = turned(turn_deg)
     status = rig_status(monitor, None)
     assert status.level == 1 and status.message.startswith("drifted: ") and monitor.finding and monitor.finding.drift
     assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
     assert float(status.values["turn_deg"]) == pytest.approx(np.linalg.norm(turn_deg), abs=0.05)
 
 
-def test_three_degrees_are_an_error(rooms: Path) -> None:
-    status = rig_status(monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))[0], None)
+def test_three_degrees_are_an_error(turned: Turned) -> None:
+    status = rig_status(turned((0.0, 3.0, 0.0))[0], None)
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
@@ -120,8 +132,9 @@ def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) 
 
 def test_few_places_give_no_finding_however_often(true: tuple[RigHealth, Collector]) -> None:
     places = true[1][::3]
-    assert monitor_after(true, places[: MIN_PLACES - 1] * 8).finding is None
-    found = monitor_after(true, places[:MIN_PLACES] * 6).finding
+    assert 4 * (MIN_PLACES - 1) > VIEWS
+    assert monitor_after(true, places[: MIN_PLACES - 1] * 4).finding is None
+    found = monitor_after(true, places[:MIN_PLACES] * 3).finding
     assert found is not None and found.state is RigState.FITS and found.tried <= MIN_PLACES * POINTS
 
 
@@ -132,8 +145,8 @@ def test_uses_no_more_views_than_its_period_allows(true: tuple[RigHealth, Collec
     assert back.new_views == 5
 
 
-def test_a_rig_that_moves_during_the_run_is_detected(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
-    _, after = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 0.0, 0.5)))
+def test_a_rig_that_moves_during_the_run_is_detected(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
+    _, after = turned((0.0, 0.0, 0.5))
     monitor = monitor_after(true, [*true[1], *after, *after])  # the same loop, where every place was viewed before
     assert monitor.finding is not None and monitor.state is RigState.DRIFTED
     assert monitor.finding.turn_deg == pytest.approx(0.5, abs=0.05)
@@ -163,8 +176,8 @@ def test_the_status_has_the_result_of_the_start(rooms: Path, true: tuple[RigHeal
     status = rig_status(health, None)
     assert (status.level, status.message, status.values["state"]) == (0, "fits", "fits") and not health.is_checking
     for turn_deg, level, words in ((0.8, 1, "do not quite fit"), (3.0, 2, "contradict the rig")):
-        _, seen = monitored(rooms, with_upper_rotated(right, (turn_deg, 0.0, 0.0)))
-        health = started(true, seen[:4])
+        _, seen = monitored(rooms, with_upper_rotated(right, (turn_deg, 0.0, 0.0)), 4)
+        health = started(true, seen)
         status = rig_status(health, None)
         assert status.level == level and words in status.message
         assert health.state is (RigState.BROKEN if level == 2 else RigState.DRIFTED)
@@ -180,9 +193,9 @@ def started(true: tuple[RigHealth, Collector], pairs: Sequence[Panoramas]) -> Ri
 
 
 def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
-    rooms: Path, true: tuple[RigHealth, Collector]
+    turned: Turned, true: tuple[RigHealth, Collector]
 ) -> None:
-    _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
+    _, wrong = turned((0.0, 3.0, 0.0))
     exchanged = [replace(one, lower=one.upper, upper=one.lower) for one in true[1]]
     for first, later, state in (
         (wrong, true[1], RigState.FITS),
@@ -191,14 +204,14 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
     ):
         health = started(true, first[:4])
         begun = health.state
-        for number, one in enumerate(later):
+        for number, one in enumerate(later[:VIEWS]):
             health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
     assert rig_status(health, None).level == 2 and "exchange" in rig_status(health, None).message
 
 
-def test_a_check_in_the_dark_changes_no_state(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
-    _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
+def test_a_check_in_the_dark_changes_no_state(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
+    _, wrong = turned((0.0, 3.0, 0.0))
     health = started(true, wrong[:4])
     rng = np.random.default_rng(4)
     for number, one in enumerate(true[1]):
@@ -217,8 +230,8 @@ def test_the_refinement_is_part_of_the_entry(true: tuple[RigHealth, Collector]) 
     assert (moved.level, moved.message, moved.values["state"]) == (1, "moved", "fits")
 
 
-def test_a_refusal_ends_with_the_hint(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
-    _, wrong = monitored(rooms, with_upper_rotated(read_rig(rooms / "rig.toml"), (0.0, 3.0, 0.0)))
+def test_a_refusal_ends_with_the_hint(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
+    _, wrong = turned((0.0, 3.0, 0.0))
     assert true[0]._views is not None
     health = RigHealth(true[0]._views._cylinder, "refuse", hint="; delete a.toml")
     with pytest.raises(RigContradictedError, match=r"contradict the rig.*; delete a\.toml$"):
