@@ -36,8 +36,9 @@ GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not
 TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
 CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
 STILL_M, STILL_RAD = 1e-4, 5e-5  # Motion of a base at rest. By judgement; not measured.
-# m/s^2 and rad/s^2: sigmas of the change of the rates where the samples of the end of a step have not come yet.
-NOT_YET_MPS2, NOT_YET_RADPS2 = 1.0, 2.0  # By judgement; not measured.
+# Sigmas of the change of the rates, m/s^2 and rad/s^2, where samples of the end of a step have not come yet: about half
+# of the most that controller.limits allows by default, 1.5 m/s^2 and 4 rad/s^2.
+NOT_YET_MPS2, NOT_YET_RADPS2 = 1.0, 2.0
 # m/s and rad/s, without the bias, below which they are at rest. By judgement; not measured.
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
 STILL_BEFORE_S = 0.2  # The sensors must have been at rest this long before the step, so that none swings on.
