@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 # A larger step of odom would be a jump for the readers of published poses, as REP 105 has odom continuous: it raises
 # reset_counter, or the gap stays open.
 JUMP_M, JUMP_RAD = 0.5, math.radians(30)
+# A smaller step keeps the view: landmarks are a metre away and farther, so that they move by 6 degrees at most besides
+# the turn. With 0.5 m and 30 degrees a base that drove slowly through a bare world of 192 px lost its map.
+SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
 # Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # m, rad
 
@@ -112,9 +115,10 @@ class GapStep:
         return bool(np.linalg.norm(self.xi[3:]) > JUMP_RAD)
 
     @property
-    def is_jump(self) -> bool:
-        """True if it leads to another place or heading."""
-        return self.is_far or self.is_turned
+    def keeps_view(self) -> bool:
+        """True if it is so small that the same landmarks are in view."""
+        moved_m, turned_rad = float(np.linalg.norm(self.xi[:3])), float(np.linalg.norm(self.xi[3:]))
+        return moved_m < SAME_VIEW_M and turned_rad < SAME_VIEW_RAD
 
     @property
     def covariance(self) -> Array:
@@ -125,6 +129,13 @@ class GapStep:
 def with_more_inliers(a: PoseEstimate | None, b: PoseEstimate | None) -> PoseEstimate | None:
     """Return the estimate with more inliers, the first one of two equal ones."""
     return max((estimate for estimate in (a, b) if estimate), key=lambda estimate: estimate.inliers, default=None)
+
+
+def supports(tracked: PoseEstimate | None, T_predicted: Array) -> bool:
+    """True if most of the landmarks that were tracked, few as they may be, show a predicted pose (4, 4)."""
+    if tracked is None or tracked.inlier_ratio <= 0.5:
+        return False
+    return GapStep.between(T_predicted, tracked.T_odom_rect).keeps_view
 
 
 def bounded(covariance: Array) -> Array:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, bounded
+from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, bounded, supports
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
@@ -101,7 +101,7 @@ class VisualOdometry:
         #    (darkness, a blank wall) are left out to save time.
         after_refusal = self._status.refused_frames > 0
         searched = not after_refusal or self._is_textured(frame, usable)
-        estimate = self._find(frame, usable, T_predicted, dt_s) if searched else None
+        tracked = estimate = self._find(frame, usable, T_predicted, dt_s) if searched else None
 
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
@@ -113,7 +113,8 @@ class VisualOdometry:
         if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
             self._untracked_mps = max(self._untracked_mps, too_fast_mps)
             known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
-            refused = self._refuse(frame, usable, T_predicted, dt_s, elsewhere=gap if known else None)
+            stayed = GapStep.between(self._T_at_fix, T_predicted).keeps_view and not supports(tracked, T_predicted)
+            refused = self._refuse(frame, usable, T_predicted, dt_s, stayed=stayed, gap=gap if known else None)
             return replace(refused, refused_mps=too_fast_mps)
         estimate = self._exposures.start_again(
             frame, usable, estimate, dt_s, request=self._request, tracked=self._search.tracked
@@ -220,26 +221,27 @@ class VisualOdometry:
         return self._doubt is not None and self._doubt.is_open
 
     def _refuse(
-        self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, elsewhere: GapStep | None
+        self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float, *, stayed: bool, gap: GapStep | None
     ) -> OdometryEstimate:
         """Continue with the predicted pose, with a growing covariance; start the map again if need be.
 
-        elsewhere: distance of the recognised from the predicted pose; None: it was not recognised elsewhere.
+        stayed: see FrameFacts; gap: from the predicted to the recognised pose, None: it was not recognised elsewhere.
         """
-        known = elsewhere is not None
+        known = gap is not None
         self._exposures.forget_first()
         carried = self._move(T_predicted, self._motion.carry(frame.sensed, dt_s)) and not known
         textured = self._is_textured(frame, usable)
-        stayed = not GapStep.between(self._T_at_fix, self._T_odom_rect).is_jump
-        facts = FrameFacts(FrameOutcome.REFUSED, dt_s, textured=textured, elsewhere=known, carried=carried)
-        self._advance(replace(facts, stayed=stayed))
+        facts = FrameFacts(
+            FrameOutcome.REFUSED, dt_s, textured=textured, elsewhere=known, carried=carried, stayed=stayed
+        )
+        self._advance(facts)
         if not self._status.restart:
             return self._result(0, 0, exposure=self._exposures.now(frame))
         self._map.clear()
         self._previous = None
         self._relocaliser.clear()
-        if elsewhere is not None:
-            self._covariance = self._covariance + elsewhere.covariance
+        if gap is not None:
+            self._covariance = self._covariance + gap.covariance
         if self._status.unknown_motion:
             self._motion.reset()
         facts = FrameFacts(FrameOutcome.NOT_STARTED, 0.0, elsewhere=known, carried=carried)

@@ -46,7 +46,7 @@ class FrameFacts:
     elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
     turned: bool = False  # an accepted pose has another heading than was published
     carried: bool = False  # wheels and gyro carry the pose on
-    stayed: bool = False  # the pose has hardly changed since the last fix
+    stayed: bool = False  # the pose has hardly changed since the last fix, and no landmark of the map shows it
 
 
 @dataclass(frozen=True, slots=True)
