@@ -78,7 +78,8 @@ def run_tags(args: argparse.Namespace) -> int:
     from omnid.sinks.files import check_outputs
 
     if args.write is not None:
-        check_outputs([("--write", args.write)], [("the file that is read", args.source)])
+        read = (args.source, args.tags, args.map, args.rig, args.config)
+        check_outputs([("--write", args.write)], [("the file that is read", path) for path in read if path is not None])
     tags, found, refused = _of_map(args) if args.source.suffix == ".omap" else _of_log(args)
     rows = [_row(tags[id], tag) for id, tag in found.items()]
     if args.json:
@@ -94,7 +95,8 @@ def run_tags(args: argparse.Namespace) -> int:
     missing = tags.keys() - found.keys()
     if missing:
         print(
-            f"omnid: not found: {', '.join(map(str, sorted(missing)))}; {refused} views were of another size",
+            f"omnid: not found, or in several places: {', '.join(map(str, sorted(missing)))}; {refused} views were of "
+            "another size",
             file=sys.stderr,
         )
     return int(bool(missing))

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.places.map_tags import MOST_REJECTED
 from omnid.core.places.tags import TagEstimate, TagFinder, fused, in_tag_axes
-from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.messages import MapKeyframes, OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Outgoing
 from omnid.stages.geometry import Geometry
 from omnid.tracking_state import TrackingState
@@ -24,6 +26,15 @@ MOVED_RAD: Final = math.radians(10)
 MAX_VIEWS: Final = 1000  # Most views of a tag.
 
 
+class _View(NamedTuple):
+    """A tag in a pair."""
+
+    seq: int
+    T_rig_tag: Array
+    covariance: Array  # (6, 6) in the axes of the tag
+    T_odom_rig: Array
+
+
 class TagCollector:
     """A sink of all messages of a run."""
 
@@ -31,9 +42,10 @@ class TagCollector:
         """sizes_m: edge of the black square of each tag, by its id."""
         self._finder = TagFinder(geometry.model(NOISE_PX), sizes_m)
         self._T_base_rig, self._T_rig_rect = geometry.rig.T_base_rig, geometry.T_rig_rect
-        self._seen: dict[int, list[tuple[Array, Array]]] = {}
+        self._seen: dict[int, list[_View]] = {}
+        self._poses: dict[int, PlaceUpdate | None] = {}  # in the map, by the pairs in which a tag was seen
+        self._keyframes: MapKeyframes | None = None  # as they were last
         self._last_T: Array | None = None
-        self._T_map_odom = np.eye(4)
 
     @property
     def refused(self) -> int:
@@ -43,14 +55,18 @@ class TagCollector:
     def process(self, message: Outgoing) -> None:
         """Search a frame where the rig has moved."""
         if isinstance(message, PlaceUpdate):
-            self._T_map_odom = message.T_map_odom
+            self._keyframes = message.keyframes
+            if message.seq in self._poses:
+                self._poses[message.seq] = replace(message, scans=None, keyframes=None)
         elif isinstance(message, OdometryUpdate) and message.state is TrackingState.TRACKING and self._is_due(message):
             self._last_T = message.T_odom_rig
             panoramas = message.depth.panoramas
             for tag in self._finder.process(panoramas.lower, panoramas.upper):
                 views = self._seen.setdefault(tag.id, [])
                 if len(views) < MAX_VIEWS:
-                    views.append((message.T_odom_rig @ self._T_rig_rect @ tag.T_rect_tag, in_tag_axes(tag)))
+                    T_rig_tag = self._T_rig_rect @ tag.T_rect_tag
+                    views.append(_View(message.seq, T_rig_tag, in_tag_axes(tag), message.T_odom_rig))
+                    self._poses.setdefault(message.seq, None)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         if self._last_T is None:
@@ -60,9 +76,25 @@ class TagCollector:
         return float(np.linalg.norm(moved[:3, 3])) >= MOVED_M or turned_rad >= MOVED_RAD
 
     def tags(self) -> dict[int, TagEstimate]:
-        """Return the tags by their ids; poses in the map, in the axes of the base at its start."""
-        T_map_odom = self._T_base_rig @ self._T_map_odom
-        return {
-            id: fused([T_map_odom @ T for T, _ in views], [covariance for _, covariance in views])
+        """Return the tags by their ids; poses in the map, in the axes of the base at its start.
+
+        Tags that contradicting views show in several places are left out.
+        """
+        found = {
+            id: fused(
+                [self._T_base_rig @ self._T_map_rig(view) @ view.T_rig_tag for view in views],
+                [view.covariance for view in views],
+            )
             for id, views in sorted(self._seen.items())
         }
+        return {id: tag for id, tag in found.items() if tag.rejected <= MOST_REJECTED * len(self._seen[id])}
+
+    def _T_map_rig(self, view: _View) -> Array:
+        """Return the pose of the rig at a view as the map knows it at the end; without a map that in odom."""
+        pose = self._poses[view.seq]
+        if pose is None:
+            return view.T_odom_rig
+        T_map_rect = None if self._keyframes is None else self._keyframes.T_map_rect.get(pose.keyframe)
+        if T_map_rect is None:
+            return pose.T_map_rig
+        return np.asarray(self._T_rig_rect @ T_map_rect @ se3.inverse(self._T_rig_rect) @ pose.T_keyframe_rig)

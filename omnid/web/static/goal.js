@@ -96,8 +96,7 @@ export function wireGoal(plan) {
       busy = BUSY.includes(report.state);
       if (before && !busy && !choosing) {
         plan.setGoal(null);
-        if (!report.state) say("The robot has started again.");
-        else say(report.reason ? `It has ended: ${report.state}: ${report.reason}.` : `It has ended: ${report.state}.`);
+        say(report.reason ? `It has ended: ${report.state}: ${report.reason}.` : `It has ended: ${report.state}.`);
       }
       showButtons();
     },
