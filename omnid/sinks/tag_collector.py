@@ -26,7 +26,7 @@ MOVED_RAD: Final = math.radians(10)
 MAX_VIEWS: Final = 1000  # Most views of a tag.
 
 
-class _View(NamedTuple):
+class _Sighting(NamedTuple):
     """A tag in a pair."""
 
     seq: int
@@ -42,7 +42,7 @@ class TagCollector:
         """sizes_m: edge of the black square of each tag, by its id."""
         self._finder = TagFinder(geometry.model(NOISE_PX), sizes_m)
         self._T_base_rig, self._T_rig_rect = geometry.rig.T_base_rig, geometry.T_rig_rect
-        self._seen: dict[int, list[_View]] = {}
+        self._seen: dict[int, list[_Sighting]] = {}
         self._poses: dict[int, PlaceUpdate | None] = {}  # in the map, by the pairs in which a tag was seen
         self._keyframes: MapKeyframes | None = None  # as they were last
         self._last_T: Array | None = None
@@ -65,7 +65,7 @@ class TagCollector:
                 views = self._seen.setdefault(tag.id, [])
                 if len(views) < MAX_VIEWS:
                     T_rig_tag = self._T_rig_rect @ tag.T_rect_tag
-                    views.append(_View(message.seq, T_rig_tag, in_tag_axes(tag), message.T_odom_rig))
+                    views.append(_Sighting(message.seq, T_rig_tag, in_tag_axes(tag), message.T_odom_rig))
                     self._poses.setdefault(message.seq, None)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
@@ -89,7 +89,7 @@ class TagCollector:
         }
         return {id: tag for id, tag in found.items() if tag.rejected <= MOST_REJECTED * len(self._seen[id])}
 
-    def _T_map_rig(self, view: _View) -> Array:
+    def _T_map_rig(self, view: _Sighting) -> Array:
         """Return the pose of the rig at a view as the map knows it at the end; without a map that in odom."""
         pose = self._poses[view.seq]
         if pose is None:
