@@ -182,6 +182,6 @@ def run_export(args: argparse.Namespace) -> int:
         if args.ply:
             write_ply(args.ply, points)
         if args.plan:
-            write_plan(args.plan, points, place_views.base_poses(places, rig)[:, :2, 3])
+            write_plan(args.plan, points, place_views.paths_xy(places, rig))
     print("written     ", ", ".join(str(path) for _, path in [*outputs, *images]))
     return 0

@@ -42,11 +42,13 @@ def plan_view(
 ) -> Image:
     """Return a BGR image (H, W, 3) of the map's points between two heights, and the path (N, 2) in metres over it.
 
+    A row of the path that is NaN, or too far away to be drawn, is a gap: what is before and after it is not joined.
     Heights are relative to the first pose, the origin of the map's frame. A cell is the darker, the more confident
     points it has. Neither side exceeds `max_side_px` (at most 2000). The farthest half per cent of the points on each
     side may be cut off; the path never is.
     """
-    path = trajectory_xy[_drawable(trajectory_xy)].astype(np.float64)
+    drawable = _drawable(trajectory_xy)
+    path = trajectory_xy[drawable].astype(np.float64)
     inside = _drawable(points.xyz) & (points.xyz[:, 2] >= z_low_m) & (points.xyz[:, 2] <= z_high_m)
     xy_m = points.xyz[inside, :2].astype(np.float64)
     sheet = _sheet(xy_m, path, int(np.clip(max_side_px, _MIN_SIDE_PX, SIDE_LIMIT_PX)))
@@ -54,7 +56,8 @@ def plan_view(
     margin = ((MARGIN_PX, MARGIN_PX), (MARGIN_PX, MARGIN_PX), (0, 0))
     image = np.pad(area, margin, constant_values=255)
     draw_frame(image, sheet)
-    _draw_path(image, sheet.pixels(path))
+    gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
+    _draw_path(image, np.split(sheet.pixels(path), gaps))
     return image
 
 
@@ -75,13 +78,13 @@ def _sheet(xy_m: NDArray[np.float64], path: NDArray[np.float64], side_px: int) -
     return Sheet(centre - half, centre + half, min(usable_px / (2 * float(half.max())), _SCALE_LIMIT_PX_PER_M))
 
 
-def _draw_path(image: Image, path_px: NDArray[np.int32]) -> None:
-    """Draw the path with a white rim, a circle at its start and a square at its end."""
-    if not len(path_px):
+def _draw_path(image: Image, parts_px: list[NDArray[np.int32]]) -> None:
+    """Draw the parts of the path with a white rim, a circle at its start and a square at its end."""
+    if not len(parts_px[0]):
         return
     for colour, width_px in zip((WHITE, RED), _PATH_WIDTHS_PX, strict=True):
-        cv2.polylines(image, [path_px.reshape(-1, 1, 2)], False, colour, width_px, cv2.LINE_AA)
-    end, start = ((int(x), int(y)) for x, y in (path_px[-1], path_px[0]))
+        cv2.polylines(image, [part.reshape(-1, 1, 2) for part in parts_px], False, colour, width_px, cv2.LINE_AA)
+    end, start = ((int(x), int(y)) for x, y in (parts_px[-1][-1], parts_px[0][0]))
     for colour, half_px in ((WHITE, _END_HALF_PX + 1), (BLACK, _END_HALF_PX)):
         corners = (end[0] - half_px, end[1] - half_px), (end[0] + half_px, end[1] + half_px)
         cv2.rectangle(image, *corners, colour, cv2.FILLED)

@@ -18,6 +18,7 @@ from omnid.errors import OmnidError
 from omnid.formats.plan_view import plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
+from omnid.formats.whole_file import write_whole
 from omnid.messages import MapUpdate, OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
@@ -172,9 +173,5 @@ class PlanFile:
 
 
 def write_plan(path: Path, points: MapPoints, path_xy: NDArray[np.float64]) -> None:
-    """Write the plan view of points with a path (N, 2) [m] as PNG. Raises OmnidError."""
-    image = cv2.imencode(".png", plan_view(points, path_xy))[1]
-    try:
-        path.write_bytes(image.tobytes())
-    except OSError as error:
-        raise OmnidError(f"{path}: cannot be written: {error.strerror or error}") from error
+    """Write the plan view of points with a path (N, 2) [m], NaN: a gap, as PNG. Raises OmnidError."""
+    write_whole(path, cv2.imencode(".png", plan_view(points, path_xy))[1].tobytes())

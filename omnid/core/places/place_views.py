@@ -115,6 +115,12 @@ def drives(places: PlaceMap, rig: PlaceRig) -> list[MappedDrive]:
     return [_drive(places, ids, rig) for ids in parts]
 
 
+def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
+    """Return the paths (N, 2) [m] of all drives, a row of NaN after each, as nothing drove from one to the next."""
+    paths = [np.vstack([drive.T_map_base[:, :2, 3], np.full((1, 2), np.nan)]) for drive in drives(places, rig)]
+    return np.vstack([np.zeros((0, 2)), *paths])
+
+
 def _drive(places: PlaceMap, ids: list[int], rig: PlaceRig) -> MappedDrive:
     T_odom = np.array([places.keyframes[id].T_odom_rect for id in ids])
     by_odometry = places.poses[ids[0]] @ se3.inverse(T_odom[0]) @ T_odom

@@ -86,6 +86,15 @@ def test_path_start_and_end_without_colour() -> None:
     assert not np.array_equal(plan_view(EMPTY, path), plan_view(EMPTY, path[::-1]))  # which end is which
 
 
+@pytest.mark.parametrize("gap", [np.nan, np.inf])
+def test_what_is_before_a_gap_of_the_path_is_not_joined_to_what_is_after(gap: float) -> None:
+    parts = np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([[4.0, 0.0], [5.0, 0.0]])
+    joined = plan_view(EMPTY, np.vstack(parts))
+    apart = plan_view(EMPTY, np.vstack([parts[0], [[gap, gap]], parts[1], [[gap, gap]]]))
+    changed = np.flatnonzero((joined != apart).any(axis=(0, 2))) / joined.shape[1]
+    assert 0.2 < changed.min() < 0.35 and 0.65 < changed.max() < 0.8
+
+
 def test_the_path_is_visible_on_a_dark_map() -> None:
     wall = np.vstack([box(x, 0.0, z) for x in np.arange(0, 5, 0.2) for z in np.arange(0, 1, 0.2)])
     image = plan_view(points(wall), np.array([[0.0, 0.0], [2.5, 0.0], [5.0, 0.0]]))

@@ -12,7 +12,7 @@ from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED
 from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
-from omnid.core.places.place_views import base_poses, drives, grid, landmarks, parts, summary
+from omnid.core.places.place_views import base_poses, drives, grid, landmarks, parts, paths_xy, summary
 from omnid.core.stereo.triangulation import view
 from tests.omnid.core.mapping.rooms import box, pose, scan_of
 
@@ -70,6 +70,10 @@ def test_a_drive_ends_with_its_session_or_where_no_odometry_joins_its_keyframes(
     first, *others = drives(found, RIG)
     assert first.ids == [0, 1, 2, 3, 4, 5] and [(drive.session, drive.ids) for drive in others] == [(0, [6]), (1, [7])]
     np.testing.assert_allclose(first.T_by_odometry, base_poses(places(), RIG), atol=1e-12)
+    # Nothing drove from one to the next.
+    paths = paths_xy(found, RIG)
+    assert np.flatnonzero(np.isnan(paths[:, 0])).tolist() == [6, 8, 10] and paths_xy(PlaceMap(), RIG).shape == (0, 2)
+    np.testing.assert_array_equal(paths[:6], first.T_map_base[:, :2, 3])
     found.move({5: found.poses[5] @ pose(0.2, 0.0, 0.0)})
     moved = drives(found, RIG)[0]
     np.testing.assert_allclose(moved.T_by_odometry, first.T_by_odometry, atol=1e-12)
