@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 from calib.rig import MountedCamera
@@ -53,6 +54,7 @@ class RunPlaces:
         _require_consistent(settings)
         uses_file = settings.map and given is None and not build
         self._path = Path(settings.map) if uses_file else None
+        self._version = None if self._path is None else _version(self._path)
         self._writes = self._path is not None and not settings.localize_only
         self._rig = place_rig(geometry)
         if self._path is not None:
@@ -132,9 +134,22 @@ class RunPlaces:
         if self._path is None or not joined - self._known or joined == self._saved:
             return False
         keep_only(places, joined)
-        write_places(self._path, places, self._rig)
+        self._write(self._path, places)
         self._saved = joined
         return True
+
+    def _write(self, path: Path, places: PlaceMap) -> None:
+        """Write the map to its file, or beside it where another program has written that meanwhile."""
+        if _version(path) not in (None, self._version):
+            other = _beside(path)
+            self._warn(
+                f"{path}: another program has written this map since this run read it: the map of this run is {other}; "
+                "`omnid map merge` joins both"
+            )
+            path = other
+        write_places(path, places, self._rig)
+        self._path = self.written = path
+        self._version = _version(path)
 
     def finish(self) -> RigPlaces | None:
         """Return the map after the run, what is not joined to it left out; write it where it was extended.
@@ -154,8 +169,7 @@ class RunPlaces:
         elif unjoined:
             self._warn(f"{name}: {unjoined} keyframes after a gap were recognised nowhere: they were left out")
         if self._path is not None and self._writes and new:
-            write_places(self._path, self.places, self._rig)
-            self.written = self._path
+            self._write(self._path, self.places)
         elif self._path is not None and self._writes and not self._known:
             self._warn(f"{self._path}: no keyframe was found: no map was written")
         return found
@@ -166,6 +180,16 @@ class RunPlaces:
             return frozenset()
         found = parts(places)
         return frozenset(next((part for part in found if self._known.intersection(part)), found[0]))
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Return what changes where a file is written again; None: there is none."""
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.is_file() else None
+
+
+def _beside(path: Path) -> Path:
+    """Return the first name beside a file that is free."""
+    return next(name for number in count(2) if not (name := path.with_stem(f"{path.stem}-{number}")).exists())
 
 
 def place_rig(geometry: Geometry) -> PlaceRig:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib import se3
 from calib.rig_file import read_rig, write_rig
 from omnid.api import replay
 from omnid.client import Robot
@@ -240,6 +241,29 @@ def test_a_replay_whose_map_cannot_be_written_keeps_its_poses(scene: Path, tmp_p
     with pytest.raises(RunFailedError, match="cannot write the map") as failed:
         replay(scene / "log.mcap", scene / "rig.toml", overrides=settings, progress=progress)
     assert len(failed.value.result.stamps_ns) == PAIRS
+
+
+@pytest.mark.parametrize("exists", [True, False])
+def test_a_map_that_another_program_has_written_meanwhile_is_not_replaced(
+    scene: Path, built: Path, tmp_path: Path, exists: bool
+) -> None:
+    """Two replays extend one map, or it is aligned while a run goes on: the last one does not win."""
+    omap, moved = tmp_path / "place.omap", tmp_path / "moved.omap"
+    places, rig = read_places(built)
+    places.move({id: se3.transform(np.eye(3), [100.0, 50.0, 0.0]) @ T for id, T in places.poses.items()})
+    write_places(moved, places, rig)
+    if exists:
+        omap.write_bytes(built.read_bytes())
+
+    def progress(done: int, expected: int | None) -> None:
+        if done and moved.exists():
+            moved.rename(omap)
+
+    result = replay(scene / "log.mcap", scene / "rig.toml", overrides=[f"places.map={omap}"], progress=progress)
+    assert result.map_file == tmp_path / "place-2.omap"
+    assert any("another program has written this map" in warning for warning in result.warnings)
+    for path, x_m in ((omap, 100.0), (tmp_path / "place-2.omap", 0.0)):
+        assert abs(min(T[0, 3] for T in read_places(path)[0].poses.values()) - x_m) < 5.0
 
 
 @pytest.mark.slow

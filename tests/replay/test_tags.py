@@ -91,6 +91,9 @@ def test_a_map_keeps_its_tags_and_is_aligned_by_them(omnid: Command, tagged: Pat
     assert "tag 5 (door 5) has an edge of 0.5 m, but 0.6 m in the map" in error
     assert "belong to a log" in omnid.refused("map", "tags", omap, "--tag", "5=0.6")
     assert "expected --tag ID=SIZE" in omnid.refused("map", "tags", tagged / "log.mcap")
+    tags = tmp_path / "tags.toml"
+    error = omnid.refused("map", "tags", tagged / "log.mcap", "--rig", rig, "--tags", tags, "--write", tags)
+    assert "--write" in error and tags.read_text().startswith(TAGS[:20])
 
 
 def test_wrong_sizes_are_one_line(omnid: Command, tagged: Path) -> None:
