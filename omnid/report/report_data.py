@@ -93,6 +93,7 @@ class ReportData:
     frames: tuple[str, str] = ("odom", "base_link")  # of the odometry
     cloud: Cloud | None = None  # the newest
     unreadable: int = 0  # messages left out: not of their type, or with an invalid stamp
+    corrupt: int = 0  # chunks and records of the file left out
 
     @property
     def T_base_rig(self) -> NDArray[np.float64]:
@@ -165,6 +166,7 @@ class _Collector:
                     self._add_twist(message.name, message.content)
         self._add_pending()
         self._data.unreadable += reader.unreadable.total()
+        self._data.corrupt = reader.corrupt
 
     def _add_pose(self, record: OdometryRecord, log_time_ns: int) -> None:
         data, offset_ns = self._data, log_time_ns - record.stamp_ns

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from omnid.report.report import report_html
 from omnid.report.report_data import ReportData, collect_report_data
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING
 from tests.omnid.report.recorded_logs import (
+    corrupt_chunks,
     map_pose,
     odom,
     run,
@@ -47,6 +49,16 @@ def test_orders_status_from_before_the_first_pose_and_late_status(tmp_path: Path
     data = collect_report_data(save(tmp_path / "log.mcap", entries))
     assert data.poses.states == {0: 1, 2: 2}
     assert event_texts(data)[0] == ("pairing", "none") and data.events.in_order()[0].start_s == -2.0
+
+
+def test_corrupt_chunks_of_a_log_with_an_index_are_counted(tmp_path: Path) -> None:
+    log = save(tmp_path / "a.mcap", run(60))
+    assert collect_report_data(log).corrupt == 0
+    corrupt_chunks(log)
+    data = collect_report_data(log)
+    assert data.corrupt == 2 and 40 < data.poses.poses < 60
+    page = report_html(log, data)
+    assert "2 corrupt chunks or records were skipped." in page and "MB, cut or corrupt. Poses" in page
 
 
 def test_a_pose_in_the_map_without_its_pose_of_odometry_is_left_out(tmp_path: Path) -> None:
