@@ -115,6 +115,7 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
     reader = RecordingReader(found, choose_odometry_topic(found, topic))
     rig, fault = _rig(reader.attachments)
     events = Events()
+    poses = PoseHistory(events, keep_poses)
     data = ReportData(
         found,
         reader.topic,
@@ -123,8 +124,8 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
         rig,
         fault,
         events,
-        PoseHistory(events, keep_poses),
-        StatusHistory(events),
+        poses,
+        StatusHistory(events, poses),
     )
     _Collector(data).collect(reader)
     if not data.poses.poses:
