@@ -120,6 +120,15 @@ def test_merge_refuses_maps_in_which_a_tag_has_other_sizes(omap: Path, capsys: p
     assert error.count("\n") == 1 and not (omap.parent / "c.omap").exists()
 
 
+def test_align_refuses_tags_one_above_the_other(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tag = SEEN.replace("facing_deg = 0\n", "")
+    (omap.parent / "tags.toml").write_text(tag + tag[11:].replace("5]", "6]", 1).replace("id = 5", "id = 6"))
+    words = ["--seen", str(omap.parent / "tags.toml"), "--known", str(omap.parent / "tags.toml")]
+    assert main(["map", "align", str(omap), *words, "-o", str(omap.parent / "b.omap")]) == 2
+    error = capsys.readouterr().err
+    assert "2 tags in common: across the floor they spread by 0.00 m" in error and error.count("\n") == 1
+
+
 def test_export_writes_what_is_asked_for_and_names_it(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = omap.parent
     assert (
