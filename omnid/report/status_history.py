@@ -51,14 +51,14 @@ _PLOTTED: Final = frozenset(
 )
 
 
-class _Progress(NamedTuple):
-    """What only rises as long as a daemon runs."""
+class _RunProgress(NamedTuple):
+    """Numbers that only rise as long as a daemon runs."""
 
     stamp_ns: int
     resets: int
     length_m: float  # of the path; NaN where it is not reported
 
-    def is_restarted_by(self, later: _Progress) -> bool:
+    def is_restarted_by(self, later: _RunProgress) -> bool:
         """True if a later entry shows that the daemon was started again in between."""
         return later.resets < self.resets or later.length_m < self.length_m
 
@@ -71,7 +71,7 @@ class StatusHistory:
         self._events, self._poses = events, poses
         # Of the periodic reports, which have the length of the path (True), and of those of a new state (False): each
         # kind comes in its own order.
-        self._progress: dict[bool, _Progress] = {}
+        self._progress: dict[bool, _RunProgress] = {}
         self._counts: dict[tuple[str, str], int] = {}
         self._messages: dict[str, str] = {}
         self._state_ns = 0
@@ -123,13 +123,13 @@ class StatusHistory:
         resets = status_names.count(status.values.get(Key.RESETS, ""))
         if resets is None or resets >= _MAX_RESETS:
             return
-        self._add_progress(_Progress(stamp_ns, resets, _length_m(status)), t_s)
+        self._add_progress(_RunProgress(stamp_ns, resets, _length_m(status)), t_s)
         before, self._reset_counter = self._reset_counter, max(resets, self._reset_counter or 0)
         if before is not None and self._reset_counter > before:
             self.resets += self._reset_counter - before
             self._events.add(Event(t_s, t_s, ERROR, "state", "odometry was reset, with an unknown gap"))
 
-    def _add_progress(self, progress: _Progress, t_s: float) -> None:
+    def _add_progress(self, progress: _RunProgress, t_s: float) -> None:
         """Add an event where the daemon was started again; older entries, recorded out of order, say nothing."""
         is_periodic = not math.isnan(progress.length_m)
         before = self._progress.get(is_periodic, progress)

@@ -104,7 +104,7 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
 
 
 def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
-    """What was driven during the gap counts; a report that was recorded late has fewer resets than the one before."""
+    """The way during the gap counts; a report that was recorded late has fewer resets than the one before."""
     entries = [*straight(0, 10), length(9, 0.9), state(9, "tracking", 1)]
     entries += [odom(60, se3.transform(np.eye(3), [5.0, 0.0, 0.0])), length(60, 5.0, 1), state(8, "tracking", 0)]
     data = collect_report_data(save(tmp_path / "a.mcap", entries))
