@@ -63,9 +63,8 @@ class RobotState:
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.robots_there = ""  # robots that were there when the connection was made, as a part of a sentence
         self.poses = self.missed = self.broken = 0
-        self.ends = self.restarts = (
-            0  # how often the token of a daemon went, and how often its poses were numbered from the start
-        )
+        self.ends = 0  # how often the daemon's token went
+        self.restarts = 0  # how often its poses were numbered from the start
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
