@@ -136,7 +136,14 @@ def run_merge(args: argparse.Namespace) -> int:
             raise OmnidError(f"{path}: this map was made with {difference}: build one with the rig of {args.maps[0]}")
         seen_by(other, other_rig, rig)
         prepare_kernels()
-        if not merge(places, other, StereoModel(rig.cylinder, rig.baseline_m)):
+        try:
+            recognised = merge(places, other, StereoModel(rig.cylinder, rig.baseline_m))
+        except ValueError as error:
+            raise OmnidError(
+                f"map merge: {path}: {error}: measure it, and build the map with the wrong size again by "
+                "`omnid map build LOG --tags TAGS.toml`"
+            ) from None
+        if not recognised:
             raise OmnidError(
                 f"{path}: it {NO_COMMON_PLACE} with the maps before that is recognised: drive where both "
                 "have been, and add that log by `omnid map build LOG --extend`"

@@ -31,14 +31,21 @@ def write_grid(path: Path, grid: Grid) -> None:
     """
     if path.suffix not in (".yaml", ".yml"):
         raise OmnidError(f"{path}: expected a name that ends in .yaml; the image gets the same name with .pgm")
+    pixels = path.with_suffix(".pgm")
+    x, y = grid.corner
+    text = _YAML.format(image=_quoted(pixels.name), cell_m=grid.cell_m, x=x, y=y)
+    try:
+        described = text.encode()
+    except UnicodeEncodeError:
+        raise OmnidError(
+            f"{path}: this name is no UTF-8, so the file cannot name its image: give another name"
+        ) from None
     image = np.full(grid.cells.shape, _GREY, np.uint8)
     image[grid.cells == FREE] = _WHITE
     image[grid.cells == OCCUPIED] = _BLACK
     height, width = grid.cells.shape
-    pixels = path.with_suffix(".pgm")
     write_whole(pixels, b"P5\n%d %d\n255\n" % (width, height) + image[::-1].tobytes())  # the first row is the highest y
-    x, y = grid.corner
-    write_whole(path, _YAML.format(image=_quoted(pixels.name), cell_m=grid.cell_m, x=x, y=y).encode())
+    write_whole(path, described)
 
 
 def _quoted(name: str) -> str:

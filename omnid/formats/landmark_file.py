@@ -33,11 +33,14 @@ Tag = TypeVar("Tag", Landmark, MapTag)
 
 def write_landmarks(path: Path, landmarks: Iterable[Landmark]) -> None:
     """Write the file. Raises OmnidError if that is impossible."""
-    lines = [f"schema = {SCHEMA}"]
-    for mark in landmarks:
+    lines, marks = [f"schema = {SCHEMA}"], list(landmarks)
+    if not marks:
+        lines += ["", "[tag]"]  # an empty table, as one is expected
+    for mark in marks:
         lines += [
             "",
-            f"[tag.{json.dumps(mark.name)}]",
+            # TOML has no escapes of surrogate pairs, which JSON in ASCII uses for letters beyond U+FFFF.
+            f"[tag.{json.dumps(mark.name, ensure_ascii=False)}]",
             f"id = {mark.id}",
             f"size_m = {mark.size_m!r}",
             f"xyz_m = [{', '.join(f'{value:.4f}' for value in mark.xyz_m)}]",

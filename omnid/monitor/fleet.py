@@ -44,6 +44,7 @@ class FleetState:
         state = self.robot(name)
         if state is not None:
             state.process(message._replace(topic=topic))
+            state.forget_ended()  # A message may arrive after the end of its daemon is noted.
 
     def note_alive(self, name: str, alive: bool) -> None:
         """Note that the daemon of a robot came or went, for `take_alive`; from any thread."""
@@ -56,6 +57,7 @@ class FleetState:
             state = self.robot(name)
             if state is not None:
                 state.set_alive(alive)
+                state.forget_ended()
 
     def robot(self, name: str) -> RobotState | None:
         """Return the state of a robot, which is new at its first message; None beyond the limit."""

@@ -104,6 +104,7 @@ def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[W
     next_s = time.monotonic() + SHOW_PERIOD_S
     while (now_s := time.monotonic()) < end_s:
         message = inbox.get(min(next_s, end_s) - now_s)
+        state.forget_ended()
         if message is not None:
             pose = state.process(message)
             for writer in writers:

@@ -63,9 +63,12 @@ class RobotState:
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
         self.robots_there = ""  # robots that were there when the connection was made, as a part of a sentence
         self.poses = self.missed = self.broken = 0
+        self.ends = 0  # how often the daemon's token went
+        self.restarts = 0  # how often its poses were numbered from the start
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
+        self._forgotten = 0  # ends of which the statuses are forgotten
 
     def process(self, message: ReceivedMessage) -> Pose | None:
         """Count a message and return the pose in it, if it is one."""
@@ -81,6 +84,19 @@ class RobotState:
     def set_alive(self, alive: bool) -> None:
         """Keep whether the daemon's liveliness token is there; from any thread."""
         self.alive = alive
+        self.ends += not alive
+
+    def forget_ended(self) -> bool:
+        """Forget the statuses of a daemon that has ended: it may start again in another state. True if there were any.
+
+        It is called by the thread that processes the messages.
+        """
+        ends = self.ends
+        had_any = bool(self.statuses) and (self.alive is False or ends > self._forgotten)
+        if had_any:
+            self.statuses.clear()
+        self._forgotten = ends
+        return had_any
 
     def add_diagnostics(self, diagnostics: Diagnostics) -> None:
         """Keep the newest status of each part of the robot."""
@@ -94,6 +110,8 @@ class RobotState:
         """Count a pose. Skipped sequence numbers are missed poses; a smaller number means that the daemon restarted."""
         if self.pose is not None and 0 <= self.pose.attachment.seq < pose.attachment.seq:
             self.missed += pose.attachment.seq - self.pose.attachment.seq - 1
+        if self.pose is not None and pose.attachment.seq < self.pose.attachment.seq:
+            self.restarts += 1
         self.pose = pose
         self.poses += 1
         self._arrivals_s.append(pose.received_ns * 1e-9)

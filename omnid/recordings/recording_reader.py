@@ -60,14 +60,15 @@ class RecordingReader:
     """Reads the messages of one robot, the one with the given odometry topic (see choose_odometry_topic).
 
     unreadable: messages left out, by topic: larger than MAX_MESSAGE_BYTES, not of their type, or not finite.
-    damaged: pieces of the file left out. Both are complete once all messages are read.
+    corrupt: chunks and records of the file left out. damaged: the same, and its missing end. All three are complete
+    once all messages are read.
     """
 
     def __init__(self, found: LogInfo, odometry_topic: str) -> None:
         """Read the attachments. Raise DriverError where the file cannot be opened."""
         self.info, self.topic = found, odometry_topic
         self.unreadable: Counter[str] = Counter()
-        self.damaged = 0
+        self.corrupt = self.damaged = 0
         with closing(LogFile(found.path)) as file:
             self.attachments: Mapping[str, bytes] = read_attachments(file, read_summary(file))
 
@@ -97,6 +98,7 @@ class RecordingReader:
                     content = self._decoded(topic.name, message, decoder)
                     if content is not None:
                         yield RecordedMessage(name, message.log_time_ns, content)
+            self.corrupt = section.broken
             self.damaged = section.broken + (not section.ended)
 
     def _decoded(self, topic: str, message: LogMessage, decoder: Decoder) -> Content | None:

@@ -104,6 +104,8 @@ def _warnings(found: LogInfo, reader: RecordingReader, repeated: Mapping[str, in
     lines = []
     if found.state in (LogState.BROKEN, LogState.WRITTEN):
         lines.append(f"{found.path}: {found.state.value}: the messages up to byte {found.readable_bytes} are compared")
+    if reader.corrupt:
+        lines.append(f"{found.path}: {reader.corrupt} corrupt chunks or records are left out")
     lines += [
         f"{found.path}: {count} messages on {topic!r} cannot be read and are left out"
         for topic, count in reader.unreadable.items()

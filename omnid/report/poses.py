@@ -47,6 +47,8 @@ class PoseHistory:
         self.states: Counter[int] = Counter()
         self.poses = self.late = self.out_of_range = 0
         self.length_m = 0.0
+        self._gap = 0.0, 0.0  # duration [s] of the longest gap since `continue_run`, and the step across it [m]
+        self._leaves_out_gap = False  # the step across the next gap is that from one odom to another
 
     def add(self, record: OdometryRecord, rank: int) -> None:
         """Add a pose; rank: of its state in STATES."""
@@ -59,11 +61,25 @@ class PoseHistory:
         if self.poses and t_s <= self.end_s:
             self.late += 1
             return
-        self._add_gap(t_s)
+        gap_s = self._add_gap(t_s)
         self._add_state(t_s, rank)
-        self._add_position(record, t_s)
+        self._add_position(record, t_s, gap_s)
         self._add_measurements(record, t_s)
         self.end_s, self.poses = t_s, self.poses + 1
+
+    def continue_run(self) -> None:
+        """Note that the poses so far are of one run of the daemon."""
+        self._gap, self._leaves_out_gap = (0.0, 0.0), False
+
+    def begin_run(self) -> None:
+        """Note that the daemon has been started again, with a new odom, since the last call of `continue_run`.
+
+        The step across the longest gap since then is no part of the path; without one, that across the next gap.
+        """
+        gap_s, step_m = self._gap
+        self.length_m -= step_m
+        self.continue_run()
+        self._leaves_out_gap = gap_s == 0.0 and self.poses > 0
 
     def seconds(self, stamp_ns: int) -> float:
         """Return the time since the first pose."""
@@ -75,17 +91,20 @@ class PoseHistory:
         stamps_ns, numbers = np.array(self._kept[0], np.int64), np.array(self._kept[1]).reshape(-1, 7)
         return Trajectory(stamps_ns, se3.transform(se3.rotation(numbers[:, 3:]), numbers[:, :3]))
 
-    def _add_gap(self, t_s: float) -> None:
+    def _add_gap(self, t_s: float) -> float:
+        """Return the duration of the gap before a pose, s; 0 where there is none."""
         step_s = t_s - self.end_s
         if not self.poses or step_s <= 0:
-            return
+            return 0.0
         if step_s > max(GAP_S, GAP_PERIODS * (self._period_s if self.poses > 2 else step_s)):
             self.gaps = [*self.gaps, (self.end_s, t_s)][-_MAX_GAPS:]
             self._events.add(Event(self.end_s, t_s, WARNING, "poses", f"none for {step_s:.2f} s"))
-        elif math.isnan(self._period_s):
+            return step_s
+        if math.isnan(self._period_s):
             self._period_s = step_s
         else:
             self._period_s += _PERIOD_GAIN * (step_s - self._period_s)
+        return 0.0
 
     def _add_state(self, t_s: float, rank: int) -> None:
         self.states[rank] += 1
@@ -96,10 +115,15 @@ class PoseHistory:
         if rank != UNKNOWN:
             self.series["state"].add(t_s, rank)
 
-    def _add_position(self, record: OdometryRecord, t_s: float) -> None:
+    def _add_position(self, record: OdometryRecord, t_s: float, gap_s: float) -> None:
+        """Add a position; gap_s: duration of the gap before it, 0 without one."""
         position = record.T_odom_base[:3, 3]
-        if self._position is not None:
-            self.length_m += float(np.linalg.norm(position - self._position))
+        step_m = 0.0 if self._position is None else float(np.linalg.norm(position - self._position))
+        if gap_s > 0.0 and self._leaves_out_gap:
+            self.continue_run()
+        else:
+            self.length_m += step_m
+            self._gap = max(self._gap, (gap_s, step_m if gap_s > 0.0 else 0.0))
         self._position = position
         self.path.add(Corner(float(position[0]), float(position[1]), t_s, self._rank))
         if self._keep and self.poses < MAX_KEPT:

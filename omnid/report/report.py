@@ -86,8 +86,9 @@ def report_html(path: Path, data: ReportData, true: Trajectory | None = None) ->
 
 def _head(path: Path, data: ReportData) -> list[str]:
     found, frames = data.info, data.frames
+    state = LogState.BROKEN if data.corrupt and found.state is LogState.WHOLE else found.state
     facts = (
-        f"{path}, {found.size_bytes / 1e6:.1f} MB, {found.state.value}. Poses of {frames[1]} in {frames[0]} on "
+        f"{path}, {found.size_bytes / 1e6:.1f} MB, {state.value}. Poses of {frames[1]} in {frames[0]} on "
         f"{data.topic}, from {utc(data.poses.start_ns)}."
     )
     return [f"<h1>Run of {escape(data.robot)}</h1><p class='sub'>{escape(facts)}</p>"]
@@ -102,8 +103,8 @@ def _warnings(data: ReportData, true: Trajectory | None) -> list[str]:
             f"The log is cut or corrupt after byte {found.readable_bytes} of {found.size_bytes}; "
             "this is what could be read."
         )
-    if found.broken:
-        lines.append(f"{found.broken} corrupt chunks or records were skipped.")
+    if data.corrupt:
+        lines.append(f"{data.corrupt} corrupt chunks or records were skipped.")
     if data.unreadable or poses.out_of_range:
         lines.append(
             f"{data.unreadable + poses.out_of_range} messages were left out: not of their type, with a stamp "

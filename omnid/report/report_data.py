@@ -93,6 +93,7 @@ class ReportData:
     frames: tuple[str, str] = ("odom", "base_link")  # of the odometry
     cloud: Cloud | None = None  # the newest
     unreadable: int = 0  # messages left out: not of their type, or with an invalid stamp
+    corrupt: int = 0  # chunks and records of the file left out
 
     @property
     def T_base_rig(self) -> NDArray[np.float64]:
@@ -114,6 +115,7 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
     reader = RecordingReader(found, choose_odometry_topic(found, topic))
     rig, fault = _rig(reader.attachments)
     events = Events()
+    poses = PoseHistory(events, keep_poses)
     data = ReportData(
         found,
         reader.topic,
@@ -122,8 +124,8 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
         rig,
         fault,
         events,
-        PoseHistory(events, keep_poses),
-        StatusHistory(events),
+        poses,
+        StatusHistory(events, poses),
     )
     _Collector(data).collect(reader)
     if not data.poses.poses:
@@ -165,6 +167,7 @@ class _Collector:
                     self._add_twist(message.name, message.content)
         self._add_pending()
         self._data.unreadable += reader.unreadable.total()
+        self._data.corrupt = reader.corrupt
 
     def _add_pose(self, record: OdometryRecord, log_time_ns: int) -> None:
         data, offset_ns = self._data, log_time_ns - record.stamp_ns

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import Final, NamedTuple
 
 from omnid.report.downsampling import Downsampled
 from omnid.report.events import ERROR, GOOD, WARNING, Event, Events, without_digits
-from omnid.report.poses import STATES, UNKNOWN
+from omnid.report.poses import STATES, UNKNOWN, PoseHistory
 from omnid.transport import status_names
 from omnid.transport.decode import Diagnostics
 from omnid.transport.records import DiagnosticStatus
@@ -50,11 +51,27 @@ _PLOTTED: Final = frozenset(
 )
 
 
+class _RunProgress(NamedTuple):
+    """Numbers that only rise as long as a daemon runs."""
+
+    stamp_ns: int
+    resets: int
+    length_m: float  # of the path; NaN where it is not reported
+
+    def is_restarted_by(self, later: _RunProgress) -> bool:
+        """True if a later entry shows that the daemon was started again in between."""
+        return later.resets < self.resets or later.length_m < self.length_m
+
+
 class StatusHistory:
     """Collects the entries of a recording in bounded memory."""
 
-    def __init__(self, events: Events) -> None:
-        self._events = events
+    def __init__(self, events: Events, poses: PoseHistory) -> None:
+        """poses: told where the daemon was started again."""
+        self._events, self._poses = events, poses
+        # Of the periodic reports, which have the length of the path (True), and of those of a new state (False): each
+        # kind comes in its own order.
+        self._progress: dict[bool, _RunProgress] = {}
         self._counts: dict[tuple[str, str], int] = {}
         self._messages: dict[str, str] = {}
         self._state_ns = 0
@@ -106,10 +123,26 @@ class StatusHistory:
         resets = status_names.count(status.values.get(Key.RESETS, ""))
         if resets is None or resets >= _MAX_RESETS:
             return
+        self._add_progress(_RunProgress(stamp_ns, resets, _length_m(status)), t_s)
         before, self._reset_counter = self._reset_counter, max(resets, self._reset_counter or 0)
         if before is not None and self._reset_counter > before:
             self.resets += self._reset_counter - before
             self._events.add(Event(t_s, t_s, ERROR, "state", "odometry was reset, with an unknown gap"))
+
+    def _add_progress(self, progress: _RunProgress, t_s: float) -> None:
+        """Add an event where the daemon was started again; older entries, recorded out of order, say nothing."""
+        is_periodic = not math.isnan(progress.length_m)
+        before = self._progress.get(is_periodic, progress)
+        if progress.stamp_ns < before.stamp_ns:
+            return
+        if before.is_restarted_by(progress):
+            self._progress.clear()
+            self._reset_counter = 0
+            self._poses.begin_run()
+            self._events.add(Event(t_s, t_s, WARNING, "state", "the robot was started again, with a new odom"))
+        elif is_periodic or True not in self._progress:
+            self._poses.continue_run()
+        self._progress[is_periodic] = progress
 
     def _add_message(self, status: DiagnosticStatus, t_s: float) -> None:
         """Add an event where the message of a part changes; a change of digits only is not an event."""
@@ -137,6 +170,12 @@ class StatusHistory:
             self._counts[name, key] = count
         if count > before:
             self._events.add(Event(t_s, t_s, WARNING, short_name(name), _COUNTERS.get(key, key), count - before))
+
+
+def _length_m(status: DiagnosticStatus) -> float:
+    """Return the length of the path in an entry of the odometry, NaN without one."""
+    length_m = status_names.number(status.values.get(Key.LENGTH_M, ""))
+    return math.nan if length_m is None else length_m
 
 
 def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:

@@ -7,6 +7,7 @@ event loop. Nothing that a browser does can reach that far.
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from typing import Final
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, parse_image
-from omnid.client import Diagnostics, Map, Robot, Unreachable
+from omnid.client import Diagnostics, Map, NavigationReport, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState
 from omnid.transport.bus_config import BusConfig
@@ -26,9 +27,12 @@ from omnid.web.browsers import Browsers
 from omnid.web.channels import Encoded, LivePath, Newest, with_header
 from omnid.web.snapshot import (
     MOST_CELLS,
+    PATH_FRAME,
     map_in_odom,
     map_message,
     navigation_message,
+    no_map_message,
+    no_scan_message,
     parts_message,
     scan_message,
     server_ms,
@@ -175,19 +179,35 @@ class RobotFeed:
             self.state.broken += 1
 
     def _forget_ended(self) -> None:
-        """Forget the statuses of a daemon that has ended: it may start again in another state."""
-        if self.state.alive is False and self.state.statuses:
-            self.state.statuses.clear()
+        """Show no more the statuses of a daemon that has ended."""
+        if self.state.forget_ended():
             self._parts_channel.changed()
 
     def _add_to_path(self, pose: Pose, before: Pose | None) -> None:
         """Add a pose; a smaller sequence number than before means that the daemon, and so odom, has begun again."""
         if before is not None and pose.attachment.seq < before.attachment.seq:
-            self.path.clear()
-            self._poses.clear()
+            self._begin_again()
         self._poses.append(pose)
         gap = before is not None and pose.attachment.resets != before.attachment.resets
         self.path.add(pose.x_m, pose.y_m, gap)
+
+    def _begin_again(self) -> None:
+        """Forget what belongs to the odom of a daemon that has ended, and let the browsers forget it."""
+        self.path.clear()
+        self._poses.clear()
+        self._map_in_odom = None
+        if self._map:
+            self._map = no_map_message(PATH_FRAME)
+            self._map_channel.changed()
+        if self._scan:
+            self._scan = no_scan_message()
+            self._scan_channel.changed()
+        if self._navigation:
+            self._navigation = navigation_message(NavigationReport(0, "", "", "", 0, math.nan, "", ""))
+            self._navigation_channel.changed()
+        if self._panorama:
+            self._panorama = with_header({"type": PANORAMA, "stamp_ms": 0}, b"")
+            self._panorama_channel.changed()
 
     async def _process_large(self) -> None:
         """Encode maps and panoramas; they take longer than a pose may wait."""

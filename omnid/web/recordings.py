@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import os
 from collections import OrderedDict
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -14,8 +14,11 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
+from drivers.errors import DriverError
 from drivers.logs.file_lock import is_locked
 from drivers.logs.log_folder import PART_SUFFIX
+from drivers.logs.mcap_index import has_footer
+from drivers.logs.mcap_records import LogFile
 from omnid.engine.python_program import python, python_environment
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
@@ -129,9 +132,15 @@ def _key(name: str) -> str:
 
 
 def _state(path: Path) -> str:
+    """Return the state of a recording by its two ends, as a list of many must be quick."""
     if is_locked(path):
         return "being written"
-    return "cut: omnid log recover" if path.name.endswith(PART_SUFFIX) else "whole"
+    try:
+        with closing(LogFile(path)) as file:
+            is_complete = has_footer(file) and not path.name.endswith(PART_SUFFIX)
+    except DriverError:
+        return "no log"
+    return "whole" if is_complete else "cut: omnid log recover"
 
 
 def recordings_routes(recordings: Recordings) -> list[BaseRoute]:

@@ -112,7 +112,7 @@ def map_message(grid: Map) -> bytes:
     lies in odom.
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
-        return with_header({"type": "map", "width": 0, "height": 0, "frame": plain(grid.frame)}, b"")
+        return no_map_message(grid.frame)
     step = -(-max(grid.cells.shape) // LARGEST_MAP_PX)
     cells = _reduced(np.where(grid.cells > 50, 2, np.where(grid.cells >= 0, 1, 0)).astype(np.uint8), step)
     header = {
@@ -127,6 +127,11 @@ def map_message(grid: Map) -> bytes:
     return with_header(header, zlib.compress(cells.tobytes(), 1))
 
 
+def no_map_message(frame: str) -> bytes:
+    """Return a message `map` without cells, for which the page shows no map."""
+    return with_header({"type": "map", "width": 0, "height": 0, "frame": plain(frame)}, b"")
+
+
 def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
     """Return the message `scan`: the nearest obstacles around the robot, in odom, and the nearest of all.
 
@@ -137,7 +142,7 @@ def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
     seen = np.isfinite(scan.ranges_m) & (scan.ranges_m > 0) & (scan.ranges_m < _LARGEST_M)
     ranges_m, azimuths_rad = scan.ranges_m[seen].astype(float), scan.azimuths_rad[seen].astype(float)
     if place is None or scan.frame != BASE_FRAME or not ranges_m.size or not math.isfinite(place.yaw_rad):
-        return compact({"type": "scan", "points": [], "nearest": None})
+        return no_scan_message()
     nearest = int(ranges_m.argmin())
     chosen = np.unique(np.append(np.arange(0, len(ranges_m), -(-len(ranges_m) // MOST_SECTORS)), nearest))
     angles = azimuths_rad[chosen] + place.yaw_rad
@@ -152,6 +157,11 @@ def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
             "nearest": [finite(float(ranges_m[nearest])), finite(turn_deg)],
         }
     )
+
+
+def no_scan_message() -> str:
+    """Return a message `scan` without points, for which the page shows no obstacles."""
+    return compact({"type": "scan", "points": [], "nearest": None})
 
 
 def navigation_message(report: NavigationReport) -> str:

@@ -64,7 +64,7 @@ class StickCommands:
     def __init__(self, feed: RobotFeed, wheels: WheelCommands) -> None:
         self._feed, self._wheels = feed, wheels
         self._thread = ThreadPoolExecutor(1)
-        self._limits: VelocityLimits | None = None
+        self._limits: tuple[tuple[int, int], VelocityLimits] | None = None  # ends and restarts before they were read
         self._sending = False
         self._page, self._held_until_s = "", -math.inf
 
@@ -114,8 +114,11 @@ class StickCommands:
         return ""
 
     async def _limits_of_robot(self) -> VelocityLimits:
-        """Return the robot's limits, read at the first call; the defaults while there is no connection."""
-        robot = self._feed.robot
-        if self._limits is None and robot is not None:
-            self._limits = await asyncio.to_thread(limits_of, robot)
-        return self._limits or VelocityLimits()
+        """Return the robot's limits, read at the first call after its start; the defaults without a connection."""
+        robot, state = self._feed.robot, self._feed.state
+        if robot is None:
+            return VelocityLimits()
+        start = state.ends, state.restarts
+        if self._limits is None or self._limits[0] != start or state.alive is False:
+            self._limits = start, await asyncio.to_thread(limits_of, robot)
+        return self._limits[1]

@@ -19,6 +19,9 @@ Array = NDArray[np.float64]
 # At which an error of 1 degree of a facing weighs as much as one of 1 cm of a position; by trial on development seeds.
 AHEAD_M: Final = 0.5
 FACING: Final = 0.7  # least horizontal part of a normal: that of a tag on the floor says nothing of the heading
+# Least horizontal spread of the points of a fit: root of the sum of their squared distances from their middle. There,
+# errors of 1 cm at each landmark, in map and plan, turn the map by 4 degrees; two landmarks are then 0.28 m apart.
+MIN_SPREAD_M: Final = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +47,8 @@ def fit(seen: Mapping[int, Landmark], known: Mapping[int, Landmark]) -> tuple[Ar
     """Return the transform T_plan_map (4, 4), level, and the distance [m] that is left at each common landmark.
 
     Least squares (Kabsch) over the landmarks, and where both facings are known over the points AHEAD_M before them.
-    Raises ValueError where they do not determine the heading: one landmark without facing, or none.
+    Raises ValueError where they do not determine the heading: one landmark without facing, none, or several that hang
+    one above the other (MIN_SPREAD_M).
     """
     common = sorted(seen.keys() & known.keys())
     here, there = (np.array([marks[id].xyz_m for id in common]).reshape(-1, 3) for marks in (seen, known))
@@ -56,6 +60,12 @@ def fit(seen: Mapping[int, Landmark], known: Mapping[int, Landmark]) -> tuple[Ar
     if len(a) < 2:
         raise ValueError("two landmarks, or one whose facing_deg is known, tell how the map lies")
     p, q = a - a.mean(axis=0), b - b.mean(axis=0)
+    spread_m = min(float(np.linalg.norm(p)), float(np.linalg.norm(q)))
+    if spread_m < MIN_SPREAD_M:
+        raise ValueError(
+            f"across the floor they spread by {spread_m:.2f} m, expected {MIN_SPREAD_M} m or more: "
+            "add one that hangs elsewhere, or facing_deg of one, which tells how the map lies"
+        )
     yaw = math.atan2(float((p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]).sum()), float((p * q).sum()))
     R = se3.rotation_exp([0.0, 0.0, yaw])
     xy = b.mean(axis=0) - R[:2, :2] @ a.mean(axis=0)

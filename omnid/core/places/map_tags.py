@@ -78,8 +78,18 @@ class MapTags:
         part.views = [view for view in self.views if view.keyframe in ids]
         return part
 
+    def require_same_sizes(self, other: MapTags) -> None:
+        """Raise ValueError where a tag has another size in another map: its views there are of another scale."""
+        for id in sorted(self.known.keys() & other.known.keys()):
+            here, there = self.known[id], other.known[id]
+            if here.size_m != there.size_m:
+                raise ValueError(
+                    f"tag {id} ({there.name}) has an edge of {there.size_m:g} m, but of {here.size_m:g} m before"
+                )
+
     def join(self, other: MapTags, renumbered: Callable[[int], int]) -> None:
-        """Add the tags of another map, whose keyframes have got new ids."""
+        """Add the tags of another map, whose keyframes have got new ids. Raises as `require_same_sizes` does."""
+        self.require_same_sizes(other)
         self.known = other.known | self.known
         self.add(TagView(renumbered(view.keyframe), view.tag, view.T_rect_tag, view.covariance) for view in other.views)
 

@@ -30,7 +30,9 @@ def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:
     """Add another map to a map; return the number of keyframes that were recognised, 0 where the maps share no place.
 
     The frame of `places` stays. Its bounds are not applied; without a common place it stays as it is.
+    Raises ValueError where a tag has another size in the other map.
     """
+    places.tags.require_same_sizes(other.tags)
     renumbered = _renumbered(other, places)
     search, ids = PlaceSearch(model), sorted(places.keyframes)
     # 1. Recognise each keyframe of the other map; each recognition tells where the other map lies.

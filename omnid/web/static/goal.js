@@ -96,7 +96,8 @@ export function wireGoal(plan) {
       busy = BUSY.includes(report.state);
       if (before && !busy && !choosing) {
         plan.setGoal(null);
-        say(report.reason ? `It has ended: ${report.state}: ${report.reason}.` : `It has ended: ${report.state}.`);
+        if (!report.state) say("The robot has started again.");
+        else say(report.reason ? `It has ended: ${report.state}: ${report.reason}.` : `It has ended: ${report.state}.`);
       }
       showButtons();
     },

@@ -150,12 +150,14 @@ function showParts(parts) {
   }));
 }
 
+// An empty body: the robot has started again, and sent none yet.
 function showPanorama(body) {
   const image = byId("panorama");
+  image.hidden = body.byteLength === 0;
+  if (image.hidden) return;
   const before = imageUrl;
   imageUrl = URL.createObjectURL(new Blob([body], { type: "image/jpeg" }));
   image.src = imageUrl;
-  image.hidden = false;
   if (before) URL.revokeObjectURL(before);
 }
 

@@ -70,7 +70,7 @@ export function wireRoutes() {
 }
 
 function showRoutes(report) {
-  byId("navigation-box").hidden = false;
+  byId("navigation-box").hidden = !report.state; // without one the robot has started again, and reported none yet
   const left = report.left_m === null ? "" : `, ${fixed(report.left_m, 1)} m left`;
   const what = report.task ? `${report.task}: ` : "";
   const why = report.reason ? `: ${report.reason}` : "";

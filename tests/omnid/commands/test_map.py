@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from omnid.cli import main
+from omnid.core.places.map_tags import MapTag
 from omnid.core.places.place_views import base_poses
 from omnid.formats.place_file import read_places, write_places
 from tests.omnid.formats.place_maps import RIG, some_places
@@ -107,6 +108,25 @@ def test_merge_replaces_no_other_map_and_joins_none_with_itself(omap: Path, caps
         error = capsys.readouterr().err
         assert message in error and error.count("\n") == 1
     assert taken.read_bytes() == b"of another building"
+
+
+def test_merge_refuses_maps_in_which_a_tag_has_other_sizes(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    places, other = some_places(12, features=20), omap.parent / "b.omap"
+    places.tags.known[5] = MapTag(5, "dock", 0.2)
+    write_places(other, places, RIG)
+    assert main(["map", "merge", str(omap), str(other), "-o", str(omap.parent / "c.omap")]) == 2
+    error = capsys.readouterr().err
+    assert f"map merge: {other}: tag 5 (dock) has an edge of 0.2 m, but of 0.16 m before: measure it" in error
+    assert error.count("\n") == 1 and not (omap.parent / "c.omap").exists()
+
+
+def test_align_refuses_tags_one_above_the_other(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tag = SEEN.replace("facing_deg = 0\n", "")
+    (omap.parent / "tags.toml").write_text(tag + tag[11:].replace("5]", "6]", 1).replace("id = 5", "id = 6"))
+    words = ["--seen", str(omap.parent / "tags.toml"), "--known", str(omap.parent / "tags.toml")]
+    assert main(["map", "align", str(omap), *words, "-o", str(omap.parent / "b.omap")]) == 2
+    error = capsys.readouterr().err
+    assert "2 tags in common: across the floor they spread by 0.00 m" in error and error.count("\n") == 1
 
 
 def test_export_writes_what_is_asked_for_and_names_it(omap: Path, capsys: pytest.CaptureFixture[str]) -> None:

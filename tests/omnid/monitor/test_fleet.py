@@ -21,7 +21,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import WHEELS
+from omnid.transport.status_names import MAP_FILE, ODOMETRY, WHEELS
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script
 
 LIMIT_S = 120  # no table needs as long as that, even on a busy computer
@@ -104,6 +104,38 @@ def test_the_number_of_robots_is_bounded_and_their_names_are_plain() -> None:
     stream = io.StringIO()
     show(hostile, stream)
     assert "\x1b" not in stream.getvalue() and max(map(len, stream.getvalue().splitlines())) < 120
+
+
+def test_a_robot_that_has_ended_takes_its_statuses_along() -> None:
+    """Started again without map and wheels, it shows neither of before."""
+    fleet, times_ns = FleetState(), iter(range(1, 9))
+    good = DiagnosticStatus(ODOMETRY, 0, "tracking", {})
+    full = DiagnosticStatus(MAP_FILE, 2, "m.omap cannot be written: disk full", {})
+
+    def report(*statuses: DiagnosticStatus) -> None:
+        message = codec.diagnostics_cdr(10**18, statuses)
+        fleet.process(ReceivedMessage(next(times_ns), "rover/status", message, b""))
+
+    def come_and_go(*alive: bool) -> None:
+        for there in alive:
+            fleet.note_alive("rover", there)
+        fleet.take_alive()
+
+    come_and_go(True)
+    report(good, full, DiagnosticStatus(WHEELS, 0, "driving", {"armed": "1"}))
+    assert set(fleet.robots["rover"].statuses) == {ODOMETRY, MAP_FILE, WHEELS}
+    come_and_go(True)
+    assert set(fleet.robots["rover"].statuses) == {ODOMETRY, MAP_FILE, WHEELS}
+    come_and_go(False)
+    assert not fleet.robots["rover"].statuses
+    report(full)  # sent before it ended
+    assert not fleet.robots["rover"].statuses
+    come_and_go(True)
+    report(good, full)
+    come_and_go(False, True)
+    report(good)
+    assert set(fleet.robots["rover"].statuses) == {ODOMETRY}
+    assert "disk full" not in "".join(fleet_table(fleet.robots))
 
 
 def test_options_of_one_robot_are_refused() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import signal
 import subprocess
 import sys
@@ -18,8 +19,10 @@ from rosbags.highlevel import AnyReader
 from calib import se3
 from omnid.client import Robot
 from omnid.formats.tum import read_tum
+from omnid.monitor import follow
+from omnid.monitor.follow import _follow
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
-from omnid.monitor.screen import summary_line
+from omnid.monitor.screen import Screen, summary_line
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.pose_attachment import PoseAttachment
@@ -158,3 +161,24 @@ def test_tells_that_the_daemon_has_ended() -> None:
         wait_until(lambda: state.alive is False)
     state._arrivals_s[-1] -= 10
     assert "its daemon has ended" in state.state and state.state in summary_line("omnid", state)
+
+
+def test_the_statuses_of_a_daemon_that_has_ended_are_not_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(follow, "SHOW_PERIOD_S", 0.02)
+    endpoint, state, parts = free_endpoint(), RobotState(), list[int]()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as robot:
+
+        class Terminal(io.StringIO):
+            """Ends the daemon once a status was shown, and the command once none is shown any more."""
+
+            def flush(self) -> None:
+                parts.append(len(state.statuses))
+                if state.alive and state.statuses:
+                    bus.close()
+                elif any(parts) and not state.statuses:
+                    raise KeyboardInterrupt
+
+        publish(bus, 1)
+        with contextlib.suppress(KeyboardInterrupt):
+            _follow(robot, state, Screen("omnid", Terminal()), [], time.monotonic() + DEADLINE_S)
+    assert max(parts) == 1 and parts[-1] == 0

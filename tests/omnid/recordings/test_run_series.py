@@ -10,6 +10,7 @@ import pytest
 from omnid.recordings import run_series
 from omnid.recordings.run_series import read_run_series
 from tests.omnid.recordings.test_comparison import pose, run_of
+from tests.omnid.report.recorded_logs import corrupt_chunks
 
 COUNT = 20
 
@@ -28,3 +29,11 @@ def test_refuses_recordings_that_are_too_long(tmp_path: Path, first: Path, monke
     monkeypatch.setattr(run_series, "MAX_ROWS", COUNT - 1)
     with pytest.raises(run_series.OmnidError, match="cut it into shorter ones"):
         read_run_series(first)
+
+
+def test_corrupt_chunks_of_a_recording_with_an_index_are_a_warning(first: Path) -> None:
+    assert read_run_series(first).warnings == ()
+    corrupt_chunks(first)
+    run = read_run_series(first)
+    assert run.warnings == (f"{first}: 2 corrupt chunks or records are left out",)
+    assert 0 < run.poses.stamps_ns.size < COUNT

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
+from mcap.opcode import Opcode
 
 from calib import se3
+from drivers.logs.mcap_records import MAGIC, LogFile, records
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec, map_codec
 from omnid.transport.records import DiagnosticStatus
@@ -76,6 +79,16 @@ def save(path: Path, entries: Iterable[Entry], attachments: dict[str, bytes] | N
         for stamp_ns, topic, schema, payload in entries:
             log.write(topic, schema, payload, stamp_ns)
     return path
+
+
+def corrupt_chunks(path: Path) -> None:
+    """Change a byte in the second and the third chunk of a log; its index stays."""
+    data = bytearray(path.read_bytes())
+    with closing(LogFile(path)) as file:
+        chunks = [record for record in records(file, len(MAGIC), file.size) if record.opcode == Opcode.CHUNK]
+    for chunk in chunks[1:3]:
+        data[chunk.offset + chunk.size - 20] ^= 0xFF
+    path.write_bytes(data)
 
 
 def run(count: int = 100, lost: Sequence[int] = (), missing: Sequence[int] = ()) -> list[Entry]:

@@ -5,11 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from calib import se3
+from omnid.report.report import report_html
 from omnid.report.report_data import ReportData, collect_report_data
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING
+from omnid.transport.status_names import ODOMETRY, PAIRING, Key
 from tests.omnid.report.recorded_logs import (
+    Entry,
+    corrupt_chunks,
     map_pose,
     odom,
     run,
@@ -47,6 +52,63 @@ def test_orders_status_from_before_the_first_pose_and_late_status(tmp_path: Path
     data = collect_report_data(save(tmp_path / "log.mcap", entries))
     assert data.poses.states == {0: 1, 2: 2}
     assert event_texts(data)[0] == ("pairing", "none") and data.events.in_order()[0].start_s == -2.0
+
+
+def test_corrupt_chunks_of_a_log_with_an_index_are_counted(tmp_path: Path) -> None:
+    log = save(tmp_path / "a.mcap", run(60))
+    assert collect_report_data(log).corrupt == 0
+    corrupt_chunks(log)
+    data = collect_report_data(log)
+    assert data.corrupt == 2 and 40 < data.poses.poses < 60
+    page = report_html(log, data)
+    assert "2 corrupt chunks or records were skipped." in page and "MB, cut or corrupt. Poses" in page
+
+
+STARTED_AGAIN = ("state", "the robot was started again, with a new odom")
+
+
+def straight(first: int, count: int) -> list[Entry]:
+    """A drive of 0.1 m from pose to pose, from the origin of a new odom on; first: number of its first pose."""
+    return [odom(first + k, se3.transform(np.eye(3), [0.1 * k, 0.0, 0.0])) for k in range(count)]
+
+
+def length(pose: float, length_m: float, resets: int = 0) -> Entry:
+    """A periodic report."""
+    values: dict[str, str] = {Key.RESETS: str(resets), Key.LENGTH_M: f"{length_m:.2f}"}
+    return status(pose, DiagnosticStatus(ODOMETRY, 0, "tracking", values))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "resets"),
+    [
+        # The length falls, a while after the start, and as the first pose comes.
+        ([length(9, 0.9)], {9: length(69, 0.85), 10: length(70, 0.95)}, 0),
+        ([length(9, 0.9)], {0: length(60, 0.0)}, 0),
+        # The number of resets falls, and is that of the new run.
+        ([state(9, "tracking", 2)], {0: state(60, "tracking", 0)}, 0),
+        ([state(9, "tracking", 2)], {0: state(60, "tracking", 0), 5: state(65, "tracking", 1)}, 1),
+        # Both kinds of report say so.
+        ([length(9, 0.9, 2), state(9, "tracking", 2)], {0: state(60, "tracking", 0), 9: length(69, 0.3)}, 0),
+    ],
+)
+def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_its_new_origin(
+    tmp_path: Path, before: list[Entry], after: dict[int, Entry], resets: int
+) -> None:
+    """A path of 1.9 m, a pause without poses, and one of 1.9 m from the origin of a new odom."""
+    entries = [*straight(-10, 20), *before]
+    for k, pose in enumerate(straight(60, 20)):
+        entries += [pose, *([after[k]] if k in after else [])]
+    data = collect_report_data(save(tmp_path / "a.mcap", entries))
+    assert data.poses.length_m == pytest.approx(2 * 1.9)
+    assert event_texts(data).count(STARTED_AGAIN) == 1 and data.statuses.resets == resets
+
+
+def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
+    """The way during the gap counts; a report that was recorded late has fewer resets than the one before."""
+    entries = [*straight(0, 10), length(9, 0.9), state(9, "tracking", 1)]
+    entries += [odom(60, se3.transform(np.eye(3), [5.0, 0.0, 0.0])), length(60, 5.0, 1), state(8, "tracking", 0)]
+    data = collect_report_data(save(tmp_path / "a.mcap", entries))
+    assert data.poses.length_m == pytest.approx(5.0) and STARTED_AGAIN not in event_texts(data)
 
 
 def test_a_pose_in_the_map_without_its_pose_of_odometry_is_left_out(tmp_path: Path) -> None:

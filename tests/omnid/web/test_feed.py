@@ -117,6 +117,43 @@ def test_the_path_begins_again_with_a_smaller_number_and_has_a_gap_after_a_reset
     assert points(feed) == [[0.25, -1.0], [0.5, -1.0]] and len(feed._poses) == 2
 
 
+def test_a_robot_that_has_started_again_is_shown_without_what_belongs_to_its_odom_before() -> None:
+    """The pages are sent messages without a map, obstacles, navigation and panorama, in place of the old ones."""
+    feed = RobotFeed(BusConfig())
+    navigation = DiagnosticStatus(NAVIGATION, 0, "", {str(Key.STATE): "driving", str(Key.TASK): "goal"})
+    large = {
+        "map": MAP,
+        "scan": SCAN,
+        "panorama": panorama(b"\xff\xd8 bytes"),
+        "navigation": codec.diagnostics_cdr(10**18, [navigation]),
+    }
+    channels = (feed._map_channel, feed._scan_channel, feed._panorama_channel, feed._navigation_channel)
+
+    async def take() -> None:
+        for topic, payload in large.items():
+            await feed._take_large(topic, payload)
+
+    for seq in (4, 0):  # with nothing to forget there is nothing to send
+        add_pose(feed, seq)
+    feed._process_inbox()
+    assert [channel.version for channel in channels] == [0, 0, 0, 0]
+    add_pose(feed, 4)
+    feed.inbox.put("map_pose", codec.pose_with_covariance_cdr(10**9 + 4, np.eye(4), np.eye(6)), b"")
+    feed._process_inbox()
+    asyncio.run(take())
+    assert feed._map_in_odom is not None and [channel.version for channel in channels] == [1, 1, 1, 1]
+    add_pose(feed, 0)
+    feed._process_inbox()
+    assert [channel.version for channel in channels] == [2, 2, 2, 2]
+    assert json.loads(feed._encode_state())["map_in_odom"] is None
+    no_map, no_panorama = (bytes(channel.message(1)[4:]) for channel in (feed._map_channel, feed._panorama_channel))
+    assert json.loads(no_map) == {"type": "map", "width": 0, "height": 0, "frame": "odom"}
+    assert json.loads(no_panorama) == {"type": "panorama", "stamp_ms": 0}
+    assert json.loads(feed._scan_channel.message(1)) == {"type": "scan", "points": [], "nearest": None}
+    report = json.loads(feed._navigation_channel.message(1))
+    assert (report["state"], report["task"], report["left_m"]) == ("", "", None)
+
+
 def test_a_status_makes_new_parts_and_a_daemon_that_has_ended_takes_them_along() -> None:
     feed = RobotFeed(BusConfig())
     add_pose(feed, 1)

@@ -33,15 +33,20 @@ def test_recordings_are_listed_and_reported(server: WebServer, recordings: Path,
     (recordings / "folder.mcap").mkdir()
     odd = os.fsencode(recordings) + b"/<b>\xff\n.mcap"
     Path(os.fsdecode(odd)).write_bytes(b"nothing")
+    (recordings / "cut.mcap").write_bytes(sample.read_bytes()[:-1])
+    (recordings / "empty.mcap").touch()
     with (recordings / "now.mcap.part").open("wb") as written:
         lock(written)
         found = listed(server)
-    assert set(found) == {"images_20261122T050000Z_001.mcap", "cut.mcap.part", r"<b>\xff\n.mcap", "now.mcap.part"}
+    assert {name: entry["state"] for name, entry in found.items()} == {
+        "images_20261122T050000Z_001.mcap": "whole",
+        "cut.mcap.part": "cut: omnid log recover",
+        "cut.mcap": "cut: omnid log recover",
+        "empty.mcap": "no log",
+        r"<b>\xff\n.mcap": "no log",
+        "now.mcap.part": "being written",
+    }
     assert found["images_20261122T050000Z_001.mcap"]["size_bytes"] == sample.stat().st_size
-    assert (found["now.mcap.part"]["state"], found["cut.mcap.part"]["state"]) == (
-        "being written",
-        "cut: omnid log recover",
-    )
     odd_key = found[r"<b>\xff\n.mcap"]["key"]
     answer = server.request(f"/recordings/{odd_key}/report", "POST", server.bearer)
     text = json.loads(answer.text)["text"]

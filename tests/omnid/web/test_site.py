@@ -212,8 +212,8 @@ def test_the_newest_recordings_are_listed_first(tmp_path: Path, monkeypatch: pyt
     described = found.described()
     assert described["folder"] == str(tmp_path)
     assert [(one["name"], one["size_bytes"], one["changed_s"], one["state"]) for one in described["recordings"]] == [
-        ("4.mcap", 4, 1004, "whole"),
-        ("3.mcap", 3, 1003, "whole"),
+        ("4.mcap", 4, 1004, "no log"),
+        ("3.mcap", 3, 1003, "no log"),
     ]
     key = described["recordings"][0]["key"]
     assert len(key) == 24 and key != described["recordings"][1]["key"]

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import time
+from contextlib import closing
 
 import pytest
 from starlette.requests import Request
 
+from omnid.client import Robot
+from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.errors import OmnidError
+from omnid.monitor.robot_state import ReceivedMessage
+from omnid.transport.bus import Bus
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.pose_attachment import PoseAttachment
 from omnid.web import snapshot
 from omnid.web.feed import RobotFeed
 from omnid.web.stick import StickCommands, StickRequest, stick_request
 from omnid.web.wheel_commands import WheelCommands
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
 
 NOW_MS = 50_000
 
@@ -89,6 +96,32 @@ def test_one_page_drives_until_it_has_asked_for_nothing_for_a_while(at_50_s: Non
     assert stick._refusal(other) == "another page drives" and stick._refusal(mine) == ""
     stick._held_until_s = time.monotonic() - 1e-6
     assert stick._refusal(other) == ""
+
+
+def test_the_limits_are_read_again_after_the_robot_has_started_again() -> None:
+    """By its token and, where the token was not seen to go, by the numbers of its poses."""
+
+    def config(velocity_mps: float) -> str:
+        return f"[controller.limits]\nvelocity_mps = {velocity_mps}\nyaw_rate_radps = 2.0\n"
+
+    def read(stick: StickCommands) -> float:
+        return asyncio.run(stick._limits_of_robot()).velocity_mps
+
+    feed, endpoint = RobotFeed(BusConfig()), free_endpoint()
+    stick = StickCommands(feed, WheelCommands(feed))
+    assert read(stick) == VelocityLimits().velocity_mps
+    with closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as feed.robot:
+        bus.serve("config", config(1.5))
+        wait_until(lambda: read(stick) == 1.5)
+        bus.serve("config", config(0.3))
+        assert read(stick) == 1.5, "a request of the stick does not wait for the robot's answer"
+        feed.state.set_alive(False)
+        feed.state.set_alive(True)
+        assert read(stick) == 0.3
+        bus.serve("config", config(0.7))
+        for seq in (9, 0):
+            feed.state.process(ReceivedMessage(1, "odom", odometry(seq), PoseAttachment(seq).to_bytes()))
+        assert read(stick) == 0.7
 
 
 def test_no_command_is_sent_before_the_last_one_has_ended(at_50_s: None, stick: StickCommands) -> None:

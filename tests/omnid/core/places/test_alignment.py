@@ -43,6 +43,18 @@ def test_one_without_facing_does_not(ids: tuple[int, ...]) -> None:
         fit({id: SEEN[id] for id in ids}, KNOWN)
 
 
+@pytest.mark.parametrize("apart_m", [0.0, 0.001, 0.27])
+def test_landmarks_one_above_the_other_do_not_either(apart_m: float) -> None:
+    """The plan is turned by 2.2 rad, which nothing but noise tells; facings that are known tell it."""
+    seen = {6: SEEN[6], 7: replace(SEEN[6], id=7, xyz_m=(-3.0 + apart_m, 0.5, 2.0))}
+    known = {id: on_plan(mark) for id, mark in seen.items()}
+    with pytest.raises(ValueError, match=rf"spread by {apart_m / np.sqrt(2):.2f} m, expected 0.2 m or more: add one"):
+        fit(seen, known)
+    facing = {id: replace(mark, facing_rad=0.3) for id, mark in seen.items()}
+    T, _ = fit(facing, {id: on_plan(mark) for id, mark in facing.items()})
+    np.testing.assert_allclose(T, T_PLAN_MAP, atol=1e-9)
+
+
 def test_what_does_not_fit_is_reported() -> None:
     wrong = replace(KNOWN[6], xyz_m=(KNOWN[6].xyz_m[0] + 1.0, *KNOWN[6].xyz_m[1:]))
     _, left_m = fit(SEEN, KNOWN | {6: wrong})

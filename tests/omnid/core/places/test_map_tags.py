@@ -209,6 +209,17 @@ def test_maps_are_merged_with_their_tags(tagged: RenderedCameras, known: PlaceMa
     np.testing.assert_allclose(places.tags.all_located(places.poses)[5].T[:3, 3], true_tag()[:3, 3], atol=0.02)
 
 
+def test_maps_that_know_a_tag_in_other_sizes_are_not_joined(tagged: RenderedCameras, known: PlaceMap) -> None:
+    """A view of a tag that is thought too large is too far away."""
+    places, other = deepcopy(known), deepcopy(known)
+    other.tags.known = {TAG.id: replace(TAG, size_m=1.25 * EDGE_M)}
+    for join in (lambda: merge(places, other, tagged.model), lambda: places.tags.join(other.tags, int)):
+        with pytest.raises(ValueError, match=r"tag 5 \(dock\) has an edge of 0\.675 m, but of 0\.54 m before"):
+            join()
+    assert places.tags.known == {TAG.id: TAG} and len(places.tags.views) == len(known.tags.views)
+    assert places.keyframes.keys() == known.keyframes.keys()
+
+
 def test_the_most_certain_views_of_a_tag_are_kept() -> None:
     tags = MapTags()
     tags.add(TagView(k, 5, np.eye(4), (MAX_VIEWS + 3 - k) * COVARIANCE) for k in range(MAX_VIEWS + 2))
