@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
             raise OmnidError("--keys: expected no log beside it: the marks are used with --marks, after the drive")
         return _write_keys(args.keys, sys.stdin)
     if args.log is None:
+        _refuse_without_log(args)
         print(INSTRUCTIONS)
         return 0
     if args.distance_m is None or not 0.1 <= args.distance_m < 1e4:
@@ -87,6 +88,19 @@ def run(args: argparse.Namespace) -> int:
     outputs = [("--output", args.output)] if args.output else []
     check_outputs(outputs, [("the log that is read", args.log)])
     return _judge(args, _read(args))
+
+
+def _refuse_without_log(args: argparse.Namespace) -> None:
+    """Raise OmnidError for options that need a log: --marks takes all words that follow it, also the name of a log."""
+    from omnid.errors import OmnidError
+
+    values = {"--distance-m": args.distance_m, "--marks": args.marks, "-o": args.output, "--json": args.json or None}
+    given = [name for name, value in values.items() if value is not None]
+    if given:
+        raise OmnidError(
+            f"accept: expected a log or a trajectory with {' and '.join(given)}, found none; name it first: "
+            "omnid accept drive.mcap --distance-m 12.34 --marks 12.5 60 110"
+        )
 
 
 class _Drive(NamedTuple):

@@ -30,6 +30,23 @@ def test_without_a_log_it_says_what_to_do(capsys: pytest.CaptureFixture[str]) ->
     assert "A B A B A B A" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--distance-m", "12", "--marks", "12.5", "60", "110", "est.tum"), "--distance-m and --marks"),
+        (("-o", "accept.html"), "-o"),
+        (("--json",), "--json"),
+    ],
+)
+def test_options_of_a_drive_without_a_log_are_one_line(
+    words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert accept(*words) == 2
+    out, error = capsys.readouterr()
+    assert f"expected a log or a trajectory with {named}, found none; name it first" in error
+    assert out == "" and error.count("\n") == 1
+
+
 def test_an_accepted_drive_and_its_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     page = tmp_path / "accept.html"
     assert accept(written(tmp_path), "--distance-m", DISTANCE_M, "-o", page) == 0
