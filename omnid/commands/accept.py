@@ -109,6 +109,7 @@ class _Drive(NamedTuple):
     odometry: Trajectory
     in_map: Trajectory | None
     map_xyz: NDArray[np.float32]
+    rig_height_m: float  # at the start, in the frame of the poses
     lost: int  # poses
 
 
@@ -124,7 +125,7 @@ def _read(args: argparse.Namespace) -> _Drive:
     T_rig_base = se3.inverse(read_rig(args.rig).T_base_rig) if args.rig else np.eye(4)
     if args.log.suffix in (".txt", ".tum"):
         read = read_tum(args.log)
-        return _Drive(Trajectory(read.stamps_ns, read.T @ T_rig_base), None, no_map, 0)
+        return _Drive(Trajectory(read.stamps_ns, read.T @ T_rig_base), None, no_map, float(read.T[0, 2, 3]), 0)
     from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.diagnostics.progress import Progress
@@ -144,6 +145,7 @@ def _read(args: argparse.Namespace) -> _Drive:
         Trajectory(result.stamps_ns, result.T_odom_rig @ T_rig_base),
         Trajectory(result.stamps_ns, live @ T_rig_base) if len(live) == len(result.stamps_ns) else None,
         no_map if result.map is None else result.map.xyz,
+        float(result.T_odom_rig[0, 2, 3]),
         sum(state is TrackingState.LOST for state in result.states),
     )
 
@@ -172,7 +174,7 @@ def _judge(args: argparse.Namespace, drive: _Drive) -> int:
         print("\n".join(acceptance_text(name, found) for name, found in drives.items()))
         print("\n".join(f"not accepted: {line}" for line in faults) or f"accepted: within {args.within_percent:g} %")
     if args.output:
-        html = acceptance_html(str(args.log), drives, faults, path, drive.map_xyz)
+        html = acceptance_html(str(args.log), drives, faults, path, drive.map_xyz, drive.rig_height_m)
         write_file(args.output, html.encode("utf-8", "replace"))
     return int(bool(faults))
 
