@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from omnid.batch.jobs import BatchOptions
 
 LOCK_FILE = ".lock"
+# Longest time for one log: eleven days, far beyond any. The system waits for a program at most 2^31 ms.
+MOST_S = 1e6
 TABLES_S = 5.0  # shortest time from one writing of the tables to the next, before the end
 
 
@@ -71,8 +73,8 @@ def run(args: argparse.Namespace) -> int:
     from omnid.errors import OmnidError
     from omnid.plain_text import plain
 
-    if not args.timeout_s > 0:
-        raise OmnidError(f"batch: --timeout-s {args.timeout_s:g}: expected a time above 0")
+    if not 0 < args.timeout_s <= MOST_S:
+        raise OmnidError(f"batch: --timeout-s {args.timeout_s:g}: expected seconds above 0 and up to {MOST_S:.0f}")
     all_jobs = jobs(find_logs(args.logs), args.out.absolute(), _options(args))
     end_by_sigterm()
     with workers_of(args.jobs, args.dask) as workers, _locked(args.out):

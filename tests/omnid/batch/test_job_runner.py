@@ -212,7 +212,8 @@ def test_a_stored_result_of_another_version_or_with_damage_is_none(tmp_path: Pat
 
 
 def test_wrong_options_are_one_line(tmp_path: Path) -> None:
-    for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1")):
+    times = [("--timeout-s", seconds) for seconds in ("inf", "nan", "0", "1e7")]
+    for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1"), *times):
         done = omnid("batch", SAMPLE, "--out", tmp_path / "out", *words)
         assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
 
