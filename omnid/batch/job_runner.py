@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.logs.log_formats import LOG_SUFFIXES
-from omnid.batch.jobs import Job, file_system, is_url
+from omnid.batch.jobs import RESULT_FILE, Job, file_system, is_url
 from omnid.batch.programs import messages, run_omnid
 from omnid.plain_text import one_line
 
-RESULT_FILE: Final = "result.json"
 _ATTEMPT: Final = ".attempt-"
 _FETCHED: Final = "fetched"  # name of a log from an address, without its suffix
 

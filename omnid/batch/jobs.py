@@ -8,7 +8,7 @@ import itertools
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
@@ -18,6 +18,7 @@ from omnid.errors import OmnidError
 from omnid.plain_text import one_line
 from omnid.version import __version__
 
+RESULT_FILE: Final = "result.json"
 MAX_LOGS: Final = 100_000
 _WILDCARDS: Final = ("*", "?", "[")
 _URL: Final = re.compile(r"[a-z][a-z0-9+.-]*://")
@@ -68,28 +69,39 @@ def find_logs(names: Sequence[str]) -> list[str]:
 
 
 def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
-    """Return the jobs of logs; their folders have the names of the logs below their common folder."""
+    """Return the jobs of logs; their folders have the names of the logs below their common folder.
+
+    A folder with the results of another log is left as it is: a number is added to the name.
+    """
     paths = [
         PurePosixPath("/", _URL.sub("", log).lstrip("/")) if is_url(log) else PurePosixPath(Path(log).absolute())
         for log in logs
     ]
     common = Path(os.path.commonpath([path.parent for path in paths])) if paths else Path("/")
     # Without a dot at the beginning: names such as ".." and those of this program's own files are no folders of logs.
-    names = _distinct(
-        _UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log" for path in paths
-    )
-    return [Job(name, log, out / name, options) for name, log in zip(names, logs, strict=True)]
+    names = [_UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log" for path in paths]
+    folders = _folders(names, logs, out)
+    return [Job(folder.name, log, folder, options) for folder, log in zip(folders, logs, strict=True)]
 
 
-def _distinct(names: Iterable[str]) -> list[str]:
-    """Return names of which none occurs twice: a.mcap and a.db3 are two logs."""
-    found: dict[str, None] = {}
-    given = list(names)
-    for name in given:
+def _folders(names: Sequence[str], logs: Sequence[str], out: Path) -> list[Path]:
+    """Return a folder for each log, none twice, a.mcap and a.db3 are two logs, and none with results of another one."""
+    given, found = set(names), dict[Path, None]()
+    for name, log in zip(names, logs, strict=True):
         # A number that no other log has as a part of its own name.
-        numbered = (f"{name}-{count}" for count in itertools.count(2))
-        found[name if name not in found else next(each for each in numbered if each not in {*found, *given})] = None
+        numbered = (each for count in itertools.count(2) if (each := f"{name}-{count}") not in given)
+        folders = (out / each for each in itertools.chain([name], numbered))
+        found[next(each for each in folders if each not in found and _stored_log(each) in (None, log))] = None
     return list(found)
+
+
+def _stored_log(folder: Path) -> str | None:
+    """Return the log of the result in a folder, None where there is none that can be read."""
+    try:
+        log = json.loads((folder / RESULT_FILE).read_text())["log"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return log if isinstance(log, str) else None
 
 
 def _of_name(name: str) -> list[str]:

@@ -39,7 +39,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=Path,
         required=True,
         metavar="DIR",
-        help="a folder for each log, results.csv, index.html, and results.parquet where pyarrow is installed",
+        help="a folder for each log, and results.csv, index.html, and results.parquet where pyarrow is installed, of "
+        "the logs of the last batch",
     )
     parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
     add_topics(parser)
@@ -75,10 +76,11 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 < args.timeout_s <= MOST_S:
         raise OmnidError(f"batch: --timeout-s {args.timeout_s:g}: expected seconds above 0 and up to {MOST_S:.0f}")
-    all_jobs = jobs(find_logs(args.logs), args.out.absolute(), _options(args))
+    logs, options = find_logs(args.logs), _options(args)
     end_by_sigterm()
     with workers_of(args.jobs, args.dask) as workers, _locked(args.out):
         remove_attempts(args.out)
+        all_jobs = jobs(logs, args.out.absolute(), options)
         stored = {job.name: result for job in all_jobs if (result := stored_result(job)) is not None}
         if stored:
             print(f"{len(stored)} of {len(all_jobs)} logs have their results already", file=sys.stderr)

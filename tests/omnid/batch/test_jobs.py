@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -27,3 +28,24 @@ def test_finds_logs(tmp_path: Path) -> None:
     for missing in ("nowhere.mcap", "nowhere/*.mcap"):
         with pytest.raises(OmnidError, match="batch: no log"):
             find_logs([str(tmp_path / missing)])
+
+
+def names_of(out: Path, *logs: str) -> list[str]:
+    return [job.name for job in jobs(logs, out, BatchOptions())]
+
+
+def test_results_of_another_log_keep_their_folder(tmp_path: Path) -> None:
+    def store(name: str, text: str) -> None:
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "result.json").write_text(text)
+
+    store("run", json.dumps({"log": "/x/mon/run.mcap"}))
+    assert names_of(tmp_path, "/x/mon/run.mcap") == ["run"]
+    assert names_of(tmp_path, "/x/tue/run.mcap") == ["run-2"]
+    store("run-2", json.dumps({"log": "/x/tue/run.mcap"}))
+    assert names_of(tmp_path, "/x/tue/run.mcap") == ["run-2"], "it goes on in its own folder"
+    assert names_of(tmp_path, "/x/wed/run-2.mcap", "/x/wed/run.mcap") == ["run-2-2", "run-3"]
+    assert names_of(tmp_path, "/x/mon/run.db3", "/x/mon/run.mcap") == ["run-3", "run"]
+    for damaged in ("", "[]", "{}", '{"log": 1}'):
+        store("run", damaged)
+        assert names_of(tmp_path, "/x/tue/run.mcap") == ["run"]
