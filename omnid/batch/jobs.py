@@ -14,6 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from drivers.logs.log_formats import LOG_SUFFIXES, logs_in, parts_in_order
+from omnid.config import PlacesConfig
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line
 from omnid.version import __version__
@@ -33,6 +34,7 @@ class BatchOptions:
     truth: str = "truth.txt"  # name of a trajectory in the folder of a log, which is compared where it exists; "": none
     record: bool = False  # keep a recording and a report of each log
     timeout_s: float = 3600.0  # for one log
+    inputs: tuple[str, ...] = ()  # files that all replays read: see `input_files`
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,11 +47,34 @@ class Job:
     options: BatchOptions
 
     def key(self) -> str:
-        """Return a number that changes with the log, the options or the version of omnid: results of others are old."""
-        state: list[Any] = [__version__, asdict(self.options), self.log]
-        if not is_url(self.log):
-            state += [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in _files(Path(self.log))]
+        """Return a number that changes with what makes a result: with another number, a result is old.
+
+        That is the version of omnid, the options, and the log, its truth and the inputs, by name, size and time.
+        """
+        paths = [*map(Path, self.options.inputs), *([] if is_url(self.log) else [Path(self.log)])]
+        if (truth := self.truth()) is not None:
+            paths.append(truth)
+        files = [(str(file), stat.st_size, stat.st_mtime_ns) for path in paths for file, stat in _files(path)]
+        state = [__version__, asdict(self.options), self.log, files]
         return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:16]
+
+    def truth(self) -> Path | None:
+        """Return the true trajectory in the folder of the log, None without one, and for a log at an address."""
+        if is_url(self.log) or not self.options.truth:
+            return None
+        log = Path(self.log)
+        path = (log if log.is_dir() else log.parent) / self.options.truth
+        return path if path.is_file() else None
+
+
+def input_files(rig: Path | None, settings: Path | None, places: PlacesConfig) -> tuple[str, ...]:
+    """Return the absolute paths of the files that all replays of a batch read. rig, settings: None: not given.
+
+    A map that the replays extend is not one of them: they change it themselves.
+    """
+    known_map = places.map if places.localize_only else ""
+    given = [rig, settings, *(Path(name) for name in (places.tags, known_map) if name)]
+    return tuple(str(path.absolute()) for path in given if path is not None)
 
 
 def is_url(name: str) -> bool:

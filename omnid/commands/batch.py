@@ -103,13 +103,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace) -> BatchOptions:
-    from omnid.batch.jobs import BatchOptions
+    from omnid.batch.jobs import BatchOptions, input_files
     from omnid.config import load_config
 
-    load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
+    config = load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
     paths, topics = {"--rig": args.rig, "--config": args.config}, {"--lower": args.lower, "--upper": args.upper}
+    inputs = input_files(args.rig, args.config, config.places)
     arguments = program_options(paths, topics, args.overrides)
-    return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s)
+    return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s, inputs)
 
 
 @contextmanager

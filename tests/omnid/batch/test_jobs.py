@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 
-from omnid.batch.jobs import BatchOptions, find_logs, jobs
+from omnid.batch.jobs import BatchOptions, find_logs, input_files, jobs
+from omnid.config import PlacesConfig
 from omnid.errors import OmnidError
 
 
@@ -49,3 +51,32 @@ def test_results_of_another_log_keep_their_folder(tmp_path: Path) -> None:
     for damaged in ("", "[]", "{}", '{"log": 1}'):
         store("run", damaged)
         assert names_of(tmp_path, "/x/tue/run.mcap") == ["run"]
+
+
+def test_the_key_changes_with_all_files_that_make_a_result(tmp_path: Path) -> None:
+    log, truth, rig, settings, tags, places = (
+        tmp_path / name for name in ("log.mcap", "truth.txt", "rig.toml", "omnid.toml", "tags.toml", "site.omap")
+    )
+    for path in (log, rig, settings, tags, places):
+        path.write_text("a")
+
+    def key(*, localize_only: bool = True) -> str:
+        known = PlacesConfig(map=str(places), tags=str(tags), localize_only=localize_only)
+        (job,) = jobs([str(log)], tmp_path / "out", BatchOptions(inputs=input_files(rig, settings, known)))
+        assert job.key() == job.key()
+        return job.key()
+
+    keys = [key()]
+    for path in (log, truth, rig, settings, tags, places):
+        path.write_text("changed")
+        keys.append(key())
+    os.utime(truth, (1, 1))
+    keys.append(key())
+    truth.unlink()
+    keys.append(key())
+    assert len(set(keys)) == len(keys)
+
+    extended = key(localize_only=False)
+    places.write_text("extended by a replay")
+    assert key(localize_only=False) == extended
+    assert input_files(None, None, PlacesConfig()) == ()
