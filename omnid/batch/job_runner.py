@@ -18,11 +18,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers.logs.log_formats import LOG_SUFFIXES
-from omnid.batch.jobs import Job, file_system, is_url
+from omnid.batch.jobs import RESULT_FILE, Job, file_system, is_url
 from omnid.batch.programs import messages, run_omnid
 from omnid.plain_text import one_line
 
-RESULT_FILE: Final = "result.json"
 _ATTEMPT: Final = ".attempt-"
 _FETCHED: Final = "fetched"  # name of a log from an address, without its suffix
 
@@ -84,13 +83,13 @@ def run_job(job: Job) -> JobResult:
 
     Raise BatchInterrupted after `end_programs`: then there is no result.
     """
-    started_s = time.monotonic()
+    started_s, key = time.monotonic(), job.key()  # of the files as they are now: they may change while it runs
     job.folder.parent.mkdir(parents=True, exist_ok=True)
     attempt = Path(tempfile.mkdtemp(prefix=f"{_ATTEMPT}{job.folder.name}-", dir=job.folder.parent))
     try:
         values = _attempt(job, attempt)
         result = JobResult(
-            name=job.name, log=job.log, seconds=round(time.monotonic() - started_s, 3), key=job.key(), **values
+            name=job.name, log=job.log, seconds=round(time.monotonic() - started_s, 3), key=key, **values
         )
         (attempt / RESULT_FILE).write_text(json.dumps(row_values(result), indent=1) + "\n")
         _replace(attempt, job.folder)
@@ -131,7 +130,7 @@ def _attempt(job: Job, folder: Path) -> dict[str, Any]:
         job.options.timeout_s,
     )
     values = _failure(code, folder) | _counters(text)
-    if code == 0 and (truth := _truth(job, log)) is not None:
+    if code == 0 and (truth := job.truth()) is not None:
         values |= _compared(folder, truth, job.options.timeout_s)
     if code in (0, 1) and job.options.record:
         run_omnid(["report", "recording.mcap", "-o", "report.html"], folder, job.options.timeout_s)
@@ -185,12 +184,6 @@ def _counters(text: str) -> dict[str, Any]:
         }
     except (ValueError, KeyError, TypeError):
         return {}
-
-
-def _truth(job: Job, log: Path) -> Path | None:
-    """Return the truth in the folder of a log, if there is one."""
-    path = (log if log.is_dir() else log.parent) / job.options.truth
-    return path if job.options.truth and not is_url(job.log) and path.is_file() else None
 
 
 def _compared(folder: Path, truth: Path, timeout_s: float) -> dict[str, Any]:

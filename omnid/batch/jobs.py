@@ -8,16 +8,18 @@ import itertools
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
 from drivers.logs.log_formats import LOG_SUFFIXES, logs_in, parts_in_order
+from omnid.config import PlacesConfig
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line
 from omnid.version import __version__
 
+RESULT_FILE: Final = "result.json"
 MAX_LOGS: Final = 100_000
 _WILDCARDS: Final = ("*", "?", "[")
 _URL: Final = re.compile(r"[a-z][a-z0-9+.-]*://")
@@ -32,6 +34,7 @@ class BatchOptions:
     truth: str = "truth.txt"  # name of a trajectory in the folder of a log, which is compared where it exists; "": none
     record: bool = False  # keep a recording and a report of each log
     timeout_s: float = 3600.0  # for one log
+    inputs: tuple[str, ...] = ()  # files that all replays read: see `input_files`
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +47,34 @@ class Job:
     options: BatchOptions
 
     def key(self) -> str:
-        """Return a number that changes with the log, the options or the version of omnid: results of others are old."""
-        state: list[Any] = [__version__, asdict(self.options), self.log]
-        if not is_url(self.log):
-            state += [(str(path), stat.st_size, stat.st_mtime_ns) for path, stat in _files(Path(self.log))]
+        """Return a number that changes with what makes a result: with another number, a result is old.
+
+        That is the version of omnid, the options, and the log, its truth and the inputs, by name, size and time.
+        """
+        paths = [*map(Path, self.options.inputs), *([] if is_url(self.log) else [Path(self.log)])]
+        if (truth := self.truth()) is not None:
+            paths.append(truth)
+        files = [(str(file), stat.st_size, stat.st_mtime_ns) for path in paths for file, stat in _files(path)]
+        state = [__version__, asdict(self.options), self.log, files]
         return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:16]
+
+    def truth(self) -> Path | None:
+        """Return the true trajectory in the folder of the log, None without one, and for a log at an address."""
+        if is_url(self.log) or not self.options.truth:
+            return None
+        log = Path(self.log)
+        path = (log if log.is_dir() else log.parent) / self.options.truth
+        return path if path.is_file() else None
+
+
+def input_files(rig: Path | None, settings: Path | None, places: PlacesConfig) -> tuple[str, ...]:
+    """Return the absolute paths of the files that all replays of a batch read. rig, settings: None: not given.
+
+    A map that the replays extend is not one of them: they change it themselves.
+    """
+    known_map = places.map if places.localize_only else ""
+    given = [rig, settings, *(Path(name) for name in (places.tags, known_map) if name)]
+    return tuple(str(path.absolute()) for path in given if path is not None)
 
 
 def is_url(name: str) -> bool:
@@ -68,28 +94,39 @@ def find_logs(names: Sequence[str]) -> list[str]:
 
 
 def jobs(logs: Sequence[str], out: Path, options: BatchOptions) -> list[Job]:
-    """Return the jobs of logs; their folders have the names of the logs below their common folder."""
+    """Return the jobs of logs; their folders have the names of the logs below their common folder.
+
+    A folder with the results of another log is left as it is: a number is added to the name.
+    """
     paths = [
         PurePosixPath("/", _URL.sub("", log).lstrip("/")) if is_url(log) else PurePosixPath(Path(log).absolute())
         for log in logs
     ]
     common = Path(os.path.commonpath([path.parent for path in paths])) if paths else Path("/")
     # Without a dot at the beginning: names such as ".." and those of this program's own files are no folders of logs.
-    names = _distinct(
-        _UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log" for path in paths
-    )
-    return [Job(name, log, out / name, options) for name, log in zip(names, logs, strict=True)]
+    names = [_UNSAFE.sub("-", str(path.relative_to(common).with_suffix(""))).lstrip(".") or "log" for path in paths]
+    folders = _folders(names, logs, out)
+    return [Job(folder.name, log, folder, options) for folder, log in zip(folders, logs, strict=True)]
 
 
-def _distinct(names: Iterable[str]) -> list[str]:
-    """Return names of which none occurs twice: a.mcap and a.db3 are two logs."""
-    found: dict[str, None] = {}
-    given = list(names)
-    for name in given:
+def _folders(names: Sequence[str], logs: Sequence[str], out: Path) -> list[Path]:
+    """Return a folder for each log, none twice, a.mcap and a.db3 are two logs, and none with results of another one."""
+    given, found = set(names), dict[Path, None]()
+    for name, log in zip(names, logs, strict=True):
         # A number that no other log has as a part of its own name.
-        numbered = (f"{name}-{count}" for count in itertools.count(2))
-        found[name if name not in found else next(each for each in numbered if each not in {*found, *given})] = None
+        numbered = (each for count in itertools.count(2) if (each := f"{name}-{count}") not in given)
+        folders = (out / each for each in itertools.chain([name], numbered))
+        found[next(each for each in folders if each not in found and _stored_log(each) in (None, log))] = None
     return list(found)
+
+
+def _stored_log(folder: Path) -> str | None:
+    """Return the log of the result in a folder, None where there is none that can be read."""
+    try:
+        log = json.loads((folder / RESULT_FILE).read_text())["log"]
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    return log if isinstance(log, str) else None
 
 
 def _of_name(name: str) -> list[str]:

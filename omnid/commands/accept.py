@@ -75,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
             raise OmnidError("--keys: expected no log beside it: the marks are used with --marks, after the drive")
         return _write_keys(args.keys, sys.stdin)
     if args.log is None:
+        _refuse_without_log(args)
         print(INSTRUCTIONS)
         return 0
     if args.distance_m is None or not 0.1 <= args.distance_m < 1e4:
@@ -89,12 +90,26 @@ def run(args: argparse.Namespace) -> int:
     return _judge(args, _read(args))
 
 
+def _refuse_without_log(args: argparse.Namespace) -> None:
+    """Raise OmnidError for options that need a log: --marks takes all words that follow it, also the name of a log."""
+    from omnid.errors import OmnidError
+
+    values = {"--distance-m": args.distance_m, "--marks": args.marks, "-o": args.output, "--json": args.json or None}
+    given = [name for name, value in values.items() if value is not None]
+    if given:
+        raise OmnidError(
+            f"accept: expected a log or a trajectory with {' and '.join(given)}, found none; name it first: "
+            "omnid accept drive.mcap --distance-m 12.34 --marks 12.5 60 110"
+        )
+
+
 class _Drive(NamedTuple):
     """Poses of a drive: of the odometry, and in the map as they were known while driving (None: no map)."""
 
     odometry: Trajectory
     in_map: Trajectory | None
     map_xyz: NDArray[np.float32]
+    rig_height_m: float  # at the start, in the frame of the poses
     lost: int  # poses
 
 
@@ -110,7 +125,7 @@ def _read(args: argparse.Namespace) -> _Drive:
     T_rig_base = se3.inverse(read_rig(args.rig).T_base_rig) if args.rig else np.eye(4)
     if args.log.suffix in (".txt", ".tum"):
         read = read_tum(args.log)
-        return _Drive(Trajectory(read.stamps_ns, read.T @ T_rig_base), None, no_map, 0)
+        return _Drive(Trajectory(read.stamps_ns, read.T @ T_rig_base), None, no_map, float(read.T[0, 2, 3]), 0)
     from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.diagnostics.progress import Progress
@@ -130,6 +145,7 @@ def _read(args: argparse.Namespace) -> _Drive:
         Trajectory(result.stamps_ns, result.T_odom_rig @ T_rig_base),
         Trajectory(result.stamps_ns, live @ T_rig_base) if len(live) == len(result.stamps_ns) else None,
         no_map if result.map is None else result.map.xyz,
+        float(result.T_odom_rig[0, 2, 3]),
         sum(state is TrackingState.LOST for state in result.states),
     )
 
@@ -158,7 +174,7 @@ def _judge(args: argparse.Namespace, drive: _Drive) -> int:
         print("\n".join(acceptance_text(name, found) for name, found in drives.items()))
         print("\n".join(f"not accepted: {line}" for line in faults) or f"accepted: within {args.within_percent:g} %")
     if args.output:
-        html = acceptance_html(str(args.log), drives, faults, path, drive.map_xyz)
+        html = acceptance_html(str(args.log), drives, faults, path, drive.map_xyz, drive.rig_height_m)
         write_file(args.output, html.encode("utf-8", "replace"))
     return int(bool(faults))
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from omnid.batch.jobs import BatchOptions
 
 LOCK_FILE = ".lock"
+# Longest time for one log: eleven days, far beyond any. The system waits for a program at most 2^31 ms.
+MOST_S = 1e6
 TABLES_S = 5.0  # shortest time from one writing of the tables to the next, before the end
 
 
@@ -37,7 +39,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         type=Path,
         required=True,
         metavar="DIR",
-        help="a folder for each log, results.csv, index.html, and results.parquet where pyarrow is installed",
+        help="a folder for each log, and results.csv, index.html, and results.parquet where pyarrow is installed, of "
+        "the logs of the last batch",
     )
     parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
     add_topics(parser)
@@ -71,12 +74,13 @@ def run(args: argparse.Namespace) -> int:
     from omnid.errors import OmnidError
     from omnid.plain_text import plain
 
-    if not args.timeout_s > 0:
-        raise OmnidError(f"batch: --timeout-s {args.timeout_s:g}: expected a time above 0")
-    all_jobs = jobs(find_logs(args.logs), args.out.absolute(), _options(args))
+    if not 0 < args.timeout_s <= MOST_S:
+        raise OmnidError(f"batch: --timeout-s {args.timeout_s:g}: expected seconds above 0 and up to {MOST_S:.0f}")
+    logs, options = find_logs(args.logs), _options(args)
     end_by_sigterm()
     with workers_of(args.jobs, args.dask) as workers, _locked(args.out):
         remove_attempts(args.out)
+        all_jobs = jobs(logs, args.out.absolute(), options)
         stored = {job.name: result for job in all_jobs if (result := stored_result(job)) is not None}
         if stored:
             print(f"{len(stored)} of {len(all_jobs)} logs have their results already", file=sys.stderr)
@@ -99,13 +103,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _options(args: argparse.Namespace) -> BatchOptions:
-    from omnid.batch.jobs import BatchOptions
+    from omnid.batch.jobs import BatchOptions, input_files
     from omnid.config import load_config
 
-    load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
+    config = load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
     paths, topics = {"--rig": args.rig, "--config": args.config}, {"--lower": args.lower, "--upper": args.upper}
+    inputs = input_files(args.rig, args.config, config.places)
     arguments = program_options(paths, topics, args.overrides)
-    return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s)
+    return BatchOptions(tuple(arguments), args.truth, args.record, args.timeout_s, inputs)
 
 
 @contextmanager

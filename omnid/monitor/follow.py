@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Final, TypeAlias
 
 from drivers.logs.mcap_writer import LogWriter
 from omnid.client import Robot
+from omnid.engine.signals import handle_stop_signals
 from omnid.formats.tum import tum_row
 from omnid.monitor.connecting import connected_until
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
@@ -21,6 +22,7 @@ from omnid.transport.decode import Pose
 from omnid.transport.topics import PUBLISHED, ros_name
 
 SHOW_PERIOD_S: Final = 1.0
+POLL_S: Final = 0.5  # Time between two checks for the end: as `omnid view`, so that Ctrl-C seems to act at once.
 # Topics of which the newest message may have been sent before this program came: frames, map, path, status.
 KEPT: Final = tuple(name.removeprefix("/") for name, topic in PUBLISHED.items() if topic.latched and not topic.realtime)
 
@@ -38,7 +40,7 @@ class TumWriter:
         if pose is None or pose.stamp_ns <= self._newest_ns:
             return
         if self._file is None:
-            self._file = self._path.open("w", encoding="ascii")
+            self._file = self._path.open("w", encoding="ascii", buffering=1)  # a row at a time
         self._newest_ns = pose.stamp_ns
         self._file.write(f"{tum_row(pose.stamp_ns, pose.T_odom_base)}\n")
 
@@ -74,15 +76,18 @@ Writer: TypeAlias = TumWriter | BusLogWriter
 def listen(
     bus: BusConfig, tum: Path | None, mcap: Path | None, seconds: float | None, *, shows_load: bool = False
 ) -> int:
-    """Show the robot until Ctrl-C or for a number of seconds. Return the exit code, 1 where no pose arrived.
+    """Show the robot until a signal or for a number of seconds. Return the exit code, 1 where no pose arrived.
+
+    Ctrl-C, SIGTERM and a closed terminal leave whole files.
 
     shows_load: the share of each of its threads, in place of its state.
     """
     check_outputs([(name, path) for name, path in (("--tum", tum), ("--mcap", mcap)) if path is not None], [])
     state, screen = RobotState(), Screen(bus.robot, shows_load=shows_load)
     end_s = math.inf if seconds is None else time.monotonic() + seconds
-    with suppress(KeyboardInterrupt), ExitStack() as stack:
-        robot = connected_until(end_s, lambda: Robot(settings=bus))
+    signals: list[int] = []
+    with handle_stop_signals(lambda number, _: signals.append(number)), ExitStack() as stack:
+        robot = connected_until(end_s, lambda: Robot(settings=bus), signals)
         if robot is not None:
             stack.enter_context(robot)
             writers: list[Writer] = [TumWriter(tum)] if tum else []
@@ -90,21 +95,33 @@ def listen(
                 writers.append(BusLogWriter(mcap, robot))
             for writer in writers:
                 stack.callback(writer.close)
-            _follow(robot, state, screen, writers, end_s)
+            _follow(robot, state, screen, writers, end_s, signals)
     screen.show(state)
     return int(state.poses == 0)
 
 
-def _follow(robot: Robot, state: RobotState, screen: Screen, writers: Sequence[Writer], end_s: float) -> None:
+def _follow(
+    robot: Robot,
+    state: RobotState,
+    screen: Screen,
+    writers: Sequence[Writer],
+    end_s: float,
+    signals: Sequence[int],
+) -> None:
     inbox = Inbox()
     robot.kept_messages(inbox.put, KEPT)
     robot.on_message(inbox.put)
     robot.on_alive(state.set_alive)
     state.robots_there = robot.robots_there
     next_s = time.monotonic() + SHOW_PERIOD_S
+<<<<<<< HEAD
     while (now_s := time.monotonic()) < end_s:
         message = inbox.get(min(next_s, end_s) - now_s)
         state.forget_ended()
+=======
+    while not signals and (now_s := time.monotonic()) < end_s:
+        message = inbox.get(min(next_s - now_s, end_s - now_s, POLL_S))
+>>>>>>> mend-a
         if message is not None:
             pose = state.process(message)
             for writer in writers:

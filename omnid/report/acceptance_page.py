@@ -23,9 +23,18 @@ HEAD: Final = ("round", "A to B", "B to A", "error of lengths", "way", "end besi
 
 
 def acceptance_html(
-    title: str, drives: Mapping[str, Acceptance], faults: Sequence[str], path: Trajectory, map_xyz: NDArray[np.float32]
+    title: str,
+    drives: Mapping[str, Acceptance],
+    faults: Sequence[str],
+    path: Trajectory,
+    map_xyz: NDArray[np.float32],
+    rig_height_m: float,
 ) -> str:
-    """Return the page. drives: by the name of their poses, the judged one first; map_xyz (M, 3) [m]: may be empty."""
+    """Return the page.
+
+    drives: by the name of their poses, the judged one first. path: T_odom_base. map_xyz (M, 3) [m]: may be empty.
+    rig_height_m: of the rig at the start, in the frame of the path; the base may be far below it.
+    """
     first = next(iter(drives.values()))
     outcome = "Not accepted" if faults else "Accepted"
     parts = [
@@ -37,7 +46,7 @@ def acceptance_html(
             f"A robot that is placed by eye stands some millimetres beside a mark: {1e3 * PLACING_M:g} mm are allowed "
             "for the two placings of a length or a return."
         ),
-        _figure(path, map_xyz),
+        _figure(path, map_xyz, rig_height_m),
         f"<p><small>Made by omnid {__version__}.</small></p>",
     ]
     return page("Acceptance drive", parts, svg.STYLE + plan.STYLE)
@@ -85,7 +94,7 @@ def _rows(found: Acceptance) -> list[tuple[str, ...]]:
     ]
 
 
-def _figure(path: Trajectory, map_xyz: NDArray[np.float32]) -> str:
+def _figure(path: Trajectory, map_xyz: NDArray[np.float32], rig_height_m: float) -> str:
     step = max(1, len(path.T) // _MOST_CORNERS)
     seconds = (path.stamps_ns - path.stamps_ns[0]) * 1e-9
     corners = [
@@ -93,5 +102,5 @@ def _figure(path: Trajectory, map_xyz: NDArray[np.float32]) -> str:
         for T, t_s in zip(path.T[::step], seconds[::step], strict=True)
     ]
     confidence = np.ones(len(map_xyz), np.float32)
-    drawn = plan.Plan(corners, map_xyz, confidence, float(path.T[0, 2, 3]))
+    drawn = plan.Plan(corners, map_xyz, confidence, rig_height_m)
     return plan.plan_figure(drawn, Clock(0.0, max(float(seconds[-1]), 1e-2)))

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pytest
 
+from drivers.logs.mcap_index import read_attachments, read_summary
+from drivers.logs.mcap_records import LogFile
 from omnid.batch.job_runner import KILLED, OK, JobTask, run_job, stored_result
 from omnid.batch.jobs import BatchOptions, find_logs, jobs
 from omnid.batch.workers import dask_workers
@@ -123,6 +125,19 @@ def test_results_are_those_of_single_runs_and_a_bad_log_stops_nothing(tmp_path: 
     assert stored_result(changed) is None
 
 
+def test_results_of_another_rig_are_old(tmp_path: Path) -> None:
+    log, rig, out = short_log(tmp_path / "log.mcap"), tmp_path / "rig.toml", tmp_path / "out"
+    file = LogFile(log)
+    rig.write_bytes(bytes(read_attachments(file, read_summary(file))["rig.toml"]))
+    file.close()
+    words = "batch", log, "--out", out, "--rig", rig
+    assert omnid(*words).returncode == 0
+    assert "1 of 1 logs have their results already" in omnid(*words).stderr
+    rig.write_text("no rig any more")
+    again = omnid(*words)
+    assert again.returncode == 1 and "1 failed" in again.stdout and "already" not in again.stderr
+
+
 def test_a_job_whose_program_is_killed_is_run_again(tmp_path: Path) -> None:
     log, out = short_log(tmp_path / "log.mcap", 2 * BYTES), tmp_path / "out"
     with subprocess.Popen(
@@ -212,7 +227,8 @@ def test_a_stored_result_of_another_version_or_with_damage_is_none(tmp_path: Pat
 
 
 def test_wrong_options_are_one_line(tmp_path: Path) -> None:
-    for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1")):
+    times = [("--timeout-s", seconds) for seconds in ("inf", "nan", "0", "1e7")]
+    for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1"), *times):
         done = omnid("batch", SAMPLE, "--out", tmp_path / "out", *words)
         assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
 

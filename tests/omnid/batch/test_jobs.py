@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import os
 from pathlib import Path
 
 import pytest
 
-from omnid.batch.jobs import BatchOptions, find_logs, jobs
+from omnid.batch.jobs import BatchOptions, find_logs, input_files, jobs
+from omnid.config import PlacesConfig
 from omnid.errors import OmnidError
 
 
@@ -27,3 +30,53 @@ def test_finds_logs(tmp_path: Path) -> None:
     for missing in ("nowhere.mcap", "nowhere/*.mcap"):
         with pytest.raises(OmnidError, match="batch: no log"):
             find_logs([str(tmp_path / missing)])
+
+
+def names_of(out: Path, *logs: str) -> list[str]:
+    return [job.name for job in jobs(logs, out, BatchOptions())]
+
+
+def test_results_of_another_log_keep_their_folder(tmp_path: Path) -> None:
+    def store(name: str, text: str) -> None:
+        (tmp_path / name).mkdir(exist_ok=True)
+        (tmp_path / name / "result.json").write_text(text)
+
+    store("run", json.dumps({"log": "/x/mon/run.mcap"}))
+    assert names_of(tmp_path, "/x/mon/run.mcap") == ["run"]
+    assert names_of(tmp_path, "/x/tue/run.mcap") == ["run-2"]
+    store("run-2", json.dumps({"log": "/x/tue/run.mcap"}))
+    assert names_of(tmp_path, "/x/tue/run.mcap") == ["run-2"], "it goes on in its own folder"
+    assert names_of(tmp_path, "/x/wed/run-2.mcap", "/x/wed/run.mcap") == ["run-2-2", "run-3"]
+    assert names_of(tmp_path, "/x/mon/run.db3", "/x/mon/run.mcap") == ["run-3", "run"]
+    for damaged in ("", "[]", "{}", '{"log": 1}'):
+        store("run", damaged)
+        assert names_of(tmp_path, "/x/tue/run.mcap") == ["run"]
+
+
+def test_the_key_changes_with_all_files_that_make_a_result(tmp_path: Path) -> None:
+    log, truth, rig, settings, tags, places = (
+        tmp_path / name for name in ("log.mcap", "truth.txt", "rig.toml", "omnid.toml", "tags.toml", "site.omap")
+    )
+    for path in (log, rig, settings, tags, places):
+        path.write_text("a")
+
+    def key(*, localize_only: bool = True) -> str:
+        known = PlacesConfig(map=str(places), tags=str(tags), localize_only=localize_only)
+        (job,) = jobs([str(log)], tmp_path / "out", BatchOptions(inputs=input_files(rig, settings, known)))
+        assert job.key() == job.key()
+        return job.key()
+
+    keys = [key()]
+    for path in (log, truth, rig, settings, tags, places):
+        path.write_text("changed")
+        keys.append(key())
+    os.utime(truth, (1, 1))
+    keys.append(key())
+    truth.unlink()
+    keys.append(key())
+    assert len(set(keys)) == len(keys)
+
+    extended = key(localize_only=False)
+    places.write_text("extended by a replay")
+    assert key(localize_only=False) == extended
+    assert input_files(None, None, PlacesConfig()) == ()

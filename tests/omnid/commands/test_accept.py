@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import re
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from drivers.logs.mcap_index import read_attachments, read_summary
+from drivers.logs.mcap_records import LogFile
 from omnid.cli import main
 from omnid.formats.tum import tum_row
 from tests.omnid.recordings.test_acceptance import DISTANCE_M, drive
@@ -28,6 +32,23 @@ def accept(*words: object) -> int:
 def test_without_a_log_it_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     assert accept() == 0
     assert "A B A B A B A" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--distance-m", "12", "--marks", "12.5", "60", "110", "est.tum"), "--distance-m and --marks"),
+        (("-o", "accept.html"), "-o"),
+        (("--json",), "--json"),
+    ],
+)
+def test_options_of_a_drive_without_a_log_are_one_line(
+    words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert accept(*words) == 2
+    out, error = capsys.readouterr()
+    assert f"expected a log or a trajectory with {named}, found none; name it first" in error
+    assert out == "" and error.count("\n") == 1
 
 
 def test_an_accepted_drive_and_its_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -54,6 +75,20 @@ def test_a_drive_that_is_too_long_is_not_accepted(tmp_path: Path, capsys: pytest
     rounds = found["drives"]["odometry"]["rounds"]
     assert len(rounds) == 3 and rounds[0]["there_m"] == pytest.approx(1.02 * DISTANCE_M, abs=0.01)
     assert "Not accepted" in page.read_text()
+
+
+def test_the_page_draws_the_same_points_of_the_map_whichever_point_of_the_robot_counts(tmp_path: Path) -> None:
+    """The base of the sample is on the floor, 1.2 m below its rig."""
+    log, rig, page = tmp_path / "log.mcap", tmp_path / "rig.toml", tmp_path / "accept.html"
+    log.write_bytes((files("omnid.sample") / "log.mcap").read_bytes()[:450_000])  # some pairs and the rig
+    file = LogFile(log)
+    rig.write_bytes(bytes(read_attachments(file, read_summary(file))["rig.toml"]))
+    file.close()
+    drawn = []
+    for words in ((), ("--rig", rig)):
+        assert accept(log, *words, "--distance-m", 1, "--marks", 0, 0.1, 0.2, "-o", page) == 1
+        drawn += re.findall(r"Grey: (\d+) of the map's (\d+) points", page.read_text())
+    assert len(drawn) == 2 and drawn[0] == drawn[1] and 0 < int(drawn[0][0]) < int(drawn[0][1])
 
 
 def test_times_of_keys_are_unix_times(

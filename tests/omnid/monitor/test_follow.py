@@ -17,10 +17,15 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib import se3
+from drivers.logs.mcap_records import MAGIC
 from omnid.client import Robot
 from omnid.formats.tum import read_tum
+<<<<<<< HEAD
 from omnid.monitor import follow
 from omnid.monitor.follow import _follow
+=======
+from omnid.monitor.follow import TumWriter
+>>>>>>> mend-a
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.monitor.screen import Screen, summary_line
 from omnid.transport import codec, map_codec
@@ -97,9 +102,12 @@ def test_prints_a_line_per_second_and_writes_files(tmp_path: Path) -> None:
     assert b"name = 'rig'" in log.read_bytes()
 
 
-def test_waits_for_the_robot_and_ends_with_ctrl_c() -> None:
-    endpoint = free_endpoint()
-    with listening("--connect", endpoint) as it:
+@pytest.mark.parametrize("number_of_signal", [signal.SIGINT, signal.SIGTERM])
+def test_waits_for_the_robot_and_ends_with_a_signal_and_whole_files(
+    number_of_signal: signal.Signals, tmp_path: Path
+) -> None:
+    endpoint, tum, log = free_endpoint(), tmp_path / "path.txt", tmp_path / "received.mcap"
+    with listening("--connect", endpoint, "--tum", tum, "--mcap", log) as it:
         assert it.stderr is not None and endpoint in it.stderr.readline()
         with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
             deadline_s = time.monotonic() + DEADLINE_S
@@ -107,12 +115,31 @@ def test_waits_for_the_robot_and_ends_with_ctrl_c() -> None:
                 publish(bus, number)
                 time.sleep(0.01)
                 if number == 150:
-                    it.send_signal(signal.SIGINT)
+                    it.send_signal(number_of_signal)
                 if it.poll() is not None:
                     break
                 assert time.monotonic() < deadline_s
             out, err = it.communicate()
     assert it.returncode == 0 and "tracking" in out.splitlines()[-1] and err == ""
+    assert rows(tum) and log.read_bytes().endswith(MAGIC)
+
+
+def test_a_signal_ends_the_wait_for_a_robot() -> None:
+    with listening("--connect", free_endpoint()) as it:
+        assert it.stderr is not None and "waiting" in it.stderr.readline()
+        it.send_signal(signal.SIGTERM)
+        out, _ = it.communicate(timeout=DEADLINE_S)
+    assert it.returncode == 1 and out == "omnid: no pose yet\n"
+
+
+def test_poses_are_in_the_file_as_they_arrive(tmp_path: Path) -> None:
+    """Also those of a program that is killed."""
+    writer = TumWriter(tmp_path / "path.txt")
+    for number in (1, 2):
+        state, message = RobotState(), received_message(number)
+        writer.write(message, state.process(message))
+        assert len(rows(tmp_path / "path.txt")) == number
+    writer.close()
 
 
 def test_exit_code_is_1_without_a_pose() -> None:
@@ -144,11 +171,15 @@ def test_refuses_invalid_options(words: tuple[str, ...], expected: str, capsys: 
     assert expected in Command(capsys).refused("listen", *words)
 
 
+def received_message(number: int) -> ReceivedMessage:
+    attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
+    return ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment)
+
+
 def received(*numbers: int) -> RobotState:
     state = RobotState()
     for number in numbers:
-        attachment = PoseAttachment(number, "tracking", 0, 50, 60, time.time_ns()).to_bytes()
-        state.process(ReceivedMessage(time.time_ns(), "odom", odometry_at(number), attachment))
+        state.process(received_message(number))
     return state
 
 

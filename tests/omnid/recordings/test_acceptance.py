@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from itertools import pairwise
 
 import numpy as np
@@ -52,6 +53,19 @@ def test_a_scale_is_the_error_of_lengths() -> None:
     found = accept(path, visits_by_standing(path, DISTANCE_M), DISTANCE_M)
     assert found.length_error_ratio == pytest.approx(0.02, abs=2e-4) and found.length_spread_ratio < 1e-3
     assert found.faults(0.005)[0].startswith("lengths are off by +2.00 %") and found.faults(0.02) == []
+
+
+def test_lengths_that_are_right_in_the_mean_only_are_not_accepted() -> None:
+    long, short = drive(rounds=1, scale=1.02), drive(rounds=1, scale=0.98)
+    later_ns = long.stamps_ns[-1] - short.stamps_ns[0] + 10**9 // HZ
+    path = Trajectory(
+        np.concatenate([long.stamps_ns, short.stamps_ns + later_ns]), np.concatenate([long.T, long.T[-1] @ short.T])
+    )
+    found = accept(path, visits_by_standing(path, DISTANCE_M), DISTANCE_M)
+    assert len(found.rounds) == 2 and found.length_error_ratio == pytest.approx(0, abs=2e-4)
+    (line,) = found.faults(0.005)
+    assert re.search(r"the worst by [+-]\d\.\d\d % from (A to B|B to A) in round [12], expected 0\.5 %", line)
+    assert found.faults(0.02) == []
 
 
 def test_a_drift_of_the_heading_is_seen_in_the_places_of_the_marks() -> None:
