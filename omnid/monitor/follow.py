@@ -114,14 +114,9 @@ def _follow(
     robot.on_alive(state.set_alive)
     state.robots_there = robot.robots_there
     next_s = time.monotonic() + SHOW_PERIOD_S
-<<<<<<< HEAD
-    while (now_s := time.monotonic()) < end_s:
-        message = inbox.get(min(next_s, end_s) - now_s)
-        state.forget_ended()
-=======
     while not signals and (now_s := time.monotonic()) < end_s:
         message = inbox.get(min(next_s - now_s, end_s - now_s, POLL_S))
->>>>>>> mend-a
+        state.forget_ended()
         if message is not None:
             pose = state.process(message)
             for writer in writers:

@@ -20,12 +20,8 @@ from calib import se3
 from drivers.logs.mcap_records import MAGIC
 from omnid.client import Robot
 from omnid.formats.tum import read_tum
-<<<<<<< HEAD
 from omnid.monitor import follow
-from omnid.monitor.follow import _follow
-=======
-from omnid.monitor.follow import TumWriter
->>>>>>> mend-a
+from omnid.monitor.follow import TumWriter, _follow
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.monitor.screen import Screen, summary_line
 from omnid.transport import codec, map_codec
@@ -211,5 +207,5 @@ def test_the_statuses_of_a_daemon_that_has_ended_are_not_shown(monkeypatch: pyte
 
         publish(bus, 1)
         with contextlib.suppress(KeyboardInterrupt):
-            _follow(robot, state, Screen("omnid", Terminal()), [], time.monotonic() + DEADLINE_S)
+            _follow(robot, state, Screen("omnid", Terminal()), [], time.monotonic() + DEADLINE_S, [])
     assert max(parts) == 1 and parts[-1] == 0
