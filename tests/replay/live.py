@@ -219,6 +219,9 @@ def command_line(scene: Path, port: int, motor: Path | None, *words: object, mod
         "live.status_s=0.2",
         "live.cloud_s=0.5",
         'controller.arming="automatic"',
+        # Such small images show little of the floor ahead.
+        "controller.collision.unknown=slow",
+        "controller.collision.slow_mps=1",
     ]
     sets = [word for setting in settings for word in ("--set", setting)]
     return [sys.executable, "-m", module, *map(str, [*run, *log, *wheels, *sets, *words])]
