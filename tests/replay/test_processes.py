@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.formats.tum import read_tum
 from omnid.transport.codec import odometry_from_cdr
 from omnid.transport.records import OdometryRecord
+from tests.busy import stopped_by_turns
 from tests.conftest import PAIRS
 from tests.ply import read_ply
 from tests.replay.command import Command, Result, rows
@@ -176,31 +176,11 @@ def test_the_first_start_of_a_drive_says_what_it_waits_for(tmp_path: Path) -> No
     assert "compiling" in first and out == ""
 
 
-@contextmanager
-def stopped_half_of_the_time(process: subprocess.Popen[str]) -> Iterator[None]:
-    """Stop a process and let it go on, as a scheduler does that shares its core."""
-    ends = threading.Event()
-
-    def stop_and_go() -> None:
-        while not ends.wait(SLICE_S):
-            process.send_signal(signal.SIGSTOP)
-            ends.wait(SLICE_S)
-            process.send_signal(signal.SIGCONT)
-
-    thread = threading.Thread(target=stop_and_go)
-    thread.start()
-    try:
-        yield
-    finally:
-        ends.set()
-        thread.join()
-
-
 def test_demo_waits_for_a_busy_computer_and_loses_nothing(tmp_path: Path) -> None:
     """It has half of one core: it is stopped for the other half of the time."""
     one_core = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0)))]
     command = [*one_core, sys.executable, "-m", "omnid", "demo", "--quiet", "--output", str(tmp_path / "out")]
-    with started(command) as process, stopped_half_of_the_time(process):
+    with started(command) as process, stopped_by_turns(process, SLICE_S, SLICE_S):
         out, err = process.communicate(timeout=4 * PATIENCE_S)
     assert process.returncode == 0 and err == "", err
     assert "against the truth" in out and "commands sent, 0 errors, 0 stops" in out

@@ -6,11 +6,7 @@ The test stands for a busy computer: it stops the whole daemon again and again, 
 from __future__ import annotations
 
 import math
-import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,31 +16,12 @@ from omnid.client import Diagnostics, Robot
 from omnid.formats.tum import read_tum
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, WHEELS, Key
-from tests.replay.live import Daemon, free_port, started, wait_until
+from tests.busy import stopped_by_turns
+from tests.replay.live import free_port, started, wait_until
 
 STOPPED_S, RUNNING_S = 0.6, 0.3  # longer than the deadlines of poses and commands; share of a computer that is left
 NEAR_M = 0.05
 GOAL = ("0.3", "0.05")
-
-
-@contextmanager
-def slowed(daemon: Daemon) -> Iterator[None]:
-    """Stop the daemon again and again in this block."""
-    ends = threading.Event()
-
-    def stop_and_go() -> None:
-        while not ends.wait(RUNNING_S):
-            daemon.process.send_signal(signal.SIGSTOP)
-            ends.wait(STOPPED_S)
-            daemon.process.send_signal(signal.SIGCONT)
-
-    thread = threading.Thread(target=stop_and_go)
-    thread.start()
-    try:
-        yield
-    finally:
-        ends.set()
-        thread.join()
 
 
 def newest(port: int) -> Diagnostics:
@@ -87,7 +64,7 @@ def test_a_slowed_daemon_reaches_its_goal_and_loses_nothing(tmp_path: Path, caps
             main(["goto", *words, *connect]) for words in (["0.2", "0", "--no-wait"], ["--pause"], ["--resume"])
         ] == [0, 0, 0]
         assert "paused by a request: `omnid goto --resume`" in capsys.readouterr().out
-        with slowed(daemon):
+        with stopped_by_turns(daemon.process, RUNNING_S, STOPPED_S):
             reached = main(["goto", *GOAL, *connect])
         status = newest(port)
         with Robot(settings=BusConfig(connect=(f"tcp/127.0.0.1:{port}",))) as robot:
