@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
+from stat import S_ISREG
 
 from calib.rig import MountedCamera
 from calib.rig_file import rig_toml
@@ -184,7 +185,11 @@ class RunPlaces:
 
 def _version(path: Path) -> tuple[int, int] | None:
     """Return what changes where a file is written again; None: there is none."""
-    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.is_file() else None
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return (found.st_ino, found.st_mtime_ns) if S_ISREG(found.st_mode) else None
 
 
 def _beside(path: Path) -> Path:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Final, NamedTuple
@@ -24,6 +25,9 @@ NOISE_PX: Final = 0.1  # Noise of a corner of odometry: not used for tags.
 MOVED_M: Final = 0.1  # Motion between two frames that are searched.
 MOVED_RAD: Final = math.radians(10)
 MAX_VIEWS: Final = 1000  # Most views of a tag.
+# Newest poses in the map that are kept: where stages have threads, that of a pair may come before the pair itself does,
+# by as many as wait in the inbox of a stage, two.
+MOST_RECENT: Final = 8
 
 
 class _Sighting(NamedTuple):
@@ -44,6 +48,7 @@ class TagCollector:
         self._T_base_rig, self._T_rig_rect = geometry.rig.T_base_rig, geometry.T_rig_rect
         self._seen: dict[int, list[_Sighting]] = {}
         self._poses: dict[int, PlaceUpdate | None] = {}  # in the map, by the pairs in which a tag was seen
+        self._recent: deque[PlaceUpdate] = deque(maxlen=MOST_RECENT)
         self._keyframes: MapKeyframes | None = None  # as they were last
         self._last_T: Array | None = None
 
@@ -56,8 +61,10 @@ class TagCollector:
         """Search a frame where the rig has moved."""
         if isinstance(message, PlaceUpdate):
             self._keyframes = message.keyframes
+            pose = replace(message, scans=None, keyframes=None)
+            self._recent.append(pose)
             if message.seq in self._poses:
-                self._poses[message.seq] = replace(message, scans=None, keyframes=None)
+                self._poses[message.seq] = pose
         elif isinstance(message, OdometryUpdate) and message.state is TrackingState.TRACKING and self._is_due(message):
             self._last_T = message.T_odom_rig
             panoramas = message.depth.panoramas
@@ -66,7 +73,8 @@ class TagCollector:
                 if len(views) < MAX_VIEWS:
                     T_rig_tag = self._T_rig_rect @ tag.T_rect_tag
                     views.append(_Sighting(message.seq, T_rig_tag, in_tag_axes(tag), message.T_odom_rig))
-                    self._poses.setdefault(message.seq, None)
+                    known = (pose for pose in self._recent if pose.seq == message.seq)
+                    self._poses.setdefault(message.seq, next(known, None))
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         if self._last_T is None:

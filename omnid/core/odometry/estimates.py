@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 # reset_counter, or the gap stays open.
 JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 # A smaller step keeps the view: landmarks are a metre away and farther, so that they move by 6 degrees at most besides
-# the turn. With 0.5 m and 30 degrees a base that drove slowly through a bare world of 192 px lost its map.
+# the turn.
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
 # Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # m, rad
