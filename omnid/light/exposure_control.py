@@ -51,12 +51,15 @@ class ExposureControl:
         self._next_ns: float = -float("inf")
         self._newest_ns = 0  # stamp of the newest pair
         self._steps_ns: deque[int] = deque(maxlen=MOST_STEPS)  # between pairs
+        self._shortest_ns = float("inf")  # period: images that come more slowly later may do so for their exposure
 
     def process(self, pair: FramePair) -> None:
         """Measure a pair if it is due, and make a request where the law takes a step."""
         # 1. Measure the pair where it is due.
         if self._newest_ns and pair.stamp_ns > self._newest_ns:
             self._steps_ns.append(pair.stamp_ns - self._newest_ns)
+            if len(self._steps_ns) == MOST_STEPS:
+                self._shortest_ns = min(self._shortest_ns, self._quartile_ns)
         self._newest_ns = pair.stamp_ns
         if pair.stamp_ns < self._next_ns:
             return
@@ -109,9 +112,14 @@ class ExposureControl:
         return "regulated", self._left_to_cameras or "regulated"
 
     @property
-    def _period_ns(self) -> float:
-        """Period of the images: the first quartile of the last steps, as pairs are skipped, and stamps may burst."""
+    def _quartile_ns(self) -> float:
+        """First quartile of the last steps: pairs are skipped, and stamps may burst."""
         return float(sorted(self._steps_ns)[len(self._steps_ns) // 4])
+
+    @property
+    def _period_ns(self) -> float:
+        """Period of the images, the shortest that was seen over MOST_STEPS."""
+        return min(self._shortest_ns, self._quartile_ns)
 
     @property
     def _limit_us(self) -> float:

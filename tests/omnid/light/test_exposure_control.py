@@ -111,6 +111,14 @@ def test_the_exposure_is_shortened_where_images_come_faster_than_at_first(area: 
     assert robot.unequal == 0 and [found.exposure_us for found in in_force if found] == [45_000]
 
 
+def test_images_that_come_more_slowly_do_not_lengthen_the_exposure(area: UsefulArea) -> None:
+    """They may be slow because of their exposure: both would grow to the limit."""
+    robot = Robot(area, 0.01, CamerasConfig(exposure_limit_ms=500.0))
+    robot.drive(15.0)
+    robot.light /= 4
+    assert float(robot.drive(15.0, period_ns=2 * PERIOD_NS).values["exposure_ms"]) == pytest.approx(45.0)
+
+
 def test_says_when_it_is_too_dark_or_too_bright_and_what_to_do(area: UsefulArea) -> None:
     robot = Robot(area, 0.0)
     status = robot.drive(15.0)
