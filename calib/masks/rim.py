@@ -82,25 +82,30 @@ def _edges(image: NDArray[np.uint8], center: tuple[float, float], levels: tuple[
     """Return the pixels (N, 2), at most one per azimuth, beyond which the image is dark, with subpixel accuracy."""
     threshold = levels[0] + EDGE_FRACTION * (levels[1] - levels[0])
     polar = _polar(image, center, int(np.hypot(*image.shape)))
-    found = [(index, radius) for index, profile in enumerate(polar) if (radius := _last_edge(profile, threshold)) > 0]
-    azimuth = 2 * np.pi * np.array([index for index, _ in found]) / AZIMUTHS
-    reach = np.array([radius for _, radius in found])
-    return np.column_stack([center[0] + reach * np.cos(azimuth), center[1] + reach * np.sin(azimuth)])
+    azimuth, radius_px = _last_edges(polar, threshold)
+    return np.column_stack([center[0] + radius_px * np.cos(azimuth), center[1] + radius_px * np.sin(azimuth)])
 
 
-def _last_edge(profile: Array, threshold: float) -> float:
-    """Return the radius [px] of the last steep fall of a profile below the threshold; 0 if there is none."""
-    profile = profile[np.isfinite(profile)]
-    light = np.flatnonzero(profile >= threshold)
-    last = int(light[-1]) if light.size else 0
-    if last < EDGE_PX or last + 2 * EDGE_PX >= len(profile):
-        return 0.0
-    inside, outside = profile[last - EDGE_PX + 1 : last + 1].mean(), profile[last + EDGE_PX : last + 2 * EDGE_PX].mean()
-    if inside - outside < MIN_STEP:
-        return 0.0
-    half = (inside + outside) / 2
-    at = last - EDGE_PX + 1 + int(np.flatnonzero(profile[last - EDGE_PX + 1 : last + 1] >= half)[-1])
-    return at + float(profile[at] - half) / float(profile[at] - profile[at + 1])
+def _last_edges(polar: Array, threshold: float) -> tuple[Array, Array]:
+    """Return azimuths [rad] and radii [px], (N,) each, of the last steep falls below the threshold, where there are.
+
+    polar: profiles (AZIMUTHS, radius); an image is convex, so each is inside it from one radius to another.
+    """
+    # 1. The last light pixel, with enough pixels of the image on either side.
+    known, light = np.isfinite(polar), polar >= threshold
+    first, count = known.argmax(axis=1), known.sum(axis=1)
+    last = polar.shape[1] - 1 - light[:, ::-1].argmax(axis=1)
+    rows = np.flatnonzero(light.any(axis=1) & (last - first >= EDGE_PX) & (last - first + 2 * EDGE_PX < count))
+    # 2. Levels on either side of the fall.
+    near = polar[rows[:, None], last[rows, None] + np.arange(1 - EDGE_PX, 2 * EDGE_PX)]
+    inside, outside = near[:, :EDGE_PX].mean(axis=1), near[:, 2 * EDGE_PX - 1 :].mean(axis=1)
+    steep = inside - outside >= MIN_STEP
+    rows, near, half = rows[steep], near[steep], (inside + outside)[steep] / 2
+    # 3. The radius at which the profile has the level between them.
+    at = EDGE_PX - 1 - (near[:, EDGE_PX - 1 :: -1] >= half[:, None]).argmax(axis=1)
+    level, beyond = near[np.arange(len(at)), at], near[np.arange(len(at)), at + 1]
+    radius_px = last[rows] + 1 - EDGE_PX + at + (level - half) / (level - beyond)
+    return 2 * np.pi * rows / AZIMUTHS, radius_px
 
 
 def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
@@ -108,8 +113,10 @@ def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
     if len(edges) < AZIMUTHS * MIN_ARC * MIN_SUPPORT:
         return None
     generator = np.random.default_rng(0)
-    circles = [_circle(edges[generator.choice(len(edges), 3, replace=False)]) for _ in range(RANSAC_ROUNDS)]
-    best = max(circles, key=lambda circle: int((_distance(edges, circle) < INLIER_PX).sum()))
+    chosen = np.array([generator.choice(len(edges), 3, replace=False) for _ in range(RANSAC_ROUNDS)])
+    circles = _circles(edges[chosen])
+    inliers = (_distance(edges, circles.T[:, :, None]) < INLIER_PX).sum(axis=1)
+    best = circles[inliers.argmax()]
     for _ in range(REFINEMENTS):
         inliers = edges[_distance(edges, best) < INLIER_PX]
         if len(inliers) < 3:
@@ -117,6 +124,20 @@ def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
         best = _circle(inliers)
     near = np.hypot(best[0] - center[0], best[1] - center[1]) < MAX_CENTER_SHIFT * best[2]
     return best if near else None
+
+
+def _circles(points: Array) -> Array:
+    """Return centres and radii (N, 3) of the circles through three points each (N, 3, 2); NaN where these are in line.
+
+    The centre c, seen from the first point, is as far from it as from the others, p: 2 p c = p^2.
+    """
+    p, q = points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]
+    p2, q2 = (p**2).sum(axis=1), (q**2).sum(axis=1)
+    twice_area = 2 * (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = (q[:, 1] * p2 - p[:, 1] * q2) / twice_area
+        v = (p[:, 0] * q2 - q[:, 0] * p2) / twice_area
+    return np.column_stack([points[:, 0, 0] + u, points[:, 0, 1] + v, np.hypot(u, v)])
 
 
 def _circle(points: Array) -> Array:
@@ -129,6 +150,7 @@ def _circle(points: Array) -> Array:
 
 
 def _distance(points: Array, circle: Array) -> Array:
+    """Return distances (N,) of points (N, 2) from a circle (3,), or (M, N) from circles (3, M, 1)."""
     return np.asarray(np.abs(np.hypot(points[:, 0] - circle[0], points[:, 1] - circle[1]) - circle[2]))
 
 
