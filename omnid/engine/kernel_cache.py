@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from omnid.engine import kernel_store as store
-from omnid.engine.kernel_compiler import Report, compile_missing
-from omnid.engine.logging_setup import log_unlimited
+from omnid.engine.kernel_compiler import compile_missing
+from omnid.engine.logging_setup import Report, log_unlimited
 from omnid.errors import OmnidError
 
 _state = {"ready": False}

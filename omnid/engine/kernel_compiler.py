@@ -16,9 +16,10 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
 from omnid.engine import kernel_store as store
+from omnid.engine.logging_setup import Report
 from omnid.engine.python_program import python, python_environment
 
 MAX_HELPERS: Final = 2  # each takes up to 280 MB, of the 768 that the service may have
@@ -28,7 +29,6 @@ PATIENCE_S: Final = 300.0
 PROGRESS_S: Final = 3.0  # Least time between two lines of progress.
 _POLL_S: Final = 0.05
 _LOCK: Final = "compiling.lock"
-Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 
 
 def compile_missing(folders: Mapping[str, Path], report: Report) -> None:

@@ -15,11 +15,13 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Final, TextIO
+from typing import Final, TextIO, TypeAlias
 
 from omnid.plain_text import one_line
 
 LOGGER: Final = logging.getLogger("omnid")
+
+Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 
 # Levels of logging and the priorities of syslog and journald (RFC 5424, section 6.2.1).
 _PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))

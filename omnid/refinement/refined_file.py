@@ -7,7 +7,6 @@ start ignores the file of another one, and the next refinement replaces it.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -18,6 +17,7 @@ from calib.errors import CalibError
 from calib.fit.drive.rig_parameters import ANGLE_UNIT_RAD, RigParameters
 from calib.refined_rig import RefinedRig, calibration_digest, read_refined_rig
 from calib.rig import Rig
+from omnid.engine.logging_setup import Report
 from omnid.errors import OmnidError
 from omnid.formats.whole_file import write_whole
 from omnid.refinement.estimate import RigChange
@@ -46,7 +46,7 @@ class RefinedRigFile:
         """Path of the file."""
         return self._path
 
-    def start(self, report: Callable[[int, str], None], *, is_wanted: bool) -> Rig:
+    def start(self, report: Report, *, is_wanted: bool) -> Rig:
         """Return the rig to begin a run with: the refined one if it is wanted and belongs to the calibration.
 
         report: takes a level of `logging` and a line that names the rig in use wherever there is a refined file.

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -18,18 +19,14 @@ from omnid.config import Config
 from omnid.engine.bounded_call import started
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
+from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.refinement.refined_file import RefinedRigFile
 from omnid.runs.live_robot import LiveRobot
-from omnid.runs.live_status import add_terminal_ticker
-from omnid.runs.live_wiring import LiveWiring, Report
-from omnid.runs.place_maps import RunPlaces
 from omnid.runs.session import Session
 from omnid.runs.systemd import print_stacks_when_killed
 from omnid.stages.geometry import Geometry
-from omnid.transport.codec import compile_serialisers
-from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
 
 
 class LiveRun:
@@ -52,8 +49,7 @@ class LiveRun:
     def run(self) -> int:
         """Run until a signal comes, or the cameras end; return the exit code."""
         print_stacks_when_killed()
-        kernels_read = started(_read_kernels, "imports")
-        compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
+        loaded = started(_load, "imports")
         offset_ns = time.time_ns() - self._robot.clock_ns()
         with ExitStack() as outputs:
             session = Session(
@@ -66,12 +62,17 @@ class LiveRun:
             )
             outputs.enter_context(session.signals(self._on_signal))
             geometry = self._geometry(session)
-            kernels_read()
+            loaded()
+            from omnid.runs.live_wiring import LiveWiring
+            from omnid.runs.place_maps import RunPlaces
+
             prepare_kernels()
             self._connected = True
             run_places = RunPlaces(self._config, geometry, session.warn)
             LiveWiring(session, geometry, self._refined, self._report).wire(self._robot, run_places)
             if self._show is not None:
+                from omnid.runs.live_status import add_terminal_ticker
+
                 add_terminal_ticker(session, self._show, self._report, self._robot.words)
             cv2.setNumThreads(self._config.graph.opencv_threads)
             if not self._robot.waits:
@@ -121,10 +122,18 @@ def _graph_that_waits(config: Config) -> Graph:
     return Graph(policy=LOSSLESS, depth=config.graph.depth, sinks_wait=True)
 
 
-def _read_kernels() -> None:
-    """Read the compiled functions while images are awaited; where that fails, `prepare_kernels` reports why."""
-    with suppress(Exception):
-        read_kept_kernels()
+def _load() -> None:
+    """Load what the stages need while images are awaited; what fails is loaded, and reported, where it is used."""
+    for load in (partial(import_module, "omnid.runs.live_wiring"), _compile_serialisers, read_kept_kernels):
+        with suppress(Exception):
+            load()
+
+
+def _compile_serialisers() -> None:
+    from omnid.transport.codec import compile_serialisers
+    from omnid.transport.navigation_codec import PATH_SCHEMA, STRING_SCHEMA
+
+    compile_serialisers(PATH_SCHEMA, STRING_SCHEMA)
 
 
 def _import_rarely_used() -> None:

@@ -12,6 +12,7 @@ from omnid.core.control.arming import ArmAnswer
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.safety_rules import NO_POSE
 from omnid.core.navigation.requests import NavigationCommand
+from omnid.engine.logging_setup import Report
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import Session
@@ -43,7 +44,7 @@ class LiveCommands:
         bus: Bus,
         controller: DriveLink | None,
         navigate: Callable[[NavigationCommand], None],
-        report: Callable[[int, str], None],
+        report: Report,
     ) -> None:
         """navigate: takes requests to the navigation. report: takes lines for the log, with a level of `logging`."""
         self._session, self._bus, self._controller = session, bus, controller

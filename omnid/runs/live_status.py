@@ -13,6 +13,7 @@ from omnid.config import Config
 from omnid.core.control.arming import MANUAL
 from omnid.diagnostics.status import StatusCollector, StatusTick
 from omnid.diagnostics.terminal_status import TerminalStatus
+from omnid.engine.logging_setup import Report
 from omnid.errors import OmnidError
 from omnid.runs.session import TICKERS, Session
 from omnid.runs.systemd import Service, StatusLine
@@ -37,7 +38,7 @@ def add_status_tickers(session: Session, status: StatusCollector, bus: Bus, reco
 
 
 def add_terminal_ticker(
-    session: Session, show: Callable[[str], None], report: Callable[[int, str], None], words: Callable[[], str]
+    session: Session, show: Callable[[str], None], report: Report, words: Callable[[], str]
 ) -> None:
     """Show the status in one line of a terminal; show: rewrites that line, which ends with the words."""
     line = StatusLine(session.statistics, session.graph.telemetry, TICKERS)

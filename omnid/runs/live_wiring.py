@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TypeAlias
 
 from calib.rig_file import rig_toml
 from drivers.motor import VelocityCommand
@@ -21,6 +19,7 @@ from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.diagnostics.threads_status import ThreadsStatus
 from omnid.engine.graph import NEWEST, Sink
+from omnid.engine.logging_setup import Report
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
@@ -47,8 +46,6 @@ from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
 from omnid.transport.bus import Bus
 from omnid.transport.navigation_commands import RequestQueue
-
-Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 
 
 class LiveWiring:

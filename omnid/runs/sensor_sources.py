@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Protocol
 
@@ -15,6 +15,7 @@ from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.engine.graph import Graph
+from omnid.engine.logging_setup import Report
 from omnid.errors import OmnidError
 from omnid.runs.session import Session
 from omnid.stages.motion_inbox import MotionInbox
@@ -68,7 +69,7 @@ class SensorSources:
         inbox: MotionInbox,
         session: Session,
         controller: DriveLink | None,
-        report: Callable[[int, str], None],
+        report: Report,
         *,
         with_images: bool = False,
     ) -> None:
@@ -89,7 +90,7 @@ class SensorSources:
         settings: MotionSensorSettings,
         session: Session,
         controller: DriveLink | None,
-        report: Callable[[int, str], None],
+        report: Report,
         joints: JointWheels | None,
     ) -> set[str]:
         """Open the devices; return the topics of the bus from which samples are taken."""
