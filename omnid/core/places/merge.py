@@ -13,7 +13,8 @@ from calib import se3
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_map import Link, PlaceMap
-from omnid.core.places.place_search import PlaceSearch
+from omnid.core.places.place_search import Expected, PlaceSearch
+from omnid.core.places.recognition import Recognition
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
@@ -23,6 +24,10 @@ SAME_M: Final = 0.5
 SAME_RAD: Final = math.radians(5)  # The same of their headings; by trial on development seeds.
 MIN_CONSISTENT: Final = 3  # keyframes that must agree
 MIN_SHARE: Final = 0.6  # Share of the recognised keyframes that must agree.
+# Keyframes, spread over the other map, that agree before the rest are searched near their places only, which costs a
+# tenth of a search among all: where 0.35 of the map lies there, so many agree with the share above in 1 % of the maps.
+ENOUGH_CONSISTENT: Final = 16
+GOLDEN_RATIO: Final = (math.sqrt(5) - 1) / 2  # steps of this part of a turn leave no large gap, however many there are
 NO_COMMON_PLACE: Final = "shares no place"  # words of the error, by which programs that join many maps know it
 
 
@@ -35,29 +40,59 @@ def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:
     places.tags.require_same_sizes(other.tags)
     renumbered = _renumbered(other, places)
     search, ids = PlaceSearch(model), sorted(places.keyframes)
-    # 1. Recognise each keyframe of the other map; each recognition tells where the other map lies.
+    others = _evenly_spread(sorted(renumbered.keyframes))
+    # 1. Recognise keyframes of the other map until enough agree; each recognition tells where that map lies.
     loops, located = list[Link](), list[Array]()
-    for id in sorted(renumbered.keyframes):
-        keyframe = renumbered.keyframes[id]
+    consistent, best = list[list[int]](), list[int]()
+    while others and len(best) < max(ENOUGH_CONSISTENT, MIN_SHARE * len(located)):
+        keyframe = renumbered.keyframes[others.pop(0)]
         found = search.far(keyframe.thumbnail, keyframe.features.loaded(), places, ids)
         if found is not None:
-            loops.append(Link(found.id, id, found.T_place_rect, found.covariance, found.inliers))
-            located.append(places.poses[found.id] @ found.T_place_rect @ se3.inverse(renumbered.poses[id]))
-    # 2. Most of them must agree.
-    consistent = [[n for n, T in enumerate(located) if _is_same(T, first)] for first in located]
-    best = max(consistent, key=len, default=[])
+            loops.append(_loop(found, keyframe.id))
+            located.append(_located(loops[-1], places, renumbered))
+            same = [n for n, T in enumerate(located) if _is_same(T, located[-1])]
+            for n in same[:-1]:
+                consistent[n].append(same[-1])
+            consistent.append(same)
+            best = max(consistent, key=len)
     if len(best) < max(MIN_CONSISTENT, MIN_SHARE * len(located)):
         return 0
-    # 3. Lay the other map there, and optimise both with the loops between them.
     T_map_other = located[best[len(best) // 2]]
+    # 2. Recognise the other keyframes near the pose that the nearest of those before gives.
+    loops, located = [loops[n] for n in best], [located[n] for n in best]
+    error_m, error_rad = dict.fromkeys(ids, SAME_M), dict.fromkeys(ids, SAME_RAD)
+    for id in sorted(others):
+        keyframe, T = renumbered.keyframes[id], renumbered.poses[id]
+        apart_m = np.linalg.norm(renumbered.positions([loop.b for loop in loops]) - T[:3, 3], axis=1)
+        expected = Expected(located[int(apart_m.argmin())] @ T, error_m, error_rad, recognised=True)
+        found = search.near(keyframe.thumbnail, keyframe.features.loaded(), places, expected)
+        if found is not None:
+            loops.append(_loop(found, id))
+            located.append(_located(loops[-1], places, renumbered))
+    # 3. Lay the other map there, and optimise both with the loops between them.
     places.keyframes |= renumbered.keyframes
     places.poses |= {id: T_map_other @ T for id, T in renumbered.poses.items()}
     places.links += renumbered.links
     places.uses |= renumbered.uses
     places.tags.join(renumbered.tags, int)
     places.dropped += renumbered.dropped
-    MapCorrection(places).close([loops[n] for n in best], sorted(places.keyframes))
-    return len(best)
+    MapCorrection(places).close(sorted(loops, key=lambda loop: loop.b), sorted(places.keyframes))
+    return len(loops)
+
+
+def _evenly_spread(ids: list[int]) -> list[int]:
+    """Return ids in an order whose first ones, however many, are evenly spread over all (golden ratio sequence)."""
+    return [ids[n] for n in sorted(range(len(ids)), key=lambda n: n * GOLDEN_RATIO % 1)]
+
+
+def _loop(found: Recognition, id: int) -> Link:
+    """Return the loop to a keyframe (id) of the other map that was recognised."""
+    return Link(found.id, id, found.T_place_rect, found.covariance, found.inliers)
+
+
+def _located(loop: Link, places: PlaceMap, other: PlaceMap) -> Array:
+    """Return the pose of the other map that a loop to one of its keyframes gives."""
+    return np.asarray(places.poses[loop.a] @ loop.T_a_b @ se3.inverse(other.poses[loop.b]))
 
 
 def _renumbered(other: PlaceMap, places: PlaceMap) -> PlaceMap:
