@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
+from omnid.core.obstacles.surface_kernels import PART
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
     CYLINDER,
@@ -40,6 +41,11 @@ def floor_at(columns: Columns, found: ColumnEvidence, near_m: float, far_m: floa
 
 def test_floor_plane_of_an_upright_rig_is_level() -> None:
     assert floor_plane(T_RECT_BASE) == pytest.approx((HEIGHT_M, 0.0, 0.0))
+
+
+def test_parts_of_directions_are_whole() -> None:
+    """The loops over a part do not ask where the directions end."""
+    assert DIRECTIONS % PART == 0
 
 
 def test_wall_and_the_floor_before_it_are_found_in_all_directions(columns: Columns) -> None:
