@@ -14,13 +14,14 @@ from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
 from drivers.motor import VelocityCommand, stop_command
-from drivers.motors.serial_motor import LateReplyError, SerialMotor
+from drivers.motors.serial_motor import LateReplyError, NoReplyError, SerialMotor
 from omnid.controller.motor import open_motor
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.errors import OmnidError
 
 MOVE_S: Final = 1.0  # Duration of a motion in each direction.
 REST_S: Final = 0.3  # The wheels come to rest in this time.
+ANSWER_S: Final = 1.0  # A stop is repeated for this time: a busy computer delays answers by parts of it.
 LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 LARGEST_TURNS: Final = 1000.0
@@ -158,16 +159,18 @@ class WiringTest:
 
 
 def _stop(motor: SerialMotor) -> None:
-    """Stop the wheels; DriverError where the controller gives no answer.
+    """Stop the wheels; DriverError where the controller gives no answer within ANSWER_S.
 
-    A late one is the fault of a busy computer: the stop is sent again, until the controller's watchdog is due.
+    A late one is the fault of a busy computer: the stop is sent again.
     """
+    deadline_s = time.monotonic() + ANSWER_S
     while True:
         try:
             motor.send(stop_command(0))
-        except LateReplyError:
-            continue
-        return
+            return
+        except NoReplyError:
+            if time.monotonic() >= deadline_s:
+                raise
 
 
 def wiring(first: Seen, second: Seen) -> dict[str, bool]:

@@ -74,7 +74,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "doctor": (("--config", "none.toml"), NO_FILE),
     "motor test": (("--motor", "simulated"), "motor.protocol is 'line'"),
     "config": (("--minimal",), "[motor"),
-    "install-service": (("--dry-run",), "omnid.service"),
+    "install-service": (("--dry-run",), "service"),  # its unit, or that the service cannot see a home
 }
 IN_ONE_PROCESS = """
 import contextlib, io, json, sys
