@@ -28,7 +28,6 @@ from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
-TURN_MPS: Final = 0.01  # slower motions turn on the spot; in 0.1 s no more than 1 mm
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
 # Slope of the way towards what is unknown beside it, up to which it leads along that: a correction of the heading by
 # three degrees. The nearest corner would be 5 cm nearer after 1 m, before which newer rings judge again.
@@ -192,7 +191,7 @@ class CollisionMonitor:
         # 3. What the base has driven over since the ring's images is not passed as if it were free.
         unknown = self._unknown + self._gaps, settings.unknown, UNKNOWN
         known = (self._points, STOP, BLOCKED), unknown, (self._unwatched, settings.stale, UNWATCHED)
-        for points, policy, reason in known if speed_mps > TURN_MPS else ():
+        for points, policy, reason in known if speed_mps > 0.0 else ():
             if policy == STOP and driven_over(self._outline, points, moved, motion.velocity_mps):
                 return Allowance(0.0, reason)
         # 4. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
@@ -228,7 +227,7 @@ class CollisionMonitor:
         share, speed_mps = first_s / settings.time_s, abs(motion.velocity_mps)
         turn_radps = max(abs(motion.yaw_rate_radps), TINY)
         share = min(share, math.sqrt(2 * BRAKING_SHARE * self._turn_deceleration * first_s / turn_radps))
-        if speed_mps > TURN_MPS:
+        if speed_mps > 0.0:
             way_m = speed_mps * first_s
             share = min(share, math.sqrt(2 * BRAKING_SHARE * self._deceleration * way_m) / speed_mps)
             if share < 1.0 and share * speed_mps < LEAST_MPS:
@@ -238,8 +237,8 @@ class CollisionMonitor:
     def _stop_polygon(self, motion: Twist) -> Outline:
         """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
         (front_m, rear_m, half_width_m), settings = self._outline, self._settings
-        ahead_m = settings.stop_m if motion.velocity_mps > TURN_MPS else 0.0
-        behind_m = settings.stop_m if motion.velocity_mps < -TURN_MPS else 0.0
+        ahead_m = settings.stop_m if motion.velocity_mps > 0.0 else 0.0
+        behind_m = settings.stop_m if motion.velocity_mps < 0.0 else 0.0
         return Outline(front_m + ahead_m, rear_m + behind_m, half_width_m + settings.side_m)
 
     def _near(self, points: list[Point], motion: Twist) -> Allowance:
@@ -264,7 +263,8 @@ class CollisionMonitor:
 
         policy: STOP or SLOW.
         """
-        if abs(motion.velocity_mps) <= TURN_MPS:
+        # Only a turn on the spot is free. A slow motion is none: the first step of each new start would lead a bit on.
+        if motion.velocity_mps == 0.0:
             return FREE
         least = 0.0
         if policy != STOP:
