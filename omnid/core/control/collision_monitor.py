@@ -202,7 +202,7 @@ class CollisionMonitor:
             gaps = self._ahead(within_reach(self._gaps, moved, reach_m), motion)
             ends = within_reach(self._unknown, moved, reach_m) + gaps
             allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
-        if settings.stale != IGNORE and self._unwatched:
+        if settings.stale != IGNORE and self._unwatched and speed_mps > 0.0:
             ends = within_reach(self._unwatched, moved, reach_m)
             allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
         if self._moving:
@@ -253,22 +253,22 @@ class CollisionMonitor:
         return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
 
     def _ahead(self, points: list[Point], motion: Twist) -> list[Point]:
-        """Return the points beyond the edge that leads."""
-        if motion.velocity_mps > 0.0:
-            return [(x, y) for x, y in points if x > self._outline.front_m]
-        return [(x, y) for x, y in points if x < -self._outline.rear_m]
+        """Return the points beyond the edge that leads; all of them for a turn on the spot."""
+        (front_m, rear_m, _), v = self._outline, motion.velocity_mps
+        return [(x, y) for x, y in points if v == 0.0 or (x > front_m if v > 0.0 else x < -rear_m)]
 
     def _into_unknown(self, unknown: list[Point], motion: Twist, policy: str, reason: str) -> Allowance:
         """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all.
 
         policy: STOP or SLOW.
         """
-        # Only a turn on the spot is free. A slow motion is none: the first step of each new start would lead a bit on.
+        edge_mps = abs(motion.velocity_mps)
         if motion.velocity_mps == 0.0:
-            return FREE
-        least = 0.0
-        if policy != STOP:
-            least = min(1.0, self._settings.slow_mps / abs(motion.velocity_mps))
+            # Corners swing as far as floor was seen. Where none was, what is there may be at the outline already: it
+            # does not keep the base from turning away.
+            unknown = self._stop_polygon(motion).parted(unknown)[1]
+            edge_mps = abs(motion.yaw_rate_radps) * self._outline.radius_m
+        least = 0.0 if policy == STOP else min(1.0, self._settings.slow_mps / edge_mps)
         share = max(self._share_before(unknown, motion, ALONG_SLOPE), least)
         return FREE if share >= 1.0 else Allowance(share, reason)
 
