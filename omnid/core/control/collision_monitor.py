@@ -28,7 +28,6 @@ from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.nanoseconds import S_PER_NS
 
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
-TURN_MPS: Final = 0.01  # slower motions turn on the spot; in 0.1 s no more than 1 mm
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
 # Slope of the way towards what is unknown beside it, up to which it leads along that: a correction of the heading by
 # three degrees. The nearest corner would be 5 cm nearer after 1 m, before which newer rings judge again.
@@ -192,7 +191,7 @@ class CollisionMonitor:
         # 3. What the base has driven over since the ring's images is not passed as if it were free.
         unknown = self._unknown + self._gaps, settings.unknown, UNKNOWN
         known = (self._points, STOP, BLOCKED), unknown, (self._unwatched, settings.stale, UNWATCHED)
-        for points, policy, reason in known if speed_mps > TURN_MPS else ():
+        for points, policy, reason in known if speed_mps > 0.0 else ():
             if policy == STOP and driven_over(self._outline, points, moved, motion.velocity_mps):
                 return Allowance(0.0, reason)
         # 4. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
@@ -203,7 +202,7 @@ class CollisionMonitor:
             gaps = self._ahead(within_reach(self._gaps, moved, reach_m), motion)
             ends = within_reach(self._unknown, moved, reach_m) + gaps
             allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
-        if settings.stale != IGNORE and self._unwatched:
+        if settings.stale != IGNORE and self._unwatched and speed_mps > 0.0:
             ends = within_reach(self._unwatched, moved, reach_m)
             allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
         if self._moving:
@@ -228,7 +227,7 @@ class CollisionMonitor:
         share, speed_mps = first_s / settings.time_s, abs(motion.velocity_mps)
         turn_radps = max(abs(motion.yaw_rate_radps), TINY)
         share = min(share, math.sqrt(2 * BRAKING_SHARE * self._turn_deceleration * first_s / turn_radps))
-        if speed_mps > TURN_MPS:
+        if speed_mps > 0.0:
             way_m = speed_mps * first_s
             share = min(share, math.sqrt(2 * BRAKING_SHARE * self._deceleration * way_m) / speed_mps)
             if share < 1.0 and share * speed_mps < LEAST_MPS:
@@ -238,8 +237,8 @@ class CollisionMonitor:
     def _stop_polygon(self, motion: Twist) -> Outline:
         """Return the outline with the distance to keep on the side to which the base moves, and at its sides."""
         (front_m, rear_m, half_width_m), settings = self._outline, self._settings
-        ahead_m = settings.stop_m if motion.velocity_mps > TURN_MPS else 0.0
-        behind_m = settings.stop_m if motion.velocity_mps < -TURN_MPS else 0.0
+        ahead_m = settings.stop_m if motion.velocity_mps > 0.0 else 0.0
+        behind_m = settings.stop_m if motion.velocity_mps < 0.0 else 0.0
         return Outline(front_m + ahead_m, rear_m + behind_m, half_width_m + settings.side_m)
 
     def _near(self, points: list[Point], motion: Twist) -> Allowance:
@@ -254,21 +253,22 @@ class CollisionMonitor:
         return self._capped(motion, settings.slow_mps, NEAR) if is_near else FREE
 
     def _ahead(self, points: list[Point], motion: Twist) -> list[Point]:
-        """Return the points beyond the edge that leads."""
-        if motion.velocity_mps > 0.0:
-            return [(x, y) for x, y in points if x > self._outline.front_m]
-        return [(x, y) for x, y in points if x < -self._outline.rear_m]
+        """Return the points beyond the edge that leads; all of them for a turn on the spot."""
+        (front_m, rear_m, _), v = self._outline, motion.velocity_mps
+        return [(x, y) for x, y in points if v == 0.0 or (x > front_m if v > 0.0 else x < -rear_m)]
 
     def _into_unknown(self, unknown: list[Point], motion: Twist, policy: str, reason: str) -> Allowance:
         """Slow down towards the end of what was seen to be free, and drive into what was not slowly, or not at all.
 
         policy: STOP or SLOW.
         """
-        if abs(motion.velocity_mps) <= TURN_MPS:
-            return FREE
-        least = 0.0
-        if policy != STOP:
-            least = min(1.0, self._settings.slow_mps / abs(motion.velocity_mps))
+        edge_mps = abs(motion.velocity_mps)
+        if motion.velocity_mps == 0.0:
+            # Corners swing as far as floor was seen. Where none was, what is there may be at the outline already: it
+            # does not keep the base from turning away.
+            unknown = self._stop_polygon(motion).parted(unknown)[1]
+            edge_mps = abs(motion.yaw_rate_radps) * self._outline.radius_m
+        least = 0.0 if policy == STOP else min(1.0, self._settings.slow_mps / edge_mps)
         share = max(self._share_before(unknown, motion, ALONG_SLOPE), least)
         return FREE if share >= 1.0 else Allowance(share, reason)
 

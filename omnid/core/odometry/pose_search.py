@@ -98,8 +98,9 @@ class PoseSearch:
             T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
             other = self._estimate(frame, T_guess, exposure, last, dt_s, is_near=True)
             others += [other] if other is not None else []
-        # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong.
-        if estimate.inlier_ratio < self._limits.good_inlier_ratio:
+        # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong. The
+        #    same where the inliers show no motion of a vehicle: they may be on a person who walks along.
+        if estimate.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
             other = self._by_outliers(frame, estimate, exposure, last, dt_s)
             others += [other] if other is not None else []
         # 3. The likeliest one, and whether another one is nearly as likely.

@@ -263,9 +263,9 @@ class Walk:
         rng, kind = self.rng, self.rings
         ranges = [math.inf] * 360
         if kind in ("ahead", "behind"):
-            middle = 180 if kind == "ahead" else 0
+            middle, nearest_m = 180 if kind == "ahead" else 0, rng.uniform(0.27, 1.2)
             for k in range(middle - 5, middle + 6):
-                ranges[k] = rng.uniform(0.27, 0.6)
+                ranges[k] = rng.uniform(nearest_m, 1.2)
         if kind == "unknown":
             ranges[rng.randrange(200) : 300] = [math.nan] * 100
         if kind == "random":

@@ -150,6 +150,19 @@ def test_turns_on_the_spot_unless_a_corner_would_touch() -> None:
     assert after(with_points((0.27, 0.2)), turn)[0].yaw_rate_radps > -0.3
 
 
+def test_a_long_base_turns_on_the_spot_as_far_as_floor_was_seen_beside_it() -> None:
+    """A plain wall 0.55 m to its left, which its front reaches; one that may be at its side already is no reason."""
+    settings, turn = replace(SETTINGS, front_m=0.6), Twist(0.0, 0.5)
+    free = tuple(0.55 if math.isnan(range_m) else 6.0 for range_m in with_unknown(20, 160))
+    for ranges in (with_unknown(20, 160), (4.0,) * 360):  # nothing is seen behind it, or another wall, past a pole
+        allowed, reason = after(ranges, turn, settings, free=free)
+        assert 0.0 < allowed.yaw_rate_radps < 0.3 and reason == monitor_module.UNKNOWN
+        assert after(ranges, turn, SETTINGS, free=free) == (turn, "")
+    assert after(with_unknown(20, 160), turn, settings) == (turn, "")
+    slow = after(with_unknown(20, 160), turn, replace(settings, unknown="slow", slow_mps=0.2), free=free)[0]
+    assert slow.yaw_rate_radps == pytest.approx(0.2 / math.hypot(0.6, 0.22))
+
+
 def test_where_a_base_may_not_drive_it_may_turn_to_a_heading() -> None:
     monitor, arc = CollisionMonitor(SETTINGS, 1.5), Twist(0.3, -0.5)
     monitor.set_ring(ControllerRing(10 * S, with_points((0.38, 0.0))))

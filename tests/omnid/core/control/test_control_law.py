@@ -9,7 +9,7 @@ import random
 import pytest
 
 from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.collision_monitor import TURN_MPS, ControllerRing
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
@@ -51,8 +51,28 @@ def test_a_base_before_a_post_turns_to_a_heading_and_drives_on_from_there() -> N
         law.set_command(TimedSetpoint(now_ns, Setpoint(0.3, heading_rad=math.radians(90))))
         motion = law.step(now_ns, TICK_S).motion
         heading_rad, driven_m = heading_rad + motion.yaw_rate_radps * TICK_S, driven_m + motion.velocity_mps * TICK_S
-        assert motion.velocity_mps <= TURN_MPS or heading_rad > math.radians(10)
+        assert motion.velocity_mps == 0.0 or heading_rad > math.radians(10)
     assert heading_rad > math.radians(85) and driven_m > 0.5
+
+
+@pytest.mark.parametrize("rate_hz", [20, 50, 200])
+@pytest.mark.parametrize("wanted", [Setpoint(0.5, heading_rad=0.0), Setpoint(0.5, None, 0.02), Setpoint(0.008)])
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_a_stick_that_is_held_leads_no_farther_however_small_the_first_step(
+    rate_hz: int, wanted: Setpoint, is_seen: bool
+) -> None:
+    """Before a wall, or floor that ends, the first step of each new start is one that would lead a bit on."""
+    law = ControlLaw(ControllerSettings(arming=AUTOMATIC, collision=CollisionSettings(stale_s=10.0)), START_NS)
+    left_m, tick_ns = 0.15 + 0.25 + 0.002, 10**9 // rate_hz
+    ways = [left_m / math.cos(math.radians(k - 179.5)) if abs(k - 179.5) < 40 else math.inf for k in range(360)]
+    ranges = tuple(way if is_seen or way == math.inf else math.nan for way in ways)
+    law.set_ring(ControllerRing(START_NS, ranges, tuple(min(way, 6.0) for way in ways)))
+    for tick in range(1, 4 * rate_hz):
+        now_ns = START_NS + tick * tick_ns
+        law.set_pose(ControllerPose(now_ns, 0.0, 0.0, "tracking", law.motion.velocity_mps))
+        law.set_command(TimedSetpoint(now_ns, wanted))
+        left_m -= law.step(now_ns, 1 / rate_hz).motion.velocity_mps / rate_hz
+    assert law.reason == "" and left_m > 0.15 + 0.25 - 0.004
 
 
 def law_with(first: ControllerPose) -> ControlLaw:

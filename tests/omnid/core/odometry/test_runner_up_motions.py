@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry import pose_search
 from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
@@ -93,6 +95,28 @@ def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
         assert likeliest(best, [other], np.eye(4), 0.5).runner_up is None
     assert likeliest(best, [same], np.eye(4), 0.5).inliers == 120
     assert likeliest(unlikely, [best], np.eye(4), 0.5).T_odom_rect[0, 3] == 0
+
+
+def test_where_the_pose_found_is_out_of_reach_one_that_is_nearer_to_the_prediction_may_be_right() -> None:
+    """A person walks along behind the base: with the landmarks on him, it seems to stand; wheels say that it drives."""
+    stands, drives, leaps = pose(0.0, 0.66, inliers=72), pose(0.028, 0.59, inliers=97), pose(0.06, 0.1)
+    T_predicted = pose(0.020, 0.0).T_odom_rect
+    assert likeliest(stands, [drives, leaps], T_predicted, 0.002).T_odom_rect[0, 3] == 0.028
+    assert likeliest(drives, [stands], T_predicted, 0.002).T_odom_rect[0, 3] == 0.028
+    assert likeliest(pose(0.0205, 0.6), [drives], T_predicted, 0.002).T_odom_rect[0, 3] == 0.0205
+
+
+@pytest.mark.parametrize(("reach_m", "expected_m"), [(0.002, 0.028), (0.05, 0.0)])
+def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_vehicle(
+    alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected_m: float
+) -> None:
+    monkeypatch.setattr(pose_search, "displacements", lambda *_: [])
+    monkeypatch.setattr(pose_search.PoseSearch, "_by_outliers", lambda *_: pose(0.028, 0.5, inliers=91))
+    search = pose_search.PoseSearch(Mock(), alike.model, OdometryLimits(), frame_to_map=Mock(), exposures=Mock())
+    frame, T_predicted = alike.frame(0, np.eye(4)), pose(0.020, 0.0).T_odom_rect
+    last = pose_search.LastFrame(np.eye(4), frame.lower)
+    found = search.with_runner_up(frame, pose(0.0, 0.6, inliers=70), last, T_predicted, 0.1, reach_m=reach_m)
+    assert found.T_odom_rect[0, 3] == expected_m
 
 
 def test_a_doubt_ends_where_clear_steps_go_on_as_was_chosen() -> None:
