@@ -32,8 +32,9 @@ TIME_KEYS = ("upper_delay_s", "line_time_s")
 TRANSLATION_DECIMALS = 12
 
 
-def read_rig(path: Path) -> Rig:
+def read_rig(path: str | os.PathLike[str]) -> Rig:
     """Read the rig of a `rig.toml`; a mask's image is read from the same folder. CalibError says what to do."""
+    path = Path(path)
     if not path.exists():
         raise CalibError(f"{path}: there is no such rig: `omnid calibrate import` or `omnid calibrate rig` makes one")
     text = read_bytes(path)

@@ -42,7 +42,7 @@ def assert_same(a: MountedCamera, b: MountedCamera) -> None:
 def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
     rig = with_masks(rig) if masks else rig
     write_rig(tmp_path / "rig.toml", rig)
-    for found in (read_rig(tmp_path / "rig.toml"), parse_rig(rig_toml(rig)), parse_rig(rig_toml(rig).encode())):
+    for found in (read_rig(str(tmp_path / "rig.toml")), parse_rig(rig_toml(rig)), parse_rig(rig_toml(rig).encode())):
         assert_same(found.lower, rig.lower)
         assert_same(found.upper, rig.upper)
         np.testing.assert_array_equal(found.T_base_rig, rig.T_base_rig)
