@@ -66,7 +66,8 @@ def replay(
     raises KeyboardInterrupt. Raises OmnidError for input that cannot be used; RunFailedError, which is one, holds the
     result up to an error after the first pose.
     """
-    settings = [*overrides, *([f"odometry.method={method}"] if method else [])]
+    given = [overrides] if isinstance(overrides, str) else overrides
+    settings = [*given, *([f"odometry.method={method}"] if method else [])]
     with _user_errors():
         loaded = _config(config, settings)
         ignored = unused_settings(loaded, "replay", settings)
