@@ -1,11 +1,11 @@
 """Folders of images with stamps, one folder for each camera.
 
 The stamp of an image is its name without suffix (1403636579763555584.png, 1305031102.175304.jpg), or the line of its
-number in timestamps.txt or times.txt in the folder of the images or the one above. Images that are all named by low
-whole numbers are numbered, not stamped, and are refused without such a list. A stamp is in nanoseconds where it
-is a whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers may have
-been meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say what is
-meant.
+number in timestamps.txt or times.txt in the folder of the images or the one above. Images that are named by low whole
+numbers that follow each other are numbered, not stamped, and are refused without such a list. A stamp is in nanoseconds
+where it is a whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers
+may have been meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say
+what is meant.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
             f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
             "they must be as many"
         )
-    if lines is None and len(paths) > 1 and all(_is_number(path.stem) for path in paths):
+    if lines is None and _are_counted([path.stem for path in paths]):
         raise DriverError(
             f"the images of {str(folder)!r} are numbered, {paths[0].name!r} and so on, and their times are not known: "
             f"write a stamp a line, in seconds or nanoseconds, to {STAMP_FILES[0]} in this folder or the one above"
@@ -142,9 +142,13 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
         yield _StampedFile(stamp_ns, topic, path)
 
 
-def _is_number(name: str) -> bool:
-    """True for the number of an image, which is too low for a time since 1970."""
-    return name.isascii() and name.isdigit() and len(name) < _NS_DIGITS and int(name) < _FIRST_SECONDS
+def _are_counted(names: Sequence[str]) -> bool:
+    """True for names that count images: whole numbers, too low for times since 1970, most of which follow another."""
+    if not all(name.isascii() and name.isdigit() and len(name) < _NS_DIGITS for name in names):
+        return False
+    numbers = sorted(map(int, names))
+    followers = sum(after - before == 1 for before, after in pairwise(numbers))
+    return followers > len(numbers) // 2 and numbers[-1] < _FIRST_SECONDS
 
 
 def _numbers_of(path: Path) -> list[tuple[int, str]]:
