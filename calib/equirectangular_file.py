@@ -16,14 +16,12 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.models.equirectangular import full_turn
-from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
+from calib.rig import MAX_BASELINE_M, MIN_BASELINE_M, MountedCamera, Rig
 from calib.validation import read_bytes
 
 # Of the file of a rig and of an image, so that a wrong file is refused before it fills the memory: a rig has some
 # hundred bytes, an image of 16384 x 8192 px about 100 MB.
 MAX_BYTES, MAX_IMAGE_BYTES = 1 << 20, 1 << 28
-# Largest baseline of two cameras on one robot: a number beyond it has another unit.
-MAX_BASELINE_M = 5.0
 HELVIPAD_SIZE, HELVIPAD_TOP_PX = (1920, 512), 192
 SUFFIXES = (".png", ".jpg", ".jpeg")
 # The camera's z is ahead in the middle of the image: the rig's x; its x is the rig's -y, its y the rig's -z.

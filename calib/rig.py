@@ -13,6 +13,7 @@ from calib.models.names import visible_part
 from calib.rig_covariance import RigCovariance
 
 MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
+MAX_BASELINE_M = 5.0  # of two cameras on one robot: a number beyond it has another unit
 # A T_base_rig with the cameras on the floor states no height: as the identity, which it is where none was measured.
 LEAST_HEIGHT_M = 0.1
 MAX_HEIGHT_M = 10.0
@@ -75,10 +76,10 @@ class Rig:
         ):
             if not se3.is_rigid(T):
                 raise CalibError(f"rig: {name} must be a 4x4 rotation and translation, found {np.round(T, 4).tolist()}")
-        if self.baseline_m < MIN_BASELINE_M:
+        if not MIN_BASELINE_M <= self.baseline_m <= MAX_BASELINE_M:
             raise CalibError(
-                f"rig: the viewpoints must lie apart, found {self.baseline_m * 1e3:.3f} mm; "
-                "check that the transforms are T_cam_rig in metres"
+                f"rig: the viewpoints must lie apart, by {MAX_BASELINE_M:g} m at most, found "
+                f"{self.baseline_m * 1e3:.3f} mm; check that the transforms are T_cam_rig in metres"
             )
 
     @property

@@ -32,8 +32,9 @@ TIME_KEYS = ("upper_delay_s", "line_time_s")
 TRANSLATION_DECIMALS = 12
 
 
-def read_rig(path: Path) -> Rig:
+def read_rig(path: str | os.PathLike[str]) -> Rig:
     """Read the rig of a `rig.toml`; a mask's image is read from the same folder. CalibError says what to do."""
+    path = Path(path)
     if not path.exists():
         raise CalibError(f"{path}: there is no such rig: `omnid calibrate import` or `omnid calibrate rig` makes one")
     text = read_bytes(path)
@@ -52,6 +53,11 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
+    if table.has("camera"):
+        raise CalibError(
+            f"{name}: a camera.toml, the file of one camera; a rig.toml was expected: `omnid calibrate rig` makes one, "
+            "also of two such files by --lower-camera and --upper-camera"
+        )
     table.allow_only(("schema", "T_base_rig", "covariance", "times", "refined", *SIDES))
     lower, upper = (table.table(side) for side in SIDES)
     T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)

@@ -7,10 +7,13 @@ import numpy as np
 from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
+from calib.models.names import sees_directly
 from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
 
 # Half the distance in pixels over which the image's axis is measured: inside any mirror or lens.
 STEP_PX = 1.0
+# From the baseline to what is below in an image: half-way to a camera that lies on its side.
+MAX_LEAN_DEG = 45.0
 
 
 def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topics: tuple[str, str] = ("", "")) -> Rig:
@@ -26,6 +29,18 @@ def rig_between(lower: OmniCamera, upper: OmniCamera, T_lower_upper: Array, topi
     T_lower_rig = se3.transform(np.column_stack([x, np.cross(z, x), z]), np.zeros(3))
     T_upper_rig = se3.inverse(T_lower_upper) @ T_lower_rig
     return Rig(MountedCamera(lower, T_lower_rig), MountedCamera(upper, T_upper_rig), topics=topics)
+
+
+def is_turned_over(rig: Rig) -> bool:
+    """True if the upper viewpoint lies below the lower one, unless the cameras are mounted upside down.
+
+    A camera below its mirror sees itself below it, and below its horizon an upright camera that looks ahead sees the
+    lower part of its image. A lens that looks along the baseline may look up or down: False.
+    """
+    camera, z = rig.lower.camera, rig.lower.T_cam_rig[:3, 2]
+    ahead = camera.lift(np.array([camera.center]))[0]
+    below = image_axis(camera, (0.0, STEP_PX)) if sees_directly(camera) else ahead
+    return bool(z @ below > np.cos(np.deg2rad(MAX_LEAN_DEG)))
 
 
 def image_axis(camera: OmniCamera, step_px: tuple[float, float]) -> Array:

@@ -25,6 +25,7 @@ from omnid.config import Config, load_config
 from omnid.config_use import unused_settings
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
+from omnid.engine.one_at_a_time import OneAtATime
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -65,7 +66,8 @@ def replay(
     raises KeyboardInterrupt. Raises OmnidError for input that cannot be used; RunFailedError, which is one, holds the
     result up to an error after the first pose.
     """
-    settings = [*overrides, *([f"odometry.method={method}"] if method else [])]
+    given = [overrides] if isinstance(overrides, str) else overrides
+    settings = [*given, *([f"odometry.method={method}"] if method else [])]
     with _user_errors():
         loaded = _config(config, settings)
         ignored = unused_settings(loaded, "replay", settings)
@@ -105,7 +107,7 @@ class Odometry:
     """Odometry of image pairs at hand, one call a pair, in the caller's thread.
 
     The poses are the same, to the last bit, as those of a replay of the same images. The settings of the stages apply;
-    those of threads, bus, motor and recording do not.
+    those of threads, bus, motor and recording do not. Calls from several threads wait for each other.
     """
 
     def __init__(
@@ -131,6 +133,7 @@ class Odometry:
             place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
             self._front_end = FrontEnd(place, settings)
         self.rig = place.rig  # with the masks that were found
+        self._lock = OneAtATime()
         self._pairs = 0
         self._skew = Skew()
         self._stamp_ns: int | None = None
@@ -156,6 +159,12 @@ class Odometry:
         replay drops it, as a camera that is frozen shows no motion. Its images count as earlier ones, too. Also raises
         it where one of the first pairs shows that the images cannot be of this rig, unless rig.check says otherwise.
         """
+        with self._lock:
+            return self._process(stamp_ns, lower, upper, upper_stamp_ns)
+
+    def _process(
+        self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None
+    ) -> OdometryUpdate:
         stamp_ns = self._later_stamp_ns(stamp_ns)
         images = (self._checked("lower", lower), self._checked("upper", upper))
         skew_ns = self._checked_skew_ns(stamp_ns, upper_stamp_ns)
@@ -184,7 +193,8 @@ class Odometry:
         `points` (N, 3) in the rig frame (m) with `variance_m2` (N,) along the ray; `disparity` (H, W) in px, NaN where
         unknown, and `pixels` (N, 2) of the points in the lower panorama.
         """
-        return self._front_end.dense.of(pose.depth)
+        with self._lock:
+            return self._front_end.dense.of(pose.depth)
 
     def _checked_skew_ns(self, stamp_ns: int, upper_stamp_ns: int | None) -> int | None:
         """Return the time from the lower to the upper stamp; None: both images were exposed at once."""

@@ -166,12 +166,13 @@ class Robot:
     def __init__(
         self,
         robot: str = "omnid",
-        connect: tuple[str, ...] = (HERE,),
+        connect: str | Sequence[str] = (HERE,),
         settings: BusConfig | None = None,
         timeout_s: float = 0.0,
     ) -> None:
         """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
-        given = settings or BusConfig(robot=robot, connect=connect)
+        endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
+        given = settings or BusConfig(robot=robot, connect=endpoints)
         self.name = given.robot
         self._session = open_client(given, timeout_s)
         self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
@@ -315,7 +316,10 @@ class Fleet:
 
 
 def subscribe(
-    robot: str = "omnid", connect: tuple[str, ...] = (HERE,), settings: BusConfig | None = None, timeout_s: float = 0.0
+    robot: str = "omnid",
+    connect: str | Sequence[str] = (HERE,),
+    settings: BusConfig | None = None,
+    timeout_s: float = 0.0,
 ) -> Subscription[Pose]:
     """Subscribe to a robot's poses over a connection of their own; arguments as those of Robot."""
     connection = Robot(robot, connect, settings, timeout_s)

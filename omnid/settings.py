@@ -107,7 +107,9 @@ def parse(
 ) -> T:
     """Return the settings of TOML bytes that were read from `origin`; the rest is as in `load`."""
     keys = Keys(tuple(_paths(root)), renamed)
-    changes = [_parsed_override(root, text, keys) for text in overrides]
+    changes = [
+        _parsed_override(root, text, keys) for text in ([overrides] if isinstance(overrides, str) else overrides)
+    ]
     try:
         table = table_of(data)
         for path, value in changes:

@@ -85,6 +85,8 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
     for azimuth in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         direction = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         J = _motion_by_parameters(rig, points, DRIVE_M * direction, (names, sigmas))
+        if J is None:
+            return None
         effect = np.stack([direction @ J[:3], J[5]]) / DRIVE_M
         variances += np.einsum("ep,pq,eq->e", effect, rig.covariance.correlation, effect) / DIRECTIONS
     scale, heading_rad_m = np.sqrt(np.maximum(0.0, variances)).tolist()
@@ -113,8 +115,10 @@ def _pixels(rig: Rig, points: Array) -> Array:
     )
 
 
-def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tuple[str, ...], Array]) -> Array:
+def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tuple[str, ...], Array]) -> Array | None:
     """Return the derivatives (6, P) of the measured motion (translation, rotation) by parameters in units of scaled.
+
+    None where the cameras see too few points from both ends: a model of a lens may have no pixel for some of them.
 
     The points' pixels stay the same. Their triangulation at the start: J_point dX + J_parameter = 0. The pose at the
     end, by the same pixels' equations: J_point dX + J_pose dp + J_parameter = 0, in least squares.
@@ -123,6 +127,10 @@ def _motion_by_parameters(rig: Rig, points: Array, move: Array, scaled: tuple[tu
     ends = points - move
     first, last = (_pixels_by_parameters(rig, se3.apply(T_rig_rect, at), scaled) for at in (points, ends))
     by_start, by_end = (_pixels_by_point(rig, at) for at in (points, ends))
+    seen = np.all([np.isfinite(part).all(axis=(1, 2)) for part in (first, last, by_start, by_end)], axis=0)
+    if seen.sum() < MIN_POINTS:
+        return None
+    first, last, by_start, by_end, ends = (part[seen] for part in (first, last, by_start, by_end, ends))
     shift = -np.linalg.pinv(by_start) @ first  # (N, 3, P)
     # The pose moves and turns the points the other way: dX_end = -dp - w x X_end.
     by_pose = np.concatenate([-by_end, by_end @ se3.hat(ends)], axis=2)

@@ -1,10 +1,11 @@
 """Folders of images with stamps, one folder for each camera.
 
 The stamp of an image is its name without suffix (1403636579763555584.png, 1305031102.175304.jpg), or the line of its
-number in timestamps.txt or times.txt in the folder of the images or the one above. A stamp is in nanoseconds where it
-is a whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers may have
-been meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say what is
-meant.
+number in timestamps.txt or times.txt in the folder of the images or the one above. Images that are named by low whole
+numbers that follow each other are numbered, not stamped, and are refused without such a list. A stamp is in nanoseconds
+where it is a whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers
+may have been meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say
+what is meant.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ _MAX_STAMP_NS: Final = 2**62
 _LONGEST_GAP_NS: Final = 3600 * 10**9  # Stamps of two successive images that differ by more are not those of one log.
 _SHORTEST_STEP_NS: Final = 100_000  # no camera gives 10,000 images a second
 _NS_DIGITS: Final = 16
+# Lower whole numbers as names count images: seconds since 1970 are above since 2001, and no camera of a robot takes one
+# image a second.
+_FIRST_SECONDS: Final = 10**9
 _SECONDS: Final = re.compile(r"\d{1,12}(?:\.(\d{1,12}))?")
 
 
@@ -121,6 +125,11 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
             f"{str(folder)!r} contains {len(paths)} images, and its list of stamps {len(lines)} lines; "
             "they must be as many"
         )
+    if lines is None and _are_counted([path.stem for path in paths]):
+        raise DriverError(
+            f"the images of {str(folder)!r} are numbered, {paths[0].name!r} and so on, and their times are not known: "
+            f"write a stamp a line, in seconds or nanoseconds, to {STAMP_FILES[0]} in this folder or the one above"
+        )
     for index, path in enumerate(paths):
         text = path.stem if lines is None else lines[index]
         stamp_ns = parse_stamp(text)
@@ -131,6 +140,15 @@ def _stamped(top: Path, folder: Path) -> Iterator[_StampedFile]:
                 f"more, or seconds, as name or in {' or '.join(STAMP_FILES)}"
             )
         yield _StampedFile(stamp_ns, topic, path)
+
+
+def _are_counted(names: Sequence[str]) -> bool:
+    """True for names that count images: whole numbers, too low for times since 1970, most of which follow another."""
+    if not all(name.isascii() and name.isdigit() and len(name) < _NS_DIGITS for name in names):
+        return False
+    numbers = sorted(map(int, names))
+    followers = sum(after - before == 1 for before, after in pairwise(numbers))
+    return followers > len(numbers) // 2 and numbers[-1] < _FIRST_SECONDS
 
 
 def _numbers_of(path: Path) -> list[tuple[int, str]]:

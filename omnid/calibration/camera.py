@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 
 import cv2
@@ -28,7 +30,7 @@ from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, is_log, read_images
 from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
-from omnid.calibration.view_guess import ViewChoice, view_of_images
+from omnid.calibration.view_guess import ViewChoice, view_notes, view_of_images
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,7 @@ class CameraResult:
     selected: SelectedCalibration
     mask: Mask | None  # rim, hub and struts, if they were searched
     images: Images
+    notes: tuple[str, ...] = ()  # about the view
 
     @property
     def calibration(self) -> CameraCalibration:
@@ -56,6 +59,7 @@ class CameraResult:
         return [
             *misfit_warning("camera", camera_structure(found)),
             *print_shape_notes(found.shape, found.board),
+            *self.notes,
             *found.warnings,
             *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
         ]
@@ -87,7 +91,7 @@ class CameraResult:
 
 
 def calibrate_camera(
-    sources: Sequence[str],
+    sources: str | PathLike[str] | Sequence[str | PathLike[str]],
     board: AnyBoard,
     *,
     topic: str | None = None,
@@ -98,18 +102,20 @@ def calibrate_camera(
 ) -> CameraResult:
     """Calibrate a camera by images of a board that it saw at several places.
 
-    sources: files, folders and patterns of images, or one log, with the topic of the camera in it. model: "auto" fits
-    every model and selects by cross-validation. view: the world is seen in a mirror or directly; "auto": as the images
-    show, see `view_guess`. with_mask: also search rim, hub and struts. progress receives one line for each image and
-    each model. Raises OmnidError or CalibError where the images do not suffice.
+    sources: a file, folder or pattern of images, or several; or one log, with the topic of the camera in it. model:
+    "auto" fits every model and selects by cross-validation. view: the world is seen in a mirror or directly; "auto": as
+    the images show, see `view_guess`. with_mask: also search rim, hub and struts. progress receives one line for each
+    image and each model. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images.
-    images = read_images(sources, topic)
-    many = any(is_log(Path(source)) for source in sources)
+    names = [os.fspath(name) for name in ([sources] if isinstance(sources, str | PathLike) else sources)]
+    images = read_images(names, topic)
+    many = any(is_log(Path(name)) for name in names)
     # 2. Find the board in each. Of a log the views that differ most are used.
     views = find_boards(images, board, thorough=not many, progress=progress)
     views = select_diverse_views(views) if many else views
     seen = view_of_images(view, [(images.values(), views)], board, progress)
+    notes = tuple(view_notes(view, [(images.values(), views)], board))
     # 3. Fit the models, and select the one with the least error at views that it was not fitted to.
     height, width = images[views[0].name].shape
     selected = select_calibration(views, board, (width, height), model, seen)
@@ -122,7 +128,7 @@ def calibrate_camera(
         report_scores(bent, "camera, with the shape of the print", progress)
     # 6. Find what never shows the world.
     center = bent.calibration.camera.center
-    return CameraResult(bent, find_mask(list(images.values()), center) if with_mask else None, images)
+    return CameraResult(bent, find_mask(list(images.values()), center) if with_mask else None, images, notes)
 
 
 def report_scores(selected: SelectedCalibration, name: str, progress: Progress) -> None:

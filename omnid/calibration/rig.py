@@ -28,7 +28,7 @@ from calib.models.camera import Mask
 from calib.models.names import sees_directly
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
-from calib.rig_frame import rig_between
+from calib.rig_frame import is_turned_over, rig_between
 from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
@@ -37,7 +37,7 @@ from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
 from omnid.calibration.rig_report import rig_report_html
-from omnid.calibration.view_guess import ViewChoice, view_of_images
+from omnid.calibration.view_guess import ViewChoice, view_notes, view_of_images
 from omnid.errors import OmnidError
 
 # The board scales the rig: a baseline outside this range, from smaller than any mirror to larger than any vehicle,
@@ -55,7 +55,7 @@ class RigResult:
     rig: Rig
     calibration: RigCalibration
     images: PairedImages
-    notes: tuple[str, ...]  # about the baseline and masks that were not found
+    notes: tuple[str, ...]  # about the baseline, the view, the order of the cameras, and masks that were not found
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras were given
 
     @property
@@ -135,9 +135,10 @@ def calibrate_rig(
             for side, own in zip(images.sides, zip(*(pair.seen for pair in views), strict=True), strict=True)
         ]
         choice = model, view_of_images(view, sides, board, progress)
+        shown = view_notes(view, sides, board)
         single = fit_cameras(views, images, board, (*choice, AS_DRAWN), progress)
     else:
-        single = FittedCameras.known(cameras, views)
+        single, shown = FittedCameras.known(cameras, views), []
     # 4. Fit the transform between the cameras, and the cameras with it.
     refined = cameras is None or refine_cameras
     found = _fit_rig(single.views, single, board, refined, AS_DRAWN, progress)
@@ -162,7 +163,7 @@ def calibrate_rig(
     drives = drive_uncertainty(rig) if refined else None
     if images.one_image is not None:
         rig = images.one_image.of_whole_image(rig)
-    return RigResult(rig, found, images, (*notes, *unmasked), drives)
+    return RigResult(rig, found, images, (*notes, *shown, *_order_notes(rig), *unmasked), drives)
 
 
 def _read(
@@ -278,6 +279,17 @@ def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | 
     if abs(off) > WARNING_PART:
         return [f"the baseline of {baseline_mm:.2f} mm is {abs(off):.1%} off the expected {expected_mm:g} mm"]
     return []
+
+
+def _order_notes(rig: Rig) -> list[str]:
+    """Return a warning where the images of both cameras seem to be exchanged: the world would be upside down."""
+    if not is_turned_over(rig):
+        return []
+    mounted = "stand upside down" if sees_directly(rig.lower.camera) else "look down into their mirrors"
+    return [
+        f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
+        "the rig's z would point down"
+    ]
 
 
 def _masked_rig(

@@ -63,9 +63,11 @@ def view_of_images(
 
     Raises OmnidError where none of them shows it, or where they contradict each other.
     """
+    if choice not in VIEW_CHOICES:
+        raise OmnidError(f"view: expected one of {', '.join(VIEW_CHOICES)}, found {choice!r}")
     if choice != "auto":
         return choice
-    shown = {_view_of_camera(brightest(images), views, board) for images, views in cameras} - {None}
+    shown = _views_shown(cameras, board)
     if len(shown) != 1:
         found = "no markers, no mirror's rim with a hub, no lines that are straight as only a lens shows them"
         if shown:
@@ -78,6 +80,26 @@ def view_of_images(
     assert view is not None
     progress(f"view: {view}, as the images show")
     return view
+
+
+def view_notes(
+    choice: ViewChoice, cameras: Sequence[tuple[Iterable[Image], Sequence[BoardView]]], board: Board | MarkerBoard
+) -> list[str]:
+    """Return a warning where the images show another view than the chosen one: the world would be its mirror image."""
+    if choice == "auto" or _views_shown(cameras, board) <= {choice}:
+        return []
+    return [
+        f"the view is given as {choice}, but the images do not look like that: where it is wrong, left and right are "
+        "exchanged in all that follows; leave --view out unless you are sure"
+    ]
+
+
+def _views_shown(
+    cameras: Sequence[tuple[Iterable[Image], Sequence[BoardView]]], board: Board | MarkerBoard
+) -> set[View]:
+    """Return the views that the images of cameras show; empty where they are undecided."""
+    shown = (_view_of_camera(brightest(images), views, board) for images, views in cameras)
+    return {view for view in shown if view is not None}
 
 
 def _view_of_camera(image: Image, views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:

@@ -67,7 +67,7 @@ def two_sides(text: str) -> tuple[int, int]:
 
 def board_of(args: argparse.Namespace) -> AnyBoard:
     """Return the board that the options describe; OmnidError for missing or unused ones, CalibError for wrong sizes."""
-    given = [name for name in ALL if getattr(args, name) not in (None, False)]
+    given = [name for name in ALL if _is_given(getattr(args, name))]
     needed = NEEDED[args.board]
     missing = [name for name in needed if name not in given]
     if missing:
@@ -93,10 +93,15 @@ def options_of(args: argparse.Namespace) -> list[str]:
     words = [] if args.board == "checkerboard" else ["--board", args.board]
     for name in ALL:
         value = getattr(args, name)
-        if value not in (None, False):
+        if _is_given(value):
             words.append("--" + name.replace("_", "-"))
             words += [] if value is True else ["x".join(map(str, value)) if isinstance(value, tuple) else f"{value}"]
     return [f"{float(word):g}" if word.replace(".", "", 1).isdigit() else word for word in words]
+
+
+def _is_given(value: object) -> bool:
+    """True for the value of an option that was given; 0 is one, though 0 == False."""
+    return value is not None and value is not False
 
 
 def _options(names: tuple[str, ...] | list[str]) -> str:

@@ -79,7 +79,8 @@ def print_result(output: Path, found: CameraResult | RigResult) -> None:
 
 def _check_outputs(args: argparse.Namespace) -> None:
     named = [("--output", args.output), ("--report", args.report), ("--mask", args.mask)]
-    read = [("an image that is read", Path(source)) for source in args.images if Path(source).is_file()]
+    sources = map(Path, args.images)
+    read = [("an image that is read", path if path.exists() else path.parent) for path in sources]  # of a pattern
     check_outputs([(option, path) for option, path in named if path is not None], read)
     if args.mask and (args.mask.suffix.lower() != ".png" or args.mask.parent.resolve() != args.output.parent.resolve()):
         raise OmnidError(f"--mask {args.mask}: expected a .png in the folder of {args.output}")

@@ -92,8 +92,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _area(text: str) -> ImageArea:
-    """Return the area of an option; ValueError for anything else, which argparse reports."""
-    left, top, width, height = map(int, text.split(","))
+    """Return the area of an option; ArgumentTypeError for anything else."""
+    try:
+        left, top, width, height = map(int, text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"expected left, top, width and height in pixels like 0,0,768,768, found {text!r}"
+        ) from error
     return ImageArea(left, top, width, height)
 
 
@@ -123,7 +128,7 @@ def _check_outputs(args: argparse.Namespace) -> None:
     read = [
         ("a file that is read", path)
         for path in (args.images, args.lower_camera, args.upper_camera)
-        if path is not None and path.is_file()
+        if path is not None
     ]
     check_outputs([(option, path) for option, path in named if path is not None], read)
     expected = args.expected_baseline_mm

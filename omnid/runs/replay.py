@@ -179,7 +179,7 @@ class _Replay:
             ("the rig that is read", rig),
             ("the configuration that is read", self._options.settings),
         )
-        in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]
+        in_folder = [("the log that is read", log) for log in sorted(self._log.glob("*.mcap"))]  # also by another name
         return [(what, path) for what, path in named if path is not None] + in_folder
 
     def _reader(self) -> LogReader:

@@ -25,13 +25,29 @@ Named: TypeAlias = Sequence[tuple[str, Path]]
 REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
 # Options of files of one format, and how such a file is named.
 SUFFIXES: Final = {"--cloud": ".ply", "--ply": ".ply", "--plan": ".png", "--record": ".mcap", "--mcap": ".mcap"}
+# What is read of a folder: images, logs, lists of stamps. A plan is an image beside the folders of a log, not in them.
+READ_SUFFIXES: Final = {
+    ".bmp",
+    ".jpeg",
+    ".jpg",
+    ".pgm",
+    ".png",
+    ".ppm",
+    ".tif",
+    ".tiff",
+    ".webp",
+    ".mcap",
+    ".db3",
+    ".bag",
+}
+READ_NAMES: Final = ("timestamps.txt", "times.txt")
 FORMATS: Final = {*SUFFIXES.values(), ".txt", ".tum", ".csv", ".json", ".jpg", ".pdf", ".pcd", ".db3", ".bag", ".toml"}
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written and none is another one or an input (name, path).
 
-    Raises OmnidError.
+    Of an input that is a folder, what is read in it and in its folders counts as well. Raises OmnidError.
     """
     taken = {_identity(path): what for what, path in inputs}
     for option, path in outputs:
@@ -39,8 +55,19 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         other = taken.setdefault(_identity(path), option)
         if other != option and path.exists() == path.is_file():
             raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
+        if folder := next((folder for _, folder in inputs if _is_read_in(folder, option, path)), None):
+            raise OmnidError(f"{option} {path}: this is a file of {folder}, which is read; name another file")
         if path.suffix.lower() in FORMATS - {SUFFIXES.get(option, path.suffix.lower())}:
             raise OmnidError(f"{option} {path}: expected a name that ends with {SUFFIXES[option]}")
+
+
+def _is_read_in(folder: Path, option: str, path: Path) -> bool:
+    """True if an output is a file that is there and that a run which reads the folder may read."""
+    if option == "--plan" or not (folder.is_dir() and path.is_file()):
+        return False
+    place = path.resolve()
+    is_near = folder.resolve() in (place.parent, place.parent.parent)
+    return is_near and (place.suffix.lower() in READ_SUFFIXES or place.name in READ_NAMES)
 
 
 def on_stdout(outputs: Named) -> bool:

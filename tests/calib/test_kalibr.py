@@ -296,6 +296,7 @@ def test_refuses_contradicting_transforms(wrong: Array) -> None:
         (chain((None, None), T_UPPER_LOWER), {}, "neither topics nor heights"),
         (chain((BOTH[0], BOTH[0]), None), {}, "neither topics nor heights"),
         (chain((BOTH[0], BOTH[0]), None, NAMED), {}, "viewpoints must lie apart"),
+        (chain((BOTH[0], se3.transform(np.eye(3), [0, 0, 200.0]) @ BOTH[0]), None, NAMED), {}, "T_cam_rig in metres"),
         (chain(BOTH, None), {"lower": "cam7"}, "there is no camera cam7, found cam0, cam1"),
         (chain(BOTH, None), {"lower": "cam1", "upper": "cam1"}, "must be two cameras"),
         (f"cam0:{CAMERA}", {}, "expected two cameras .*found cam0"),

@@ -42,7 +42,7 @@ def assert_same(a: MountedCamera, b: MountedCamera) -> None:
 def test_rig_round_trip(rig: Rig, masks: bool, tmp_path: Path) -> None:
     rig = with_masks(rig) if masks else rig
     write_rig(tmp_path / "rig.toml", rig)
-    for found in (read_rig(tmp_path / "rig.toml"), parse_rig(rig_toml(rig)), parse_rig(rig_toml(rig).encode())):
+    for found in (read_rig(str(tmp_path / "rig.toml")), parse_rig(rig_toml(rig)), parse_rig(rig_toml(rig).encode())):
         assert_same(found.lower, rig.lower)
         assert_same(found.upper, rig.upper)
         np.testing.assert_array_equal(found.T_base_rig, rig.T_base_rig)
@@ -208,3 +208,8 @@ def test_times_of_exposure_are_kept_and_bounded(omni_rig: Rig) -> None:
         assert old in text
         with pytest.raises(CalibError, match=message):
             parse_rig(text.replace(old, new))
+
+
+def test_the_file_of_one_camera_is_named() -> None:
+    with pytest.raises(CalibError, match=r"c.toml: a camera.toml, the file of one camera; a rig.toml was expected"):
+        parse_rig("schema = 1\n[camera]\n", name="c.toml")

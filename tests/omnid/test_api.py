@@ -7,7 +7,9 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,6 +25,7 @@ from drivers.logs.log_reader import LogReader
 from omnid.engine.graph import Graph
 from omnid.errors import OmnidError
 from omnid.formats.tum import Trajectory, tum_row
+from omnid.messages import FramePair
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunFailedError
 from omnid.stages.synchronise import Synchronise
@@ -160,7 +163,7 @@ def test_replay_takes_settings_a_rig_and_a_method(scene: Path, start: Path, resu
     coarse = omnid.replay(scene / "log.mcap", rig, config=config)
     assert result.map is not None and coarse.map is not None and len(coarse.map.xyz) < len(result.map.xyz) / 2
     assert np.array_equal(coarse.T_odom_rig, result.T_odom_rig)
-    paper = omnid.replay(start, rig, config=config, method="paper", overrides=["log.reorder_frames=8"])
+    paper = omnid.replay(start, rig, config=config, method="paper", overrides="log.reorder_frames=8")
     assert len(paper.stamps_ns) == FEW and not np.array_equal(paper.T_odom_rig, result.T_odom_rig[:FEW])
 
 
@@ -248,6 +251,28 @@ def test_exchanged_images_are_refused(scene: Path, pairs: list[Pair]) -> None:
     with pytest.raises(OmnidError, match="the other way round"):
         for stamp_ns, lower, upper in pairs[:6]:
             odometry.process(stamp_ns, upper, lower)
+
+
+def test_threads_that_share_an_odometry_wait_for_each_other(scene: Path, pairs: list[Pair]) -> None:
+    """Unless they do, both work on the same landmarks, and fail with whatever is missing."""
+    odometry = omnid.Odometry(scene / "rig.toml")
+    busy = [0, 0]  # threads in the stages now, and at most
+    whole = odometry._front_end.process
+
+    def counted(pair: FramePair) -> omnid.OdometryUpdate:
+        busy[0] += 1
+        busy[1] = max(busy)
+        time.sleep(0.05)
+        pose = whole(pair)
+        busy[0] -= 1
+        return pose
+
+    odometry._front_end.process = counted  # type: ignore[method-assign]
+    with ThreadPoolExecutor(4) as threads:
+        given = [threads.submit(odometry.process, *pair) for pair in pairs[:4]]
+    failed = [error for future in given if (error := future.exception())]
+    assert busy[1] == 1 and all("expected a stamp after" in str(error) for error in failed)
+    assert odometry.process(*pairs[4]).state is omnid.TrackingState.TRACKING
 
 
 def test_images_may_be_views(scene: Path, pairs: list[Pair]) -> None:

@@ -36,7 +36,7 @@ def robot() -> Iterator[tuple[Bus, str]]:
 
 
 def test_keeps_only_the_newest_pose() -> None:
-    with robot() as (bus, endpoint), subscribe(connect=(endpoint,)) as poses:
+    with robot() as (bus, endpoint), subscribe(connect=endpoint) as poses:
         assert poses.newest() is None and poses.wait(0.05) is None
         numbers = count()
         wait_until(lambda: bus.publish("odom", odometry(next(numbers))) is None and poses.newest() is not None)

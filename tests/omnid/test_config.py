@@ -55,3 +55,7 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
 def test_a_wrong_key_is_answered_by_keys_of_its_own_section(key: str, proposed: str) -> None:
     with pytest.raises(OmnidError, match=re.escape(f"unknown key {key}: {proposed}")):
         load_config(None, [f"{key}=1"])
+
+
+def test_one_override_needs_no_list() -> None:
+    assert load_config(overrides="motor.rate_hz=31") == load_config(overrides=["motor.rate_hz=31"]) != Config()

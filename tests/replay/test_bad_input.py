@@ -215,6 +215,18 @@ def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Pa
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.parametrize("name", ["timestamps.txt", "lower/1.5.png", "bag_0.db3"])
+def test_what_is_read_of_a_folder_is_no_output(omnid: Command, tmp_path: Path, name: str) -> None:
+    read = tmp_path / name
+    read.parent.mkdir(exist_ok=True)
+    read.write_text("0.1")
+    assert f"this is a file of {tmp_path}, which is read" in omnid.refused("replay", tmp_path, "--tum", read)
+    assert read.read_text() == "0.1"
+    for option, mine in (("--tum", "est.txt"), ("--plan", "plan.png")):  # of the run before
+        (tmp_path / mine).write_text("before")
+        check_outputs([(option, tmp_path / mine)], [("the log that is read", tmp_path)])
+
+
 def test_a_run_without_a_pair_keeps_existing_files(omnid: Command, tmp_path: Path, scene: Path) -> None:
     """It is refused at the first image, or it ends without one."""
     rig = (scene / "rig.toml").read_text().replace("size = [256, 256]", "size = [640, 640]")

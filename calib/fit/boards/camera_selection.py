@@ -81,6 +81,8 @@ def select_calibration(
     shape: start value of the print's shape, whose free modes are fitted. Models are compared on the views that all of
     them accept. Raises CalibError if no model can be fitted.
     """
+    if choice not in MODEL_CHOICES:
+        raise CalibError(f"model: expected one of {', '.join(MODEL_CHOICES)}, found {choice!r}")
     good, rejected = consistent_views(views, board, size, view)
     fitted, failures = dict[Model, CameraCalibration](), list[CalibError]()
     ocam: FittedModel | None = None

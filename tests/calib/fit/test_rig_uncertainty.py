@@ -15,6 +15,7 @@ from calib.rig import Rig
 from calib.rig_covariance import TRANSFORM_NAMES, RigCovariance
 from omnid.simulation.rendering.rigs import make_rig
 from tests.calib.fit.boards.test_rig_fit import RIG
+from tests.simulation.rigs import lens_rig
 
 
 def with_sigma(rig: Rig, name: str, sigma: float) -> Rig:
@@ -57,3 +58,10 @@ def test_parameters_are_perturbed_as_documented() -> None:
     assert changed.baseline_m == pytest.approx(RIG.baseline_m + 1e-3)
     with pytest.raises(CalibError, match="no parameter 'lower a0'"):
         perturbed_rig(RIG, ("lower a0",), np.array([1.0]))
+
+
+def test_points_that_a_lens_loses_on_the_way_are_left_out() -> None:
+    """Its distortion ends within the image, so that points of the start have no pixel at the end of the drive."""
+    camera = UnifiedCamera(0.0, (250.0, 250.0), (319.5, 239.5), (640, 480), (-0.3, 0.0, 0.0, 0.0))
+    found = drive_uncertainty(with_sigma(lens_rig(camera), "baseline", 0.2e-3))
+    assert found is not None and found.scale == pytest.approx(1e-3, rel=1e-2)

@@ -205,6 +205,15 @@ def test_folders_with_a_list_of_stamps(tmp_path: Path) -> None:
     for path in folder.glob("*/*.jpg"):  # 10 comes after 9, not after 1
         path.rename(path.with_stem(str(int(path.stem))))
     assert read(folder)[0] == expected(tmp_path)
+    kept = (folder / "upper" / "timestamps.txt").read_text()
+    for name in ("0000000007", "7"):  # without the list it would be taken for 7 s
+        (folder / "upper" / "timestamps.txt").unlink(missing_ok=True)
+        with pytest.raises(DriverError, match=r"upper' are numbered, .*timestamps.txt"):
+            LogReader(folder)
+        for path in (folder / "upper").glob("*.jpg"):
+            path.rename(path.with_stem(f"{int(path.stem):0{len(name)}d}"))
+    (folder / "upper" / "timestamps.txt").write_text(kept)
+    assert read(folder)[0] == expected(tmp_path)
     (folder / "upper" / "timestamps.txt").write_text("1.0\n")
     with pytest.raises(DriverError, match="12 images, and its list of stamps 1 lines"):
         LogReader(folder)

@@ -28,7 +28,7 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> CameraResult:
     renderer = BoardRenderer.of(BOARD, CAMERA, MASK)
     for seed, T in enumerate(board_poses_around_camera(CAMERA, BOARD, MASK, VIEWS, distance_m=(0.14, 0.25))):
         cv2.imwrite(str(folder / f"p{seed}.png"), renderer.render_board(T, seed=seed).image)
-    return omnid.calibrate_camera([str(folder)], BOARD, model="ocam", progress=lines.append)
+    return omnid.calibrate_camera(folder, BOARD, model="ocam", progress=lines.append)
 
 
 def test_the_result_prints_itself_in_one_line(found: CameraResult) -> None:

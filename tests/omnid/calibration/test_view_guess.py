@@ -11,7 +11,7 @@ from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
 from calib.boards.marker_finder import find_marker_board
 from omnid.calibration.progress import silent
-from omnid.calibration.view_guess import view_of_images
+from omnid.calibration.view_guess import view_notes, view_of_images
 from omnid.errors import OmnidError
 from tests.simulation.boards import board_pose
 from tests.simulation.marker_boards import print_of
@@ -91,3 +91,18 @@ def test_what_the_images_leave_open_is_asked_for(cameras: list[Camera], found: s
     with pytest.raises(OmnidError, match=rf"\(found {found}.*add --view mirror or --view direct"):
         guess(*cameras)
     assert view_of_images("direct", cameras, CHECKERBOARD, silent) == "direct"
+    if found == "no markers":
+        assert not view_notes("direct", cameras, CHECKERBOARD)
+
+
+def test_a_view_that_the_images_contradict_is_a_warning() -> None:
+    mirror, lens = rim(25.0), seen_boards(600, 0.0)
+    assert "given as direct" in view_notes("direct", [mirror, rim(0.0)], CHECKERBOARD)[0]
+    assert "given as mirror" in view_notes("mirror", [lens], CHECKERBOARD)[0]
+    assert not view_notes("mirror", [mirror], CHECKERBOARD) and not view_notes("direct", [lens], CHECKERBOARD)
+    assert not view_notes("auto", [mirror], CHECKERBOARD)
+
+
+def test_an_unknown_view_is_refused() -> None:
+    with pytest.raises(OmnidError, match="expected one of auto, mirror, direct, found 'mirrors'"):
+        view_of_images("mirrors", [rim(25.0)], CHECKERBOARD, silent)  # type: ignore[arg-type]

@@ -69,6 +69,7 @@ def test_calibrates_with_half_hidden_boards(
     ("words", "message"),
     [
         (["--corners", "6x5"], "--board checkerboard: expected --corners, --square-mm, found no --square-mm"),
+        (["--corners", "6x5", "--square-mm", "0"], "expected squares of 0.1 mm to 10 m, found 0 mm"),
         (["--board", "aprilgrid", "--corners", "6x5"], "--tags, --tag-mm, --tag-spacing, found no --tags, --tag-mm"),
         (
             ["--corners", "6x5", "--square-mm", "30", "--dictionary", "4X4_50"],

@@ -136,6 +136,18 @@ def test_invalid_input_is_one_line_and_exit_code_2(
     assert not (tmp_path / "camera.toml").exists()
 
 
+@pytest.mark.parametrize("source", [".", "p*.png"])
+def test_images_that_are_read_are_kept(
+    folder: Path, tmp_path: Path, source: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for path in folder.glob("p0.png"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    before = (tmp_path / "p0.png").read_bytes()
+    assert run(tmp_path / source, "-o", tmp_path / "p0.png") == 2
+    assert "which is read; name another file" in capsys.readouterr().err
+    assert (tmp_path / "p0.png").read_bytes() == before
+
+
 def test_suggests_the_right_number_of_corners(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(folder / "p0.png", "-o", tmp_path / "camera.toml", corners="7x4") == 2
     assert "a grid of 5x6 was found in 1: try --corners 5x6" in capsys.readouterr().err

@@ -73,10 +73,11 @@ def run(*words: object, corners: str = "7x6", square_mm: float = 30) -> int:
     return main(["calibrate", "rig", *map(str, words), "--corners", corners, "--square-mm", str(square_mm), "--quiet"])
 
 
-@pytest.fixture(scope="module")
-def four(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture
+def four(folder: Path, tmp_path: Path) -> Path:
     """Return a folder with the first four pairs."""
-    made = tmp_path_factory.mktemp("four")
+    made = tmp_path / "four"
+    made.mkdir()
     for path in folder.glob("*_0[0-3].png"):
         shutil.copy(path, made)
     return made
@@ -238,6 +239,32 @@ def test_invalid_input_is_one_line_and_exit_code_2(
     assert run(*bad(folder, tmp_path, kind), "-o", tmp_path / "rig.toml") == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert message in line and not (tmp_path / "rig.toml").exists()
+
+
+def test_exchanged_cameras_are_a_warning(folder: Path, four: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The rig would be upside down: its z, and with it every turn and every height."""
+    for path in four.glob("*.png"):
+        side, number = path.stem.split("_")
+        path.rename(four / f"{'upper' if side == 'lower' else 'lower'}_{number}x.png")
+    words = ["--lower-camera", folder / "upper.toml", "--upper-camera", folder / "lower.toml"]
+    assert run(four, "-o", four / "rig.toml", *words) == 0
+    assert "exchange their images, unless the cameras look down into their mirrors" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--output", "--report"])
+def test_images_that_are_read_are_kept(four: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    image = four / "lower_00.png"
+    before = image.read_bytes()
+    assert run(four, "-o", four / "rig.toml", option, image) == 2
+    assert f"{option} {image}: this is a file of {four}, which is read" in capsys.readouterr().err
+    assert image.read_bytes() == before
+
+
+def test_an_area_says_what_is_expected(four: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run(four, "-o", four / "rig.toml", "--lower-area", "0,0,480")
+    assert ended.value.code == 2
+    assert "--lower-area: expected left, top, width and height in pixels like 0,0,768,768" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

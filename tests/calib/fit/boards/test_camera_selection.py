@@ -7,6 +7,7 @@ import pytest
 
 from calib import se3
 from calib.boards.board import Board, BoardView
+from calib.errors import CalibError
 from calib.fit.boards.camera_fit import observations
 from calib.fit.boards.camera_selection import MODELS, camera_structure, select_calibration, with_print_shape
 from calib.fit.boards.cross_validation import held_out_error_px
@@ -51,6 +52,11 @@ def test_the_tangential_model_describes_a_tilted_camera() -> None:
     assert isinstance(found.camera, OcamCamera) and any(found.camera.tangential)
     assert found.fit.mean_px < 0.08 and not camera_structure(found).is_misfit
     assert [name for name, _, _ in found.parameters][-2:] == ["p1", "p2"]
+
+
+def test_an_unknown_model_is_refused() -> None:
+    with pytest.raises(CalibError, match=r"model: expected one of auto, .*found 'pinhole'"):
+        select_calibration([], BOARD, SIZE, "pinhole")  # type: ignore[arg-type]
 
 
 def test_held_out_error_of_the_right_model_is_near_the_noise() -> None:
