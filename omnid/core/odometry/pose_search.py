@@ -88,7 +88,7 @@ class PoseSearch:
     ) -> PoseEstimate:
         """Return the likeliest pose within reach_m of the prediction, with its runner-up: runner_up_motions.py."""
         # 1. Displacements there from which the images are alike, and the poses to which they lead.
-        off_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
+        off_m = _off_m(estimate, T_predicted)
         peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
         exposure = self._exposures.predicted(frame, dt_s)
         is_good, others = is_good_enough(estimate, self._limits, is_near=False), []
@@ -97,14 +97,15 @@ class PoseSearch:
                 continue
             T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
             other = self._estimate(frame, T_guess, exposure, last, dt_s, is_near=True)
-            others += [other] if other is not None else []
+            others += [other] if other is not None and _off_m(other, T_predicted) < reach_m else []
         # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong. The
-        #    same where the inliers show no motion of a vehicle: they may be on a person who walks along.
+        #    same where the inliers show no motion of a vehicle: they may be on a person who walks along, and what is
+        #    nearer to the prediction is right.
         if estimate.inlier_ratio < self._limits.good_inlier_ratio or off_m > reach_m:
             other = self._by_outliers(frame, estimate, exposure, last, dt_s)
             others += [other] if other is not None else []
         # 3. The likeliest one, and whether another one is nearly as likely.
-        return likeliest(estimate, others, T_predicted, reach_m)
+        return likeliest(estimate, others, T_predicted, max(reach_m, off_m))
 
     def _by_outliers(
         self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure, last: LastFrame, dt_s: float
@@ -146,6 +147,10 @@ class PoseSearch:
         T_unturned = last.T_odom_rect.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
         yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
+
+
+def _off_m(estimate: PoseEstimate, T_predicted: Array) -> float:
+    return float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
 
 
 def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_near: bool) -> bool:

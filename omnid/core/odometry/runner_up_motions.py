@@ -141,9 +141,8 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     """Return the most likely estimate, with the farthest of its runners-up.
 
     others: from displacements, or by outliers; one that is not within reach_m [m] of the pose T_predicted is no motion
-    of a vehicle, unless the one found is farther from it: landmarks on a person who walks along may have led there. One
-    that explains less than LEAST_SHARE of the landmarks in view is no view of the scene. Of estimates of one pose the
-    one with most inliers is taken.
+    of a vehicle, and one that explains less than LEAST_SHARE of the landmarks in view no view of the scene. Of
+    estimates of one pose the one with most inliers is taken.
 
     Where half of the landmarks contradict the others, one half has a wrong depth, all of it by the same period of the
     texture. The costs are sums over landmarks that err independently, so they do not decide; the motion does: the pose
@@ -152,7 +151,6 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     if not others:
         return found
     # 1. The estimate with the lowest cost, and those that contradict it; of these, the motion decides.
-    reach_m = max(reach_m, _apart_m(found, T_predicted))
     near = [each for each in others if _apart_m(each, T_predicted) < reach_m]
     views = [found, *(each for each in near if len(each.landmarks) >= LEAST_SHARE * each.in_view)]
     cheapest = min(views, key=lambda each: each.cost)

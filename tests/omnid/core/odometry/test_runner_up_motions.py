@@ -97,15 +97,6 @@ def test_a_runner_up_is_within_reach_elsewhere_and_nearly_as_likely() -> None:
     assert likeliest(unlikely, [best], np.eye(4), 0.5).T_odom_rect[0, 3] == 0
 
 
-def test_where_the_pose_found_is_out_of_reach_one_that_is_nearer_to_the_prediction_may_be_right() -> None:
-    """A person walks along behind the base: with the landmarks on him, it seems to stand; wheels say that it drives."""
-    stands, drives, leaps = pose(0.0, 0.66, inliers=72), pose(0.028, 0.59, inliers=97), pose(0.06, 0.1)
-    T_predicted = pose(0.020, 0.0).T_odom_rect
-    assert likeliest(stands, [drives, leaps], T_predicted, 0.002).T_odom_rect[0, 3] == 0.028
-    assert likeliest(drives, [stands], T_predicted, 0.002).T_odom_rect[0, 3] == 0.028
-    assert likeliest(pose(0.0205, 0.6), [drives], T_predicted, 0.002).T_odom_rect[0, 3] == 0.0205
-
-
 @pytest.mark.parametrize(("reach_m", "expected_m"), [(0.002, 0.028), (0.05, 0.0)])
 def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_vehicle(
     alike: RenderedCameras, monkeypatch: pytest.MonkeyPatch, reach_m: float, expected_m: float
