@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles import column_kernels as kernels
+from omnid.core.obstacles.surface_kernels import surface_evidence
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
@@ -166,7 +167,7 @@ class Columns:
         surface, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
         limits = np.float32(FLOOR_WEIGHT), np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
         compared = views.lower, views.upright, views.plane, views.live
-        kernels.surface_evidence(*compared, self._strips, OUTLIER, scale, *limits, surface)
+        surface_evidence(*compared, self._strips, OUTLIER, scale, *limits, surface)
         # A surface fits a little at the disparities next to its own.
         peak = np.ones_like(surface, bool)
         peak[1:] &= surface[1:] >= surface[:-1]
@@ -273,7 +274,7 @@ class Columns:
         return offsets
 
     def _made_strips(self) -> Tables:
-        """Return the table of kernels.surface_evidence."""
+        """Return the table of surface_evidence."""
         found = []
         h, (low_m, high_m) = self._plane.height_m, self._heights_m
         for v in range(self._first_row + STRIP_OVERLAP, self._last_row - STRIP_ROWS - STRIP_OVERLAP, STRIP_ROWS):

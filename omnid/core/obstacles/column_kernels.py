@@ -19,24 +19,25 @@ Numbers = NDArray[np.int32]
 
 LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
-# Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
-LEAST_LIKELIHOOD = np.float32(1e-3)
 # exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
 FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO, FLOOR_NEAR = 0, 1, 2, 3, 4, 5, 6
-STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR = 0, 1, 2, 3, 4
+
+
+@inner
+def difference(lower: np.uint8, least: np.uint8, most: np.uint8, live: np.uint8, outlier: np.uint8) -> np.uint8:
+    """Return by how much a pixel lies outside of the bounds of another one, at most an outlier's; live: 255, else 0."""
+    above = np.uint8(lower - most) if lower > most else np.uint8(0)
+    below = np.uint8(least - lower) if least > lower else np.uint8(0)
+    found = above | below
+    return np.uint8((found if found < outlier else outlier) & live)
 
 
 @inner
 def add_differences(lower: Bytes, least: Bytes, most: Bytes, live: Bytes, outlier: np.uint8, sums: Words) -> None:
     """Add to sums (W,) by how much a row lies outside of the bounds of another one, at most an outlier's."""
     for u in range(len(sums)):
-        a = lower[u]
-        above = np.uint8(a - most[u]) if a > most[u] else np.uint8(0)
-        below = np.uint8(least[u] - a) if least[u] > a else np.uint8(0)
-        difference = above | below
-        difference = difference if difference < outlier else outlier
-        sums[u] = np.uint16(sums[u] + np.uint16(difference & live[u]))
+        sums[u] = np.uint16(sums[u] + np.uint16(difference(lower[u], least[u], most[u], live[u], outlier)))
 
 
 @inner
@@ -88,40 +89,6 @@ def lower_to(values: Words, into: Words) -> None:
     """Lower `into` (W,) to values (W,)."""
     for u in range(len(into)):
         into[u] = values[u] if values[u] < into[u] else into[u]
-
-
-@inner
-def add_run(
-    before: Floats,
-    mine: Floats,
-    after: Floats,
-    total: Floats,
-    blank: np.float32,
-    bound: np.float32,
-    prior: np.float32,
-    run: Floats,
-    best: Floats,
-) -> None:
-    """Go on with the maximum-sum runs (W,) by a strip (Kadane), and raise `best` to them.
-
-    before, mine, after: likelihoods of three neighbouring disparities; total: of all of them. The logarithm is taken as
-    2 (x^(1/4) - x^(-1/4)); blank: that of the number of the others by these three. A strip without texture, and one
-    that fits at two disparities, is no evidence.
-    """
-    for u in range(len(run)):
-        three = before[u] + mine[u] + after[u]
-        others = total[u] - three
-        others = others if others > LEAST_LIKELIHOOD else LEAST_LIKELIHOOD
-        root = np.float32(math.sqrt(math.sqrt((three + LEAST_LIKELIHOOD) / others)))
-        ratio = np.float32(2.0) * (root - ONE / root)
-        without = ratio + blank
-        ratio = ratio if ratio > NOTHING else (without if without < NOTHING else NOTHING)
-        ratio = ratio if ratio < bound else bound
-        ratio = ratio if ratio > -bound else -bound
-        value = run[u] + ratio - prior
-        value = value if value > NOTHING else NOTHING
-        run[u] = value
-        best[u] = value if value > best[u] else best[u]
 
 
 @compiled(
@@ -229,60 +196,3 @@ def floor_evidence(
                 weights += prior[abs(d - k)]
         for u in range(width):
             others[k, u] /= weights
-
-
-@compiled(
-    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4[:, ::1])",
-    writes=("surface",),
-)
-def surface_evidence(
-    lower: Bytes,
-    upright: Bytes,
-    plane: Bytes,
-    live: Bytes,
-    strips: Numbers,
-    outlier: np.uint8,
-    scale: np.float32,
-    floor_weight: np.float32,
-    bound: np.float32,
-    prior: np.float32,
-    surface: Floats,
-) -> None:
-    """Write the best run (K, W) of strips of rows that are a surface at a disparity, as a log-likelihood ratio.
-
-    Images as for floor_evidence. strips (N, 5), from above: first row and end; first disparity that is a surface within
-    the robot's heights, and end of the disparities; 1 where the floor is an explanation, too.
-    floor_weight: probability of the floor by that of one disparity; bound: of the ratio of a strip; prior: less ratio.
-    """
-    width, bins = lower.shape[1], len(surface)
-    sums, floor = np.zeros((bins, width), np.uint16), np.zeros(width, np.uint16)
-    value, total = np.zeros((bins + 2, width), np.float32), np.empty(width, np.float32)
-    best, plain = np.empty(width, np.uint16), np.empty(width, np.float32)
-    run = np.zeros((bins, width), np.float32)
-    surface[:] = NOTHING
-    for n in range(len(strips)):
-        first, end = strips[n, STRIP_FIRST], strips[n, STRIP_END]
-        mine, last = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS]
-        if last <= mine:
-            continue
-        sums[:last], floor[:], best[:] = 0, 0, LARGEST
-        for v in range(first, end):
-            for d in range(last):
-                add_differences(lower[v], upright[0, v + d], upright[1, v + d], live[v], outlier, sums[d])
-        for d in range(last):
-            lower_to(sums[d], best)
-        total[:] = NOTHING
-        if strips[n, STRIP_FLOOR] > 0:
-            for v in range(first, end):
-                add_differences(lower[v], plane[0, v], plane[1, v], live[v], outlier, floor)
-            lower_to(floor, best)
-            likelihoods(floor, best, scale, plain)
-            add(plain, floor_weight, total)
-        value[last + 1] = NOTHING
-        for d in range(last):
-            likelihoods(sums[d], best, scale, value[d + 1])
-            add(value[d + 1], ONE, total)
-        fourth = math.pow((last + strips[n, STRIP_FLOOR] * floor_weight - 3.0) / 3.0, 0.25)
-        blank = np.float32(2.0 * (fourth - 1.0 / fourth))
-        for d in range(mine, last):
-            add_run(value[d], value[d + 1], value[d + 2], total, blank, bound, prior, run[d], surface[d])
