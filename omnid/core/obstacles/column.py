@@ -200,8 +200,8 @@ class Columns:
         image = self._working(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
         smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
         coarse = cv2.blur(cv2.blur(smooth, (1, COARSE_ROWS)), (1, COARSE_ROWS))
-        band = cv2.subtract(smooth, coarse)
-        contrast2 = cv2.blur(cv2.multiply(band, band), (3, CONTRAST_ROWS))
+        band = np.asarray(cv2.subtract(smooth, coarse), np.float32)
+        contrast2 = np.asarray(cv2.blur(cv2.multiply(band, band), (3, CONTRAST_ROWS)), np.float32)
         into = np.empty(band.shape, np.uint8)
         kernels.normalise(band, contrast2, TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO, into)
         return into

@@ -203,10 +203,10 @@ def floor_evidence(
 def normalise(
     band: Floats,
     contrast2: Floats,
-    share2: np.float32,
-    noise2: np.float32,
-    units: np.float32,
-    zero: np.float32,
+    share2: float,
+    noise2: float,
+    units: float,
+    zero: float,
     into: Bytes,
 ) -> None:
     """Write a band-pass (H, W) in units of what two views differ by, whose variance is share2 contrast2 + noise2."""

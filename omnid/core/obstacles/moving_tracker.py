@@ -72,9 +72,10 @@ class _Track:
         dt_s = (stamp_ns - self.stamp_ns) * 1e-9
         self.stamp_ns = stamp_ns
         F = np.eye(4)
-        F[:2, 2:] = dt_s * np.eye(2)
-        Q = ACCELERATION_PSD * np.kron([[dt_s**3 / 3, dt_s**2 / 2], [dt_s**2 / 2, dt_s]], np.eye(2))
-        self._filter.predict(F=F, Q=Q)
+        F[0, 2] = F[1, 3] = dt_s
+        a, b = dt_s**3 / 3, dt_s**2 / 2
+        Q = np.array([[a, 0.0, b, 0.0], [0.0, a, 0.0, b], [b, 0.0, dt_s, 0.0], [0.0, b, 0.0, dt_s]])
+        self._filter.predict(F=F, Q=ACCELERATION_PSD * Q)
 
     def update(self, cluster: _Cluster) -> None:
         self._filter.update(cluster.middle[:, None], R=cluster.covariance)
@@ -129,12 +130,14 @@ class MovingTracker:
         near = np.isfinite(arrived_m) & (arrived_m < FARTHEST_M)
         found = []
         for sectors in surfaces(np.where(near, arrived_m, np.nan), sigma_m):
+            if len(sectors) < LEAST_SECTORS:
+                continue
             # What hides the nearest floor in view is anywhere before it: as near as a person is who fills that angle.
             most_m = PERSON_M * SECTORS / (math.tau * len(sectors))
             share = np.where(arrivals.is_nearer[sectors], np.minimum(most_m / arrived_m[sectors], 1.0), 1.0)
             at = (share * arrived_m[sectors])[:, None] * self._directions[sectors]
             width_m = float(np.linalg.norm(at[-1] - at[0]))
-            if len(sectors) < LEAST_SECTORS or width_m > WIDEST_M:
+            if width_m > WIDEST_M:
                 continue
             middle = at.mean(axis=0) @ T_odom_eye[:2, :2].T + T_odom_eye[:2, 3]
             along = (middle - T_odom_eye[:2, 3]) / np.linalg.norm(middle - T_odom_eye[:2, 3])
