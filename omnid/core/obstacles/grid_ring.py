@@ -55,7 +55,8 @@ def ring_of(cells: Bytes, view: RingView, arrivals: Arrivals) -> GridRing:
     )
     kernels.march(cells, origin, view.angles, hit, free)
     # 2. A direction between cells may belong to either side.
-    free = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
+    around = np.concatenate([free[-1:], free, free[:1]])
+    free = np.minimum(free, np.minimum(around[:-2], around[2:]))
     is_open = np.isinf(hit) & (free >= OPEN_SHARE * view.max_range_m)
     ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
     sigma = np.where(np.isfinite(ranges), view.cell_m / 2, np.nan)

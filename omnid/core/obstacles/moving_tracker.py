@@ -175,7 +175,7 @@ def surfaces(ranges_m: RangeScan, sigma_m: RangeScan) -> list[NDArray[np.intp]]:
     known = np.flatnonzero(np.isfinite(ranges_m))
     if not len(known):
         return []
-    following = np.roll(known, -1)
+    following = np.concatenate([known[1:], known[:1]])
     gap = (following - known) % SECTORS
     largest = SAME_SURFACE_M + NOISE_SIGMAS * np.nan_to_num(sigma_m[known])
     joined = (gap <= SECTOR_GAP + 1) & (np.abs(ranges_m[following] - ranges_m[known]) <= largest)

@@ -132,6 +132,8 @@ class NearField:
 
 def _side_by_side(flags: Flags) -> Flags:
     """Return the flags (SECTORS,) that stand with PAST_SECTORS others on either side."""
-    return np.asarray(
-        np.logical_and.reduce([np.roll(flags, shift) for shift in range(-PAST_SECTORS, PAST_SECTORS + 1)])
-    )
+    around = np.concatenate([flags[-PAST_SECTORS:], flags, flags[:PAST_SECTORS]])
+    found = flags.copy()
+    for shift in range(2 * PAST_SECTORS + 1):
+        found &= around[shift : shift + len(flags)]
+    return found
