@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles import column_kernels as kernels
+from omnid.core.obstacles import panorama_kernels as panoramas
 from omnid.core.obstacles.surface_kernels import surface_evidence
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -131,7 +132,7 @@ class Columns:
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         rows = np.arange(self._height)
         self._plane_rows = (rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)).astype(np.float32)
-        self._plane_steps = np.rint(self._plane_rows * kernels.STEPS_PER_ROW).astype(np.int32)
+        self._plane_steps = np.rint(self._plane_rows * panoramas.STEPS_PER_ROW).astype(np.int32)
         self._offsets = self._made_offsets()
         self._leave_out_cut_planes()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
@@ -149,8 +150,8 @@ class Columns:
         shown = self._visible if lost is None else self._visible & (self._working(lost * np.uint8(255)) == 0)
         live = np.where(shown, np.uint8(255), np.uint8(0))
         upright, plane = np.empty((2, 2, *two.shape), np.uint8)
-        kernels.bounds(two, upright)
-        kernels.bounds_on_plane(two, self._plane_steps, plane)
+        panoramas.bounds(two, upright)
+        panoramas.bounds_on_plane(two, self._plane_steps, plane)
         views = _Views(one, two, upright, plane, live)
         # 2. Each explanation against all others.
         ratios = self._floor(views), self._surface(views), self._level(views)
@@ -199,11 +200,9 @@ class Columns:
         """Return the panorama less its mean along columns, in units of what two views of it differ by."""
         image = self._working(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
         smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
-        coarse = cv2.blur(cv2.blur(smooth, (1, COARSE_ROWS)), (1, COARSE_ROWS))
-        band = np.asarray(cv2.subtract(smooth, coarse), np.float32)
-        contrast2 = np.asarray(cv2.blur(cv2.multiply(band, band), (3, CONTRAST_ROWS)), np.float32)
-        into = np.empty(band.shape, np.uint8)
-        kernels.normalise(band, contrast2, TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO, into)
+        into = np.empty(smooth.shape, np.uint8)
+        limits = TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO
+        panoramas.normalise(np.asarray(smooth, np.float32), COARSE_ROWS, CONTRAST_ROWS, *limits, into)
         return into
 
     def _levelled(self, image: Bytes) -> Bytes:

@@ -18,10 +18,9 @@ Floats = NDArray[np.float32]
 Numbers = NDArray[np.int32]
 
 LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
-ONE, NOTHING, GREYEST = np.float32(1.0), np.float32(0.0), np.float32(255.0)
+ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 # exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
-STEPS_PER_ROW = 32  # Places between two rows that are told apart.
 FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO, FLOOR_NEAR = 0, 1, 2, 3, 4, 5, 6
 
 
@@ -197,65 +196,3 @@ def floor_evidence(
                 weights += prior[abs(d - k)]
         for u in range(width):
             others[k, u] /= weights
-
-
-@compiled("(f4[:, ::1], f4[:, ::1], f4, f4, f4, f4, u1[:, ::1])", writes=("into",))
-def normalise(
-    band: Floats,
-    contrast2: Floats,
-    share2: float,
-    noise2: float,
-    units: float,
-    zero: float,
-    into: Bytes,
-) -> None:
-    """Write a band-pass (H, W) in units of what two views differ by, whose variance is share2 contrast2 + noise2."""
-    for v in range(into.shape[0]):
-        for u in range(into.shape[1]):
-            found = band[v, u] * units / np.float32(math.sqrt(contrast2[v, u] * share2 + noise2)) + zero
-            found = found if found > NOTHING else NOTHING
-            into[v, u] = np.uint8(np.int32(found if found < GREYEST else GREYEST))
-
-
-@inner
-def half_way(a: np.uint8, b: np.uint8) -> np.uint8:
-    """Return the mean of two numbers, of which a half is rounded to the even one."""
-    apart = np.uint8(a ^ b)
-    mean = np.uint8(np.uint8(a & b) + np.uint8(apart >> np.uint8(1)))
-    return np.uint8(mean + np.uint8(np.uint8(apart & mean) & np.uint8(1)))
-
-
-@inner
-def row_bounds(above: Bytes, mine: Bytes, below: Bytes, least: Bytes, most: Bytes) -> None:
-    """Write the least and the most (W,) within half a row of each pixel of a row."""
-    for u in range(len(mine)):
-        pixel = mine[u]
-        up, down = half_way(pixel, above[u]), half_way(pixel, below[u])
-        low = up if up < down else down
-        high = down if up < down else up
-        least[u] = low if low < pixel else pixel
-        most[u] = high if high > pixel else pixel
-
-
-@compiled("(u1[:, ::1], u1[:, :, ::1])", writes=("into",))
-def bounds(image: Bytes, into: Bytes) -> None:
-    """Write the least and the most (2, H, W) of an image (H, W) within half a row of each pixel."""
-    last = len(image) - 1
-    for v in range(len(image)):
-        row_bounds(image[max(v - 1, 0)], image[v], image[min(v + 1, last)], into[0, v], into[1, v])
-
-
-@compiled("(u1[:, ::1], i4[::1], u1[:, :, ::1])", writes=("into",))
-def bounds_on_plane(image: Bytes, steps: Numbers, into: Bytes) -> None:
-    """Write the same of the image whose rows are those of an image (H, W) at steps (H,) by STEPS_PER_ROW."""
-    plane, last = np.empty_like(image), len(image) - 1
-    for v in range(len(image)):
-        row = steps[v] // STEPS_PER_ROW
-        share = np.uint16(steps[v] % STEPS_PER_ROW)
-        rest, half = np.uint16(STEPS_PER_ROW - share), np.uint16(STEPS_PER_ROW // 2)
-        one, two = image[min(row, last)], image[min(row + 1, last)]
-        for u in range(image.shape[1]):
-            between = np.uint16(np.uint16(one[u]) * rest + np.uint16(two[u]) * share + half)
-            plane[v, u] = np.uint8(between >> np.uint16(5))
-    for v in range(len(image)):
-        row_bounds(plane[max(v - 1, 0)], plane[v], plane[min(v + 1, last)], into[0, v], into[1, v])
