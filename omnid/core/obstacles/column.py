@@ -125,6 +125,7 @@ class Columns:
         self.bins = math.ceil(self.at_1m / ranges_m[0])
         self._first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))
         self._visible = self._working(visible * np.uint8(255)) > 127
+        self._live = self._visible * np.uint8(255)
         in_view = self._visible[:, self._shown].mean(axis=1)
         self._first_row, self._last_row = (int(row) for row in np.flatnonzero(in_view > 0.5)[[0, -1]])
         self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
@@ -147,8 +148,9 @@ class Columns:
         one, two = self._normalised(lower, noise), self._normalised(upper, noise)
         if self._plane.a or self._plane.b:
             one, two = self._levelled(one), self._levelled(two)
-        shown = self._visible if lost is None else self._visible & (self._working(lost * np.uint8(255)) == 0)
-        live = np.where(shown, np.uint8(255), np.uint8(0))
+        live = self._live
+        if lost is not None:
+            live = np.where(self._working(lost * np.uint8(255)) == 0, live, np.uint8(0))
         upright, plane = np.empty((2, 2, *two.shape), np.uint8)
         panoramas.bounds(two, upright)
         panoramas.bounds_on_plane(two, self._plane_steps, plane)
@@ -173,11 +175,6 @@ class Columns:
         limits = np.float32(FLOOR_WEIGHT), np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
         compared = views.lower, views.upright, views.plane, views.live
         surface_evidence(*compared, self._strips, OUTLIER, scale, *limits, surface)
-        # A surface fits a little at the disparities next to its own.
-        peak = np.ones_like(surface, bool)
-        peak[1:] &= surface[1:] >= surface[:-1]
-        peak[:-1] &= surface[:-1] >= surface[1:]
-        surface[~peak] = 0.0
         return surface
 
     def _level(self, views: _Views) -> Floats:

@@ -102,6 +102,19 @@ def add_run(
         best[u] = value if value > best[u] else best[u]
 
 
+@inner
+def keep_peaks(surface: Floats) -> None:
+    """Clear ratios (K, W) that are lower than one of the next disparities: a surface fits a little there, too."""
+    bins, width = surface.shape
+    before = np.zeros(width, np.float32)
+    for d in range(bins):
+        mine, after = surface[d], surface[min(d + 1, bins - 1)]
+        for u in range(width):
+            value = mine[u]
+            mine[u] = value if (value >= before[u]) & (value >= after[u]) else NOTHING
+            before[u] = value
+
+
 @compiled(
     "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4[:, ::1])",
     writes=("surface",),
@@ -119,7 +132,7 @@ def surface_evidence(
     prior: np.float32,
     surface: Floats,
 ) -> None:
-    """Write the best run (K, W) of strips of rows that are a surface at a disparity, as a log-likelihood ratio.
+    """Write the best run (K, W) of strips of rows that are a surface, where it fits best, as a log-likelihood ratio.
 
     Images as for floor_evidence. strips (N, 5), from above: first row and end; first disparity that is a surface within
     the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too.
@@ -168,3 +181,4 @@ def surface_evidence(
                 if has_run(value[d], value[d + 1], value[d + 2], total, run[d]):
                     near = value[d], value[d + 1], value[d + 2]
                     add_run(*near, total, blank, bound, prior, run[d], surface[d, part])
+    keep_peaks(surface)

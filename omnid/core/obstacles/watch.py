@@ -70,11 +70,11 @@ class Watch:
         unwatched = ~self.watched
         self.free_ns[free] = stamp_ns
         # 1. Where it may come from: what was free, wider than an object, and is hidden or lost.
-        lost = (unwatched & (visible | ~free) & self.was_free(stamp_ns)).astype(np.uint8)
+        lost = (unwatched & (visible | ~free) & self.was_free(stamp_ns)).view(np.uint8)
         box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
         reached = np.asarray(cv2.morphologyEx(lost, cv2.MORPH_OPEN, box), np.uint8) | (self.flooded & lost)
         # 2. How far it may have come since the pair before, through what is not watched.
-        ways = (free & unwatched).astype(np.uint8) | lost
+        ways = (free & unwatched).view(np.uint8) | lost
         passable = np.asarray(cv2.morphologyEx(ways, cv2.MORPH_OPEN, GAP), np.uint8)
         for step in range(steps):
             kernel = np.ones((3, 3), np.uint8) if step % 2 else CROSS
