@@ -21,6 +21,7 @@ Three = tuple[Number, Number, Number]
 Limits = tuple[Number, Number, Number, Number]
 
 FLOOR, ABOVE, BELOW, SURFACE, VISIBLE = 0, 1, 2, 3, 4  # layers of log-odds, as in grid_layers.py
+# Exact; numbers of other types would make sums of 64 bits.
 NOTHING, ONE, TWO, INFINITE = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(np.inf)
 
 

@@ -14,13 +14,13 @@ Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 
 
-LANES = 64  # Cells of a row whose places are computed at once, in vector instructions.
-# Where the numbers of those cells begin: place, range and azimuth of a cell, ... (see `places`).
+LANES = 64  # Cells of a row that are computed at once, because the compiler makes vector instructions of a known count.
+# Where the numbers of those cells begin in `found` of `places`: one kind after the other, LANES of each.
 X, Y, RANGE, AT, HALF, NEAR, FAR, LAST_SURFACE, FIRST_SURFACE = 0, 64, 128, 192, 256, 320, 384, 448, 512
 PLACES = 576
-# Directions by which a place is known, at least: `azimuth` and a turn of 480 directions make 2e-6.
+# Directions by which a cell is off a border of one, so that `azimuth` is enough: its 2e-8 rad are 2e-6 directions.
 SURE = 1e-5
-FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3
+FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3  # numbers of a direction and disparity in the table
 
 
 @inner

@@ -18,8 +18,8 @@ Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Numbers = NDArray[np.int32]
 
-NOTHING, GREYEST = np.float32(0.0), np.float32(255.0)
-STEPS_PER_ROW = 32  # Places between two rows that are told apart.
+NOTHING, GREYEST = np.float32(0.0), np.float32(255.0)  # limits, because a normalised image has 8 bits
+STEPS_PER_ROW = 32  # Places between two rows, as many as in OpenCV because results are to be the same.
 
 
 @inner

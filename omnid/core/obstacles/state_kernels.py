@@ -18,8 +18,8 @@ Numbers = NDArray[np.int64]
 Limits = tuple[Any, Any, Any, Any, Any]
 
 FLOOR, SURFACE, VISIBLE = 0, 3, 4  # layers of log-odds, as in grid_layers.py
-NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)
-NOTHING = np.float32(0.0)
+NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)  # of flags, and of cells: unknown, free, taken
+NOTHING = np.float32(0.0)  # Exact.
 
 
 @inner
