@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles import column_kernels as kernels
+from omnid.core.obstacles import panorama_kernels as panoramas
 from omnid.core.obstacles.surface_kernels import surface_evidence
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -128,10 +129,11 @@ class Columns:
         in_view = self._visible[:, self._shown].mean(axis=1)
         self._first_row, self._last_row = (int(row) for row in np.flatnonzero(in_view > 0.5)[[0, -1]])
         self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
-        self._warps = self._made_warps()
+        self._maps = self._made_maps()
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
         rows = np.arange(self._height)
         self._plane_rows = (rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)).astype(np.float32)
+        self._plane_steps = np.rint(self._plane_rows * panoramas.STEPS_PER_ROW).astype(np.int32)
         self._offsets = self._made_offsets()
         self._leave_out_cut_planes()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
@@ -145,11 +147,14 @@ class Columns:
         noise = BAND_NOISE * max(lower.noise_grey, upper.noise_grey)
         one, two = self._normalised(lower, noise), self._normalised(upper, noise)
         if self._plane.a or self._plane.b:
-            one, two = self._warped(one, 0), self._warped(two, 0)
+            one, two = self._levelled(one), self._levelled(two)
         live = self._live
         if lost is not None:
             live = np.where(self._working(lost * np.uint8(255)) == 0, live, np.uint8(0))
-        views = _Views(one, two, _bounds(two), _bounds(self._warped(two, 1)), live)
+        upright, plane = np.empty((2, 2, *two.shape), np.uint8)
+        panoramas.bounds(two, upright)
+        panoramas.bounds_on_plane(two, self._plane_steps, plane)
+        views = _Views(one, two, upright, plane, live)
         # 2. Each explanation against all others.
         ratios = self._floor(views), self._surface(views), self._level(views)
         return ColumnEvidence(*ratios, self.nearest_floor_m, ~self._unseen)
@@ -192,29 +197,23 @@ class Columns:
         """Return the panorama less its mean along columns, in units of what two views of it differ by."""
         image = self._working(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
         smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
-        coarse = cv2.blur(cv2.blur(smooth, (1, COARSE_ROWS)), (1, COARSE_ROWS))
-        band = cv2.subtract(smooth, coarse)
-        contrast2 = cv2.blur(cv2.multiply(band, band), (3, CONTRAST_ROWS))
-        unit = cv2.sqrt(contrast2 * np.float32(TEXTURE_SHARE**2) + np.float32(noise_grey**2))
-        found = cv2.divide(band, unit, scale=UNITS) + np.float32(ZERO)
-        return np.asarray(np.clip(found, 0, 255), np.uint8)
+        into = np.empty(smooth.shape, np.uint8)
+        limits = TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO
+        panoramas.normalise(np.asarray(smooth, np.float32), COARSE_ROWS, CONTRAST_ROWS, *limits, into)
+        return into
 
-    def _warped(self, image: Bytes, number: int) -> Bytes:
-        return np.asarray(
-            cv2.remap(image, *self._warps[number], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8
-        )
+    def _levelled(self, image: Bytes) -> Bytes:
+        """Return a panorama in which the floor's horizon is level."""
+        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
-    def _made_warps(self) -> list[tuple[NDArray[np.int16], NDArray[np.uint16]]]:
-        """Return the maps to a panorama in which the floor's horizon is level, and from that to the floor's plane."""
+    def _made_maps(self) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+        """Return the maps to a panorama in which the floor's horizon is level."""
         azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
         tilt = self._plane.a * np.cos(azimuth) + self._plane.b * np.sin(azimuth)
         rows = np.arange(self._height)[:, None]
         columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self._height, DIRECTIONS))
-        plane = rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)
-        maps = []
-        for found in (rows - FOCAL_PX * tilt, np.broadcast_to(plane, columns.shape)):
-            maps.append(cv2.convertMaps(columns, found.astype(np.float32), cv2.CV_16SC2))
-        return [(np.asarray(a, np.int16), np.asarray(b, np.uint16)) for a, b in maps]
+        places, shares = cv2.convertMaps(columns, (rows - FOCAL_PX * tilt).astype(np.float32), cv2.CV_16SC2)
+        return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
 
     def _made_floor_bins(self) -> Tables:
         """Return the table of kernels.floor_evidence."""
@@ -291,11 +290,3 @@ def _wide_runs(flags: Flags) -> Flags:
     """Return the flags (DIRECTIONS,) of a circle that stand in runs of UNSEEN_RUN or more."""
     starts = np.logical_and.reduce([np.roll(flags, -shift) for shift in range(UNSEEN_RUN)])
     return np.asarray(np.logical_or.reduce([np.roll(starts, shift) for shift in range(UNSEEN_RUN)]))
-
-
-def _bounds(image: Bytes) -> Bytes:
-    """Return the least and the most (2, H, W) of an image within half a row of each pixel."""
-    above = np.concatenate([image[:1], image[:-1]])
-    below = np.concatenate([image[1:], image[-1:]])
-    up, down = cv2.addWeighted(image, 0.5, above, 0.5, 0.0), cv2.addWeighted(image, 0.5, below, 0.5, 0.0)
-    return np.stack([cv2.min(cv2.min(up, down), image), cv2.max(cv2.max(up, down), image)])

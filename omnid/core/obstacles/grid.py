@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
+from omnid.core.obstacles.cell_kernels import add_pair
 from omnid.core.obstacles.column import ColumnEvidence, floor_plane
 from omnid.core.obstacles.grid_layers import (
-    ABOVE,
     FLOOR,
     FLOORS,
     FREE_ODDS,
@@ -164,7 +164,7 @@ class ObstacleGrid:
         self._near.lose_before(lost, eye, nearest)
         past = partial(self._near.seen_past, self._odds, self._watch, eye, max(nearest, 1))
         gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
-        amount = self._add((rows, columns), cells, lost[rows, columns], gone, weight, at_rest)
+        amount = self._add((rows, columns), cells, lost, gone, weight, at_rest)
         self._near.forget((self._odds[SURFACE] <= PRIOR[SURFACE]) & (self._shown <= FREE_SHOWN))
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
@@ -195,34 +195,31 @@ class ObstacleGrid:
     ) -> Floats:
         """Add the evidence of a pair to the log-odds of a window; return the most of each cell, of floor or surface.
 
-        cells (5, N, N): evidence of the cells; lost (N, N): log-odds that visible floor loses; gone (N, N): surfaces
-        that would be seen; weight, at_rest: of the pair, and the part of it by time alone.
+        cells (5, N, N): evidence of the cells; lost (CELLS, CELLS): log-odds that visible floor loses; gone (N, N):
+        surfaces that would be seen; weight, at_rest: of the pair, and the part of it by time alone.
         """
-        floor, level, surface = cells[FLOOR], cells[ABOVE:SURFACE], cells[SURFACE]
-        odds = self._odds[:, *window]
-        in_view = np.isfinite(floor)
-        floor = np.clip(np.where(in_view, floor, np.float32(0)), -MOST_RATIO, MOST_RATIO)
-        noise = np.where(in_view, NOISE_SURFACE, UNSEEN_SURFACE)
-        # An obstacle that is hidden or too near to be seen remains one.
-        noise[(surface <= 0) & ~in_view & ~gone & (odds[SURFACE] > TAKEN_ODDS)] = 0.0
-        self._keep_shown(surface, in_view | (_patches(gone) > 0) if gone.any() else in_view, weight, window)
-        surface = np.minimum(surface - noise, MOST_SURFACE)
-        is_surface = surface > 0
-        # Where floor is usual, a single cell that shows none is noise unless all floor behind it is hidden, too.
-        least = np.where(
-            ~is_surface & (lost <= 0) & (self._usual_thin.mean[window] > USUAL), np.float32(0), -MOST_RATIO
+        # What a pair shows around a surface that is known is that surface.
+        known = _patches(self._odds[SURFACE][window] > TAKEN_ODDS) > 0
+        shown = np.where(known, np.float32(0), np.clip(cells[SURFACE], 0, MOST_SHOWN))
+        amount: Floats = np.empty_like(cells[FLOOR])
+        add_pair(
+            cells,
+            gone.view(np.uint8),
+            _patches(gone),
+            np.asarray(cv2.blur(shown, (SHOWN_CELLS, SHOWN_CELLS)), np.float32),
+            lost,
+            self._usual_thin.mean,
+            (window[0].start, window[1].start),
+            (weight, at_rest, weight * SHOWN_RATE),
+            (NOISE_SURFACE, UNSEEN_SURFACE, MOST_SURFACE, TAKEN_ODDS),
+            (MOST_RATIO, USUAL, -LIMIT / 2, LIMIT),
+            (PLACE_PAIRS, PRIOR[SURFACE], LIMIT, CONTRADICTION),
+            (MOST_VISIBLE, LEAST_VISIBLE, PRIOR[VISIBLE]),
+            self._odds,
+            self._shown,
+            amount,
         )
-        odds[FLOOR] += weight * np.maximum(np.where(is_surface, np.minimum(floor, 0), floor), least)
-        passes = (floor > 0) & ~is_surface
-        # The sum over pairs from one place tends to their mean, PLACE_PAIRS times: what is no surface stays none.
-        surplus = np.where(is_surface, (odds[SURFACE] - np.float32(PRIOR[SURFACE])) / np.float32(PLACE_PAIRS), 0)
-        odds[SURFACE] += weight * np.where(passes, np.float32(CONTRADICTION), surface) - at_rest * surplus
-        odds[ABOVE:SURFACE] += weight * np.clip(level, -MOST_RATIO, MOST_RATIO)
-        odds[VISIBLE] -= weight * np.clip(lost, -MOST_VISIBLE, MOST_VISIBLE)
-        np.clip(odds[FLOORS], -LIMIT / 2, LIMIT, out=odds[FLOORS])
-        np.clip(odds[VISIBLE], LEAST_VISIBLE, PRIOR[VISIBLE], out=odds[VISIBLE])
-        np.clip(odds[SURFACE], PRIOR[SURFACE], LIMIT, out=odds[SURFACE])
-        return np.asarray(np.maximum(floor, surface))
+        return amount
 
     @property
     def corner_m(self) -> Array:
@@ -245,7 +242,8 @@ class ObstacleGrid:
         c, s = T_rect_odom[0, 0], T_rect_odom[1, 0]
         norm = math.hypot(c, s)
         cells = np.empty((MEAN_FLOOR + 1, 2 * VIEW_CELLS + 1, 2 * VIEW_CELLS + 1), np.float32)
-        floor, level = np.full_like(evidence.floor, np.nan), np.zeros_like(evidence.level)
+        floor, level = np.empty_like(evidence.floor), np.empty_like(evidence.level)
+        floor[:END_BINS], level[:, :END_BINS] = np.nan, 0.0
         floor[END_BINS:], level[:, END_BINS:] = evidence.floor[:-END_BINS], evidence.level[:, :-END_BINS]
         kernels.gather(
             floor,
@@ -269,16 +267,6 @@ class ObstacleGrid:
         self._place_m = place_m.copy()
         weight = min(max(by_way, passed_ns * 1e-9 / APART_S), 1.0)
         return np.float32(weight), np.float32(weight - by_way)
-
-    def _keep_shown(self, surface: Floats, in_view: Flags, weight: np.float32, window: tuple[slice, slice]) -> None:
-        """Take the surface that a pair shows into the mean of single pairs, of cells that it shows at all."""
-        taken = self._odds[SURFACE][window] > TAKEN_ODDS
-        # What a pair shows around a surface that is known is that surface.
-        known = _patches(taken) > 0
-        amount = np.where(known, np.float32(0), np.clip(surface, 0, MOST_SHOWN))
-        amount = cv2.blur(amount, (SHOWN_CELLS, SHOWN_CELLS))
-        changed = in_view | (amount > 0)
-        self._shown[window] += np.where(changed, weight * SHOWN_RATE * (amount - self._shown[window]), np.float32(0))
 
     def _assume_free(self, eye: NDArray[np.int64], T_odom_base: Array, evidence: ColumnEvidence) -> None:
         """Take the floor nearer than what is in view for free, up to a surface that hides the nearest floor in view."""
@@ -318,4 +306,4 @@ class ObstacleGrid:
 
 def _patches(cells: Flags) -> Bytes:
     """Return 1 in the patches (N, N) of the mean of single pairs around cells."""
-    return np.asarray(cv2.dilate(cells.astype(np.uint8), np.ones((SHOWN_CELLS, SHOWN_CELLS), np.uint8)), np.uint8)
+    return np.asarray(cv2.dilate(cells.view(np.uint8), np.ones((SHOWN_CELLS, SHOWN_CELLS), np.uint8)), np.uint8)

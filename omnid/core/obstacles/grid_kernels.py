@@ -7,11 +7,84 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.compiled import compiled
+from omnid.core.compiled import compiled, inner
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
+
+
+LANES = 64  # Cells of a row that are computed at once, because the compiler makes vector instructions of a known count.
+# Where the numbers of those cells begin in `found` of `places`: one kind after the other, LANES of each.
+X, Y, RANGE, AT, HALF, NEAR, FAR, LAST_SURFACE, FIRST_SURFACE = 0, 64, 128, 192, 256, 320, 384, 448, 512
+PLACES = 576
+# Directions by which a cell is off a border of one, so that `azimuth` is enough: its 2e-8 rad are 2e-6 directions.
+SURE = 1e-5
+FLOOR, ABOVE, BELOW, SURFACE = 0, 1, 2, 3  # numbers of a direction and disparity in the table
+
+
+@inner
+def azimuth(x: float, y: float) -> float:
+    """Return atan2(y, x) within 2e-8 (Abramowitz and Stegun 1964, 4.4.49), without branches."""
+    a, b = abs(x), abs(y)
+    share = min(a, b) / max(a, b)
+    z = share * share
+    angle = z * (z * (0.0429096138 + z * (-0.0161657367 + z * 0.0028662257)) - 0.0752896400)
+    angle = share * (1.0 + z * (z * (0.1999355085 + z * (z * (0.1065626393 + angle) - 0.1420889944)) - 0.3333314528))
+    angle = 0.5 * math.pi - angle if b > a else angle
+    angle = math.pi - angle if x < 0.0 else angle
+    return -angle if y < 0.0 else angle
+
+
+@inner
+def places(i: int, begin: int, origin: Doubles, scale: tuple[float, float, float, float], found: Doubles) -> None:
+    """Write where the cells of row i from `begin` on are among directions and disparities.
+
+    scale: disparity at 1 m, last disparity, size of a cell [m], directions in a radian. found (PLACES,): x, y and
+    range [m]; direction, by `azimuth`, and half a cell in directions; disparities of the near and the far end of the
+    cell, and of the ends of what a surface in it may have.
+    """
+    at_1m, last_bin, cell_m, by_angle = scale
+    x0, y0, c, s, lean_x, lean_y = origin[0], origin[1], origin[2], origin[3], origin[4], origin[5]
+    for n in range(LANES):
+        j = np.float64(np.int32(begin + n))
+        x = x0 + cell_m * (c * j - s * i)
+        y = y0 + cell_m * (s * j + c * i)
+        r = math.sqrt(x * x + y * y)
+        # A surface counts in the cell of its foot, whichever of its heights is seen.
+        lean = (lean_x * x + lean_y * y) / r
+        nearest = r - 0.5 * cell_m - (lean if lean > 0.0 else 0.0)
+        farthest = r + 0.5 * cell_m - (lean if lean < 0.0 else 0.0)
+        last_surface = at_1m / nearest + 0.5 if nearest > 0.0 else last_bin
+        found[X + n], found[Y + n], found[RANGE + n] = x, y, r
+        found[AT + n] = (math.pi - azimuth(x, y)) * by_angle - 0.5
+        found[HALF + n] = 0.5 * cell_m / r * by_angle
+        found[NEAR + n] = min(np.floor(at_1m / (r - 0.5 * cell_m)), last_bin)
+        found[FAR + n] = np.floor(at_1m / (r + 0.5 * cell_m))
+        found[LAST_SURFACE + n] = min(np.floor(last_surface), last_bin)
+        found[FIRST_SURFACE + n] = np.floor(at_1m / farthest + 0.5)
+
+
+@inner
+def directions(x: float, y: float, at: float, half: float, by_angle: float) -> tuple[int, int]:
+    """Return the first and the last direction of a cell at x, y [m]; at, half: of `places`."""
+    first, last = math.ceil(at - half), math.floor(at + half)
+    before, after = first - (at - half), (at + half) - last
+    if last < first or min(before, after) < SURE or max(before, after) > 1.0 - SURE:
+        at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
+        first, last = math.ceil(at - half), math.floor(at + half)
+        if last < first:
+            first = last = round(at)
+    return first, last
+
+
+@inner
+def evidence_table(floor: Floats, surface: Floats, level: Floats, table: Floats) -> None:
+    """Write what `gather` adds up (W, K, 4), in the order in which it reads: a surface as its likelihood."""
+    for k in range(floor.shape[0]):
+        for u in range(floor.shape[1]):
+            table[u, k, FLOOR], table[u, k, ABOVE], table[u, k, BELOW] = floor[k, u], level[0, k, u], level[1, k, u]
+            table[u, k, SURFACE] = math.exp(surface[k, u]) if surface[k, u] != 0.0 else 1.0
 
 
 @compiled("(f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
@@ -37,17 +110,15 @@ def gather(
     obstacle, whose directions count together.
     """
     bins, width = floor.shape
-    likelihoods = np.empty((bins, width), np.float32)
-    for k in range(bins):
-        for u in range(width):
-            likelihoods[k, u] = math.exp(surface[k, u])
+    table, found = np.empty((width, bins, 4), np.float32), np.empty(PLACES, np.float64)
+    evidence_table(floor, surface, level, table)
     by_angle = width / math.tau
-    c, s = origin[2], origin[3]
+    scale = at_1m, bins - 1.0, cell_m, by_angle
     for i in range(cells.shape[1]):
         for j in range(cells.shape[2]):
-            x = origin[0] + cell_m * (c * j - s * i)
-            y = origin[1] + cell_m * (s * j + c * i)
-            r = math.sqrt(x * x + y * y)
+            n = j % LANES
+            if n == 0:
+                places(i, j, origin, scale, found)
             cells[0, i, j], cells[1, i, j], cells[2, i, j], cells[3, i, j], cells[4, i, j] = (
                 np.nan,
                 0.0,
@@ -55,40 +126,30 @@ def gather(
                 0.0,
                 np.nan,
             )
-            if r < cell_m or r > reach_m:
+            r = found[RANGE + n]
+            # The second: nearer than the last disparity that is compared.
+            if r < cell_m or r > reach_m or found[FAR + n] > found[NEAR + n]:
                 continue
-            at = (math.pi - math.atan2(y, x)) * by_angle - 0.5
-            half = 0.5 * cell_m / r * by_angle
-            first, last = math.ceil(at - half), math.floor(at + half)
-            if last < first:
-                first = last = round(at)
-            near = min(math.floor(at_1m / (r - 0.5 * cell_m)), bins - 1)
-            far = math.floor(at_1m / (r + 0.5 * cell_m))
-            if far > near:  # nearer than the last disparity that is compared
-                continue
-            # A surface counts in the cell of its foot, whichever of its heights is seen.
-            lean = (origin[4] * x + origin[5] * y) / r
-            nearest, farthest = r - 0.5 * cell_m - max(lean, 0.0), r + 0.5 * cell_m - min(lean, 0.0)
-            last_surface = bins - 1
-            if nearest * (bins - 1) > at_1m:
-                last_surface = min(math.floor(at_1m / nearest + 0.5), bins - 1)
-            first_surface = min(math.floor(at_1m / farthest + 0.5), last_surface)
+            near, far, last_surface = int(found[NEAR + n]), int(found[FAR + n]), int(found[LAST_SURFACE + n])
+            first_surface = min(int(found[FIRST_SURFACE + n]), last_surface)
+            first, last = directions(found[X + n], found[Y + n], found[AT + n], found[HALF + n], by_angle)
             least, sum_floor, likelihood, above, below = np.inf, 0.0, 0.0, 0.0, 0.0
             run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
             for u in range(first, last + 1):
-                at_u = (u + width) % width
+                at_u = u + width if u < 0 else (u - width if u >= width else u)
                 for k in range(first_surface, last_surface + 1):
-                    likelihood += likelihoods[k, at_u]
+                    likelihood += table[at_u, k, SURFACE]
+                total = 0.0
                 for k in range(far, near + 1):
-                    above += level[0, k, at_u]
-                    below += level[1, k, at_u]
-                    sum_floor += floor[k, at_u]
+                    above += table[at_u, k, ABOVE]
+                    below += table[at_u, k, BELOW]
+                    sum_floor += table[at_u, k, FLOOR]
+                    total += table[at_u, k, FLOOR]
                 if u + run <= last + 1:
                     # The mean of the disparities, the sum of the directions that something thin would hide.
-                    total = 0.0
-                    for n in range(u, u + run):
+                    for m in range(u + 1, u + run):
                         for k in range(far, near + 1):
-                            total += floor[k, (n + width) % width]
+                            total += table[(m + width) % width, k, FLOOR]
                     # One direction in which nothing can be seen makes the cell such, whichever it is.
                     if not math.isnan(least) and not total >= least:
                         least = total
@@ -96,7 +157,7 @@ def gather(
             patches = (last - first + 1) * (near - far + 1)
             cells[1, i, j], cells[2, i, j] = above / patches, below / patches
             count = (last - first + 1) * (last_surface - first_surface + 1)
-            cells[3, i, j] = math.log(likelihood / count)
+            cells[3, i, j] = math.log(likelihood / count) if likelihood != count else 0.0
             cells[4, i, j] = sum_floor * run / patches  # in units of what something thin would hide, as the weakest
 
 

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.obstacles.state_kernels import free_cells
+
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
@@ -26,7 +28,6 @@ SPECK_CELLS: Final = 4
 WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
 # The same of an edge: a hole into which a base falls is wide. With 3, by trial, bases stood before joints of tiles.
 EDGE_CELLS: Final = 5
-GAP: Final = np.ones((3, 3), np.uint8)  # cells beside a step, because directions at its corner show half floor
 
 
 def cells_of(odds: Floats, shown: Floats) -> Bytes:
@@ -34,23 +35,10 @@ def cells_of(odds: Floats, shown: Floats) -> Bytes:
 
     shown (H, W): mean surface of single pairs.
     """
-    taken = odds[SURFACE] > TAKEN_ODDS
-    suspect = ((odds[SURFACE] > CLEAR_ODDS) | (shown > FREE_SHOWN)) & ~taken
-    floor, level = odds[FLOOR], level_odds(odds)
-    # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
-    is_floor = (floor > FREE_ODDS) | ((floor > 0) & (mean_over(floor, WIDE_CELLS) > FREE_ODDS))
-    is_floor &= (level > FREE_ODDS) & (odds[VISIBLE] > VISIBLE_ODDS)
-    free = (is_floor & ~suspect) | taken
-    _, patch, about, _ = cv2.connectedComponentsWithStats((~free).astype(np.uint8), connectivity=8)
-    # Specks are noise unless something may stand there.
-    sizes = about[:, cv2.CC_STAT_AREA]
-    hides = suspect | (odds[VISIBLE] <= VISIBLE_ODDS)
-    cells = np.where(np.bincount(patch[hides], minlength=len(sizes)) > 0, taken.size, sizes)[patch]
-    free |= cells <= SPECK_CELLS
-    # Steps are seen by several directions together, of which those at a corner show half floor.
-    beside = cv2.dilate(((level < 0) & ~free).astype(np.uint8), GAP) > 0
-    free = taken | (free & ~beside)
-    return np.where(taken, np.uint8(2), free.astype(np.uint8))
+    floor, cells = mean_over(odds[FLOOR], WIDE_CELLS), np.empty(shown.shape, np.uint8)
+    limits = FREE_ODDS, VISIBLE_ODDS, TAKEN_ODDS, CLEAR_ODDS, FREE_SHOWN
+    free_cells(odds, shown, floor, level_odds(odds), limits, SPECK_CELLS, cells)
+    return cells
 
 
 def level_odds(odds: Floats) -> Floats:

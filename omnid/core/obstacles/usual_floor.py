@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.obstacles import grid_kernels as kernels
+from omnid.core.obstacles.cell_kernels import hidden_odds, learn
 
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
@@ -49,15 +50,10 @@ class UsualFloor:
 
         floor: of the window, evidence of a pair, NaN where nothing can be seen.
         """
-        mean = self.mean[window]
-        # 1. Evidence with the variance 2 about the usual m or about 0, what is hidden: log-odds m/2 (m/2 - floor).
-        in_view = np.isfinite(floor)
-        seen = np.clip(np.where(in_view, floor, 0), -MOST_RATIO, MOST_RATIO)
-        hidden = np.clip(mean / 2 * (mean / 2 - seen), -MOST_RATIO, MOST_RATIO)
-        hidden[~in_view] = 0
-        # 2. Hidden cells are no evidence of the floor.
-        mean += LEARNED * weight * in_view / (1 + np.exp(hidden)) * (seen - mean)
-        np.maximum(mean, 0, out=mean)
+        corner, hidden = (window[0].start, window[1].start), np.empty_like(floor)
+        hidden_odds(floor, self.mean, corner, MOST_RATIO, hidden)
+        # Hidden cells are no evidence of the floor.
+        learn(floor, np.exp(hidden), corner, MOST_RATIO, LEARNED * weight, self.mean)
         found = np.zeros_like(self.mean)
         found[window] = hidden
         return found
