@@ -5,8 +5,6 @@ Flags have a margin of one cell on each side, which is 0, so that all cells have
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +13,7 @@ from omnid.core.compiled import compiled, inner
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 Numbers = NDArray[np.int64]
-Limits = tuple[Any, Any, Any, Any, Any]
+Limits = tuple[float, float, float, float, float]
 
 FLOOR, SURFACE, VISIBLE = 0, 3, 4  # layers of log-odds, as in grid_layers.py
 NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)  # of flags, and of cells: unknown, free, taken
