@@ -26,6 +26,7 @@ from tests.replay.live import wait_until
 ROOT = Path(__file__).parents[3]
 RADIUS_M = 0.02
 LATE_S = 0.25  # more than an answer may take
+REST_S = 0.6  # more than half of the watchdog's time: the driver no longer knows that it lives
 
 
 class WatchedController:
@@ -35,11 +36,18 @@ class WatchedController:
         self._controller, self.base = controller, controller.base
         self.notes: list[tuple[float, float]] = []
         self.late_stops = 0  # stops of wheels that turn whose answers are still to come late
+        self.late_after_rests = 0  # answers after rests that are still to come late
+        self._fed_s = math.inf
 
     def feed(self, data: bytes) -> bytes:
         """Return the answers of the controller."""
         did_turn = any(self.base.commanded_mps)
+        has_rested = time.monotonic() - self._fed_s > REST_S
         answer = self._controller.feed(data)
+        if self.late_after_rests and has_rested:
+            self.late_after_rests -= 1
+            time.sleep(LATE_S)
+        self._fed_s = time.monotonic()
         if self.late_stops and did_turn and not any(self.base.commanded_mps):
             self.late_stops -= 1
             time.sleep(LATE_S)
@@ -139,6 +147,13 @@ def test_a_late_answer_to_a_stop_is_no_fault() -> None:
         person.base.late_stops = 3
         drive = WiringTest(config, person.answer, speed_mps=0.4, turns=0, move_s=0.05, rest_s=0.0).run()
         assert drive.swapped and person.base.late_stops == 0 and not any(motor.base.commanded_mps)
+
+
+def test_a_late_answer_after_a_rest_is_waited_for() -> None:
+    with simulated("roboteq", swapped=True) as (config, person, motor):
+        person.base.late_after_rests = 1
+        drive = WiringTest(config, person.answer, speed_mps=0.4, turns=0, move_s=0.05, rest_s=1.1 * REST_S).run()
+        assert drive.swapped and person.base.late_after_rests == 0 and not any(motor.base.commanded_mps)
 
 
 @pytest.mark.parametrize("swapped", [False, True])
