@@ -114,7 +114,7 @@ def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
         return None
     generator = np.random.default_rng(0)
     chosen = np.array([generator.choice(len(edges), 3, replace=False) for _ in range(RANSAC_ROUNDS)])
-    circles = _circles(edges[chosen])
+    circles = circles_through(edges[chosen])
     inliers = (_distance(edges, circles.T[:, :, None]) < INLIER_PX).sum(axis=1)
     best = circles[inliers.argmax()]
     for _ in range(REFINEMENTS):
@@ -126,8 +126,8 @@ def _fit(edges: Array, center: tuple[float, float]) -> Array | None:
     return best if near else None
 
 
-def _circles(points: Array) -> Array:
-    """Return centres and radii (N, 3) of the circles through three points each (N, 3, 2); NaN where these are in line.
+def circles_through(points: Array) -> Array:
+    """Return centres and radii (N, 3) of the circles through three points each (N, 3, 2); not finite for three in line.
 
     The centre c, seen from the first point, is as far from it as from the others, p: 2 p c = p^2.
     """

@@ -28,6 +28,8 @@ from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
+# What OpenCV reads as an image, as of boards: a log has those above.
+IMAGE_SUFFIXES: Final = frozenset({*SUFFIXES, ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"})
 STAMP_FILES: Final = ("timestamps.txt", "times.txt")
 ATTACHMENT: Final = "rig.toml"  # The rig's file, in the same folder as the folders of the cameras.
 MAX_IMAGES: Final = 1_000_000

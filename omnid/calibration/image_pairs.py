@@ -11,8 +11,9 @@ from calib.image_area import ImageArea, TwoViews
 from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Frame, gray
+from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.images import SUFFIXES, Image, Images, image_topic, is_log, one_size, read_images
+from omnid.calibration.images import Image, Images, image_topic, is_log, one_size, read_images
 from omnid.errors import OmnidError
 
 SIDES = ("lower", "upper")
@@ -76,7 +77,7 @@ def _of_folder(folder: Path) -> PairedImages:
 
 
 def _of_side(folder: Path, side: str) -> Images:
-    paths = sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in SUFFIXES)
+    paths = sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
         raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
     found = read_images([str(path) for path in paths])

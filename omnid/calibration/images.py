@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import MAX_PIXELS, gray
+from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.image_log import ImageLog, LoggedImage, images_of
 from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
 from drivers.logs.mcap_records import RecordError
@@ -23,7 +24,6 @@ from omnid.errors import OmnidError
 Image = NDArray[np.uint8]
 # By name, all of one size.
 Images = dict[str, Image]
-SUFFIXES = {".bmp", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tif", ".tiff", ".webp"}
 MAX_IMAGES = 400
 # Number of frames of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_FRAMES = 120
@@ -70,11 +70,11 @@ def _expanded(source: str) -> list[Path]:
     """Return the files of a name, a folder or a pattern."""
     path = Path(source)
     if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+        found = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
     else:
         found = [path] if path.exists() else sorted(map(Path, glob.glob(source)))
     if not found:
-        what = f"no image ({' '.join(sorted(SUFFIXES))}) in this folder" if path.is_dir() else "no such file"
+        what = f"no image ({' '.join(sorted(IMAGE_SUFFIXES))}) in this folder" if path.is_dir() else "no such file"
         raise OmnidError(f"{source}: {what}; give files, a folder or a pattern like 'calib/*.png'")
     return found
 

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.logs.image_folder import IMAGE_SUFFIXES, STAMP_FILES
+from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.plan_view import plan_view
@@ -26,21 +28,7 @@ REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files t
 # Options of files of one format, and how such a file is named.
 SUFFIXES: Final = {"--cloud": ".ply", "--ply": ".ply", "--plan": ".png", "--record": ".mcap", "--mcap": ".mcap"}
 # What is read of a folder: images, logs, lists of stamps. A plan is an image beside the folders of a log, not in them.
-READ_SUFFIXES: Final = {
-    ".bmp",
-    ".jpeg",
-    ".jpg",
-    ".pgm",
-    ".png",
-    ".ppm",
-    ".tif",
-    ".tiff",
-    ".webp",
-    ".mcap",
-    ".db3",
-    ".bag",
-}
-READ_NAMES: Final = ("timestamps.txt", "times.txt")
+READ_SUFFIXES: Final = IMAGE_SUFFIXES.union(LOG_SUFFIXES)
 FORMATS: Final = {*SUFFIXES.values(), ".txt", ".tum", ".csv", ".json", ".jpg", ".pdf", ".pcd", ".db3", ".bag", ".toml"}
 
 
@@ -67,7 +55,7 @@ def _is_read_in(folder: Path, option: str, path: Path) -> bool:
         return False
     place = path.resolve()
     is_near = folder.resolve() in (place.parent, place.parent.parent)
-    return is_near and (place.suffix.lower() in READ_SUFFIXES or place.name in READ_NAMES)
+    return is_near and (place.suffix.lower() in READ_SUFFIXES or place.name in STAMP_FILES)
 
 
 def on_stdout(outputs: Named) -> bool:

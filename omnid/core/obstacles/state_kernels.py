@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
+from omnid.core.obstacles.cell_kernels import FLOOR, NOTHING, SURFACE, VISIBLE, Bytes, Floats
 
-Floats = NDArray[np.float32]
-Bytes = NDArray[np.uint8]
 Numbers = NDArray[np.int64]
 Limits = tuple[float, float, float, float, float]
 
-FLOOR, SURFACE, VISIBLE = 0, 3, 4  # layers of log-odds, as in grid_layers.py
 NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)  # of flags, and of cells: unknown, free, taken
-NOTHING = np.float32(0.0)  # Exact.
 
 
 @inner

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.masks.rim import find_rim
+from calib.masks.rim import circles_through, find_rim
 from calib.models.camera import Mask
 
 Image = NDArray[np.uint8]
@@ -108,3 +108,10 @@ def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
     rings = np.array([(*mask.center, mask.inner_px, mask.outer_px) for mask in masks])
     assert (np.ptp(rings, axis=0) < (1.0, 1.0, 3.0, 0.6)).all()
     np.testing.assert_allclose(rings.mean(axis=0), (516.7, 384.1, 79.0, 451.7), atol=1.0)
+
+
+def test_circles_go_through_their_points_and_points_in_line_have_none() -> None:
+    points = np.random.default_rng(3).uniform(0, 500, (50, 3, 2))
+    u, v, radius = circles_through(points).T[:, :, None]
+    np.testing.assert_allclose(np.hypot(points[..., 0] - u, points[..., 1] - v) / radius, 1, rtol=1e-6)
+    assert not np.isfinite(circles_through(np.array([[[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]]))).any()
