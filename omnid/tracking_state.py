@@ -9,7 +9,7 @@ class TrackingState(StrEnum):
     """Trust in a pose. The values are the words used on the bus, in logs and in the terminal."""
 
     TRACKING = "tracking"  # the pose has enough inliers
-    DEGRADED = "degraded"  # few inliers, the first pose after a gap, or a refused frame
+    DEGRADED = "degraded"  # few inliers, the first pose after a gap, a refused frame, or one that wheels contradict
     LOST = "lost"  # the pose is only predicted and its covariance grows
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import OdometryConfig
 from omnid.core.control.motion_monitor import Witness
+from omnid.core.odometry.contradiction import Contradiction, contradiction_after
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
@@ -53,9 +54,10 @@ class OdometryStage:
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
         self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, at a pose known well
-        T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
-        self._to_base = se3.adjoint(T_base_rect)
-        self.sensors, self._agreement = MotionSensors(se3.inverse(T_base_rect)), MotionAgreement()
+        self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
+        self._to_base = se3.adjoint(self._T_base_rect)
+        self.sensors, self._agreement = MotionSensors(se3.inverse(self._T_base_rect)), MotionAgreement()
+        self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
 
     def _features(self) -> float:
         """Return the share of the landmarks that the next keyframe is to have."""
@@ -92,6 +94,7 @@ class OdometryStage:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
             seen = self._to_base @ se3.log(estimate.step[0])
             self._agreement.add_step(last_ns, pair.stamp_ns, float(seen[0]), float(seen[5]))
+        covariance_rect = estimate.covariance + self._contradicted(estimate.T_odom_rect, pair.stamp_ns)
         # 4. The message, in the frame of the rig.
         earlier = self._earlier(pair, estimate)
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
@@ -99,10 +102,10 @@ class OdometryStage:
             pair.seq,
             pair.stamp_ns,
             T_odom_rig,
-            self._in_rig(estimate.covariance),
+            self._in_rig(covariance_rect),
             self._to_rig @ estimate.velocity,
             self._in_rig(estimate.velocity_covariance),
-            _state(estimate.state, pair),
+            _state(estimate.state, pair, self.witness),
             estimate.resets,
             estimate.inliers,
             estimate.tracked,
@@ -114,7 +117,7 @@ class OdometryStage:
             self._agreement.result,
             estimate.refused_mps,
             estimate.T_odom_rect,
-            estimate.covariance,
+            covariance_rect,
         )
 
     def after(self) -> None:
@@ -136,6 +139,15 @@ class OdometryStage:
         """Return the disparities (H, W) of a pair for a motion during its exposures."""
         return self._dense.points(pair, _moving(exposure)).disparity
 
+    def _contradicted(self, T_odom_rect: Array, stamp_ns: int) -> Array:
+        """Return what wheels and gyro that contradict the poses add to the covariance (6, 6) of one."""
+        T_odom_base = T_odom_rect @ se3.inverse(self._T_base_rect)
+        self._contradiction = contradiction_after(self._contradiction, self.witness, T_odom_base, stamp_ns)
+        if self._contradiction is None:
+            return np.zeros((6, 6))
+        to_rect = np.linalg.inv(self._to_base)
+        return np.asarray(to_rect @ self._contradiction.covariance(T_odom_base) @ to_rect.T)
+
     def _in_rig(self, covariance: Array) -> Array:
         """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""
         return np.asarray(self._to_rig @ covariance @ self._to_rig.T)
@@ -146,9 +158,10 @@ def _moving(exposure: Exposure | None) -> Exposure | None:
     return None if exposure is None or exposure.times.is_at_once else exposure
 
 
-def _state(state: TrackingState, pair: Panoramas) -> TrackingState:
-    """Return the state of a pose: at best DEGRADED where it is too dark."""
-    return TrackingState.DEGRADED if state is TrackingState.TRACKING and pair.light.is_too_dark else state
+def _state(state: TrackingState, pair: Panoramas, witness: Witness) -> TrackingState:
+    """Return the state of a pose: at best DEGRADED where it is too dark, or wheels and gyro contradict the images."""
+    is_doubtful = pair.light.is_too_dark or witness.doubts_images
+    return TrackingState.DEGRADED if state is TrackingState.TRACKING and is_doubtful else state
 
 
 def _method(model: StereoModel, config: OdometryConfig, features: Callable[[], float]) -> OdometryMethod:

@@ -210,6 +210,24 @@ def test_wheels_that_contradict_the_cameras_are_reported(
     assert TrackingState.LOST in result.states  # no wheels to be trusted in the dark
 
 
+def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_theirs(
+    scene: Path, samples: list[MotionSample], tmp_path: Path
+) -> None:
+    """As if the rig were smaller than it says. In the dark, wheels whose scale was learned carry the pose."""
+    faster = [
+        replace(sample, velocity_mps=1.7 * sample.velocity_mps) if isinstance(sample, WheelSample) else sample
+        for sample in samples
+    ]
+    honest, contradicted = (
+        run(saved(tmp_path / f"{name}.mcap", scene, [entry(sample) for sample in log]), scene)
+        for name, log in (("honest", samples), ("faster", faster))
+    )
+    assert contradicted.states[-1] == TrackingState.DEGRADED and honest.states[-1] == TrackingState.TRACKING
+    sigma_m, honest_m = (np.sqrt(np.diag(result.covariances[-1])[:3].max()) for result in (contradicted, honest))
+    travelled_m = float(np.linalg.norm(contradicted.T_odom_rig[-1, :3, 3]))
+    assert 0.3 * 0.7 * travelled_m < sigma_m < 0.7 * travelled_m and honest_m < 0.02
+
+
 def test_the_daemon_on_a_log_reads_its_wheels_and_gyro_and_no_others(log: Path, scene: Path, tmp_path: Path) -> None:
     for name, source in (("log.mcap", log), ("rig.toml", scene / "rig.toml")):
         shutil.copy(source, tmp_path / name)

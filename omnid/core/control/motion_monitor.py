@@ -46,12 +46,30 @@ DISAGREEMENTS: Final = (*COMPARED, *WITNESSES)
 ADVICE: Final = "check wheels, cameras, motor.drive, baseline and T_base_rig of the rig; see controller.motion"
 
 
+class Difference(NamedTuple):
+    """By how much wheels or gyro have moved farther than the images show."""
+
+    amount: float = 0.0  # m or rad
+    span_s: float = 0.0  # in the newest so many seconds
+
+    def part(self, seconds: float) -> float:
+        """Return its part in so many seconds, the whole at most."""
+        return self.amount * min(1.0, seconds / self.span_s) if self.span_s > 0 else 0.0
+
+
 class Witness(NamedTuple):
     """Account of the motion (images, wheels, gyro) that differs slowly from the others."""
 
     reason: str = ""  # one of WITNESSES; empty: all agree
     detail: str = ""  # size of the disagreement, in words
     is_fault: bool = False  # False: a doubt
+    distance: Difference = Difference()
+    turn: Difference = Difference()
+
+    @property
+    def doubts_images(self) -> bool:
+        """True if the images contradict the others, and it is not known that the others are wrong."""
+        return self.is_fault and self.reason in (IMAGES_DIFFER, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
 
 
 AGREE: Final = Witness()

@@ -33,6 +33,7 @@ from omnid.core.control.motion_monitor import (
     IMAGES_OR_GYRO,
     IMAGES_OR_WHEELS,
     WHEELS_DIFFER,
+    Difference,
     Witness,
 )
 
@@ -82,6 +83,7 @@ class _Finding(NamedTuple):
     lag_s: float = 0.0  # delay of the images; beyond the allowed ones where there is evidence
     excess: float = 0.0  # difference of the sums in parts of its limit; 1 and more is a fault
     text: str = ""
+    difference: Difference = Difference()  # empty where the images are late
 
     @property
     def differs(self) -> bool:
@@ -195,7 +197,10 @@ class MotionAgreement:
         is_late = abs(found.lag_s) > ALLOWED_LAG_S
         self._late_since_s = (self._late_since_s or now_s) if is_late else None
         is_long = self._late_since_s is not None and now_s - self._late_since_s >= LATE_S
-        return Witness(reason, found.text, bool(is_long or found.excess >= 1.0))
+        is_fault = bool(is_long or found.excess >= 1.0)
+        turn = of_gyro if of_gyro.differs else of_wheels
+        differences = (each.difference if each.differs else Difference() for each in (distance, turn))
+        return Witness(reason, found.text, is_fault, *differences)
 
     def _finding(
         self, spans: tuple[Array, Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
@@ -225,7 +230,8 @@ class MotionAgreement:
         path = np.cumsum(np.abs(moved))
         count = int(np.searchsorted(path if unit == "m" else np.cumsum(np.abs(ways_m[known][::-1])), WINDOW_M)) + 1
         length = float(path[min(count, len(path)) - 1])
-        difference = abs(float((moved[:count] - seen[:count]).sum()))
+        apart = float((moved[:count] - seen[:count]).sum())
+        difference = abs(apart)
         is_whole = count <= len(path) or span_s[1][-1] - span_s[0][0] >= WINDOW_S - LEAST_STEPS * EVERY_S
         limit = (
             max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
@@ -233,14 +239,16 @@ class MotionAgreement:
             else max(SCALE_SHARE * length, least)
         )
         steps_s = span_s[1][known] - span_s[0][known]
+        duration_s = float(steps_s[::-1][:count].sum())
         limit += LAG_SIGMA_S * float((np.abs(seen[::-1]) / np.maximum(steps_s, LEAST_SAMPLE_S)).max())
         if unit == "m":
             soon = int(np.searchsorted(span_s[1][-1] - span_s[1][known][::-1], SOON_S))
             lacking = abs(float((moved[:soon] - seen[:soon]).sum()))
             if lacking > max(SOON_M, SOON_SHARE * float(np.abs(moved[:soon]).sum())) and difference < limit:
-                return _Finding(0.0, max(DOUBT_SHARE, difference / limit), f"by {lacking:.2f} m in {SOON_S:.0f} s")
+                text = f"by {lacking:.2f} m in {SOON_S:.0f} s"
+                return _Finding(0.0, max(DOUBT_SHARE, difference / limit), text, Difference(apart, duration_s))
         shown = f"{difference:.2f} m in {length:.1f} m" if unit == "m" else f"{np.degrees(difference):.0f} degrees"
-        return _Finding(0.0, difference / limit, f"by {shown}")
+        return _Finding(0.0, difference / limit, f"by {shown}", Difference(apart, duration_s))
 
     def _lag(self, by_lag: Array, seen: Array, noise: float) -> tuple[int, int, bool]:
         """Return the best lag, the best one that is allowed, and whether the evidence for the other is strong."""
