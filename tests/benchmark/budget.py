@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,16 +31,13 @@ from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.synchronise import Synchronise
 from tests.benchmark.accuracy import rig_of
 from tests.benchmark.budget_steps import STEPS, StepClock, measured_steps
+from tests.benchmark.reference_kernels import LK_CORNERS, ReferenceKernels
 from tests.benchmark.results import Cell, Column, ResultTable
 from tests.busy import busy_processes
 from tests.replay.test_memory import to_and_fro
 
 REFERENCE_EVERY: Final = 10  # pairs between two runs of the reference kernels
 SKIPPED: Final = 10  # first pairs, in which caches, buffers and the first map are filled
-SGBM_DISPARITIES, SGBM_BLOCK_PX = 128, 5
-LK_CORNERS, LK_WINDOW_PX, LK_LEVELS = 500, 15, 3
-LK_QUALITY, LK_APART_PX = 0.001, 8
-LUCAS_KANADE: Final = cv2.calcOpticalFlowPyrLK  # not the one that is timed as a step
 Image = NDArray[np.uint8]
 Labels = tuple[str, ...]
 COLUMNS: Final = (
@@ -66,22 +62,14 @@ class Budget:
         return sum(own for labels, own in self.own_ms.items() if labels[: len(path)] == path)
 
 
-class ReferenceKernels:
-    """A sink of poses that times one StereoSGBM and one Lucas-Kanade call on the panoramas of some pairs [ns]."""
+class ReferenceTimes:
+    """A sink of poses that times the reference kernels on the panoramas of some pairs [ns]."""
 
     def __init__(self, clock: StepClock) -> None:
-        self._clock = clock
+        self._clock, self._kernels = clock, ReferenceKernels()
         self.sgbm_ns: list[int] = []
         self.lk_ns: list[int] = []
         self._before: Image | None = None
-        self._sgbm = cv2.StereoSGBM.create(
-            minDisparity=0,
-            numDisparities=SGBM_DISPARITIES,
-            blockSize=SGBM_BLOCK_PX,
-            P1=8 * SGBM_BLOCK_PX**2,
-            P2=32 * SGBM_BLOCK_PX**2,
-            mode=cv2.STEREO_SGBM_MODE_SGBM,
-        )
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Time the kernels at every REFERENCE_EVERY-th pair; after the first pairs, forget the steps so far."""
@@ -92,15 +80,8 @@ class ReferenceKernels:
         self._before = lower
         if odometry.seq % REFERENCE_EVERY or before is None:
             return
-        turned = [np.ascontiguousarray(image.T[:, ::-1]) for image in (lower, pair.upper.panorama)]
-        start_ns = time.thread_time_ns()
-        self._sgbm.compute(*turned)
-        middle_ns = time.thread_time_ns()
-        self.sgbm_ns.append(middle_ns - start_ns)
-        corners = cv2.goodFeaturesToTrack(before, LK_CORNERS, LK_QUALITY, LK_APART_PX)
-        start_ns = time.thread_time_ns()
-        LUCAS_KANADE(before, lower, corners, None, winSize=(LK_WINDOW_PX, LK_WINDOW_PX), maxLevel=LK_LEVELS)
-        self.lk_ns.append(time.thread_time_ns() - start_ns)
+        self.sgbm_ns.append(self._kernels.sgbm_ns(lower, pair.upper.panorama))
+        self.lk_ns.append(self._kernels.lucas_kanade_ns(before, lower))
 
 
 def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Budget:
@@ -110,7 +91,7 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Bu
     place = geometry(with_rims(rig_of(folder), frames), config.panorama)
     cv2.setNumThreads(config.graph.opencv_threads)
     clock = StepClock()
-    reference = ReferenceKernels(clock)
+    reference = ReferenceTimes(clock)
     with TemporaryDirectory() as work, measured_steps(clock):
         graph = Graph(threaded=False)
         sinks = Sinks(

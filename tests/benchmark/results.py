@@ -35,6 +35,7 @@ from typing import Any, Final, TypeAlias
 import cv2
 import numpy as np
 
+from tests.benchmark.reference_kernels import reference_ms
 from tests.benchmark.seeds import family_and_seed, role_of
 
 ROOT: Final = Path(__file__).parents[2]
@@ -146,7 +147,7 @@ class ResultTable:
             "title": self.title,
             "command": command(),
             "commit": commit(),
-            "machine": machine(),
+            "machine": machine() + (f", reference kernels {reference_ms():.0f} ms" if self.question == "speed" else ""),
             "date": self.date,
             "load": self.load,
             "seeds": seeds,

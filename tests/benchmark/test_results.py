@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,13 @@ def test_a_continued_table_keeps_the_rows_of_other_keys(folder: Path) -> None:
     for key, value in (("a", 1), ("b", 2), ("a", 3)):
         ResultTable("live", "speed", "Live", COLUMNS[:2], continued=True).add(key, value)
     assert read_result(folder / "live.json")["rows"] == [["b", 2], ["a", 3]]
+
+
+def test_a_table_of_times_says_how_fast_the_machine_was(folder: Path) -> None:
+    for name, question in (("drive", "driving"), ("live", "speed")):
+        ResultTable(name, question, "Title", COLUMNS[:2]).add("a", 1)
+    assert re.search(r", reference kernels [1-9]\d* ms$", read_result(folder / "live.json")["machine"])
+    assert "reference" not in read_result(folder / "drive.json")["machine"]
 
 
 def test_a_row_of_another_length_is_refused(folder: Path) -> None:
