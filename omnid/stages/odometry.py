@@ -160,7 +160,7 @@ def _moving(exposure: Exposure | None) -> Exposure | None:
 
 def _state(state: TrackingState, pair: Panoramas, witness: Witness) -> TrackingState:
     """Return the state of a pose: at best DEGRADED where it is too dark, or wheels and gyro contradict the images."""
-    is_doubtful = pair.light.is_too_dark or witness.doubts_images
+    is_doubtful = pair.light.is_too_dark or witness.contradicts_images
     return TrackingState.DEGRADED if state is TrackingState.TRACKING and is_doubtful else state
 
 

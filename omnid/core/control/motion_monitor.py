@@ -67,7 +67,7 @@ class Witness(NamedTuple):
     turn: Difference = Difference()
 
     @property
-    def doubts_images(self) -> bool:
+    def contradicts_images(self) -> bool:
         """True if the images contradict the others, and it is not known that the others are wrong."""
         return self.is_fault and self.reason in (IMAGES_DIFFER, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
 

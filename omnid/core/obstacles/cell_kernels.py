@@ -6,7 +6,7 @@ All loops along rows are innermost and without branches: the compiler turns them
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +18,38 @@ Bytes = NDArray[np.uint8]
 Corner = tuple[int, int]
 Number = Any  # np.float32, or a float that becomes one
 Three = tuple[Number, Number, Number]
-Limits = tuple[Number, Number, Number, Number]
 
-FLOOR, ABOVE, BELOW, SURFACE, VISIBLE = 0, 1, 2, 3, 4  # layers of log-odds, as in grid_layers.py
-# Exact; numbers of other types would make sums of 64 bits.
+# Layers: floor against upright surfaces, against planes just above and below it; surface; visible floor against floor
+# that something plain hides.
+FLOOR, ABOVE, BELOW, SURFACE, VISIBLE = 0, 1, 2, 3, 4
+# Numbers have 32 bits, as sums with others would have 64.
 NOTHING, ONE, TWO, INFINITE = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(np.inf)
+
+# Log-odds where nothing was seen: floor that was not seen is not free, so that pairs must show it.
+FLOOR_PRIOR, SURFACE_PRIOR, VISIBLE_PRIOR = np.float32(-1.0), np.float32(-6.0), np.float32(3.0)
+LIMIT: Final = np.float32(6.0)  # Limit of all log-odds: a change is believed after a few pairs.
+FLOOR_LOW: Final = np.float32(
+    -3.0
+)  # Least log-odds of the floor: what was hidden for long is free again after few pairs.
+TAKEN_ODDS: Final = np.float32(0.0)  # Log-odds of a surface from which a cell is occupied.
+# Of the floor, of a cell and a pair: the errors of pairs that follow each other are alike, so that a few count.
+MOST_RATIO: Final = np.float32(3.0)
+# Mean evidence of a cell's floor from which it is usual. With 1.5 and 2, by trial, more bases stood on polished floors;
+# of the directions of white poles as many were free with all three.
+USUAL: Final = np.float32(1.0)
+# Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
+MOST_SURFACE: Final = np.float32(1.0)
+# Mean evidence of a surface where there is none, as the best of many runs is never negative: below 0.13 in 95 % of the
+# cells of bare floor. It would add up as the robot moves: two of three false surfaces before plain walls came of it.
+NOISE_SURFACE: Final = np.float32(0.15)
+UNSEEN_SURFACE: Final = np.float32(0.4)  # The same where no floor is in view, as nothing contradicts a surface there.
+# Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
+CONTRADICTION: Final = np.float32(-1.5)
+# Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
+# below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
+PLACE_PAIRS: Final = np.float32(18.0)
+MOST_VISIBLE: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
+LEAST_VISIBLE: Final = np.float32(-1.0)  # One or two pairs with the usual evidence make it free again.
 
 
 @inner
@@ -33,14 +60,14 @@ def bounded(value: Number, low: Number, high: Number) -> Number:
 
 
 @inner
-def seen(floor: Number, most: Number) -> Number:
-    """Return the evidence of the floor of a cell within +-most, 0 where nothing can be seen (NaN)."""
-    return bounded(floor if abs(floor) < INFINITE else NOTHING, -most, most)
+def seen(floor: Number) -> Number:
+    """Return the evidence of the floor of a cell within its limits, 0 where nothing can be seen (NaN)."""
+    return bounded(floor if abs(floor) < INFINITE else NOTHING, -MOST_RATIO, MOST_RATIO)
 
 
-@compiled("(f4[:, ::1], f4[:, ::1], UniTuple(i8, 2), f4, f4[:, ::1])", writes=("hidden",))
-def hidden_odds(floor: Floats, mean: Floats, corner: Corner, most: np.float32, hidden: Floats) -> None:
-    """Write the log-odds (N, N) that the floor is hidden, which are at most +-most, 0 where nothing can be seen.
+@compiled("(f4[:, ::1], f4[:, ::1], UniTuple(i8, 2), f4[:, ::1])", writes=("hidden",))
+def hidden_odds(floor: Floats, mean: Floats, corner: Corner, hidden: Floats) -> None:
+    """Write the log-odds (N, N) that the floor is hidden, at most +-MOST_RATIO, 0 where nothing can be seen.
 
     The evidence (N, N) has the variance 2 about the usual m of the mean (H, W), or about 0: m/2 (m/2 - floor).
     """
@@ -48,31 +75,31 @@ def hidden_odds(floor: Floats, mean: Floats, corner: Corner, most: np.float32, h
         usual = mean[corner[0] + i, corner[1] : corner[1] + hidden.shape[1]]
         for j in range(hidden.shape[1]):
             half = usual[j] / TWO
-            odds = bounded(half * (half - seen(floor[i, j], most)), -most, most)
+            odds = bounded(half * (half - seen(floor[i, j])), -MOST_RATIO, MOST_RATIO)
             hidden[i, j] = odds if abs(floor[i, j]) < INFINITE else NOTHING
 
 
-@compiled("(f4[:, ::1], f4[:, ::1], UniTuple(i8, 2), f4, f4, f4[:, ::1])", writes=("mean",))
-def learn(floor: Floats, by_odds: Floats, corner: Corner, most: np.float32, share: np.float32, mean: Floats) -> None:
+@compiled("(f4[:, ::1], f4[:, ::1], UniTuple(i8, 2), f4, f4[:, ::1])", writes=("mean",))
+def learn(floor: Floats, by_odds: Floats, corner: Corner, share: np.float32, mean: Floats) -> None:
     """Take evidence (N, N) into the mean (H, W), where it is not hidden; by_odds (N, N): exp of the odds that it is."""
     for i in range(floor.shape[0]):
         usual = mean[corner[0] + i, corner[1] : corner[1] + floor.shape[1]]
         for j in range(floor.shape[1]):
-            changed = usual[j] + share / (ONE + by_odds[i, j]) * (seen(floor[i, j], most) - usual[j])
+            changed = usual[j] + share / (ONE + by_odds[i, j]) * (seen(floor[i, j]) - usual[j])
             changed = changed if changed > NOTHING else NOTHING
             usual[j] = changed if abs(floor[i, j]) < INFINITE else usual[j]
 
 
 @inner
-def surfaces(floor: Floats, surface: Floats, gone: Bytes, odds: Floats, limits: Limits, into: Floats) -> None:
+def surfaces(floor: Floats, surface: Floats, gone: Bytes, odds: Floats, into: Floats) -> None:
     """Write the evidence of surfaces (N,) less that of noise; gone: 1 where a surface would be seen."""
-    noise_seen, noise_unseen, most, taken = limits
     for j in range(len(into)):
-        noise = noise_seen if abs(floor[j]) < INFINITE else noise_unseen
+        noise = NOISE_SURFACE if abs(floor[j]) < INFINITE else UNSEEN_SURFACE
         # An obstacle that is hidden or too near to be seen remains one.
-        stays = (surface[j] <= NOTHING) & (not abs(floor[j]) < INFINITE) & (gone[j] == np.uint8(0)) & (odds[j] > taken)
+        is_hidden = (surface[j] <= NOTHING) & (not abs(floor[j]) < INFINITE) & (gone[j] == np.uint8(0))
+        stays = is_hidden & (odds[j] > TAKEN_ODDS)
         value = surface[j] - (NOTHING if stays else noise)
-        into[j] = value if value < most else most
+        into[j] = value if value < MOST_SURFACE else MOST_SURFACE
 
 
 @inner
@@ -83,32 +110,28 @@ def add_bounded(values: Floats, weight: Number, most: Number, low: Number, high:
 
 
 @inner
-def add_floor(
-    floor: Floats, surface: Floats, lost: Floats, usual: Floats, limits: Limits, weight: Number, odds: Floats
-) -> None:
+def add_floor(floor: Floats, surface: Floats, lost: Floats, usual: Floats, weight: Number, odds: Floats) -> None:
     """Add the evidence of the floor (N,) to its log-odds."""
-    most, least_usual, low, high = limits
     for j in range(len(odds)):
-        value = seen(floor[j], most)
+        value = seen(floor[j])
         below = value if value < NOTHING else NOTHING
         is_surface = surface[j] > NOTHING
         # Where floor is usual, a single cell that shows none is noise unless all floor behind it is hidden, too.
-        least = NOTHING if (not is_surface) & (lost[j] <= NOTHING) & (usual[j] > least_usual) else -most
+        least = NOTHING if (not is_surface) & (lost[j] <= NOTHING) & (usual[j] > USUAL) else -MOST_RATIO
         value = below if is_surface else value
-        odds[j] = bounded(odds[j] + weight * (value if value > least else least), low, high)
+        odds[j] = bounded(odds[j] + weight * (value if value > least else least), FLOOR_LOW, LIMIT)
 
 
 @inner
-def add_surface(floor: Floats, surface: Floats, limits: Limits, weights: Three, odds: Floats) -> None:
+def add_surface(floor: Floats, surface: Floats, weights: Three, odds: Floats) -> None:
     """Add the evidence of surfaces (N,) to their log-odds."""
-    pairs, low, high, contradiction = limits
     weight, at_rest, _ = weights
     for j in range(len(odds)):
         is_surface = surface[j] > NOTHING
         # The sum over pairs from one place tends to their mean, so many times: what is no surface stays none.
-        surplus = (odds[j] - low) / pairs if is_surface else NOTHING
-        value = contradiction if (floor[j] > NOTHING) & (not is_surface) else surface[j]
-        odds[j] = bounded(odds[j] + (weight * value - at_rest * surplus), low, high)
+        surplus = (odds[j] - SURFACE_PRIOR) / PLACE_PAIRS if is_surface else NOTHING
+        value = CONTRADICTION if (floor[j] > NOTHING) & (not is_surface) else surface[j]
+        odds[j] = bounded(odds[j] + (weight * value - at_rest * surplus), SURFACE_PRIOR, LIMIT)
 
 
 @inner
@@ -122,7 +145,7 @@ def add_shown(floor: Floats, beside: Bytes, amount: Floats, share: Number, shown
 
 @compiled(
     "(f4[:, :, ::1], u1[:, ::1], u1[:, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], UniTuple(i8, 2), UniTuple(f4, 3), "
-    "UniTuple(f4, 4), UniTuple(f4, 4), UniTuple(f4, 4), UniTuple(f4, 3), f4[:, :, ::1], f4[:, ::1], f4[:, ::1])",
+    "f4[:, :, ::1], f4[:, ::1], f4[:, ::1])",
     writes=("odds", "shown", "amount"),
 )
 def add_pair(
@@ -134,10 +157,6 @@ def add_pair(
     usual: Floats,
     corner: Corner,
     weights: Three,
-    of_surfaces: Limits,
-    of_floors: Limits,
-    of_surface_odds: Limits,
-    of_visible: Three,
     odds: Floats,
     shown: Floats,
     amount: Floats,
@@ -147,23 +166,19 @@ def add_pair(
     cells (5, N, N): evidence of `gather`; gone (N, N): 1 where a surface would be seen, beside (N, N): around it;
     surface_shown (N, N): surface for the mean of single pairs, shown (H, W); lost (H, W): log-odds that visible floor
     loses; usual (H, W): mean evidence of the floor.
-    weights: of the pair, the part of it by time alone, of the pair in the mean of single pairs. of_surfaces: noise
-    where floor is in view and where not, most surface of a pair, log-odds from which a cell is taken. of_floors: most
-    floor of a pair, mean from which floor is usual, limits of log-odds. of_surface_odds: pairs from one place, limits
-    of log-odds, evidence where floor is seen. of_visible: most of a pair, and limits of log-odds.
+    weights: of the pair, the part of it by time alone, of the pair in the mean of single pairs.
     """
-    size = amount.shape[0]
+    size, weight = amount.shape[0], weights[0]
     surface, row = np.empty(size, np.float32), slice(corner[1], corner[1] + size)
-    weight, most, low, high = weights[0], of_floors[0], of_floors[2], of_floors[3]
     for i in range(size):
         at, floor = corner[0] + i, cells[FLOOR, i]
-        surfaces(floor, cells[SURFACE, i], gone[i], odds[SURFACE, at, row], of_surfaces, surface)
+        surfaces(floor, cells[SURFACE, i], gone[i], odds[SURFACE, at, row], surface)
         add_shown(floor, beside[i], surface_shown[i], weights[2], shown[at, row])
-        add_floor(floor, surface, lost[at, row], usual[at, row], of_floors, weight, odds[FLOOR, at, row])
-        add_bounded(cells[ABOVE, i], weight, most, low, high, odds[ABOVE, at, row])
-        add_bounded(cells[BELOW, i], weight, most, low, high, odds[BELOW, at, row])
-        add_surface(floor, surface, of_surface_odds, weights, odds[SURFACE, at, row])
-        add_bounded(lost[at, row], -weight, of_visible[0], of_visible[1], of_visible[2], odds[VISIBLE, at, row])
+        add_floor(floor, surface, lost[at, row], usual[at, row], weight, odds[FLOOR, at, row])
+        add_bounded(cells[ABOVE, i], weight, MOST_RATIO, FLOOR_LOW, LIMIT, odds[ABOVE, at, row])
+        add_bounded(cells[BELOW, i], weight, MOST_RATIO, FLOOR_LOW, LIMIT, odds[BELOW, at, row])
+        add_surface(floor, surface, weights, odds[SURFACE, at, row])
+        add_bounded(lost[at, row], -weight, MOST_VISIBLE, LEAST_VISIBLE, VISIBLE_PRIOR, odds[VISIBLE, at, row])
         for j in range(size):
-            value = seen(floor[j], most)
+            value = seen(floor[j])
             amount[i, j] = value if value > surface[j] else surface[j]

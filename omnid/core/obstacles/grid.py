@@ -17,24 +17,14 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
-from omnid.core.obstacles.cell_kernels import add_pair
+from omnid.core.obstacles.cell_kernels import FLOOR, LIMIT, MOST_RATIO, SURFACE, TAKEN_ODDS, VISIBLE, add_pair
 from omnid.core.obstacles.column import ColumnEvidence, floor_plane
-from omnid.core.obstacles.grid_layers import (
-    FLOOR,
-    FLOORS,
-    FREE_ODDS,
-    FREE_SHOWN,
-    PRIOR,
-    SURFACE,
-    TAKEN_ODDS,
-    VISIBLE,
-    cells_of,
-    level_odds,
-)
+from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of, level_odds
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
 from omnid.core.obstacles.near_field import NearField
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.usual_floor import MOST_RATIO, UsualFloor, arrivals_at
+from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN
+from omnid.core.obstacles.usual_floor import UsualFloor, arrivals_at
 from omnid.core.obstacles.watch import FRESH_NS, Watch
 
 Array = NDArray[np.float64]
@@ -49,16 +39,6 @@ VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes:
 
 MEAN_FLOOR: Final = 4  # Index in the evidence of cells; the others are those of the layers.
 
-LIMIT: Final = 6.0  # Limit of all log-odds: a change is believed after a few pairs.
-# Of a surface: six pairs are needed. With 1.5 and 3.0, by trial, one that was none stopped a base in a corridor.
-MOST_SURFACE: Final = np.float32(1.0)
-MOST_VISIBLE: Final = np.float32(1.0)  # Limit of one pair: three that show no floor where it was end a free cell.
-LEAST_VISIBLE: Final = -1.0  # One or two pairs with the usual evidence make it free again.
-# Mean evidence of a surface where there is none, as the best of many runs is never negative: below 0.13 in 95 % of the
-# cells of bare floor. It would add up as the robot moves: two of three false surfaces before plain walls came of it.
-NOISE_SURFACE: Final = np.float32(0.15)
-UNSEEN_SURFACE: Final = np.float32(0.4)  # The same where no floor is in view, as nothing contradicts a surface there.
-CONTRADICTION: Final = -1.5  # Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
 # A thin thing shows a surface in half of the pairs, and floor in the others, which contradict it: its log-odds stay at
 # the prior. So a cell is free only where the mean surface of single pairs is low. Set on development seeds 1 and 2.
 SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean
@@ -67,12 +47,6 @@ MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair; by trial, too
 
 APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.
 APART_S: Final = 0.2  # A pair from the same place counts in full after it, so that a base that stands sees what comes.
-# Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair
-# below 95 % of its cells) from that of walls and boxes (0.8, median), in the world `room` at rest, development seed 1.
-PLACE_PAIRS: Final = 18.0
-# Mean evidence of a cell's floor from which it is usual. With 1.5 and 2, by trial, more bases stood on polished floors;
-# of the directions of white poles as many were free with all three.
-USUAL: Final = 1.0
 THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 
@@ -211,10 +185,6 @@ class ObstacleGrid:
             self._usual_thin.mean,
             (window[0].start, window[1].start),
             (weight, at_rest, weight * SHOWN_RATE),
-            (NOISE_SURFACE, UNSEEN_SURFACE, MOST_SURFACE, TAKEN_ODDS),
-            (MOST_RATIO, USUAL, -LIMIT / 2, LIMIT),
-            (PLACE_PAIRS, PRIOR[SURFACE], LIMIT, CONTRADICTION),
-            (MOST_VISIBLE, LEAST_VISIBLE, PRIOR[VISIBLE]),
             self._odds,
             self._shown,
             amount,

@@ -8,23 +8,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.obstacles.cell_kernels import ABOVE, BELOW, FLOOR, FLOOR_PRIOR, SURFACE, SURFACE_PRIOR, VISIBLE_PRIOR
 from omnid.core.obstacles.state_kernels import free_cells
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-# Layers: floor against upright surfaces, against planes just above and below it; surface; visible floor against floor
-# that something plain hides.
-FLOOR, ABOVE, BELOW, SURFACE, VISIBLE = 0, 1, 2, 3, 4
 FLOORS: Final = slice(FLOOR, SURFACE)
-PRIOR: Final = (-1.0, 0.0, 0.0, -6.0, 3.0)  # log-odds where nothing was seen
-VISIBLE_ODDS: Final = 0.0  # Log-odds of visible floor above which a cell is free.
-FREE_ODDS: Final = 1.5  # Log-odds of the floor from which a cell is free.
-TAKEN_ODDS: Final = 0.0  # Log-odds of a surface from which a cell is occupied.
-CLEAR_ODDS: Final = -3.5  # Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
-FREE_SHOWN: Final = 0.1  # largest mean in a free cell
-# Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
-SPECK_CELLS: Final = 4
+# Log-odds of the layers where nothing was seen: steps up and down are even, because nothing speaks for either.
+PRIOR: Final = (FLOOR_PRIOR, 0.0, 0.0, SURFACE_PRIOR, VISIBLE_PRIOR)
 WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
 # The same of an edge: a hole into which a base falls is wide. With 3, by trial, bases stood before joints of tiles.
 EDGE_CELLS: Final = 5
@@ -36,8 +28,7 @@ def cells_of(odds: Floats, shown: Floats) -> Bytes:
     shown (H, W): mean surface of single pairs.
     """
     floor, cells = mean_over(odds[FLOOR], WIDE_CELLS), np.empty(shown.shape, np.uint8)
-    limits = FREE_ODDS, VISIBLE_ODDS, TAKEN_ODDS, CLEAR_ODDS, FREE_SHOWN
-    free_cells(odds, shown, floor, level_odds(odds), limits, SPECK_CELLS, cells)
+    free_cells(odds, shown, floor, level_odds(odds), cells)
     return cells
 
 

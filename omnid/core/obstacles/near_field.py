@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.obstacles import near_field_kernels as kernels
-from omnid.core.obstacles.grid_layers import FLOOR, FLOORS, FREE_ODDS, SURFACE, TAKEN_ODDS
+from omnid.core.obstacles.cell_kernels import FLOOR, SURFACE, TAKEN_ODDS
+from omnid.core.obstacles.grid_layers import FLOORS
+from omnid.core.obstacles.state_kernels import FREE_ODDS
 from omnid.core.obstacles.watch import LEAST_FRESH, Watch
 
 Array = NDArray[np.float64]

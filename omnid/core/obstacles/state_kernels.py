@@ -5,16 +5,26 @@ Flags have a margin of one cell on each side, which is 0, so that all cells have
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.compiled import compiled, inner
-from omnid.core.obstacles.cell_kernels import FLOOR, NOTHING, SURFACE, VISIBLE, Bytes, Floats
+from omnid.core.obstacles.cell_kernels import FLOOR, NOTHING, SURFACE, TAKEN_ODDS, VISIBLE, Bytes, Floats
 
 Numbers = NDArray[np.int64]
-Limits = tuple[float, float, float, float, float]
 
 NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)  # of flags, and of cells: unknown, free, taken
+
+# Log-odds of the floor from which a cell is free, so that it takes three pairs of the usual evidence, 1 each, from -1.
+FREE_ODDS: Final = np.float32(1.5)
+VISIBLE_ODDS: Final = np.float32(0.0)  # Log-odds of visible floor above which a cell is free.
+# Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
+CLEAR_ODDS: Final = np.float32(-3.5)
+FREE_SHOWN: Final = np.float32(0.1)  # largest mean in a free cell
+# Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
+SPECK_CELLS: Final = 4
 
 
 @inner
@@ -25,17 +35,15 @@ def judge(
     shown: Floats,
     mean_floor: Floats,
     level: Floats,
-    limits: Limits,
     unknown: Bytes,
 ) -> None:
     """Write 1 where cells (W,) are neither free nor taken, each by itself."""
-    free_odds, visible_odds, taken_odds, clear_odds, free_shown = limits
     for j in range(len(floor)):
-        is_suspect = (surface[j] > clear_odds) | (shown[j] > free_shown)
+        is_suspect = (surface[j] > CLEAR_ODDS) | (shown[j] > FREE_SHOWN)
         # Single cells are noisy: one that is more likely floor than not is so by its neighbours, too.
-        is_floor = (floor[j] > free_odds) | ((floor[j] > NOTHING) & (mean_floor[j] > free_odds))
-        is_free = is_floor & (level[j] > free_odds) & (visible[j] > visible_odds) & (not is_suspect)
-        unknown[j] = NO if is_free | (surface[j] > taken_odds) else YES
+        is_floor = (floor[j] > FREE_ODDS) | ((floor[j] > NOTHING) & (mean_floor[j] > FREE_ODDS))
+        is_free = is_floor & (level[j] > FREE_ODDS) & (visible[j] > VISIBLE_ODDS) & (not is_suspect)
+        unknown[j] = NO if is_free | (surface[j] > TAKEN_ODDS) else YES
 
 
 @inner
@@ -68,46 +76,41 @@ def patch(flags: Bytes, i: int, j: int, found: Numbers) -> int:
 
 
 @inner
-def remove_specks(odds: Floats, shown: Floats, limits: Limits, most: int, unknown: Bytes) -> None:
-    """Clear the flags (H + 2, W + 2) of unknown patches of so few cells, unless something may stand in one of them."""
+def remove_specks(odds: Floats, shown: Floats, unknown: Bytes) -> None:
+    """Clear the flags (H + 2, W + 2) of unknown patches of few cells, unless something may stand in one of them."""
     height, width = shown.shape
-    count, found = np.empty(width, np.uint8), np.empty((most + 1, 2), np.int64)
+    count, found = np.empty(width, np.uint8), np.empty((SPECK_CELLS + 1, 2), np.int64)
     for i in range(height):
         count_around(unknown, i, count)
         for j in range(width):
-            if count[j] > most or unknown[i + 1, j + 1] == NO:
+            if count[j] > SPECK_CELLS or unknown[i + 1, j + 1] == NO:
                 continue
             cells = patch(unknown, i + 1, j + 1, found)
-            hides = cells > most
+            hides = cells > SPECK_CELLS
             for n in range(cells):
                 y, x = found[n, 0] - 1, found[n, 1] - 1
-                hides |= odds[SURFACE, y, x] > limits[3] or shown[y, x] > limits[4] or odds[VISIBLE, y, x] <= limits[1]
+                hides |= odds[SURFACE, y, x] > CLEAR_ODDS or shown[y, x] > FREE_SHOWN
+                hides |= odds[VISIBLE, y, x] <= VISIBLE_ODDS
             if not hides:
                 for n in range(cells):
                     unknown[found[n, 0], found[n, 1]] = NO
 
 
-@compiled(
-    "(f4[:, :, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], UniTuple(f4, 5), i8, u1[:, ::1])",
-    writes=("cells",),
-)
-def free_cells(
-    odds: Floats, shown: Floats, mean_floor: Floats, level: Floats, limits: Limits, speck: int, cells: Bytes
-) -> None:
+@compiled("(f4[:, :, ::1], f4[:, ::1], f4[:, ::1], f4[:, ::1], u1[:, ::1])", writes=("cells",))
+def free_cells(odds: Floats, shown: Floats, mean_floor: Floats, level: Floats, cells: Bytes) -> None:
     """Write the cells (H, W): 0 unknown, 1 free, 2 taken.
 
     odds (5, H, W): of all layers; shown (H, W): mean surface of single pairs; mean_floor (H, W): mean of the floor
-    around a cell; level (H, W): log-odds against steps. limits: log-odds above which a cell is floor, visible, taken,
-    those of a surface above which it is suspect, and `shown` above which it is. speck: most cells of a patch of noise.
+    around a cell; level (H, W): log-odds against steps.
     """
     height, width = cells.shape
     unknown, steps = np.zeros((height + 2, width + 2), np.uint8), np.zeros((height + 2, width + 2), np.uint8)
     inside, count = slice(1, width + 1), np.empty(width, np.uint8)
     for i in range(height):
         row = unknown[i + 1, inside]
-        judge(odds[FLOOR, i], odds[SURFACE, i], odds[VISIBLE, i], shown[i], mean_floor[i], level[i], limits, row)
+        judge(odds[FLOOR, i], odds[SURFACE, i], odds[VISIBLE, i], shown[i], mean_floor[i], level[i], row)
     # Specks are noise unless something may stand there.
-    remove_specks(odds, shown, limits, speck, unknown)
+    remove_specks(odds, shown, unknown)
     # Steps are seen by several directions together, of which those at a corner show half floor.
     for i in range(height):
         row, step, against = unknown[i + 1, inside], steps[i + 1, inside], level[i]
@@ -118,4 +121,4 @@ def free_cells(
         row, surface, into = unknown[i + 1, inside], odds[SURFACE, i], cells[i]
         for j in range(width):
             is_free = (row[j] == NO) & (count[j] == NO)
-            into[j] = TAKEN if surface[j] > limits[2] else (YES if is_free else NO)
+            into[j] = TAKEN if surface[j] > TAKEN_ODDS else (YES if is_free else NO)

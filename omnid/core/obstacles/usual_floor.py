@@ -19,9 +19,6 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Array = NDArray[np.float64]
 
-MOST_RATIO: Final = np.float32(
-    3.0
-)  # of a cell and a pair: the errors of pairs that follow each other are alike, so that a few count
 # Share of a pair that counts in full in the mean. With 0.5, by trial, the mean behind a plain pole was forgotten before
 # the base came to it, as F is about 0 there; it need not follow faster than F falls from 3.3 at 4 m to 1.5 at 1 m.
 LEARNED: Final = np.float32(0.2)
@@ -51,9 +48,9 @@ class UsualFloor:
         floor: of the window, evidence of a pair, NaN where nothing can be seen.
         """
         corner, hidden = (window[0].start, window[1].start), np.empty_like(floor)
-        hidden_odds(floor, self.mean, corner, MOST_RATIO, hidden)
+        hidden_odds(floor, self.mean, corner, hidden)
         # Hidden cells are no evidence of the floor.
-        learn(floor, np.exp(hidden), corner, MOST_RATIO, LEARNED * weight, self.mean)
+        learn(floor, np.exp(hidden), corner, LEARNED * weight, self.mean)
         found = np.zeros_like(self.mean)
         found[window] = hidden
         return found

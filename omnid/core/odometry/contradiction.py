@@ -1,4 +1,4 @@
-"""Contradiction of a pose: where the base would be by wheels and gyro, while nobody knows whether the images are right.
+"""Contradiction of a pose: where the base would be by wheels and gyro, where the images may be wrong.
 
 A person who walks along with the base, or a rig of another size, gives poses whose images agree with each other. Their
 covariance then says nothing of the error, but the other accounts of the motion do (motion_agreement.py).
@@ -43,7 +43,7 @@ def contradiction_after(
     before: Contradiction | None, witness: Witness, T_odom_base: Array, stamp_ns: int
 ) -> Contradiction | None:
     """Return the contradiction at a pose: that of before, with what the accounts differ by since then."""
-    if not witness.doubts_images or not (witness.distance.amount or witness.turn.amount):
+    if not witness.contradicts_images or not (witness.distance.amount or witness.turn.amount):
         return before
     # The sums of the witness overlap from pair to pair: only their part since the last one is new.
     since_s = math.inf if before is None else (stamp_ns - before.stamp_ns) * 1e-9

@@ -10,8 +10,8 @@ import pytest
 
 from calib import se3
 from omnid.config import load_config
+from omnid.core.obstacles.cell_kernels import SURFACE
 from omnid.core.obstacles.grid import CELL_M
-from omnid.core.obstacles.grid_layers import SURFACE
 from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.simulation.rendering.rigs import make_rig

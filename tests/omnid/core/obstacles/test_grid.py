@@ -9,13 +9,15 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.obstacles.cell_kernels import ABOVE, BELOW, FLOOR, LEAST_VISIBLE, SURFACE
+from omnid.core.obstacles.cell_kernels import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
-from omnid.core.obstacles.grid import CELL_M, CELLS, LEAST_VISIBLE, ObstacleGrid
-from omnid.core.obstacles.grid_layers import ABOVE, BELOW, FLOOR, FREE_ODDS, PRIOR, SURFACE
-from omnid.core.obstacles.grid_layers import VISIBLE as VISIBLE_LAYER
+from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
+from omnid.core.obstacles.grid_layers import PRIOR
 from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.state_kernels import FREE_ODDS
 from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.obstacles.drawn_floor import (

@@ -1,4 +1,4 @@
-"""What wheels and gyro that contradict the images add to the covariance of the pose, on drives that are computed."""
+"""Covariance of a pose that wheels and gyro contradict, on drives that are computed."""
 
 from __future__ import annotations
 
