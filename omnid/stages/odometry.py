@@ -142,11 +142,11 @@ class OdometryStage:
     def _contradicted(self, T_odom_rect: Array, stamp_ns: int) -> Array:
         """Return what wheels and gyro that contradict the poses add to the covariance (6, 6) of one."""
         T_odom_base = T_odom_rect @ se3.inverse(self._T_base_rect)
-        self._contradiction = contradiction_after(self._contradiction, self.witness, T_odom_base, stamp_ns)
+        self._contradiction = contradiction_after(self._contradiction, self.witness, T_odom_base, stamp_ns * 1e-9)
         if self._contradiction is None:
             return np.zeros((6, 6))
         to_rect = np.linalg.inv(self._to_base)
-        return np.asarray(to_rect @ self._contradiction.covariance(T_odom_base) @ to_rect.T)
+        return np.asarray(to_rect @ self._contradiction.covariance() @ to_rect.T)
 
     def _in_rig(self, covariance: Array) -> Array:
         """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""
@@ -160,7 +160,7 @@ def _moving(exposure: Exposure | None) -> Exposure | None:
 
 def _state(state: TrackingState, pair: Panoramas, witness: Witness) -> TrackingState:
     """Return the state of a pose: at best DEGRADED where it is too dark, or wheels and gyro contradict the images."""
-    is_doubtful = pair.light.is_too_dark or witness.contradicts_images
+    is_doubtful = pair.light.is_too_dark or (witness.is_fault and witness.contradicts_images)
     return TrackingState.DEGRADED if state is TrackingState.TRACKING and is_doubtful else state
 
 

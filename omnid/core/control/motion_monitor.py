@@ -69,7 +69,7 @@ class Witness(NamedTuple):
     @property
     def contradicts_images(self) -> bool:
         """True if the images contradict the others, and it is not known that the others are wrong."""
-        return self.is_fault and self.reason in (IMAGES_DIFFER, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
+        return self.reason in (IMAGES_DIFFER, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
 
 
 AGREE: Final = Witness()

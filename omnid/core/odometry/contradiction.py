@@ -20,34 +20,44 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """The displacement from a pose by the images to the one by the other accounts.
+    """Displacements (6,) [t; r] [m; rad] from a pose by the images to the one by the other accounts, in its axes.
 
-    It stays in the covariance when the accounts agree again, since a later image does not mend a pose that went wrong.
+    What they differed by in a fault stays when they agree again, since a later image does not mend a pose that went
+    wrong. A doubt is over with its reason.
     """
 
-    T_odom_base: Array  # (4, 4) the pose by the images when it was last added to
-    displacement: Array  # (6,) [t; r] [m; rad] from it to the other one, in its axes
-    stamp_ns: int
+    T_odom_base: Array  # (4, 4) the pose by the images
+    faults: Array
+    doubt: Array
+    fault_s: float  # time of the last fault
 
-    def at(self, T_odom_base: Array) -> Array:
-        """Return the displacement (6,) from a later pose, in its axes."""
-        return np.asarray(se3.adjoint(se3.inverse(T_odom_base) @ self.T_odom_base) @ self.displacement)
-
-    def covariance(self, T_odom_base: Array) -> Array:
-        """Return what it adds to the covariance (6, 6) of a later pose of the base, in the axes of the pose."""
-        moved = self.at(T_odom_base)
-        return np.outer(moved, moved)
+    def covariance(self) -> Array:
+        """Return what it adds to the covariance (6, 6) of the pose, in its axes."""
+        displacement = self.faults + self.doubt
+        return np.outer(displacement, displacement)
 
 
 def contradiction_after(
-    before: Contradiction | None, witness: Witness, T_odom_base: Array, stamp_ns: int
+    before: Contradiction | None, witness: Witness, T_odom_base: Array, time_s: float
 ) -> Contradiction | None:
     """Return the contradiction at a pose: that of before, with what the accounts differ by since then."""
-    if not witness.contradicts_images or not (witness.distance.amount or witness.turn.amount):
-        return before
-    # The sums of the witness overlap from pair to pair: only their part since the last one is new.
-    since_s = math.inf if before is None else (stamp_ns - before.stamp_ns) * 1e-9
-    displacement = np.array([witness.distance.part(since_s), 0.0, 0.0, 0.0, 0.0, witness.turn.part(since_s)])
+    if before is None and not witness.contradicts_images:
+        return None
+    faults, fault_s, doubt = np.zeros(6), -math.inf, np.zeros(6)
     if before is not None:
-        displacement = displacement + before.at(T_odom_base)
-    return Contradiction(T_odom_base, displacement, stamp_ns)
+        moved = se3.adjoint(se3.inverse(T_odom_base) @ before.T_odom_base)
+        faults, fault_s = moved @ before.faults, before.fault_s
+    if witness.contradicts_images and witness.is_fault:
+        # The sums of the witness overlap from pair to pair: only their part since the last fault is new.
+        faults, fault_s = faults + _displacement(witness, time_s - fault_s), time_s
+    elif witness.contradicts_images:
+        doubt = _displacement(witness, time_s - fault_s)
+    return Contradiction(T_odom_base, faults, doubt, fault_s)
+
+
+def _displacement(witness: Witness, seconds: float) -> Array:
+    """Return how much farther the base is by the others (6,), by the newest so many seconds.
+
+    Ways and turns in them are so short that their order does not matter.
+    """
+    return np.array([witness.distance.part(seconds), 0.0, 0.0, 0.0, 0.0, witness.turn.part(seconds)])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.control.motion_monitor import AGREE, GYRO_DIFFERS, IMAGES_OR_WHEELS, WHEELS_DIFFER, Difference, Witness
 from omnid.core.odometry.contradiction import Contradiction, contradiction_after
-from tests.omnid.core.odometry.test_motion_agreement import BEGINS_S, Errors, driven, ns
+from tests.omnid.core.odometry.test_motion_agreement import BEGINS_S, Errors, driven
 
 Array = NDArray[np.float64]
 
@@ -21,24 +21,36 @@ def pose(x_m: float, yaw_rad: float = 0.0) -> Array:
 @pytest.mark.parametrize("scale", [0.6, 0.85, 1.2])
 def test_it_is_about_the_whole_difference_of_the_drive(scale: float) -> None:
     """Of 9 m straight on: images of a rig whose size is wrong, or of a person who walks along."""
-    seconds, found = 20.0, None
-    for at_s, witness in driven(Errors(images_scale=scale), seconds, turns=False):
+    found = None
+    for at_s, witness in driven(Errors(images_scale=scale), 20.0, turns=False):
         way_m = 0.5 * max(0.0, at_s - BEGINS_S - 0.4)
-        found = contradiction_after(found, witness, pose(scale * way_m), ns(at_s))
+        found = contradiction_after(found, witness, pose(scale * way_m), at_s)
     assert found is not None
-    assert found.displacement[0] == pytest.approx((1 - scale) * way_m, rel=0.1)
-    sigmas_m = np.sqrt(np.diag(found.covariance(pose(scale * way_m)))[:3])
-    assert sigmas_m == pytest.approx([abs(found.displacement[0]), 0.0, 0.0], abs=1e-9)
+    assert found.faults[0] == pytest.approx((1 - scale) * way_m, rel=0.1)
+    sigmas_m = np.sqrt(np.diag(found.covariance())[:3])
+    assert sigmas_m == pytest.approx([abs(found.faults[0]), 0.0, 0.0], abs=1e-9)
 
 
-def test_it_stays_in_a_later_pose_and_turns_with_it() -> None:
+def test_a_fault_stays_in_a_later_pose_and_turns_with_it() -> None:
     """After a quarter turn to the left, what was ahead is to the right."""
     witness = Witness(IMAGES_OR_WHEELS, "", True, Difference(0.4, 6.0))
-    found = contradiction_after(None, witness, pose(1.0), ns(1.0))
-    assert found is not None
-    later = contradiction_after(found, AGREE, pose(1.0, np.pi / 2), ns(9.0))
-    assert later is found
-    assert found.at(pose(1.0, np.pi / 2))[:3] == pytest.approx([0.0, -0.4, 0.0], abs=1e-9)
+    found = contradiction_after(None, witness, pose(1.0), 1.0)
+    later = contradiction_after(found, AGREE, pose(1.0, np.pi / 2), 9.0)
+    assert later is not None
+    assert later.faults[:3] == pytest.approx([0.0, -0.4, 0.0], abs=1e-9)
+    assert np.diag(later.covariance())[1] == pytest.approx(0.4**2)
+
+
+def test_a_doubt_is_over_with_its_reason() -> None:
+    """Until then the pose may be off by it, beside what a fault has left."""
+    doubt, fault = (Witness(IMAGES_OR_WHEELS, "", is_fault, Difference(0.2, 6.0)) for is_fault in (False, True))
+    found = contradiction_after(None, doubt, pose(0.0), 1.0)
+    assert found is not None and found.covariance()[0, 0] == pytest.approx(0.2**2)
+    found = contradiction_after(found, AGREE, pose(0.0), 2.0)
+    assert found is not None and not found.covariance().any()
+    found = contradiction_after(found, fault, pose(0.0), 3.0)
+    found = contradiction_after(found, doubt, pose(0.0), 6.0)
+    assert found is not None and found.covariance()[0, 0] == pytest.approx((0.2 + 0.2 * 3 / 6) ** 2)
 
 
 def test_a_fault_that_comes_and_goes_counts_no_time_twice() -> None:
@@ -46,17 +58,11 @@ def test_a_fault_that_comes_and_goes_counts_no_time_twice() -> None:
     witness = Witness(IMAGES_OR_WHEELS, "", True, Difference(0.4, 6.0))
     found: Contradiction | None = None
     for k in range(61):
-        found = contradiction_after(found, witness if k % 2 == 0 else AGREE, pose(0.0), ns(0.1 * k))
-    assert found is not None and found.displacement[0] == pytest.approx(0.8)
+        found = contradiction_after(found, witness if k % 2 == 0 else AGREE, pose(0.0), 0.1 * k)
+    assert found is not None and found.faults[0] == pytest.approx(0.8)
 
 
 @pytest.mark.parametrize("reason", [WHEELS_DIFFER, GYRO_DIFFERS])
 def test_accounts_that_two_others_contradict_say_nothing_about_the_pose(reason: str) -> None:
-    assert (
-        contradiction_after(None, Witness(reason, "", True, Difference(0.4, 6.0), Difference(0.1, 6.0)), pose(0.0), 0)
-        is None
-    )
-
-
-def test_a_doubt_adds_nothing() -> None:
-    assert contradiction_after(None, Witness(IMAGES_OR_WHEELS, "", False, Difference(0.4, 6.0)), pose(0.0), 0) is None
+    witness = Witness(reason, "", True, Difference(0.4, 6.0), Difference(0.1, 6.0))
+    assert contradiction_after(None, witness, pose(0.0), 0.0) is None
