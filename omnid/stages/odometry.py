@@ -93,7 +93,7 @@ class OdometryStage:
         if estimate.step is not None and last_ns is not None:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
             seen = self._to_base @ se3.log(estimate.step[0])
-            self._agreement.add_step(last_ns, pair.stamp_ns, float(seen[0]), float(seen[5]))
+            self._agreement.add_step(last_ns, pair.stamp_ns, *map(float, seen[[0, 5, 1]]))
         covariance_rect = estimate.covariance + self._contradicted(estimate.T_odom_rect, pair.stamp_ns)
         # 4. The message, in the frame of the rig.
         earlier = self._earlier(pair, estimate)

@@ -41,7 +41,8 @@ WHEELS_DIFFER: Final = "the wheels disagree with images and gyro"
 GYRO_DIFFERS: Final = "the gyro disagrees with images and wheels"
 IMAGES_OR_WHEELS: Final = "images and wheels disagree"
 IMAGES_OR_GYRO: Final = "images and gyro disagree"
-WITNESSES: Final = (IMAGES_DIFFER, WHEELS_DIFFER, GYRO_DIFFERS, IMAGES_OR_WHEELS, IMAGES_OR_GYRO)
+IMAGES_ASIDE: Final = "the images show motion to the side"
+WITNESSES: Final = (IMAGES_DIFFER, WHEELS_DIFFER, GYRO_DIFFERS, IMAGES_OR_WHEELS, IMAGES_OR_GYRO, IMAGES_ASIDE)
 DISAGREEMENTS: Final = (*COMPARED, *WITNESSES)
 ADVICE: Final = "check wheels, cameras, motor.drive, baseline and T_base_rig of the rig; see controller.motion"
 

@@ -1,4 +1,4 @@
-"""Contradiction of a pose: where the base would be by wheels and gyro, where the images may be wrong.
+"""Contradiction of a pose: the base is elsewhere by wheels and gyro, and the images may be wrong.
 
 A person who walks along with the base, or a rig of another size, gives poses whose images agree with each other. Their
 covariance then says nothing of the error, but the other accounts of the motion do (motion_agreement.py).

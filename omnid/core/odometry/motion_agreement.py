@@ -10,6 +10,8 @@ of them is consistent in itself. Three accounts of the same drive are not:
    10 s, D the motion by a sensor. The smallest J(l) is compared with the smallest one within 0.3 s of 0: their
    difference in variances of the residuals is the evidence (a likelihood ratio). A steady motion has none.
 2. Scale. The sums of both over the newest 3 m or 10 s, whichever is shorter, at the likeliest lag within 0.3 s.
+3. Direction. Wheels roll forwards: motion to the side, as the images show it while the base drives straight on, is that
+   of a rig whose yaw on the base is not that of T_base_rig.
 
 The account that two others contradict, which agree, is named; of two it is not known which one is wrong. A
 part of a limit is a doubt. Once all have been at rest for STILL_S everything is forgotten: a person may arm and try
@@ -29,6 +31,7 @@ from drivers.motion import MotionSample, WheelSample
 from omnid.core.control.motion_monitor import (
     AGREE,
     GYRO_DIFFERS,
+    IMAGES_ASIDE,
     IMAGES_DIFFER,
     IMAGES_OR_GYRO,
     IMAGES_OR_WHEELS,
@@ -49,6 +52,9 @@ LAG_SIGMA_S: Final = 0.1
 DOUBT_SHARE: Final = 0.5  # Share of a limit from which on the base drives slowly; by trial on development seeds.
 # The same of the newest second alone: 0.1 m, and a third of the way, as of images that play at half of the speed.
 SOON_S, SOON_M, SOON_SHARE = 1.0, 0.1, 1 / 3
+# Motion to the side as a share of the way: 0.15 m a metre ahead, as much as the collision monitor keeps as distance.
+ASIDE_SHARE: Final = 0.15
+STRAIGHT_RADPM: Final = 0.1  # Most turn of a straight way, because in a curve an offset of the rig shows motion aside.
 LEAST_M: Final = 0.05  # Least motion that counts, because an allowed delay moves a base of 0.2 m/s so far.
 TURN_RAD: Final = np.radians(5.0)  # because a gyro's bias is estimated to less than half a degree a second
 # Wheels whose diameters differ by 0.7 %, as those of the simulation, turn by 4 degrees over 3 m: that is no doubt yet.
@@ -75,6 +81,7 @@ class _Step(NamedTuple):
     end_s: float
     distance_m: float
     turn_rad: float
+    aside_m: float
 
 
 class _Finding(NamedTuple):
@@ -155,9 +162,12 @@ class MotionAgreement:
             else:
                 self._gyro_rad.add(at_s, sample.z_radps - gyro_bias_radps)
 
-    def add_step(self, start_ns: int, end_ns: int, distance_m: float, turn_rad: float) -> None:
-        """Add the motion of the base from one pair to the next, as the cameras saw it; compare."""
-        step = _Step(self._seconds(start_ns), self._seconds(end_ns), distance_m, turn_rad)
+    def add_step(self, start_ns: int, end_ns: int, distance_m: float, turn_rad: float, aside_m: float = 0.0) -> None:
+        """Add the motion of the base from one pair to the next, as the cameras saw it; compare.
+
+        aside_m: along its y axis.
+        """
+        step = _Step(self._seconds(start_ns), self._seconds(end_ns), distance_m, turn_rad, aside_m)
         self._steps.append(step)
         while self._steps and self._steps[0].end_s < step.end_s - WINDOW_S:
             self._steps.popleft()
@@ -173,7 +183,7 @@ class MotionAgreement:
 
     def _compare(self, now_s: float) -> Witness:
         """Return the account that differs, and whether it is a fault."""
-        starts_s, ends_s, seen_m, seen_rad = np.array(self._steps).T
+        starts_s, ends_s, seen_m, seen_rad, aside_m = np.array(self._steps).T
         spans = starts_s, ends_s, seen_m
         distance = self._finding(spans, seen_m, self._wheels_m, (STEP_M, LEAST_M, "m"))
         of_wheels = self._finding(spans, seen_rad, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
@@ -184,7 +194,8 @@ class MotionAgreement:
         wheels = max((distance, of_wheels), key=lambda found: (found.differs, found.excess, abs(found.lag_s)))
         if not wheels.differs and not of_gyro.differs:
             self._late_since_s = None
-            return AGREE
+            aside = _UNKNOWN if distance is _UNKNOWN else self._aside(spans, seen_rad, aside_m)
+            return Witness(IMAGES_ASIDE, aside.text, aside.excess >= 1.0) if aside.differs else AGREE
         if wheels.differs and of_gyro.differs:
             reason, found = IMAGES_DIFFER, max(wheels, of_gyro, key=lambda found: found.excess)
         elif wheels.differs:
@@ -249,6 +260,21 @@ class MotionAgreement:
                 return _Finding(0.0, max(DOUBT_SHARE, difference / limit), text, Difference(apart, duration_s))
         shown = f"{difference:.2f} m in {length:.1f} m" if unit == "m" else f"{np.degrees(difference):.0f} degrees"
         return _Finding(0.0, difference / limit, f"by {shown}", Difference(apart, duration_s))
+
+    @staticmethod
+    def _aside(spans: tuple[Array, Array, Array], turns: Array, aside: Array) -> _Finding:
+        """Return the motion to the side (N,) in the straight part of the newest WINDOW_M."""
+        starts_s, ends_s, ways_m = spans
+        straight = (np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways_m)) & (np.abs(aside) < np.abs(ways_m))
+        path_m = np.cumsum(np.abs(ways_m[straight][::-1]))
+        count = min(len(path_m), int(np.searchsorted(path_m, WINDOW_M)) + 1)
+        if count < LEAST_STEPS:
+            return _UNKNOWN
+        moved_m = float((aside * np.sign(ways_m))[straight][::-1][:count].sum())
+        is_whole = count < len(path_m) or ends_s[-1] - starts_s[0] >= WINDOW_S - LEAST_STEPS * EVERY_S
+        length_m = float(path_m[count - 1])
+        limit_m = max(ASIDE_SHARE * (length_m if is_whole else WINDOW_M), LEAST_M)
+        return _Finding(0.0, abs(moved_m) / limit_m, f"by {np.degrees(np.arctan2(abs(moved_m), length_m)):.0f} degrees")
 
     def _lag(self, by_lag: Array, seen: Array, noise: float) -> tuple[int, int, bool]:
         """Return the best lag, the best one that is allowed, and whether the evidence for the other is strong."""

@@ -12,6 +12,7 @@ from drivers.motion import GyroSample, WheelSample
 from omnid.core.control.motion_monitor import (
     AGREE,
     GYRO_DIFFERS,
+    IMAGES_ASIDE,
     IMAGES_DIFFER,
     IMAGES_OR_WHEELS,
     WHEELS_DIFFER,
@@ -37,6 +38,9 @@ class Errors:
     wheels_turn: float = 1.0
     wheels_curve: float = 0.0  # rad/m, of wheels with different diameters
     gyro_scale: float = 1.0
+    rig_yaw_deg: float = 0.0  # of T_base_rig
+    side_m: float = 0.0  # of the rig from the base, by which T_base_rig is wrong: it moves aside in a curve
+    has_wheels: bool = True
     has_gyro: bool = True
 
 
@@ -65,18 +69,21 @@ def driven(
             shown = errors.wheels_scale * at(t_s - errors.wheels_late_s, speed) + rng.normal(0, 0.004)
             turn = errors.wheels_turn * at(t_s - errors.wheels_late_s, rate) + rng.normal(0, 0.01)
             turn += errors.wheels_curve * at(t_s - errors.wheels_late_s, speed)
-            agreement.add([WheelSample(ns(t_s), float(shown), float(turn))], 0.0)
+            if errors.has_wheels:
+                agreement.add([WheelSample(ns(t_s), float(shown), float(turn))], 0.0)
         for t_s in np.arange(end_s - PAIR_S, end_s - 1e-9, GYRO_S):
             if errors.has_gyro:
                 shown = errors.gyro_scale * at(t_s, rate) + rng.normal(0, 0.003)
                 agreement.add([GyroSample(ns(t_s), 0.0, 0.0, float(shown))], 0.0)
         span = np.array([end_s - PAIR_S, end_s]) - errors.images_late_s
         distance, turn = np.diff(at(span, way))[0], np.diff(at(span, angle))[0]
+        way_m, yaw = errors.images_scale * float(distance), np.radians(errors.rig_yaw_deg)
         agreement.add_step(
             ns(end_s - PAIR_S),
             ns(end_s),
-            errors.images_scale * float(distance) + rng.normal(0, 0.001),
+            way_m * np.cos(yaw) + rng.normal(0, 0.001),
             float(turn) + rng.normal(0, 0.001),
+            way_m * np.sin(yaw) + errors.side_m * float(turn) + rng.normal(0, 0.001),
         )
         found.append((float(end_s), agreement.result))
     return found
@@ -103,6 +110,9 @@ def first(found: list[tuple[float, Witness]], *, is_fault: bool) -> tuple[float,
         Errors(gyro_scale=1.02),
         Errors(images_scale=0.97),
         Errors(wheels_late_s=0.1, has_gyro=False),
+        Errors(rig_yaw_deg=3.0),
+        Errors(side_m=0.3),
+        Errors(rig_yaw_deg=60.0, has_wheels=False),
     ],
 )
 @pytest.mark.parametrize("turns", [True, False])
@@ -138,6 +148,19 @@ def test_another_scale_is_a_fault_within_3_m(scale: float) -> None:
     assert fault.reason == IMAGES_OR_WHEELS and " m in " in fault.detail
     limit_m = 0.3 / abs(1.0 - scale) + 0.2
     assert 0.5 * (fault_s - BEGINS_S) < max(limit_m, 3.2) + 0.5, fault_s
+
+
+@pytest.mark.parametrize("yaw_deg", [10.0, -20.0])
+@pytest.mark.parametrize("turns", [True, False])
+def test_a_rig_that_is_turned_on_its_base_is_named(yaw_deg: float, turns: bool) -> None:
+    """The collision monitor would look beside the way."""
+    found = driven(Errors(rig_yaw_deg=yaw_deg), 25.0, turns=turns)
+    doubt_s, _ = first(found, is_fault=False)
+    _, fault = first(found, is_fault=True)
+    assert fault.reason == IMAGES_ASIDE and fault.detail in {
+        f"by {abs(yaw_deg) + off:.0f} degrees" for off in (-1, 0, 1)
+    }
+    assert 0.5 * (doubt_s - BEGINS_S) < 3.0 or turns
 
 
 def test_a_gyro_that_turns_otherwise_is_named() -> None:
