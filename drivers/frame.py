@@ -30,6 +30,9 @@ _MAX_PNG_CHUNKS = 1000
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
 _LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
+# Bits of cameras whose samples are written to files of 16 bits as they are, not multiplied.
+_CAMERA_BITS = (10, 12)
+FILE_BITS = 16
 _MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
@@ -80,12 +83,39 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
     return image
 
 
+def deep_samples(frame: Frame) -> NDArray[np.uint16] | None:
+    """Return the grey samples (H, W) of a compressed image of 16 bits a sample, None for one of eight.
+
+    Raises FrameDecodeError as `gray` does.
+    """
+    try:
+        image = _decompress(frame, cv2.IMREAD_ANYDEPTH)
+        return image if image.dtype == np.uint16 else None
+    except (cv2.error, ValueError) as error:
+        raise _decode_error(frame, " ".join(str(error).split())[:_MAX_REASON]) from error
+
+
+def bits_of_camera(largest: int) -> int:
+    """Return the bits of the samples of a camera, 10 or 12, by the largest one in all its images of 16 bits; else 16.
+
+    A file of 16 bits whose largest sample is below 1/16 of the possible ones would be black: it is taken for one of a
+    camera of fewer bits.
+    """
+    return next((bits for bits in _CAMERA_BITS if largest < 2**bits), FILE_BITS)
+
+
+def upper_eight_bits(deep: NDArray[np.uint16], bits: int) -> NDArray[np.uint8]:
+    """Return the upper eight of so many bits of each sample (H, W); larger samples become 255."""
+    return np.asarray(np.minimum(deep >> (bits - 8), 255), np.uint8)
+
+
 def _decode_error(frame: Frame, reason: str) -> FrameDecodeError:
     encoding = frame.encoding[:_MAX_ENCODING]
     return FrameDecodeError(f"{frame.camera} frame {frame.seq} ({encoding!r}) cannot be decoded: {reason}")
 
 
-def _decompress(frame: Frame) -> NDArray[np.uint8]:
+def _decompress(frame: Frame, depth: int = 0) -> NDArray[Any]:
+    """Return the grey image (H, W): uint8, or as in the file with depth IMREAD_ANYDEPTH."""
     data = np.frombuffer(frame.data, np.uint8)
     head = data[: len(_START_MARKER[frame.encoding])].tobytes()
     if head != _START_MARKER[frame.encoding]:
@@ -100,10 +130,10 @@ def _decompress(frame: Frame) -> NDArray[np.uint8]:
         raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
     if fault := restart_fault(data, header):
         raise _decode_error(frame, fault)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None or image.ndim != 2 or image.dtype != np.uint8:
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | depth)
+    if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise _decode_error(frame, "its content is corrupt")
-    return np.ascontiguousarray(image, np.uint8)
+    return np.ascontiguousarray(image)
 
 
 def _unpadded_tail(data: NDArray[np.uint8]) -> bytes:

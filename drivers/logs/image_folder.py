@@ -6,6 +6,9 @@ numbers that follow each other are numbered, not stamped, and are refused withou
 where it is a whole number of 16 digits or more; otherwise in seconds, or a date and time (UTC). Shorter whole numbers
 may have been meant as nanoseconds since a start: images that lie hours apart are refused, because their user must say
 what is meant.
+
+Files of 16 bits a sample may hold the 10 or 12 bits of a camera. That is so where 16 images of a folder, evenly spread,
+have no larger sample; all images of the folder are then read by the upper eight of these bits.
 """
 
 from __future__ import annotations
@@ -16,15 +19,18 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from drivers.errors import DriverError
+from drivers.errors import DriverError, FrameDecodeError
+from drivers.frame import FILE_BITS, bits_of_camera, deep_samples, upper_eight_bits
 from drivers.logs.image_log import LogDamage, LoggedImage
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
+from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
@@ -43,6 +49,7 @@ _MAX_STAMP_NS: Final = 2**62
 _LONGEST_GAP_NS: Final = 3600 * 10**9  # Stamps of two successive images that differ by more are not those of one log.
 _SHORTEST_STEP_NS: Final = 100_000  # no camera gives 10,000 images a second
 _NS_DIGITS: Final = 16
+_BITS_IMAGES: Final = 16  # images of a camera that show the bits of its samples
 # Lower whole numbers as names count images: seconds since 1970 are above since 2001, and no camera of a robot takes one
 # image a second.
 _FIRST_SECONDS: Final = 10**9
@@ -93,10 +100,11 @@ class ImageFolder:
 
     def messages(self) -> Iterator[LoggedImage]:
         """Yield the images of all folders in the order of their stamps."""
+        bits = {topic: _bits_of_camera(files) for topic, files in self._files.items()}
         for file in sorted(file for files in self._files.values() for file in files):
             if self._closed:
                 return
-            yield LoggedImage(file.topic, file.stamp_ns, partial(_read, file))
+            yield LoggedImage(file.topic, file.stamp_ns, partial(_read, file, bits[file.topic]))
 
     def attachments(self) -> dict[str, bytes]:
         """Return the rig.toml in the folder of the folders, if it is a regular file of at most 16 MiB."""
@@ -261,9 +269,30 @@ def _parse_date(text: str) -> int | None:
     return seconds * 10**9 + int(fraction[:9].ljust(9, "0")) if seconds >= 0 else None
 
 
-def _read(file: _StampedFile) -> RosImage:
+def _bits_of_camera(files: Sequence[_StampedFile]) -> int:
+    """Return the bits of the samples in the images of a camera, 16 where they are not fewer or the files have eight."""
+    largest = 0
+    for file in files[:: max(1, len(files) // _BITS_IMAGES)]:
+        with suppress(RecordError, FrameDecodeError):
+            deep = deep_samples(frame_of(_read(file, FILE_BITS)))
+            if deep is None:
+                return FILE_BITS
+            largest = max(largest, int(deep.max()))
+    return bits_of_camera(largest)
+
+
+def _read(file: _StampedFile, bits: int) -> RosImage:
+    """Return an image: the file, or its pixels where a camera has fewer than 16 bits in files of 16."""
     try:
         data = _read_regular(file.path, MAX_RECORD_BYTES)
     except OSError as error:
         raise RecordError(f"{str(file.path)!r} cannot be read: {error.strerror}") from error
-    return RosImage(file.stamp_ns, image_encoding(data), memoryview(data))
+    image = RosImage(file.stamp_ns, image_encoding(data), memoryview(data))
+    if bits == FILE_BITS:
+        return image
+    with suppress(FrameDecodeError):  # who decodes the file says what is wrong with it
+        deep = deep_samples(frame_of(image))
+        if deep is not None:
+            pixels = memoryview(upper_eight_bits(deep, bits).tobytes())
+            return RosImage(file.stamp_ns, "mono8", pixels, deep.shape[1], deep.shape[0])
+    return image

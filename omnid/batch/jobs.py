@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, Final
 
+from drivers.logs.image_folder import image_folders
 from drivers.logs.log_formats import LOG_SUFFIXES, logs_in, parts_in_order
 from omnid.config import PlacesConfig
 from omnid.errors import OmnidError
@@ -70,10 +71,14 @@ class Job:
 def input_files(rig: Path | None, settings: Path | None, places: PlacesConfig) -> tuple[str, ...]:
     """Return the absolute paths of the files that all replays of a batch read. rig, settings: None: not given.
 
-    A map that the replays extend is not one of them: they change it themselves.
+    Raises OmnidError for a map that the replays would extend: results would depend on their order.
     """
-    known_map = places.map if places.localize_only else ""
-    given = [rig, settings, *(Path(name) for name in (places.tags, known_map) if name)]
+    if places.map and not places.localize_only:
+        raise OmnidError(
+            f"batch: expected a map that stays as it is, found {places.map!r}, which each replay would extend: add "
+            "--set places.localize_only=true, or make a map of all logs by `omnid map build`"
+        )
+    given = [rig, settings, *(Path(name) for name in (places.tags, places.map) if name)]
     return tuple(str(path.absolute()) for path in given if path is not None)
 
 
@@ -138,12 +143,13 @@ def _of_name(name: str) -> list[str]:
     else:
         raise OmnidError(f"batch: no log {name!r}; give files, folders, patterns in quotes, or addresses")
     if not paths:
-        raise OmnidError(f"batch: no log ({' '.join(LOG_SUFFIXES)}) in {name!r}; give files, folders or patterns")
+        kinds = f"{' '.join(LOG_SUFFIXES)}, or a folder of images for each camera"
+        raise OmnidError(f"batch: no log ({kinds}) in {name!r}; give files, folders or patterns")
     return [str(log.absolute()) for log in paths]
 
 
 def _of_path(path: Path) -> Iterator[Path]:
-    """Yield a file, a folder with the parts of one log, or the logs below a folder."""
+    """Yield a file, a folder with the parts of one log or with folders of images, or the logs below a folder."""
     if not path.is_dir():
         yield path
         return
@@ -151,10 +157,13 @@ def _of_path(path: Path) -> Iterator[Path]:
     if len(inside) > 1 and parts_in_order(inside):
         yield path
         return
-    yield from inside
     # Links to folders are not followed: they may form circles.
-    for folder in sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.is_symlink()):
-        yield from _of_path(folder)
+    below = sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.is_symlink())
+    found = [*inside, *(log for folder in below for log in _of_path(folder))]
+    # Folders of images, one for each camera, are a log: of nested folders the lowest that holds two.
+    if not found and len(image_folders(path)) > 1:
+        found = [path]
+    yield from found
 
 
 def _of_url(name: str) -> list[str]:

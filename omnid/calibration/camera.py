@@ -27,7 +27,7 @@ from calib.models.camera import Mask
 from calib.rig_file import write_file
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera_report import camera_report_html
-from omnid.calibration.images import Images, is_log, read_images
+from omnid.calibration.images import Images, is_log, read_images, repeat_notes, repeats
 from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.view_guess import ViewChoice, view_notes, view_of_images
@@ -40,7 +40,7 @@ class CameraResult:
     selected: SelectedCalibration
     mask: Mask | None  # rim, hub and struts, if they were searched
     images: Images
-    notes: tuple[str, ...] = ()  # about the view
+    notes: tuple[str, ...] = ()  # about images that are the same, and the view
 
     @property
     def calibration(self) -> CameraCalibration:
@@ -107,15 +107,19 @@ def calibrate_camera(
     the images show, see `view_guess`. with_mask: also search rim, hub and struts. progress receives one line for each
     image and each model. Raises OmnidError or CalibError where the images do not suffice.
     """
-    # 1. Read the images.
+    # 1. Read the images, each once.
     names = [os.fspath(name) for name in ([sources] if isinstance(sources, str | PathLike) else sources)]
     images = read_images(names, topic)
+    repeated = repeats([images])
+    images = {name: image for name, image in images.items() if name not in repeated}
+    for line in (left_out := repeat_notes(repeated)):
+        progress(line)
     many = any(is_log(Path(name)) for name in names)
     # 2. Find the board in each. Of a log the views that differ most are used.
     views = find_boards(images, board, thorough=not many, progress=progress)
     views = select_diverse_views(views) if many else views
     seen = view_of_images(view, [(images.values(), views)], board, progress)
-    notes = tuple(view_notes(view, [(images.values(), views)], board))
+    notes = (*left_out, *view_notes(view, [(images.values(), views)], board))
     # 3. Fit the models, and select the one with the least error at views that it was not fitted to.
     height, width = images[views[0].name].shape
     selected = select_calibration(views, board, (width, height), model, seen)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from calib.image_area import ImageArea, TwoViews
@@ -13,7 +13,16 @@ from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Frame, gray
 from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.images import Image, Images, image_topic, is_log, one_size, read_images
+from omnid.calibration.images import (
+    Image,
+    Images,
+    image_topic,
+    is_log,
+    one_size,
+    read_images,
+    repeat_notes,
+    repeats,
+)
 from omnid.errors import OmnidError
 
 SIDES = ("lower", "upper")
@@ -30,6 +39,7 @@ class PairedImages:
     sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
     one_image: TwoViews | None = None  # the areas of both views, where one image holds them
+    notes: tuple[str, ...] = ()  # about images that were left out
 
     @property
     def names(self) -> list[str]:
@@ -48,7 +58,7 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
             f"{source}: no pair of images: found {_counted(pairs)}; expected pairs like lower_001.png "
             "and upper_001.png in a folder, or images with nearly equal stamps in a log"
         )
-    return pairs
+    return _each_once(pairs)
 
 
 def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None) -> PairedImages:
@@ -59,7 +69,14 @@ def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str 
     height, width = next(iter(images.values())).shape
     lower, upper = ({name: area.crop(image) for name, image in images.items()} for area in areas)
     topics = (topic, topic) if topic else ("", "")
-    return PairedImages((lower, upper), topics, TwoViews(areas, (width, height)))
+    return _each_once(PairedImages((lower, upper), topics, TwoViews(areas, (width, height))))
+
+
+def _each_once(pairs: PairedImages) -> PairedImages:
+    """Return the pairs without those whose images are all the same as those of an earlier pair."""
+    repeated = repeats(pairs.sides)
+    lower, upper = ({name: image for name, image in side.items() if name not in repeated} for side in pairs.sides)
+    return replace(pairs, sides=(lower, upper), notes=repeat_notes(repeated))
 
 
 def _counted(pairs: PairedImages) -> str:
@@ -80,6 +97,10 @@ def _of_side(folder: Path, side: str) -> Images:
     paths = sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in IMAGE_SUFFIXES)
     if not paths:
         raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
+    first = dict[str, Path]()
+    for path in paths:
+        if (other := first.setdefault(path.stem, path)) != path:
+            raise OmnidError(f"{folder}: {other.name} and {path.name} have one name; remove or rename one of them")
     found = read_images([str(path) for path in paths])
     return {Path(name).stem.removeprefix(f"{side}_"): image for name, image in found.items()}
 

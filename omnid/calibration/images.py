@@ -1,18 +1,24 @@
-"""Images of one camera: from files, folders and patterns, or from one topic of a log."""
+"""Images of one camera: from files, folders and patterns, or from one topic of a log.
+
+Files of 16 bits a sample may hold the 10 or 12 bits of a camera: where none of the images has a larger sample, all are
+read by the upper eight of these bits.
+"""
 
 from __future__ import annotations
 
 import glob
-from collections.abc import Iterable, Iterator, Sequence
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
-from drivers.frame import MAX_PIXELS, gray
+from drivers.frame import FILE_BITS, MAX_PIXELS, bits_of_camera, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.image_log import ImageLog, LoggedImage, images_of
 from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
@@ -47,6 +53,26 @@ def is_log(source: Path) -> bool:
     return source.suffix in LOG_SUFFIXES
 
 
+def repeats(sides: Sequence[Images]) -> dict[str, str]:
+    """Return the names of images, or of images of several cameras of one instant, that have all pixels of earlier ones.
+
+    sides: the images of each camera by the name of the instant. A repeated image is no further view of a board: it
+    would count the same errors again. Return name -> the earlier name.
+    """
+    first, found = dict[tuple[bytes, ...], str](), dict[str, str]()
+    for name in sorted({name for side in sides for name in side}):
+        key = tuple(hashlib.sha256(side[name].tobytes()).digest() if name in side else b"" for side in sides)
+        earlier = first.setdefault(key, name)
+        if earlier != name:
+            found[name] = earlier
+    return found
+
+
+def repeat_notes(repeated: Mapping[str, str]) -> tuple[str, ...]:
+    """Return a line for each image that is left out because it repeats another one."""
+    return tuple(f"left out {name}: the same image as {earlier}" for name, earlier in repeated.items())
+
+
 def brightest(images: Iterable[Image]) -> Image:
     """Return the maximum (H, W) of images of one size: of a mirror it shows the rim best."""
     return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
@@ -62,8 +88,21 @@ def _of_files(sources: Sequence[str]) -> Images:
     paths = list(dict.fromkeys(path for source in sources for path in _expanded(source)))
     if len(paths) > MAX_IMAGES:
         raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
-    names = _short_names(paths)
-    return {name: _read(path) for name, path in zip(names, paths, strict=True)}
+    images = [np.asarray(_read(path), np.uint8) for path in paths]
+    # The upper eight of 16 bits show which images hold fewer bits: only these are read again.
+    if bits_of_camera(256 * max(int(image.max()) for image in images) + 255) < FILE_BITS:
+        images = _by_the_bits_of_the_camera(paths, images)
+    return dict(zip(_short_names(paths), images, strict=True))
+
+
+def _by_the_bits_of_the_camera(paths: Sequence[Path], images: Sequence[Image]) -> list[Image]:
+    """Return images of 8 bits as they are, and those of 16 by the upper eight of the 10 or 12 bits of their camera."""
+    deep = [_read(path, cv2.IMREAD_ANYDEPTH) for path in paths]
+    bits = bits_of_camera(max((int(image.max()) for image in deep if image.dtype == np.uint16), default=0))
+    return [
+        upper_eight_bits(samples, bits) if samples.dtype == np.uint16 else image
+        for samples, image in zip(deep, images, strict=True)
+    ]
 
 
 def _expanded(source: str) -> list[Path]:
@@ -85,10 +124,12 @@ def _short_names(paths: Sequence[Path]) -> list[str]:
     return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
 
-def _read(path: Path) -> Image:
+def _read(path: Path, depth: int = 0) -> NDArray[Any]:
+    """Return a grey image (H, W): uint8, or as in the file with depth IMREAD_ANYDEPTH."""
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | depth
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
-        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+        image = cv2.imdecode(data, flags) if data.size else None
     except OSError as error:
         raise OmnidError(f"{path}: cannot be read: {error.strerror or error}") from error
     except cv2.error:
@@ -97,7 +138,7 @@ def _read(path: Path) -> Image:
         raise OmnidError(
             f"{path}: expected an image (PNG, JPEG, TIFF ...) of at most {MAX_PIXELS} pixels, found none; leave it out"
         )
-    return np.ascontiguousarray(image, np.uint8)
+    return np.ascontiguousarray(image)
 
 
 def one_size(images: Images) -> None:

@@ -55,7 +55,9 @@ class RigResult:
     rig: Rig
     calibration: RigCalibration
     images: PairedImages
-    notes: tuple[str, ...]  # about the baseline, the view, the order of the cameras, and masks that were not found
+    notes: tuple[
+        str, ...
+    ]  # about repeated images, the baseline, the view, the order of the cameras, and masks that were not found
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras were given
 
     @property
@@ -123,10 +125,12 @@ def calibrate_rig(
     are all images of the folder or of the log's topic; the result is the rig of the whole images. Raises OmnidError or
     CalibError where the images do not suffice.
     """
-    # 1. Read the images.
+    # 1. Read the images, each once.
     images = _read(Path(source), topics, areas, cameras)
     _require_sizes(images, cameras)
     # 2. Find the board in all of them.
+    for line in images.notes:
+        progress(line)
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
     if cameras is None:
@@ -163,7 +167,7 @@ def calibrate_rig(
     drives = drive_uncertainty(rig) if refined else None
     if images.one_image is not None:
         rig = images.one_image.of_whole_image(rig)
-    return RigResult(rig, found, images, (*notes, *shown, *_order_notes(rig), *unmasked), drives)
+    return RigResult(rig, found, images, (*images.notes, *notes, *shown, *_order_notes(rig), *unmasked), drives)
 
 
 def _read(

@@ -70,11 +70,11 @@ def select_rig(
     except (CalibError, np.linalg.LinAlgError):
         return SelectedRig(central, (_score("central cameras", central, np.nan),))
     if not _may_be_better(central, general):
-        scores = (_score("central cameras", central, np.nan), _score("real mirrors", general, np.nan))
+        scores = (_score("central cameras", central, np.nan), _score("non-central cameras", general, np.nan))
         return SelectedRig(central, scores)
     scores = (
         _score("central cameras", central, rig_held_out_px(central)),
-        _score("real mirrors", general, rig_held_out_px(general)),
+        _score("non-central cameras", general, rig_held_out_px(general)),
     )
     if scores[1].held_out_px < (1 - MIN_IMPROVEMENT) * scores[0].held_out_px:
         return SelectedRig(replace(general, rejected=(*central.rejected, *general.rejected)), scores[::-1])

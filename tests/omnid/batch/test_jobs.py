@@ -32,6 +32,22 @@ def test_finds_logs(tmp_path: Path) -> None:
             find_logs([str(tmp_path / missing)])
 
 
+def test_finds_logs_that_are_folders_of_images(tmp_path: Path) -> None:
+    """Each camera has a folder; some tools write the images one folder deeper; one camera alone is no log."""
+    for name in ("run1/lower/1.5.png", "run1/upper/1.5.png", "run2/cam0/data/1.5.png", "run2/cam1/data/1.5.png"):
+        path = tmp_path / "logs" / name
+        path.parent.mkdir(parents=True)
+        path.touch()
+    (tmp_path / "logs/run1/truth.txt").touch()
+    logs = [str(tmp_path / "logs" / name) for name in ("run1", "run2")]
+    assert find_logs([str(tmp_path)]) == logs == find_logs([str(tmp_path / "logs/*")])
+    found = jobs(logs, tmp_path / "out", BatchOptions())
+    assert [job.name for job in found] == ["run1", "run2"]
+    assert [job.truth() for job in found] == [tmp_path / "logs/run1/truth.txt", None]
+    with pytest.raises(OmnidError, match="or a folder of images for each camera"):
+        find_logs([str(tmp_path / "logs/run1/lower")])
+
+
 def names_of(out: Path, *logs: str) -> list[str]:
     return [job.name for job in jobs(logs, out, BatchOptions())]
 
@@ -60,8 +76,8 @@ def test_the_key_changes_with_all_files_that_make_a_result(tmp_path: Path) -> No
     for path in (log, rig, settings, tags, places):
         path.write_text("a")
 
-    def key(*, localize_only: bool = True) -> str:
-        known = PlacesConfig(map=str(places), tags=str(tags), localize_only=localize_only)
+    def key() -> str:
+        known = PlacesConfig(map=str(places), tags=str(tags), localize_only=True)
         (job,) = jobs([str(log)], tmp_path / "out", BatchOptions(inputs=input_files(rig, settings, known)))
         assert job.key() == job.key()
         return job.key()
@@ -76,7 +92,9 @@ def test_the_key_changes_with_all_files_that_make_a_result(tmp_path: Path) -> No
     keys.append(key())
     assert len(set(keys)) == len(keys)
 
-    extended = key(localize_only=False)
-    places.write_text("extended by a replay")
-    assert key(localize_only=False) == extended
     assert input_files(None, None, PlacesConfig()) == ()
+
+
+def test_a_map_that_each_replay_would_extend_is_refused() -> None:
+    with pytest.raises(OmnidError, match=r"'site.omap', which each replay would extend: add --set places.localize_on"):
+        input_files(None, None, PlacesConfig(map="site.omap"))
