@@ -7,13 +7,14 @@ import shutil
 import sys
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from typing import IO, Final
 
 from omnid.client import Fleet
+from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.monitor.connecting import connected_until
+from omnid.monitor.follow import POLL_S, SHOW_PERIOD_S
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState
 from omnid.monitor.screen import CLEAR, fitted
 from omnid.plain_text import plain
@@ -23,7 +24,6 @@ from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import short_name
 
 MAX_ROBOTS: Final = 500
-SHOW_PERIOD_S: Final = 1.0
 _NAME_COLUMNS: Final = 20
 FLEET_TOPICS: Final = ("odom", "status")
 _POSE_HEAD: Final = f" {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
@@ -71,26 +71,27 @@ class FleetState:
 
 
 def listen_to_all(bus: BusConfig, seconds: float | None) -> int:
-    """Show all robots until Ctrl-C or for a number of seconds. Return the exit code, 1 where there was none."""
+    """Show all robots until a signal or for a number of seconds. Return the exit code, 1 where there was none."""
     fleet, stream = FleetState(), sys.stdout
     end_s = math.inf if seconds is None else time.monotonic() + seconds
-    with suppress(KeyboardInterrupt):
-        connection = connected_until(end_s, lambda: Fleet(bus))
+    signals: list[int] = []
+    with handle_stop_signals(lambda number, _: signals.append(number)):
+        connection = connected_until(end_s, lambda: Fleet(bus), signals)
         if connection is not None:
             with connection:
-                _follow(connection, fleet, stream, end_s)
+                _follow(connection, fleet, stream, end_s, signals)
     show(fleet, stream)
     return int(not fleet.robots)
 
 
-def _follow(connection: Fleet, fleet: FleetState, stream: IO[str], end_s: float) -> None:
+def _follow(connection: Fleet, fleet: FleetState, stream: IO[str], end_s: float, signals: Sequence[int]) -> None:
     inbox = Inbox()
     connection.on_alive(fleet.note_alive)
     connection.on_message(inbox.put, FLEET_TOPICS)
     next_s = time.monotonic() + SHOW_PERIOD_S
-    while (now_s := time.monotonic()) < end_s:
+    while not signals and (now_s := time.monotonic()) < end_s:
         fleet.take_alive()
-        message = inbox.get(min(next_s, end_s) - now_s)
+        message = inbox.get(min(next_s - now_s, end_s - now_s, POLL_S))
         if message is not None:
             fleet.process(message)
         if time.monotonic() >= next_s:

@@ -86,7 +86,9 @@ class RunComparison:
         if self.differences:
             yield f"the runs differ: {', '.join(self.differences)}"
         else:
-            yield f"the runs agree: no difference is larger than {self._tolerance.text}"
+            is_whole = self._share == 1.0 and not (self._a.warnings or self._b.warnings)
+            where = "" if is_whole else " in what could be compared"
+            yield f"the runs agree{where}: no difference is larger than {self._tolerance.text}"
 
     @property
     def _share(self) -> float:

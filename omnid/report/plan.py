@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -42,6 +43,7 @@ class Plan:
     truth: Sequence[Point] = ()  # x, y of the true path
     in_map: Sequence[Point] = ()  # x, y of the path in the map, where it is another one
     lost: Sequence[Point] = ()  # positions at which the pose was lost
+    restarts_s: Sequence[float] = ()  # times at which a path with a new odom begins
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ def plan_figure(plan: Plan, clock: Clock) -> str:
         *_frame(sheet),
         *_line(sheet, plan.truth, "pt"),
         *_line(sheet, plan.in_map, "pm"),
-        *_path(sheet, plan.corners),
+        *_path(sheet, _runs(plan.corners, plan.restarts_s)),
         *_times(sheet, plan.corners, clock),
         *(_cross(*sheet.px(*position)) for position in plan.lost),
         *_ends(sheet, plan.corners),
@@ -175,14 +177,24 @@ def _line(sheet: _PlanArea, points: Sequence[Point], style: str) -> Iterator[str
         yield polyline([sheet.px(*at) for at in points], f"class='{style}'")
 
 
-def _path(sheet: _PlanArea, corners: Sequence[Corner]) -> Iterator[str]:
-    """Yield one line for each stretch of the same state, which starts at the end of the previous one."""
-    at = [sheet.px(corner.x_m, corner.y_m) for corner in corners]
-    times = " ".join(f"{corner.t_s:.2f}" for corner in corners)
-    yield f"<path class='halo' d='{path_d(at)}' data-t='{times}'/>"
-    for rank, group in groupby(range(1, len(corners)), lambda k: max(corners[k].rank, 0)):
+def _runs(corners: Sequence[Corner], restarts_s: Sequence[float]) -> list[list[Corner]]:
+    """Return the vertices of each run of the daemon: no line leads from one odom to the next."""
+    return [list(run) for _, run in groupby(corners, lambda corner: bisect_right(restarts_s, corner.t_s))]
+
+
+def _path(sheet: _PlanArea, runs: Sequence[Sequence[Corner]]) -> Iterator[str]:
+    """Yield one line for each stretch of the same state, which starts at the end of the previous one of its run."""
+    at = [[sheet.px(corner.x_m, corner.y_m) for corner in run] for run in runs]
+    times = " ".join(f"{corner.t_s:.2f}" for run in runs for corner in run)
+    yield f"<path class='halo' d='{''.join(map(path_d, at))}' data-t='{times}'/>"
+    for places, run in zip(at, runs, strict=True):
+        yield from _stretches(places, [max(corner.rank, 0) for corner in run])
+
+
+def _stretches(places: Sequence[Point], ranks: Sequence[int]) -> Iterator[str]:
+    for rank, group in groupby(range(1, len(places)), ranks.__getitem__):
         indices = list(group)
-        yield polyline(at[indices[0] - 1 : indices[-1] + 1], f"class='p{rank}'")
+        yield polyline(places[indices[0] - 1 : indices[-1] + 1], f"class='p{rank}'")
 
 
 def _times(sheet: _PlanArea, corners: Sequence[Corner], clock: Clock) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,14 @@ _SERIES: Final = ("speed", "yaw_rate", "sigma_position", "sigma_heading", "state
 Array = NDArray[np.float64]
 
 
+class _Gap(NamedTuple):
+    """A time without pose; sorts by its duration."""
+
+    duration_s: float = 0.0
+    step_m: float = 0.0  # between the poses before and after it
+    end_s: float = 0.0
+
+
 class PoseHistory:
     """Collects the poses in their order; times are in s since the first one."""
 
@@ -47,7 +55,8 @@ class PoseHistory:
         self.states: Counter[int] = Counter()
         self.poses = self.late = self.out_of_range = 0
         self.length_m = 0.0
-        self._gap = 0.0, 0.0  # duration [s] of the longest gap since `continue_run`, and the step across it [m]
+        self.restarts_s: list[float] = []  # of the first pose after each start of the daemon but the first
+        self._gap = _Gap()  # the longest since `continue_run`
         self._leaves_out_gap = False  # the step across the next gap is that from one odom to another
 
     def add(self, record: OdometryRecord, rank: int) -> None:
@@ -69,17 +78,19 @@ class PoseHistory:
 
     def continue_run(self) -> None:
         """Note that the poses so far are of one run of the daemon."""
-        self._gap, self._leaves_out_gap = (0.0, 0.0), False
+        self._gap, self._leaves_out_gap = _Gap(), False
 
     def begin_run(self) -> None:
         """Note that the daemon has been started again, with a new odom, since the last call of `continue_run`.
 
         The step across the longest gap since then is no part of the path; without one, that across the next gap.
         """
-        gap_s, step_m = self._gap
-        self.length_m -= step_m
+        gap = self._gap
+        self.length_m -= gap.step_m
         self.continue_run()
-        self._leaves_out_gap = gap_s == 0.0 and self.poses > 0
+        if gap.duration_s > 0.0:
+            self._add_restart(gap.end_s)
+        self._leaves_out_gap = gap.duration_s == 0.0 and self.poses > 0
 
     def seconds(self, stamp_ns: int) -> float:
         """Return the time since the first pose."""
@@ -121,14 +132,18 @@ class PoseHistory:
         step_m = 0.0 if self._position is None else float(np.linalg.norm(position - self._position))
         if gap_s > 0.0 and self._leaves_out_gap:
             self.continue_run()
+            self._add_restart(t_s)
         else:
             self.length_m += step_m
-            self._gap = max(self._gap, (gap_s, step_m if gap_s > 0.0 else 0.0))
+            self._gap = max(self._gap, _Gap(gap_s, step_m, t_s) if gap_s > 0.0 else _Gap())
         self._position = position
         self.path.add(Corner(float(position[0]), float(position[1]), t_s, self._rank))
         if self._keep and self.poses < MAX_KEPT:
             self._kept[0].append(record.stamp_ns)
             self._kept[1].extend([*position, *se3.quaternion(record.T_odom_base[:3, :3])])
+
+    def _add_restart(self, t_s: float) -> None:
+        self.restarts_s = [*self.restarts_s, t_s][-_MAX_GAPS:]
 
     def _add_measurements(self, record: OdometryRecord, t_s: float) -> None:
         variances = np.diag(record.covariance)

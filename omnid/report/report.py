@@ -140,6 +140,7 @@ def _plan(data: ReportData, comparison: TruthComparison | None) -> plan.Plan:
         comparison.path if comparison else (),
         sections.path_in_map(data),
         _losses(data, corners),
+        data.poses.restarts_s,
     )
 
 

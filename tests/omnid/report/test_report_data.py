@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib import se3
-from omnid.report.report import report_html
+from omnid.report.chart import Clock
+from omnid.report.plan import plan_figure
+from omnid.report.report import _plan, report_html
 from omnid.report.report_data import ReportData, collect_report_data
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import ODOMETRY, PAIRING, Key
@@ -101,6 +104,10 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
     data = collect_report_data(save(tmp_path / "a.mcap", entries))
     assert data.poses.length_m == pytest.approx(2 * 1.9)
     assert event_texts(data).count(STARTED_AGAIN) == 1 and data.statuses.resets == resets
+    # The plan has a line for each path, and none from one to the other.
+    shown = plan_figure(_plan(data, None), Clock(0.0, data.poses.end_s))
+    assert [len(re.findall("[ML]", d)) for d in re.findall(r"class='p\d' d='([^']*)'", shown)][-2:] == [20, 20]
+    assert re.findall("[ML]", re.findall("class='halo' d='([^']*)'", shown)[0]).count("M") == 2
 
 
 def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
