@@ -42,6 +42,8 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
             if search.grid_size != (0, 0):
                 other_grids[_sorted(search.grid_size)] += 1
             progress(f"[{number}/{len(images)}] {name}: {_outcome(search, board)}")
+    if views and max(other_grids.values(), default=0) > len(views):
+        progress(f"the board was found in {len(views)}, {_grid_hint(other_grids)}")
     if not views:
         hint = _grid_hint(other_grids) if isinstance(board, Board) else _marker_hint(images, board)
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")

@@ -161,6 +161,7 @@ def run_export(args: argparse.Namespace) -> int:
     from omnid.errors import OmnidError
     from omnid.formats.grid_map import write_grid
     from omnid.formats.place_file import read_places
+    from omnid.formats.plan_view import drawn_heights
     from omnid.formats.ply import write_ply
     from omnid.sinks.files import check_outputs, write_plan
     from omnid.stages.floor import ADVICE
@@ -189,6 +190,10 @@ def run_export(args: argparse.Namespace) -> int:
         if args.ply:
             write_ply(args.ply, points)
         if args.plan:
-            write_plan(args.plan, points, place_views.paths_xy(places, rig))
+            # A map has the axes of the base, whose origin is on the floor where the rig states the cameras' height.
+            height_m = float(rig.T_base_rect[2, 3])
+            low_m, high_m = drawn_heights(height_m)
+            paths_xy = place_views.paths_xy(places, rig)
+            write_plan(args.plan, points, paths_xy, (low_m + height_m, high_m + height_m))
     print("written     ", ", ".join(str(path) for _, path in [*outputs, *images]))
     return 0

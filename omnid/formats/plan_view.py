@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.rig import LEAST_HEIGHT_M
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.plan_sheet import (
     BLACK,
@@ -30,26 +31,36 @@ _BORDER = 1.06  # drawn area over the extent of points and path
 _MIN_ASPECT = 0.1  # shorter side over longer side, so that a straight path is visible
 _END_HALF_PX = 6  # half the side of the square at the end of the path
 _PATH_WIDTHS_PX = (7, 3)  # Widths of the white rim and of the line.
+_LOW_M, _HIGH_M = -1.0, 1.5  # heights that are drawn, relative to the lower viewpoint
+# Lower surfaces are the floor: obstacles begin at 0.06 m (obstacles.ring.heights_m), and a voxel of the map has 0.05 m.
+_FLOOR_M = 0.1
+
+
+def drawn_heights(height_m: float) -> tuple[float, float]:
+    """Return the lowest and the highest z [m] relative to the lower viewpoint that a plan shows: those above the floor.
+
+    height_m: of the viewpoint above the floor; less than LEAST_HEIGHT_M, as 0, where the rig does not state it.
+    """
+    return (max(_LOW_M, _FLOOR_M - height_m) if height_m >= LEAST_HEIGHT_M else _LOW_M), _HIGH_M
 
 
 def plan_view(
     points: MapPoints,
     trajectory_xy: NDArray[np.float64],
     *,
-    z_low_m: float = -1.0,
-    z_high_m: float = 1.5,
+    heights_m: tuple[float, float] = (_LOW_M, _HIGH_M),
     max_side_px: int = 1400,
 ) -> Image:
-    """Return a BGR image (H, W, 3) of the map's points between two heights, and the path (N, 2) in metres over it.
+    """Return a BGR image (H, W, 3) of the map's points between two heights [m], and the path (N, 2) [m] over it.
 
     A row of the path that is NaN, or too far away to be drawn, is a gap: what is before and after it is not joined.
-    Heights are relative to the first pose, the origin of the map's frame. A cell is the darker, the more confident
-    points it has. Neither side exceeds `max_side_px` (at most 2000). The farthest half per cent of the points on each
-    side may be cut off; the path never is.
+    Heights are z of the points' frame. A cell is the darker, the more confident points it has. Neither side exceeds
+    `max_side_px` (at most 2000). The farthest half per cent of the points on each side may be cut off, the path never.
     """
     drawable = _drawable(trajectory_xy)
     path = trajectory_xy[drawable].astype(np.float64)
-    inside = _drawable(points.xyz) & (points.xyz[:, 2] >= z_low_m) & (points.xyz[:, 2] <= z_high_m)
+    low_m, high_m = heights_m
+    inside = _drawable(points.xyz) & (points.xyz[:, 2] >= low_m) & (points.xyz[:, 2] <= high_m)
     xy_m = points.xyz[inside, :2].astype(np.float64)
     sheet = _sheet(xy_m, path, int(np.clip(max_side_px, _MIN_SIDE_PX, SIDE_LIMIT_PX)))
     area = cells_image(sheet, xy_m, points.confidence[inside])

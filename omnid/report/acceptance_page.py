@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.formats.plan_view import drawn_heights
 from omnid.formats.tum import Trajectory
 from omnid.recordings.acceptance import PLACING_M, Acceptance
 from omnid.report import plan, svg
@@ -102,5 +103,5 @@ def _figure(path: Trajectory, map_xyz: NDArray[np.float32], rig_height_m: float)
         for T, t_s in zip(path.T[::step], seconds[::step], strict=True)
     ]
     confidence = np.ones(len(map_xyz), np.float32)
-    drawn = plan.Plan(corners, map_xyz, confidence, rig_height_m)
+    drawn = plan.Plan(corners, map_xyz, confidence, rig_height_m, drawn_heights(rig_height_m))
     return plan.plan_figure(drawn, Clock(0.0, max(float(seconds[-1]), 1e-2)))

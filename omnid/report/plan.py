@@ -19,7 +19,6 @@ from omnid.report.svg import Point, coord, key, label, mark_key, path_d, pixel_i
 
 Array = NDArray[np.float64]
 
-Z_M: Final = (-1.0, 1.5)  # heights that are drawn, relative to that of the rig at the start
 _MAX_SIDES_PX: Final = (1000.0, 760.0)
 _MIN_SIDE_M: Final = 1.0
 _MIN_ASPECT: Final = 0.15  # Least ratio of the shorter to the longer side.
@@ -40,6 +39,7 @@ class Plan:
     points: NDArray[np.float32]  # (N, 3) m, of the map
     confidence: NDArray[np.float32]  # (N,)
     height_m: float  # of the rig at the start
+    heights_m: tuple[float, float]  # that are drawn, relative to that of the rig at the start
     truth: Sequence[Point] = ()  # x, y of the true path
     in_map: Sequence[Point] = ()  # x, y of the path in the map, where it is another one
     lost: Sequence[Point] = ()  # positions at which the pose was lost
@@ -62,7 +62,8 @@ class _PlanArea:
 
 def plan_figure(plan: Plan, clock: Clock) -> str:
     """Return the figure."""
-    inside = np.abs(plan.points[:, 2] - plan.height_m - sum(Z_M) / 2) <= (Z_M[1] - Z_M[0]) / 2
+    low, high = plan.heights_m
+    inside = (plan.points[:, 2] >= plan.height_m + low) & (plan.points[:, 2] <= plan.height_m + high)
     points_xy, confidence = plan.points[inside, :2].astype(float), plan.confidence[inside]
     sheet = _plan_area([*((c.x_m, c.y_m) for c in plan.corners), *plan.truth, *plan.in_map], points_xy)
     width, height = sheet.size
@@ -103,7 +104,7 @@ def _keys(plan: Plan) -> str:
 def _footnote(plan: Plan, drawn: int) -> str:
     if not len(plan.points):
         return "The log holds no map that can be drawn."
-    low, high = Z_M
+    low, high = plan.heights_m
     return (
         f"Grey: {drawn} of the map's {len(plan.points)} points, those from {-low:g} m below the rig's height at "
         f"the start to {high:g} m above it; they stand out by their confidence and number in a column."

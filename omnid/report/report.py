@@ -10,6 +10,7 @@ import numpy as np
 
 from drivers.logs.mcap_info import LogState
 from omnid.errors import OmnidError
+from omnid.formats.plan_view import drawn_heights
 from omnid.formats.tum import Trajectory
 from omnid.report import chart, health, plan, sections, setup, svg
 from omnid.report.chart import Clock
@@ -137,6 +138,7 @@ def _plan(data: ReportData, comparison: TruthComparison | None) -> plan.Plan:
         points[finite],
         confidence[finite],
         height_m,
+        drawn_heights((data.rig and data.rig.height_m()) or 0.0),
         comparison.path if comparison else (),
         sections.path_in_map(data),
         _losses(data, corners),

@@ -20,7 +20,7 @@ from omnid.engine.bounded_call import started
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
-from omnid.engine.realtime import ThreadStart, prepare, priorities
+from omnid.engine.realtime import ThreadStart, name_thread, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.refinement.refined_file import RefinedRigFile
 from omnid.runs.live_robot import LiveRobot
@@ -119,7 +119,7 @@ def _graph_in_time(config: Config, report: Report) -> Graph:
 
 def _graph_that_waits(config: Config) -> Graph:
     """Return a graph that drops nothing, in threads as others are: the robot's time waits for it."""
-    return Graph(policy=LOSSLESS, depth=config.graph.depth, sinks_wait=True)
+    return Graph(policy=LOSSLESS, depth=config.graph.depth, sinks_wait=True, on_thread=name_thread)
 
 
 def _load() -> None:

@@ -243,7 +243,8 @@ class _Replay:
         if options.cloud:
             sinks.maps["map"] = MapFile(options.cloud)
         if options.plan:
-            sinks.maps["plan"] = PlanFile(options.plan)
+            height_m = geometry.rig.height_m(self._config.obstacles.ring.floor_m)
+            sinks.maps["plan"] = PlanFile(options.plan, height_m or 0.0)
         return sinks
 
     def _parts(self, session: Session, geometry: Geometry) -> RunParts:

@@ -17,7 +17,7 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES, STAMP_FILES
 from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
-from omnid.formats.plan_view import plan_view
+from omnid.formats.plan_view import drawn_heights, plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
 from omnid.formats.whole_file import write_whole
@@ -179,14 +179,15 @@ class MapFile:
 class PlanFile:
     """The plan view of the map with the path, as PNG; each map replaces the previous one."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, height_m: float) -> None:
+        """height_m: of the lower viewpoint above the floor, 0: not known."""
+        self._path, self._heights_m = path, drawn_heights(height_m)
 
     def process(self, update: MapUpdate) -> None:
         """Write the image."""
-        write_plan(self._path, update.points, update.path_xy)
+        write_plan(self._path, update.points, update.path_xy, self._heights_m)
 
 
-def write_plan(path: Path, points: MapPoints, path_xy: NDArray[np.float64]) -> None:
-    """Write the plan view of points with a path (N, 2) [m], NaN: a gap, as PNG. Raises OmnidError."""
-    write_whole(path, cv2.imencode(".png", plan_view(points, path_xy))[1].tobytes())
+def write_plan(path: Path, points: MapPoints, path_xy: NDArray[np.float64], heights_m: tuple[float, float]) -> None:
+    """Write the plan view of points between two heights [m] with a path (N, 2) [m], NaN: a gap. Raises OmnidError."""
+    write_whole(path, cv2.imencode(".png", plan_view(points, path_xy, heights_m=heights_m))[1].tobytes())

@@ -38,8 +38,8 @@ class RigScore:
     held_out_px: float
 
     def __str__(self) -> str:
-        held_out = f"held out {self.held_out_px:.3f} px" if np.isfinite(self.held_out_px) else "no better"
-        return f"{self.name}: {self.parameters} parameters, mean {self.mean_px:.4f} px, {held_out}"
+        held_out = f", held out {self.held_out_px:.3f} px" if np.isfinite(self.held_out_px) else ""
+        return f"{self.name}: {self.parameters} parameters, mean {self.mean_px:.4f} px{held_out}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ import omnid
 from calib.camera_file import read_camera
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
+from omnid.calibration.board_search import find_boards
 from omnid.calibration.camera import CameraResult
 from omnid.calibration.image_pairs import read_pairs
 from omnid.calibration.images import read_images
@@ -42,6 +43,17 @@ def test_the_result_prints_itself_in_one_line(found: CameraResult) -> None:
 
 def test_progress_has_a_line_for_each_image_the_view_and_each_model(found: CameraResult) -> None:
     assert [line.split()[0] for line in lines] == [f"[{k}/{VIEWS}]" for k in range(1, VIEWS + 1)] + ["view:", "camera:"]
+
+
+def test_another_grid_in_more_images_than_the_board_is_named(found: CameraResult) -> None:
+    """Part of a larger board may pass for the one that was asked for: then too few views are left, or wrong ones."""
+    other, shown = omnid.Board(8, 5, 0.03), list[str]()
+    renderer = BoardRenderer.of(other, CAMERA, MASK)
+    poses = board_poses_around_camera(CAMERA, other, MASK, 2, distance_m=(0.2, 0.25))
+    images = {f"other{seed}": renderer.render_board(T, seed=seed).image for seed, T in enumerate(poses)}
+    views = find_boards({"p0": found.images["p0.png"], **images}, BOARD, thorough=True, progress=shown.append)
+    assert [view.name for view in views] == ["p0"]
+    assert shown[-1] == "the board was found in 1, a grid of 5x8 was found in 2: try --corners 5x8"
 
 
 def test_what_is_saved_is_the_camera(found: CameraResult, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.formats.plan_view import plan_view
+from omnid.formats.plan_view import drawn_heights, plan_view
 
 MARGIN_PX = 64
 NO_PATH = np.empty((0, 2))
@@ -55,8 +55,17 @@ def test_forward_is_right_and_left_is_up() -> None:
 def test_only_the_height_band_is_drawn() -> None:
     cloud = points(np.vstack([box(0, 0, -2.0), box(0, 0, 2.0)]))
     assert (area(plan_view(cloud, NO_PATH)) == 255).all()
-    assert (area(plan_view(cloud, NO_PATH, z_high_m=2.5)) < 200).any()
-    assert (area(plan_view(cloud, NO_PATH, z_low_m=-2.5)) < 200).any()
+    assert (area(plan_view(cloud, NO_PATH, heights_m=(-1.0, 2.5))) < 200).any()
+    assert (area(plan_view(cloud, NO_PATH, heights_m=(-2.5, 1.5))) < 200).any()
+
+
+@pytest.mark.parametrize(("height_m", "is_drawn"), [(0.0, True), (0.9, False), (0.4, False), (1.2, False)])
+def test_the_floor_below_cameras_of_known_height_is_not_drawn(height_m: float, is_drawn: bool) -> None:
+    """It filled the plans of robots whose cameras are lower than a metre; a box on it is drawn."""
+    floor_m = -(height_m or 0.9)
+    heights_m = drawn_heights(height_m)
+    assert (area(plan_view(points(box(0, 0, floor_m + 0.02)), NO_PATH, heights_m=heights_m)) < 200).any() == is_drawn
+    assert (area(plan_view(points(box(0, 0, floor_m + 0.25)), NO_PATH, heights_m=heights_m)) < 200).any()
 
 
 def test_cells_are_darker_with_confidence_and_density() -> None:
