@@ -27,7 +27,8 @@ INSTRUCTIONS: Final = """The acceptance drive
   3. Place the robot on A, with a point of it that you can find again over the mark, and let it stand for 5 s.
   4. Drive to B, on any way, with the same point over the mark and heading as on A if you can; stand for 5 s.
      Drive back to A, and stand for 5 s. This is a round of 20 to 40 m. Drive three: A B A B A B A.
-  5. Run `omnid accept drive.mcap --rig rig.toml --distance-m 12.34 -o accept.html`, and send the page.
+  5. Run `omnid accept drive --rig rig.toml --distance-m 12.34 -o accept.html`, and send the page; drive is the folder
+     of the recording, of `omnid run` that of record.folder.
 Where the robot cannot stand: run `omnid accept --keys marks.txt` on the robot while it drives, press Enter each time
 the point is over a mark, and give the times as `--marks marks.txt`."""
 

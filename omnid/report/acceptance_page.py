@@ -103,5 +103,6 @@ def _figure(path: Trajectory, map_xyz: NDArray[np.float32], rig_height_m: float)
         for T, t_s in zip(path.T[::step], seconds[::step], strict=True)
     ]
     confidence = np.ones(len(map_xyz), np.float32)
-    drawn = plan.Plan(corners, map_xyz, confidence, rig_height_m, drawn_heights(rig_height_m))
+    above_base_m = rig_height_m - float(path.T[0, 2, 3])
+    drawn = plan.Plan(corners, map_xyz, confidence, rig_height_m, drawn_heights(above_base_m))
     return plan.plan_figure(drawn, Clock(0.0, max(float(seconds[-1]), 1e-2)))
