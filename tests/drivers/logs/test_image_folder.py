@@ -65,7 +65,7 @@ def test_a_sample_beyond_the_bits_of_the_others_is_white(tmp_path: Path) -> None
     """Of a long log 16 images are looked at."""
     (tmp_path / "lower").mkdir()
     for k in range(64):
-        image = np.full((4, 4), 65535 if k == 1 else 1023, np.uint16)
+        image = np.full((4, 4), 2048 if k == 1 else 1023, np.uint16)
         cv2.imwrite(str(tmp_path / "lower" / f"{k}.5.png"), image)
     assert {int(image.min()) for image in read_by_log(tmp_path)} == {255}
 

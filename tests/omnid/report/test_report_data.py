@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calib import se3
+from calib.rig_file import rig_toml
 from omnid.report.chart import Clock
 from omnid.report.plan import plan_figure
 from omnid.report.report import _plan, report_html
@@ -25,6 +26,7 @@ from tests.omnid.report.recorded_logs import (
     state,
     status,
 )
+from tests.omnid.report.test_report import attached_rig_of_sample
 
 
 def event_texts(data: ReportData) -> list[tuple[str, str]]:
@@ -108,6 +110,17 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
     shown = plan_figure(_plan(data, None), Clock(0.0, data.poses.end_s))
     assert [len(re.findall("[ML]", d)) for d in re.findall(r"class='p\d' d='([^']*)'", shown)][-2:] == [20, 20]
     assert re.findall("[ML]", re.findall("class='halo' d='([^']*)'", shown)[0]).count("M") == 2
+
+
+def test_the_plan_draws_what_is_above_the_floor_where_the_rig_states_its_height(tmp_path: Path) -> None:
+    """The floor filled the plans of robots whose cameras are lower than a metre."""
+    rig = attached_rig_of_sample()
+    for height_m, low_m in ((0.9, -0.8), (1.5, -1.0)):
+        files = {"rig.toml": rig_toml(rig.at_height(height_m)).encode()}
+        data = collect_report_data(save(tmp_path / "a.mcap", run(3), files))
+        assert _plan(data, None).heights_m == pytest.approx((low_m, 1.5))
+    without = collect_report_data(save(tmp_path / "a.mcap", run(3)))
+    assert _plan(without, None).heights_m == (-1.0, 1.5)
 
 
 def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
