@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help does not load these
     import numpy as np
@@ -68,7 +69,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Print the errors and write the page; 1 where the drive is not accepted."""
-    from omnid.errors import OmnidError
     from omnid.sinks.files import check_outputs
 
     if args.keys:
@@ -93,8 +93,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _refuse_without_log(args: argparse.Namespace) -> None:
     """Raise OmnidError for options that need a log: --marks takes all words that follow it, also the name of a log."""
-    from omnid.errors import OmnidError
-
     values = {"--distance-m": args.distance_m, "--marks": args.marks, "-o": args.output, "--json": args.json or None}
     given = [name for name, value in values.items() if value is not None]
     if given:
@@ -130,7 +128,6 @@ def _read(args: argparse.Namespace) -> _Drive:
     from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.diagnostics.progress import Progress
-    from omnid.errors import OmnidError
     from omnid.runs.replay import ReplayOptions, run_log
     from omnid.tracking_state import TrackingState
 
@@ -197,8 +194,6 @@ def _plain(found: Acceptance) -> dict[str, object]:
 
 def _since_start(words: Sequence[str], start_ns: int) -> list[float]:
     """Return the times of --marks in s since the first pose; a single word that is no number is a file of them."""
-    from omnid.errors import OmnidError
-
     numbers = [_number(word) for word in words]
     if len(words) == 1 and numbers[0] is None:
         try:
@@ -227,8 +222,6 @@ def _number(word: str) -> float | None:
 
 def _write_keys(path: Path, keys: TextIO | Iterable[str]) -> int:
     """Write the Unix time of each line that is entered, as soon as it is; refuse to replace times that are there."""
-    from omnid.errors import OmnidError
-
     if path.is_file() and path.stat().st_size:
         raise OmnidError(f"--keys {path}: expected a new file, found one of marks already taken; give another name")
     print("press Enter each time the point of the robot is over a mark: A, B, A, ...; Ctrl-D ends", file=sys.stderr)

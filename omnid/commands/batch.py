@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.log_options import add_topics
 from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
     from omnid.batch.jobs import BatchOptions
@@ -71,7 +72,6 @@ def run(args: argparse.Namespace) -> int:
     from omnid.batch.jobs import find_logs, jobs
     from omnid.batch.tables import write_tables
     from omnid.batch.workers import workers_of
-    from omnid.errors import OmnidError
     from omnid.plain_text import plain
 
     if not 0 < args.timeout_s <= MOST_S:
@@ -116,8 +116,6 @@ def _options(args: argparse.Namespace) -> BatchOptions:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     """Keep other batches out of a folder, which is created."""
-    from omnid.errors import OmnidError
-
     out.mkdir(parents=True, exist_ok=True)
     with (out / LOCK_FILE).open("wb") as file:
         try:

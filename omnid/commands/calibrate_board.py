@@ -7,6 +7,7 @@ import shlex
 from pathlib import Path
 
 from omnid.commands.board_options import add_board_options, board_of, options_of
+from omnid.errors import OmnidError
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -26,7 +27,6 @@ def run(args: argparse.Namespace) -> int:
     """Write the PDF."""
     from calib.boards.board_pose import ambiguous_orders
     from omnid.calibration.printable_board import board_pdf
-    from omnid.errors import OmnidError
 
     board, options = board_of(args), shlex.join(options_of(args))
     if len(ambiguous_orders(board)) > 1:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from omnid.commands.board_options import add_board_options, board_of, options_of
 from omnid.commands.config import add_settings
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.calibration.images import Image
@@ -62,7 +63,6 @@ def run(args: argparse.Namespace) -> int:
     """Search until Ctrl-C, or until the end of the log; return 0 if there is enough for a calibration."""
     from omnid.calibration.live_boards import LiveBoards
     from omnid.config import load_config
-    from omnid.errors import OmnidError
 
     board = board_of(args)
     if args.images is None and args.log is None:
@@ -88,7 +88,6 @@ def run(args: argparse.Namespace) -> int:
 def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     """Take the pairs that are in the folder, which is made if it is missing; return the highest number of an image."""
     from omnid.calibration.image_pairs import SIDES, read_pairs
-    from omnid.errors import OmnidError
 
     if folder is None:
         return 0
@@ -116,7 +115,6 @@ def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Ima
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.calibration.camera_pairs import newest_pairs
     from omnid.engine.logging_setup import log
-    from omnid.errors import OmnidError
 
     if config.cameras.is_one_device:
         raise OmnidError(
@@ -133,7 +131,6 @@ def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Ima
 def _bus(config: Config, closing: ExitStack) -> Bus | None:
     """Return the bus for the page; None where another program holds the endpoint."""
     from omnid.engine.logging_setup import log
-    from omnid.errors import OmnidError
     from omnid.transport.bus import Bus
 
     try:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.log_options import add_topics
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the list loads none of these
     from drivers.frame import Camera, Frame
@@ -45,8 +46,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Print the list, or write the snapshots; return 1 if there is no camera, or something to correct."""
-    from omnid.errors import OmnidError
-
     if args.snapshot is not None:
         return _snapshot(args)
     for option in ("log", "lower", "upper"):
@@ -76,7 +75,6 @@ def _snapshot(args: argparse.Namespace) -> int:
 
     from calib.rig_file import write_file
     from omnid.calibration.snapshot import annotated, described, view_of, warnings
-    from omnid.errors import OmnidError
 
     try:
         args.snapshot.mkdir(exist_ok=True)
@@ -99,7 +97,6 @@ def _images(args: argparse.Namespace) -> Iterator[tuple[Camera, list[Image]]]:
 
     from drivers.frame import gray
     from omnid.calibration.snapshot import IMAGES
-    from omnid.errors import OmnidError
 
     for camera in CAMERAS:
         frames = _of_device(args, camera) if args.log is None else _of_log(args, camera)

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from omnid.errors import OmnidError
+
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
 
@@ -77,7 +79,6 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print, check or migrate settings."""
     from omnid.config import FIRST_SETTINGS, load_config, migrated_config
-    from omnid.errors import OmnidError
     from omnid.settings_dump import dump, dump_minimal
 
     if (args.action == "print") != (args.file is None):

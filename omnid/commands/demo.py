@@ -8,6 +8,7 @@ from pathlib import Path
 
 from omnid.commands.config import add_settings
 from omnid.commands.replay import Output, replay_and_print
+from omnid.errors import OmnidError
 
 DRIVE_S = 90.0  # Longest drive in simulated time.
 
@@ -68,8 +69,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make_folder(folder: Path) -> None:
-    from omnid.errors import OmnidError
-
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
@@ -83,7 +82,6 @@ def _drive(args: argparse.Namespace) -> int:
 
     from omnid.config import load_config
     from omnid.engine.kernel_cache import prepare_kernels
-    from omnid.errors import OmnidError
     from omnid.navigation_state import NavigationState
     from omnid.simulation.demonstration import TeachAndRepeat, both_paths, cross_track_m, draw, drift_m, seen_obstacles
     from omnid.simulation.lockstep import simulate

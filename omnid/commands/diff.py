@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 
 from omnid.commands.json_output import add_json, print_json
+from omnid.errors import OmnidError
 
 AGREE, DIFFER = 0, 1
 
@@ -83,8 +84,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _limit(args: argparse.Namespace, name: str) -> float:
     """Return the value of an option; raise OmnidError where it is negative or not finite."""
-    from omnid.errors import OmnidError
-
     value = float(getattr(args, name))
     if not 0.0 <= value < math.inf:
         raise OmnidError(f"--{name.replace('_', '-')} {value:g}: expected a number of 0 or more")
@@ -94,8 +93,6 @@ def _limit(args: argparse.Namespace, name: str) -> float:
 def _identical(a: Path, b: Path) -> bool:
     """True if both files hold the same bytes."""
     import filecmp
-
-    from omnid.errors import OmnidError
 
     try:
         return filecmp.cmp(a, b, shallow=False)

@@ -7,6 +7,7 @@ import math
 
 from omnid.commands.config import add_settings
 from omnid.commands.listen import add_robot, config_of
+from omnid.errors import OmnidError
 
 FARTHEST_M = 1e6
 
@@ -50,7 +51,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Drive, or cancel, pause, resume."""
-    from omnid.errors import OmnidError
     from omnid.monitor.navigation import connected, drive_to_end, granted
 
     if args.verb and args.pose:

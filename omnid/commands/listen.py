@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
     from omnid.config import Config
@@ -50,8 +51,6 @@ def config_of(args: argparse.Namespace) -> Config:
 
 def check_seconds(seconds: float | None) -> None:
     """Raise OmnidError where the value of --seconds is no duration."""
-    from omnid.errors import OmnidError
-
     if seconds is not None and not 0 < seconds < 1e9:
         raise OmnidError(f"--seconds {seconds} is not a duration: expected seconds above 0")
 

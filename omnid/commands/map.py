@@ -14,6 +14,7 @@ from omnid.commands.map_build import add_build
 from omnid.commands.map_option import add_replace, require_replace
 from omnid.commands.map_summary import described
 from omnid.commands.map_tags import add_align, add_tags
+from omnid.errors import OmnidError
 
 CELL_M = 0.05
 
@@ -65,7 +66,6 @@ def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 def run_info(args: argparse.Namespace) -> int:
     """Print the content of each map; return 2 if a file is not a map."""
     from omnid.core.places.place_views import summary
-    from omnid.errors import OmnidError
     from omnid.formats.place_file import read_places
 
     code, found = 0, []
@@ -118,7 +118,6 @@ def run_merge(args: argparse.Namespace) -> int:
     from omnid.core.places.place_views import summary
     from omnid.core.types.stereo_model import StereoModel
     from omnid.engine.kernel_cache import prepare_kernels
-    from omnid.errors import OmnidError
     from omnid.formats.place_file import read_places, write_places
     from omnid.sinks.files import check_outputs
 
@@ -158,7 +157,6 @@ def run_export(args: argparse.Namespace) -> int:
     import numpy as np
 
     from omnid.core.places import place_views
-    from omnid.errors import OmnidError
     from omnid.formats.grid_map import write_grid
     from omnid.formats.place_file import read_places
     from omnid.formats.plan_view import drawn_heights

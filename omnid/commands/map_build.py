@@ -13,6 +13,7 @@ from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_replace, add_tags_option, tag_settings
 from omnid.commands.map_summary import described
 from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
     from omnid.config import Config
@@ -39,7 +40,6 @@ def run_build(args: argparse.Namespace) -> int:
     from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.core.places.place_views import summary
-    from omnid.errors import OmnidError
     from omnid.formats.place_file import write_places
     from omnid.sinks.files import check_outputs
 

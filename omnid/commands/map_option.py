@@ -7,6 +7,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from omnid.errors import OmnidError
+
 
 def add_map(parser: argparse.ArgumentParser) -> None:
     """Add --map, --localize-only and --tags."""
@@ -40,8 +42,6 @@ def add_replace(parser: argparse._ActionsContainer) -> None:
 
 def require_replace(command: str, args: argparse.Namespace, maps: Sequence[Path]) -> None:
     """Raise OmnidError for an output that exists, unless it is one of the maps that are read or --replace is given."""
-    from omnid.errors import OmnidError
-
     output: Path = args.output
     is_read = any(path.exists() and output.exists() and path.samefile(output) for path in maps)
     if output.exists() and not (is_read or args.replace):
@@ -55,8 +55,6 @@ def tag_settings(args: argparse.Namespace) -> list[str]:
 
 def map_settings(args: argparse.Namespace) -> list[str]:
     """Return the settings that the options set. Raises OmnidError for a name that is no map's."""
-    from omnid.errors import OmnidError
-
     if args.map is not None and args.map.suffix == ".ply":
         raise OmnidError(
             f"--map {args.map}: expected a map of places (.omap) to localise in; the points of the 3-D "

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.map_option import add_map, add_replace, map_settings, require_replace
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
     from omnid.core.places.map_tags import MapTag
@@ -104,7 +105,6 @@ def run_tags(args: argparse.Namespace) -> int:
 
 def _of_map(args: argparse.Namespace) -> Found:
     """Return the tags of a map, their poses, and 0."""
-    from omnid.errors import OmnidError
     from omnid.formats.place_file import read_places
 
     if args.tag or args.tags or args.rig or args.map:
@@ -125,7 +125,6 @@ def _of_log(args: argparse.Namespace) -> Found:
     """Return the tags that are asked for, the poses of those that a log shows, and how many views were refused."""
     from omnid.config import load_config
     from omnid.core.places.map_tags import MapTag
-    from omnid.errors import OmnidError
     from omnid.formats.landmark_file import read_tags
     from omnid.runs.replay import ReplayOptions, run_log
     from omnid.sinks.tag_collector import TagCollector
@@ -173,7 +172,6 @@ def _row(tag: MapTag, found: TagEstimate) -> dict[str, Any]:
 def run_align(args: argparse.Namespace) -> int:
     """Write the map in the axes of the plan."""
     from omnid.core.places.alignment import align, fit, landmark
-    from omnid.errors import OmnidError
     from omnid.formats.landmark_file import read_landmarks
     from omnid.formats.place_file import read_places, write_places
     from omnid.sinks.files import check_outputs
@@ -210,7 +208,6 @@ def run_align(args: argparse.Namespace) -> int:
 def _sizes_m(words: list[str]) -> dict[int, float]:
     """Return the sizes of "5=0.2" by their tags. Raises OmnidError."""
     from omnid.core.places.tags import MAX_TAG, SIZES_M
-    from omnid.errors import OmnidError
 
     sizes: dict[int, float] = {}
     for word in words:

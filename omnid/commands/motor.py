@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.controller.motor_settings import DriveSettings
@@ -55,7 +56,6 @@ def run(args: argparse.Namespace) -> int:
     """Test the wiring and print the settings."""
     from omnid.config import load_config
     from omnid.doctor.wheel_wiring import WiringTest
-    from omnid.errors import OmnidError
 
     named = [] if args.motor is None else [f"motor.port={args.motor}"]
     config = load_config(args.config, [*args.overrides, *named]).motor
@@ -76,8 +76,6 @@ def run(args: argparse.Namespace) -> int:
 
 def ask(question: str) -> str:
     """Print a question and return the answer. Raise OmnidError at the end of the input."""
-    from omnid.errors import OmnidError
-
     sys.stdout.write(question)
     sys.stdout.flush()
     line = sys.stdin.readline()
@@ -122,7 +120,6 @@ def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) 
     from calib.rig_file import write_file
     from omnid.config import load_config
     from omnid.doctor.wheel_wiring import toml_with
-    from omnid.errors import OmnidError
 
     after = toml_with(text, SECTION, values)
     with tempfile.TemporaryDirectory() as folder:

@@ -12,6 +12,7 @@ from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.log_options import add_topics
 from omnid.commands.map_option import add_map, map_settings
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -182,8 +183,6 @@ def _speed(result: RunResult) -> str:
 def _span_of(args: argparse.Namespace) -> tuple[float, float]:
     """Return the part of the log that is read. Raise OmnidError for times that are none."""
     import math
-
-    from omnid.errors import OmnidError
 
     if not 0 <= args.start_s < math.inf:
         raise OmnidError(f"--start-s {args.start_s:g}: expected a time of 0 s or more")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.listen import add_robot, config_of
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
     from omnid.core.navigation.route import Route
@@ -105,7 +106,6 @@ def run_teach(args: argparse.Namespace) -> int:
 def run_repeat(args: argparse.Namespace) -> int:
     """Repeat a route; return 0 if its end is reached, else 1."""
     from omnid.core.navigation.requests import MAX_LOOPS, route_name
-    from omnid.errors import OmnidError
     from omnid.monitor.navigation import connected, drive_to_end, granted
 
     if not 1 <= args.loops <= MAX_LOOPS:
@@ -129,8 +129,6 @@ def run_text(args: argparse.Namespace) -> int:
 
 def run_list(args: argparse.Namespace) -> int:
     """Print the routes; return 2 if a file is damaged."""
-    from omnid.errors import OmnidError
-
     folder, code, found = _folder(args), 0, []
     for name in folder.names():
         try:

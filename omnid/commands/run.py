@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from omnid.commands.config import add_settings
 from omnid.commands.log_options import attached_rig_of
 from omnid.commands.map_option import add_map, map_settings
+from omnid.errors import OmnidError
 
 RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
 
@@ -86,8 +87,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _require_no_log_options(args: argparse.Namespace) -> None:
-    from omnid.errors import OmnidError
-
     if args.once or args.pace != 1.0:
         raise OmnidError("--once and --pace need the images of a log: add --log, or leave them out")
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings
 from omnid.commands.map_option import add_map, map_settings
+from omnid.errors import OmnidError
 
 AUTO, REAL_TIME = "auto", "1.0"
 IMU_BAUD = 115_200  # Baud rate at which the stamps of the simulated gyro are right.
@@ -86,8 +87,6 @@ def run(args: argparse.Namespace) -> int:
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     if args.seed < 0:
-        from omnid.errors import OmnidError
-
         raise OmnidError(f"--seed {args.seed}: expected 0 or more")
     options = WorldOptions(people=not args.no_people, brightness=args.light, other_posters=args.other_posters)
     world = load_world(args.world, args.seed, options)
@@ -119,7 +118,6 @@ def _end(args: argparse.Namespace, robot: PacedRobot | RealtimeRobot, code: int)
 
 def _robot(args: argparse.Namespace) -> SimulatedRobot:
     from calib.rig_file import read_rig
-    from omnid.errors import OmnidError
     from omnid.simulation.robot import make_robot
 
     if not 64 <= args.size <= 2048:

@@ -11,6 +11,7 @@ from omnid.commands.config import add_settings
 from omnid.commands.listen import add_robot, check_seconds, config_of
 from omnid.commands.log_options import add_topics
 from omnid.commands.replay import Output, replay_and_print
+from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -107,8 +108,6 @@ def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
 
 
 def _refuse_contradictions(args: argparse.Namespace) -> None:
-    from omnid.errors import OmnidError
-
     live = {"--connect": args.connect, "--seconds": args.seconds}
     of_log = {
         "--topic": args.topic,
@@ -133,8 +132,6 @@ def _refuse_contradictions(args: argparse.Namespace) -> None:
 def _require_rerun() -> None:
     import os
     from importlib.util import find_spec
-
-    from omnid.errors import OmnidError
 
     if find_spec("rerun") is None:
         raise OmnidError(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from omnid.commands.config import add_settings
 from omnid.commands.listen import add_robot, config_of
+from omnid.errors import OmnidError
 
 PACKAGES = ("starlette", "uvicorn", "websockets")
 
@@ -59,7 +60,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from omnid.errors import OmnidError
     from omnid.monitor.fleet import check_all
 
     require_packages()
@@ -83,8 +83,6 @@ def require_packages() -> None:
     """Raise OmnidError where a package of the page is missing."""
     import sys
     from importlib.util import find_spec
-
-    from omnid.errors import OmnidError
 
     missing = [name for name in PACKAGES if find_spec(name) is None]
     if missing:
