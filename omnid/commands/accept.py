@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.json_output import add_json, print_json
 from omnid.errors import OmnidError
 
@@ -125,13 +125,12 @@ def _read(args: argparse.Namespace) -> _Drive:
     if args.log.suffix in (".txt", ".tum"):
         read = read_tum(args.log)
         return _Drive(Trajectory(read.stamps_ns, read.T @ T_rig_base), None, no_map, float(read.T[0, 2, 3]), 0)
-    from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.diagnostics.progress import Progress
     from omnid.runs.replay import ReplayOptions, run_log
     from omnid.tracking_state import TrackingState
 
-    config = load_config(args.config, args.overrides)
+    config = settings_of(args)
     warnings = unused_settings(config, "replay", args.overrides)
     result = run_log(args.log, config, ReplayOptions(rig=args.rig, collect=True, progress=Progress))
     for warning in (*warnings, *result.warnings):

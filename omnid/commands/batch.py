@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from omnid.commands.config import settings_of
 from omnid.commands.log_options import add_topics
 from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
 from omnid.errors import OmnidError
@@ -104,9 +105,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _options(args: argparse.Namespace) -> BatchOptions:
     from omnid.batch.jobs import BatchOptions, input_files
-    from omnid.config import load_config
 
-    config = load_config(args.config, args.overrides)  # a mistake is reported now, and not by each log
+    config = settings_of(args)  # a mistake is reported now, and not by each log
     paths, topics = {"--rig": args.rig, "--config": args.config}, {"--lower": args.lower, "--upper": args.upper}
     inputs = input_files(args.rig, args.config, config.places)
     arguments = program_options(paths, topics, args.overrides)

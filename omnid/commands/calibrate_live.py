@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from omnid.commands.board_options import add_board_options, board_of, options_of
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -62,13 +62,12 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
 def run(args: argparse.Namespace) -> int:
     """Search until Ctrl-C, or until the end of the log; return 0 if there is enough for a calibration."""
     from omnid.calibration.live_boards import LiveBoards
-    from omnid.config import load_config
 
     board = board_of(args)
     if args.images is None and args.log is None:
         raise OmnidError("calibrate live: expected the DIR of the images, found none: name a folder, or a --log")
     named = {} if args.log else {"cameras.lower": args.lower, "cameras.upper": args.upper}
-    config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
+    config = settings_of(args, named)
     boards = LiveBoards(board)
     with ExitStack() as closing:
         closing.callback(boards.close)

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.log_options import add_topics
 from omnid.errors import OmnidError
 
@@ -119,9 +119,8 @@ def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, Non
     from itertools import islice
 
     from drivers.cameras.v4l2_camera import V4l2Camera
-    from omnid.config import load_config
 
-    settings = load_config(args.config, args.overrides).cameras.settings(camera)
+    settings = settings_of(args).cameras.settings(camera)
 
     def end_when_lost(_: int, __: str) -> None:
         if source.state.status == "lost":

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from omnid.errors import OmnidError
@@ -16,6 +17,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 PROFILES: Final = {
     "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
 }
+_NO_SHORTCUTS: Final[Mapping[str, object]] = MappingProxyType({})
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -74,6 +76,17 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
         dest="overrides",
         help="a setting that replaces that of the file; may be repeated",
     )
+
+
+def settings_of(args: argparse.Namespace, shortcuts: Mapping[str, object] = _NO_SHORTCUTS) -> Config:
+    """Return the configuration of --config, --profile and --set.
+
+    shortcuts: values of options that stand for a setting, by its name; None: the option is not given.
+    """
+    from omnid.config import load_config
+
+    given = [f"{key}={value}" for key, value in shortcuts.items() if value is not None]
+    return load_config(args.config, [*args.overrides, *given])
 
 
 def run(args: argparse.Namespace) -> int:

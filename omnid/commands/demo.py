@@ -6,7 +6,7 @@ import argparse
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
@@ -80,7 +80,6 @@ def _drive(args: argparse.Namespace) -> int:
     import cv2
     import numpy as np
 
-    from omnid.config import load_config
     from omnid.engine.kernel_cache import prepare_kernels
     from omnid.navigation_state import NavigationState
     from omnid.simulation.demonstration import TeachAndRepeat, both_paths, cross_track_m, draw, drift_m, seen_obstacles
@@ -92,7 +91,7 @@ def _drive(args: argparse.Namespace) -> int:
         raise OmnidError(f"--seed {args.seed}: expected 0 or more")
     _make_folder(args.output)
     place_map, routes, image = (args.output / name for name in ("demo.omap", "routes", "drive.png"))
-    config = load_config(args.config, [*args.overrides, f"places.map={place_map}", f"navigation.routes={routes}"])
+    config = settings_of(args, {"places.map": place_map, "navigation.routes": routes})
     place_map.unlink(missing_ok=True)  # of an earlier demonstration
     world, robot = load_world("room", args.seed), make_robot()
     prepare_kernels()  # which says so where it takes long

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.json_output import add_json, print_json
 
 if TYPE_CHECKING:
@@ -28,11 +28,10 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Print a line for each check; return 1 if something is wrong."""
-    from omnid.config import load_config
     from omnid.doctor.finding import summary
 
     found: list[Finding] = []
-    for finding in examine(load_config(args.config, args.overrides)):
+    for finding in examine(settings_of(args)):
         if not args.json:
             print(finding, flush=True)
         found.append(finding)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
@@ -40,11 +41,7 @@ def add_robot(parser: argparse._ActionsContainer, more: str = "") -> None:
 
 def config_of(args: argparse.Namespace) -> Config:
     """Return the configuration with the robot's name and endpoints of --robot and --connect."""
-    from dataclasses import replace
-
-    from omnid.config import load_config
-
-    config = load_config(args.config, args.overrides)
+    config = settings_of(args)
     robot, connect = args.robot or config.bus.robot, tuple(args.connect or config.bus.connect)
     return replace(config, bus=replace(config.bus, robot=robot, connect=connect))
 

@@ -9,8 +9,8 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
-from omnid.commands.map_option import add_replace, add_tags_option, tag_settings
+from omnid.commands.config import add_settings, settings_of
+from omnid.commands.map_option import add_replace, add_tags_option
 from omnid.commands.map_summary import described
 from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
 from omnid.errors import OmnidError
@@ -37,13 +37,12 @@ def add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> N
 
 def run_build(args: argparse.Namespace) -> int:
     """Replay the logs one after the other, each in the map of those before, or side by side; write the map."""
-    from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.core.places.place_views import summary
     from omnid.formats.place_file import write_places
     from omnid.sinks.files import check_outputs
 
-    config = load_config(args.config, [*args.overrides, *tag_settings(args)])
+    config = settings_of(args, {"places.tags": args.tags})
     warnings = unused_settings(config, "replay", args.overrides)
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")

@@ -48,17 +48,12 @@ def require_replace(command: str, args: argparse.Namespace, maps: Sequence[Path]
         raise OmnidError(f"{command}: {output} exists: --replace makes a new one")
 
 
-def tag_settings(args: argparse.Namespace) -> list[str]:
-    """Return the settings that --tags sets."""
-    return [] if args.tags is None else [f"places.tags={args.tags}"]
-
-
-def map_settings(args: argparse.Namespace) -> list[str]:
-    """Return the settings that the options set. Raises OmnidError for a name that is no map's."""
+def map_settings(args: argparse.Namespace) -> dict[str, object]:
+    """Return the settings that the options stand for. Raises OmnidError for a name that is no map's."""
     if args.map is not None and args.map.suffix == ".ply":
         raise OmnidError(
             f"--map {args.map}: expected a map of places (.omap) to localise in; the points of the 3-D "
             "map are written by --cloud FILE.ply"
         )
-    settings = [] if args.map is None else [f"places.map={args.map}"]
-    return [*settings, *tag_settings(args), *(["places.localize_only=true"] if args.localize_only else [])]
+    localize_only = "true" if args.localize_only else None
+    return {"places.map": args.map, "places.tags": args.tags, "places.localize_only": localize_only}

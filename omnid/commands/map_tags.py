@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.map_option import add_map, add_replace, map_settings, require_replace
 from omnid.errors import OmnidError
@@ -123,7 +123,6 @@ def _tags_of(places: PlaceMap, rig: PlaceRig) -> dict[int, TagEstimate]:
 
 def _of_log(args: argparse.Namespace) -> Found:
     """Return the tags that are asked for, the poses of those that a log shows, and how many views were refused."""
-    from omnid.config import load_config
     from omnid.core.places.map_tags import MapTag
     from omnid.formats.landmark_file import read_tags
     from omnid.runs.replay import ReplayOptions, run_log
@@ -136,7 +135,7 @@ def _of_log(args: argparse.Namespace) -> Found:
             f"map tags {args.source}: expected --tag ID=SIZE for each tag that a log shows, such as "
             "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap"
         )
-    config = load_config(args.config, [*args.overrides, *map_settings(args)])
+    config = settings_of(args, map_settings(args))
     collectors: list[TagCollector] = []  # the one of the run, which makes it when it knows its rig
 
     def observer(front_end: FrontEnd, _: Telemetry) -> TagCollector:

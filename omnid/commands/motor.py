@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -54,11 +54,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Test the wiring and print the settings."""
-    from omnid.config import load_config
     from omnid.doctor.wheel_wiring import WiringTest
 
-    named = [] if args.motor is None else [f"motor.port={args.motor}"]
-    config = load_config(args.config, [*args.overrides, *named]).motor
+    config = settings_of(args, {"motor.port": args.motor}).motor
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     text = _text_of(args.write)

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -35,7 +35,6 @@ def run(args: argparse.Namespace) -> int:
     """Record until a signal comes; return 1 if nothing was recorded."""
     from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
-    from omnid.config import load_config
     from omnid.runs.record import record
 
     named = {
@@ -44,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         "cameras.lower": args.lower,
         "cameras.upper": args.upper,
     }
-    config = load_config(args.config, [*args.overrides, *(f"{key}={v}" for key, v in named.items() if v is not None)])
+    config = settings_of(args, named)
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, ...] = ("lower", "upper")
     if config.cameras.is_one_device:

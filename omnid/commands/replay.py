@@ -8,7 +8,7 @@ from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, NamedTuple
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.log_options import add_topics
 from omnid.commands.map_option import add_map, map_settings
@@ -90,7 +90,6 @@ def _add_computation(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print its summary; return 1 where no pose was found."""
-    from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.runs.replay import ReplayOptions
 
@@ -110,7 +109,8 @@ def run(args: argparse.Namespace) -> int:
         drops=args.realtime,
         settings=args.config,
     )
-    config = load_config(args.config, [*args.overrides, *_shortcuts(args)])
+    shortcuts = {"odometry.method": args.method, "odometry.tracker": args.tracker, "motor.port": args.motor}
+    config = settings_of(args, shortcuts | map_settings(args))
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
     return replay_and_print(args.log, config, options, Output(args.quiet, args.verbose, args.json))
@@ -189,9 +189,3 @@ def _span_of(args: argparse.Namespace) -> tuple[float, float]:
     if args.seconds is not None and not 0 < args.seconds < math.inf:
         raise OmnidError(f"--seconds {args.seconds:g}: expected a time above 0 s")
     return args.start_s, math.inf if args.seconds is None else args.start_s + args.seconds
-
-
-def _shortcuts(args: argparse.Namespace) -> list[str]:
-    """Return the settings that have an option of their own."""
-    named = {"odometry.method": args.method, "odometry.tracker": args.tracker, "motor.port": args.motor}
-    return [*(f"{key}={value}" for key, value in named.items() if value is not None), *map_settings(args)]

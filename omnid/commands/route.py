@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.json_output import add_json, print_json
 from omnid.commands.listen import add_robot, config_of
 from omnid.errors import OmnidError
@@ -190,10 +190,9 @@ def run_delete(args: argparse.Namespace) -> int:
 
 
 def _folder(args: argparse.Namespace) -> RouteFolder:
-    from omnid.config import load_config
     from omnid.formats.route_file import RouteFolder
 
-    return RouteFolder(Path(load_config(args.config, args.overrides).navigation.routes))
+    return RouteFolder(Path(settings_of(args).navigation.routes))
 
 
 def _summary(route: Route) -> dict[str, object]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.log_options import attached_rig_of
 from omnid.commands.map_option import add_map, map_settings
 from omnid.errors import OmnidError
@@ -63,7 +63,6 @@ def run(args: argparse.Namespace) -> int:
     from omnid.engine.malloc_settings import use_one_malloc_arena
 
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
-    from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import LiveRun
@@ -72,8 +71,7 @@ def run(args: argparse.Namespace) -> int:
     named = {"cameras.rig": args.rig, "motor.port": args.motor}
     if args.log is None:
         named |= {"cameras.lower": args.lower, "cameras.upper": args.upper}
-    shortcuts = [f"{key}={value}" for key, value in named.items() if value is not None]
-    config = load_config(args.config, [*args.overrides, *shortcuts, *map_settings(args)])
+    config = settings_of(args, named | map_settings(args))
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     show = HANDLER.show if sys.stderr.isatty() else None

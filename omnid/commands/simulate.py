@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.map_option import add_map, map_settings
 from omnid.errors import OmnidError
 
@@ -72,7 +72,6 @@ def run(args: argparse.Namespace) -> int:
     from omnid.engine.malloc_settings import use_one_malloc_arena
 
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
-    from omnid.config import load_config
     from omnid.config_use import unused_settings
     from omnid.controller.motor import SIMULATED
     from omnid.engine.logging_setup import HANDLER, log
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.sinks.files import check_outputs
 
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
-    config = load_config(args.config, [*args.overrides, *map_settings(args)])
+    config = settings_of(args, map_settings(args))
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     if args.seed < 0:

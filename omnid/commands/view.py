@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings
+from omnid.commands.config import add_settings, settings_of
 from omnid.commands.listen import add_robot, check_seconds, config_of
 from omnid.commands.log_options import add_topics
 from omnid.commands.replay import Output, replay_and_print
@@ -68,13 +68,11 @@ def _add_live(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the log or the robot; return 1 if there was no pose to show."""
-    from omnid.config import load_config
-
     _refuse_contradictions(args)
     _require_rerun()
     from omnid.viewer.view import check_file, show_robot, target_for
 
-    config = config_of(args) if args.log is None else load_config(args.config, args.overrides)
+    config = config_of(args) if args.log is None else settings_of(args)
     check_file(
         args.output,
         ("the log that is read", args.log),
