@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NamedTuple, Protocol
 
 from drivers.logs.joint_wheels import JointWheels
-from drivers.logs.ros_image import RosImage
-from drivers.logs.ros_motion import MotionReading
+from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
+from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 
 class LoggedImage(NamedTuple):
@@ -24,6 +24,23 @@ class LoggedMotion(NamedTuple):
     topic: str
     log_time_ns: int
     read: Callable[[JointWheels | None], MotionReading]  # raises FrameDecodeError or RecordError: no valid message
+
+
+def logged_message(
+    topic: str, kind: str, log_time_ns: int, data: Callable[[], memoryview], *, aligned: bool = True
+) -> LoggedImage | LoggedMotion | None:
+    """Return a message of a type of images or of motion, None of any other type; it is decoded when it is read.
+
+    data: returns its bytes, raises RecordError where they cannot be read. aligned: True for CDR (ROS 2), False for the
+    serialisation of ROS 1.
+    """
+    if kind in IMAGE_TYPES:
+        return LoggedImage(topic, log_time_ns, lambda: parse_image(kind, data(), aligned=aligned))
+    if kind in MOTION_TYPES:
+        return LoggedMotion(
+            topic, log_time_ns, lambda joints: parse_motion(kind, data(), aligned=aligned, joints=joints)
+        )
+    return None
 
 
 class LogDamage(NamedTuple):

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
-from functools import partial
 
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
-from drivers.logs.joint_wheels import JointWheels
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, logged_message
 from drivers.logs.mcap_catalog import Catalog
 from drivers.logs.mcap_index import has_footer, read_attachments, read_summary
-from drivers.logs.mcap_messages import DataSection, LogMessage, scan_channels
+from drivers.logs.mcap_messages import DataSection, scan_channels
 from drivers.logs.mcap_records import LogFile
-from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
-from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 
 class McapImageLog:
@@ -42,12 +38,11 @@ class McapImageLog:
         section = DataSection(self._file, self._catalog)
         for message in section.messages():
             topic = self._catalog.topic(message.channel_id)
-            if topic is not None and topic.type in IMAGE_TYPES:
-                yield LoggedImage(topic.name, message.log_time_ns, partial(_read, topic.type, message, topic.aligned))
-            elif topic is not None and topic.type in MOTION_TYPES:
-                yield LoggedMotion(
-                    topic.name, message.log_time_ns, partial(_read_motion, topic.type, message, topic.aligned)
-                )
+            if topic is not None:
+                kind, time_ns = topic.type, message.log_time_ns
+                logged = logged_message(topic.name, kind, time_ns, message.data, aligned=topic.aligned)
+                if logged is not None:
+                    yield logged
             if self._file.closed:
                 return
         complete = section.ended and has_footer(self._file)
@@ -76,11 +71,3 @@ class McapImageLog:
         if self._summary is not None and self._summary.catalog.topics():
             return self._summary.catalog
         return scan_channels(self._file)
-
-
-def _read(kind: str, message: LogMessage, aligned: bool) -> RosImage:
-    return parse_image(kind, message.data(), aligned=aligned)
-
-
-def _read_motion(kind: str, message: LogMessage, aligned: bool, joints: JointWheels | None) -> MotionReading:
-    return parse_motion(kind, message.data(), aligned=aligned, joints=joints)

@@ -17,7 +17,7 @@ from drivers.logs.mcap_records import (
     RecordError,
     read_content,
     records,
-    unpack_chunk,
+    records_of_chunk,
 )
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -66,15 +66,10 @@ class DataSection:
 
     def _chunk(self, record: Record) -> Iterator[LogMessage]:
         try:
-            chunk = unpack_chunk(read_content(self._file, record))
+            for chunk, inner in records_of_chunk(self._file, record):
+                yield from self._single(chunk, inner)
         except RecordError:
             self.broken += 1
-            return
-        end = 0
-        for inner in records(chunk, 0, chunk.size):
-            end = inner.offset + inner.size
-            yield from self._single(chunk, inner)
-        self.broken += end != chunk.size
 
     def _single(self, source: ByteSource, record: Record) -> Iterator[LogMessage]:
         try:

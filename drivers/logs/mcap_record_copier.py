@@ -21,7 +21,7 @@ from drivers.logs.mcap_records import (
     parser,
     read_content,
     records,
-    unpack_chunk,
+    records_of_chunk,
 )
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -57,15 +57,10 @@ class RecordCopier:
     def copy_chunk(self, file: LogFile, record: Record) -> None:
         """Copy the records of a chunk."""
         try:
-            chunk = unpack_chunk(read_content(file, record))
+            for chunk, inner in records_of_chunk(file, record):
+                self.copy_record(chunk, inner)
         except RecordError:
             self.broken += 1
-            return
-        end = 0
-        for inner in records(chunk, 0, chunk.size):
-            end = inner.offset + inner.size
-            self.copy_record(chunk, inner)
-        self.broken += end != chunk.size
 
     def copy_record(self, source: ByteSource, record: Record) -> None:
         """Copy one record; those of an index are skipped, since the writer makes its own."""

@@ -182,6 +182,19 @@ def unpack_chunk(body: memoryview) -> ByteBuffer:
     return ByteBuffer(data)
 
 
+def records_of_chunk(source: ByteSource, chunk: Record) -> Iterator[tuple[ByteBuffer, Record]]:
+    """Yield the records of a chunk, each with the source that it is in.
+
+    Raise RecordError where the chunk does not unpack, and at its end where the last record is not whole.
+    """
+    unpacked, end = unpack_chunk(read_content(source, chunk)), 0
+    for record in records(unpacked, 0, unpacked.size):
+        end = record.offset + record.size
+        yield unpacked, record
+    if end != unpacked.size:
+        raise RecordError("the last record of a chunk is not whole")
+
+
 def _decompress(kind: bytes, packed: memoryview, size: int) -> bytes | memoryview:
     """Decompress at most size bytes, the size that the chunk states, whatever the data contains."""
     if size > MAX_RECORD_BYTES:

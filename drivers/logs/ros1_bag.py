@@ -18,12 +18,9 @@ from typing import BinaryIO, Final, NamedTuple
 import lz4.frame  # type: ignore[import-untyped]
 
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
-from drivers.logs.joint_wheels import JointWheels
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, logged_message
 from drivers.logs.mcap_catalog import ros_name
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
-from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
-from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7  # field op of a record's header
@@ -165,10 +162,10 @@ class Ros1Bag:
             seconds, nanoseconds = _TIME.unpack(record.fields["time"])
         except _PARSE_ERRORS as error:
             raise RecordError("a message record is malformed") from error
-        if kind in IMAGE_TYPES:
-            yield LoggedImage(name, seconds * 10**9 + nanoseconds, partial(_read, kind, source, record))
-        elif kind in MOTION_TYPES:
-            yield LoggedMotion(name, seconds * 10**9 + nanoseconds, partial(_read_motion, kind, source, record))
+        time_ns = seconds * 10**9 + nanoseconds
+        logged = logged_message(name, kind, time_ns, partial(_data, source, record), aligned=False)
+        if logged is not None:
+            yield logged
 
     def _add(self, record: _Record, source: _Source) -> None:
         try:
@@ -250,14 +247,6 @@ def _unpack(record: _Record, source: _Source) -> bytes:
     if len(packed) != size:
         raise RecordError(f"a chunk has {len(packed)} of {size} bytes")
     return packed
-
-
-def _read(kind: str, source: _Source, record: _Record) -> RosImage:
-    return parse_image(kind, _data(source, record), aligned=False)
-
-
-def _read_motion(kind: str, source: _Source, record: _Record, joints: JointWheels | None) -> MotionReading:
-    return parse_motion(kind, _data(source, record), aligned=False, joints=joints)
 
 
 def _data(source: _Source, record: _Record) -> memoryview:

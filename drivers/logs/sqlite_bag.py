@@ -21,11 +21,10 @@ import zstandard
 
 from drivers.bounded_sqlite import bound_work, open_bounded
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion
-from drivers.logs.joint_wheels import JointWheels
+from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, logged_message
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
-from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
-from drivers.logs.ros_motion import MOTION_TYPES, MotionReading, parse_motion
+from drivers.logs.ros_image import IMAGE_TYPES
+from drivers.logs.ros_motion import MOTION_TYPES
 
 MAGIC: Final = b"SQLite format 3\0"
 _MAX_TOPICS: Final = 4096
@@ -111,13 +110,11 @@ class SqliteBag:
             with closing(self._rows(_MESSAGES.format(", ".join(map(str, wanted))))) as rows:
                 for key, time_ns, data in rows:
                     count += 1
+                    logged = None
                     if isinstance(data, bytes) and isinstance(time_ns, int):
-                        name, kind = wanted[key]
-                        yield (
-                            LoggedImage(name, time_ns, partial(_read, kind, data))
-                            if kind in IMAGE_TYPES
-                            else LoggedMotion(name, time_ns, partial(_read_motion, kind, data))
-                        )
+                        logged = logged_message(*wanted[key], time_ns, partial(_unpacked, data))
+                    if logged is not None:
+                        yield logged
                     else:
                         broken += 1
                     if self._closed:
@@ -158,23 +155,14 @@ class SqliteBag:
         self._bag.close()
 
 
-def _read(kind: str, data: bytes) -> RosImage:
-    return parse_image(kind, memoryview(_unpacked(data)))
-
-
-def _read_motion(kind: str, data: bytes, joints: JointWheels | None) -> MotionReading:
-    return parse_motion(kind, memoryview(_unpacked(data)), joints=joints)
-
-
-def _unpacked(data: bytes) -> bytes:
+def _unpacked(data: bytes) -> memoryview:
     """Return a message that may be compressed; raise RecordError where it does not unpack."""
     if not data.startswith(_ZSTD):
-        return data
+        return memoryview(data)
     try:
-        unpacked: bytes = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES)
+        return memoryview(zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES))
     except (zstandard.ZstdError, MemoryError) as error:
         raise RecordError(f"a compressed message does not unpack: {error}") from error
-    return unpacked
 
 
 def _line(error: Exception) -> str:
