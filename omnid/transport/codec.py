@@ -83,12 +83,17 @@ def message_cdr(message: object, schema: str) -> bytes:
     return bytes(_typestore().serialize_cdr(message, schema))
 
 
-def time_message(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
-    """Return a stamp. Raise OmnidError for one that is no ROS time."""
+def ros_time(stamp_ns: int) -> tuple[int, int]:
+    """Return seconds and nanoseconds of a stamp. Raise OmnidError for one that is no ROS time."""
     seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
     if not 0 <= seconds <= MAX_SECONDS:
         raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
-    return ros.builtin_interfaces__msg__Time(seconds, nanoseconds)
+    return seconds, nanoseconds
+
+
+def time_message(stamp_ns: int) -> ros.builtin_interfaces__msg__Time:
+    """Return a stamp. Raise OmnidError for one that is no ROS time."""
+    return ros.builtin_interfaces__msg__Time(*ros_time(stamp_ns))
 
 
 def header_message(stamp_ns: int, frame: str) -> ros.std_msgs__msg__Header:
@@ -292,7 +297,7 @@ def _stamp_ns(stamp: ros.builtin_interfaces__msg__Time) -> int:
     """Return the stamp of an Odometry. Raise OmnidError for one that is invalid."""
     if stamp.sec < 0 or stamp.nanosec >= NS_PER_S:
         raise OmnidError(f"odometry stamp {stamp.sec} s {stamp.nanosec} ns: expected Unix time; check the sender")
-    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+    return unchecked_stamp_ns(stamp)
 
 
 def _xyz(vector: Cartesian) -> tuple[float, float, float]:

@@ -16,7 +16,7 @@ from calib import se3
 from omnid.errors import OmnidError
 from omnid.transport import codec, map_codec, status_names
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import NS_PER_S
+from omnid.transport.codec import unchecked_stamp_ns
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import Key
@@ -175,7 +175,7 @@ def decode_diagnostics(payload: bytes, _: bytes = b"") -> Diagnostics:
         DiagnosticStatus(entry.name, int(entry.level), entry.message, {pair.key: pair.value for pair in entry.values})
         for entry in message.status
     )
-    return Diagnostics(_stamp_ns(message.header), statuses)
+    return Diagnostics(unchecked_stamp_ns(message.header.stamp), statuses)
 
 
 def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
@@ -191,7 +191,7 @@ def decode_cloud(payload: bytes, _: bytes = b"") -> Cloud:
             f"expected the fields {', '.join(map_codec.CLOUD_FIELDS)} in {step} bytes"
         )
     packed = message.data.view("<f4").reshape(-1, len(map_codec.CLOUD_FIELDS))
-    return Cloud(_stamp_ns(message.header), message.header.frame_id, packed[:, :3], packed[:, 3])
+    return Cloud(unchecked_stamp_ns(message.header.stamp), message.header.frame_id, packed[:, :3], packed[:, 3])
 
 
 def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
@@ -199,7 +199,9 @@ def decode_map_pose(payload: bytes, _: bytes = b"") -> PoseInMap:
     message = codec.message_from_cdr(payload, codec.MAP_POSE_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__PoseWithCovarianceStamped)
     return PoseInMap(
-        _stamp_ns(message.header), codec.rigid_transform(message.pose.pose), message.pose.covariance.reshape(6, 6)
+        unchecked_stamp_ns(message.header.stamp),
+        codec.rigid_transform(message.pose.pose),
+        message.pose.covariance.reshape(6, 6),
     )
 
 
@@ -214,13 +216,9 @@ def decode_map(payload: bytes, _: bytes = b"") -> Map:
             f"{info.width} x {info.height} cells of a positive size, parallel to the frame's axes"
         )
     return Map(
-        _stamp_ns(message.header),
+        unchecked_stamp_ns(message.header.stamp),
         message.header.frame_id,
         message.data.reshape(info.height, info.width),
         float(info.resolution),
         (at.position.x, at.position.y),
     )
-
-
-def _stamp_ns(header: ros.std_msgs__msg__Header) -> int:
-    return int(header.stamp.sec) * NS_PER_S + int(header.stamp.nanosec)

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.frame import Frame
 from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
-from omnid.errors import OmnidError
-from omnid.transport.codec import MAX_SECONDS, NS_PER_S
+from omnid.transport.codec import ros_time
 
 COMPRESSED: Final = ("jpeg", "png")
 # Encoding in drivers.frame -> name in sensor_msgs/image_encodings.hpp, where that is different.
@@ -33,10 +32,7 @@ def image_cdr(frame: Frame, stamp_ns: int) -> tuple[str, bytes]:
 
     Raise OmnidError where the stamp does not fit a ROS time.
     """
-    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    if not 0 <= seconds <= MAX_SECONDS:
-        raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
-    header = _aligned(pack("<iI", seconds, nanoseconds) + _string(frame.camera))
+    header = _aligned(pack("<iI", *ros_time(stamp_ns)) + _string(frame.camera))
     data = np.frombuffer(frame.data, np.uint8)
     if frame.encoding in COMPRESSED:
         return COMPRESSED_IMAGE, _message(_aligned(header + _string(frame.encoding)), data)

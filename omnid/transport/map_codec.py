@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -26,19 +28,22 @@ def point_cloud_cdr(
 
     T_frame_points (4, 4) maps the points into `frame`; None where they are given in it.
     """
-    packed = _packed(points, confidence, T_frame_points)
+    return packed_cloud_cdr(stamp_ns, frame, CLOUD_FIELDS, _packed(points, confidence, T_frame_points))
+
+
+def packed_cloud_cdr(stamp_ns: int, frame: str, names: Sequence[str], rows: NDArray[np.float32]) -> bytes:
+    """Encode a sensor_msgs/msg/PointCloud2 of rows (N, F), little-endian float32, whose F fields have these names."""
     number = ros.sensor_msgs__msg__PointField.FLOAT32
-    fields = [ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(CLOUD_FIELDS)]
     message = ros.sensor_msgs__msg__PointCloud2(
         header=codec.header_message(stamp_ns, frame),
         height=1,
-        width=len(packed),
-        fields=fields,
+        width=len(rows),
+        fields=[ros.sensor_msgs__msg__PointField(name, 4 * i, number, 1) for i, name in enumerate(names)],
         is_bigendian=False,
-        point_step=16,
-        row_step=16 * len(packed),
-        data=packed.reshape(-1).view(np.uint8),
-        is_dense=bool(np.isfinite(packed).all()),
+        point_step=4 * len(names),
+        row_step=4 * len(names) * len(rows),
+        data=rows.reshape(-1).view(np.uint8),
+        is_dense=bool(np.isfinite(rows).all()),
     )
     return codec.message_cdr(message, codec.POINT_CLOUD_SCHEMA)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros
-from omnid.transport.codec import MAX_SECONDS, NS_PER_S, message_from_cdr
+from omnid.transport.codec import message_from_cdr, ros_time, unchecked_stamp_ns
 
 SCAN_SCHEMA: Final = "sensor_msgs/msg/LaserScan"
 MOST_RANGES: Final = 100_000
@@ -39,11 +39,8 @@ def scan_cdr(stamp_ns: int, frame: str, ranges_m: Floats, sigma_m: Floats, limit
 
     Raise OmnidError where the stamp does not fit a ROS time.
     """
-    seconds, nanoseconds = divmod(int(stamp_ns), NS_PER_S)
-    if not 0 <= seconds <= MAX_SECONDS:
-        raise OmnidError(f"stamp {stamp_ns} ns does not fit a ROS time (1970 to 2038); give nanoseconds of Unix time")
     name = frame.encode() + b"\0"
-    head = pack("<iII", seconds, nanoseconds, len(name)) + name
+    head = pack("<iII", *ros_time(stamp_ns), len(name)) + name
     step = 2 * math.pi / len(ranges_m)
     numbers = pack("<7f", step / 2 - math.pi, math.pi - step / 2, step, 0.0, 0.0, *limits_m)
     arrays = [
@@ -65,7 +62,7 @@ def decode_scan(payload: bytes, _: bytes = b"") -> Scan:
             f"found; expected finite angles and at most {MOST_RANGES} ranges"
         )
     azimuths = message.angle_min + message.angle_increment * np.arange(count)
-    stamp_ns = int(message.header.stamp.sec) * NS_PER_S + int(message.header.stamp.nanosec)
+    stamp_ns = unchecked_stamp_ns(message.header.stamp)
     return Scan(
         stamp_ns, message.header.frame_id, azimuths, message.ranges, message.intensities, float(message.range_max)
     )
