@@ -16,8 +16,16 @@ from calib.models.camera import Mask, OmniCamera
 from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import LENS_KEYS, LensCamera, lens_camera, lens_parameters
 from calib.models.names import model_name
-from calib.models.ocam import DISTANCE_M, NO_WAVEFRONT, VIEWS, OcamCamera, View
-from calib.models.unified import UnifiedCamera
+from calib.models.ocam import (
+    ASTIGMATISM_NAMES,
+    DISTANCE_M,
+    NO_WAVEFRONT,
+    TANGENTIAL_NAMES,
+    VIEWS,
+    OcamCamera,
+    View,
+)
+from calib.models.unified import OMNI_NAMES, UnifiedCamera
 from calib.validation import ValidatedTable, read_bytes
 
 # Signature, length and name of the first chunk, then width and height. Source: PNG 1.2, sections 3.1 and 4.1.1.
@@ -27,11 +35,10 @@ PNG_FIRST_CHUNK = 8
 PNG_CHUNK_BYTES = 12
 MAX_PNG_CHUNKS = 1000
 EMBEDDED = "data:image/png;base64,"
-OMNI_KEYS = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 PINHOLE_KEYS = ("fu", "fv", "pu", "pv")
 OCAM_KEYS = ("polynomial", "center_row", "center_column", "c", "d", "e")
 # Optional terms of an ocam camera: tangential [1/px], secondary astigmatism [1/px^2]; files without them are read as 0.
-TANGENTIAL_KEYS, ASTIGMATISM_KEYS = ("p1", "p2"), ("s1", "s2")
+OPTIONAL_KEYS = (*TANGENTIAL_NAMES, *ASTIGMATISM_NAMES)
 # Optional wavefront [m], with the distance [m] at which the central model is exact.
 WAVEFRONT_KEYS = ("wavefront", "distance_m")
 
@@ -52,9 +59,8 @@ def read_camera_table(
 
 def _omni(table: ValidatedTable) -> UnifiedCamera:
     values = table.table("intrinsics")
-    values.allow_only(OMNI_KEYS)
-    xi, fu, fv, pu, pv = (values.number(key) for key in OMNI_KEYS[:5])
-    k1, k2, p1, p2 = (values.number(key) for key in OMNI_KEYS[5:])
+    values.allow_only(OMNI_NAMES)
+    xi, fu, fv, pu, pv, k1, k2, p1, p2 = (values.number(key) for key in OMNI_NAMES)
     size = table.size("size")
     try:
         return UnifiedCamera(xi, (fu, fv), (pu, pv), size, (k1, k2, p1, p2))
@@ -84,9 +90,9 @@ def _equirectangular(table: ValidatedTable) -> EquirectangularCamera:
 
 def _ocam(table: ValidatedTable) -> OcamCamera:
     values = table.table("intrinsics")
-    values.allow_only((*OCAM_KEYS, *TANGENTIAL_KEYS, *ASTIGMATISM_KEYS, *WAVEFRONT_KEYS))
+    values.allow_only((*OCAM_KEYS, *OPTIONAL_KEYS, *WAVEFRONT_KEYS))
     row, column, c, d, e = (values.number(key) for key in OCAM_KEYS[1:])
-    p1, p2, s1, s2 = (values.number(key) if values.has(key) else 0.0 for key in (*TANGENTIAL_KEYS, *ASTIGMATISM_KEYS))
+    p1, p2, s1, s2 = (values.number(key) if values.has(key) else 0.0 for key in OPTIONAL_KEYS)
     wavefront = values.numbers("wavefront", len(NO_WAVEFRONT)) if values.has("wavefront") else NO_WAVEFRONT
     distance_m = values.number("distance_m") if values.has("distance_m") else DISTANCE_M
     view: View = "mirror" if table.choice("view", VIEWS) == "mirror" else "direct"
@@ -188,12 +194,12 @@ def intrinsics_text(name: str, camera: OmniCamera) -> str:
     """Return the table of the intrinsics within a camera's table."""
     if isinstance(camera, UnifiedCamera):
         values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
-        named = [f"{key} = {number_text(value)}" for key, value in zip(OMNI_KEYS, values, strict=True)]
+        named = [f"{key} = {number_text(value)}" for key, value in zip(OMNI_NAMES, values, strict=True)]
     elif isinstance(camera, OcamCamera):
         numbers = (*camera.center_row_column, *camera.affine)
         named = [f"polynomial = [{', '.join(map(number_text, camera.polynomial))}]"]
         named += [f"{key} = {number_text(value)}" for key, value in zip(OCAM_KEYS[1:], numbers, strict=True)]
-        for keys, terms in ((TANGENTIAL_KEYS, camera.tangential), (ASTIGMATISM_KEYS, camera.astigmatism)):
+        for keys, terms in ((TANGENTIAL_NAMES, camera.tangential), (ASTIGMATISM_NAMES, camera.astigmatism)):
             if any(terms):
                 named += [f"{key} = {number_text(value)}" for key, value in zip(keys, terms, strict=True)]
         if any(camera.wavefront):

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.camera_table import OMNI_KEYS, number_text, string_text
+from calib.camera_table import number_text, string_text
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
-from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera
+from calib.models.ocam import ASTIGMATISM_NAMES, MAX_COEFFICIENTS, TANGENTIAL_NAMES, OcamCamera
+from calib.models.unified import OMNI_NAMES
+from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
 from calib.validation import ValidatedTable
 
@@ -18,15 +20,9 @@ OCAM_NAMES = (
     "center_column",
     "c",
     "d",
-    "p1",
-    "p2",
-    "s1",
-    "s2",
-    "w_a",
-    "w_b",
-    "w_x",
-    "w_y",
-    "w_s",
+    *TANGENTIAL_NAMES,
+    *ASTIGMATISM_NAMES,
+    *WAVEFRONT_NAMES,
 )
 
 
@@ -51,7 +47,7 @@ def _names(table: ValidatedTable, cameras: tuple[OmniCamera, OmniCamera]) -> tup
         *(
             f"{side} {name}"
             for side, camera in zip(("lower", "upper"), cameras, strict=True)
-            for name in (OCAM_NAMES if isinstance(camera, OcamCamera) else OMNI_KEYS)
+            for name in (OCAM_NAMES if isinstance(camera, OcamCamera) else OMNI_NAMES)
         ),
     }
     if (

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
-from calib.models.ocam import OcamCamera
-from calib.models.unified import UnifiedCamera
+from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
+from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.models.wavefront import WAVEFRONT_NAMES
 
-OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
-OCAM_TANGENTIAL_NAMES, OCAM_ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
-WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
 # One step of a wavefront's coefficient [m]: about half a pixel of a board at half a metre, as of the other parameters.
 WAVEFRONT_UNIT_M = 1e-3
+# A parameter: its name, its value, and one step in its own unit.
+_Row = tuple[str, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,55 +50,45 @@ def parameterise(
     ocam camera's wavefront, and its secondary astigmatism, even if they are 0. Without, the wavefront stays: only near
     objects such as boards show it.
     """
-    scale = min(camera.size) / 2
     if isinstance(camera, UnifiedCamera):
-        values = np.array([camera.xi, *camera.focal, *camera.center, *camera.distortion])
-        kept = (values != 0) | np.isin(OMNI_NAMES, [*OMNI_NAMES[:5], *distortion])
-        units = np.array([1, scale, scale, scale, scale, 1, 1, 1, 1]) / scale
-        return CameraParameterisation(camera, tuple(np.array(OMNI_NAMES)[kept].tolist()), values[kept], units[kept])
-    if not isinstance(camera, OcamCamera):
+        rows = _omni_rows(camera, distortion)
+    elif isinstance(camera, OcamCamera):
+        rows = _ocam_rows(camera, wavefront=wavefront)
+    else:
         raise CalibError(
             f"calibrate: expected an omni or ocam camera, whose parameters can be fitted, found "
             f"{type(camera).__name__}: calibrate lenses by Kalibr"
         )
-    powers = [power for power, value in enumerate(camera.polynomial) if value != 0]
+    names, start, units = zip(*rows, strict=True)
+    return CameraParameterisation(camera, names, np.array(start), np.array(units))
+
+
+def _omni_rows(camera: UnifiedCamera, distortion: Collection[str]) -> list[_Row]:
+    scale = min(camera.size) / 2
+    values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
+    pixels = OMNI_NAMES[1:5]  # the others have no unit
+    rows = [(name, value, 1.0 if name in pixels else 1 / scale) for name, value in zip(OMNI_NAMES, values, strict=True)]
+    kept = ("xi", *pixels, *distortion)
+    return [row for row in rows if row[1] != 0 or row[0] in kept]
+
+
+def _ocam_rows(camera: OcamCamera, *, wavefront: bool) -> list[_Row]:
+    scale = min(camera.size) / 2
+    rows = [(f"a{power}", value, scale ** -float(power)) for power, value in enumerate(camera.polynomial) if value != 0]
+    rows += _rows(("center_row", "center_column"), camera.center_row_column, 1.0)
+    rows += _rows(("c", "d"), camera.affine[:2], 1 / scale)
     # p1 and p2 are correlated, so both are adjusted or neither.
-    tangential = camera.tangential if any(camera.tangential) else ()
-    astigmatism = camera.astigmatism if wavefront or any(camera.astigmatism) else ()
-    waves = camera.wavefront if wavefront else ()
-    start = np.array(
-        [
-            *(camera.polynomial[power] for power in powers),
-            *camera.center_row_column,
-            *camera.affine[:2],
-            *tangential,
-            *astigmatism,
-            *waves,
-        ]
-    )
-    units = np.array(
-        [
-            *(scale ** -float(power) for power in powers),
-            1.0,
-            1.0,
-            1 / scale,
-            1 / scale,
-            *[1 / scale**2 for _ in tangential],
-            *[1 / scale**3 for _ in astigmatism],
-            *[WAVEFRONT_UNIT_M for _ in waves],
-        ]
-    )
-    names = (
-        *(f"a{power}" for power in powers),
-        "center_row",
-        "center_column",
-        "c",
-        "d",
-        *OCAM_TANGENTIAL_NAMES[: len(tangential)],
-        *OCAM_ASTIGMATISM_NAMES[: len(astigmatism)],
-        *WAVEFRONT_NAMES[: len(waves)],
-    )
-    return CameraParameterisation(camera, names, start, units)
+    if any(camera.tangential):
+        rows += _rows(TANGENTIAL_NAMES, camera.tangential, 1 / scale**2)
+    if wavefront or any(camera.astigmatism):
+        rows += _rows(ASTIGMATISM_NAMES, camera.astigmatism, 1 / scale**3)
+    if wavefront:
+        rows += _rows(WAVEFRONT_NAMES, camera.wavefront, WAVEFRONT_UNIT_M)
+    return rows
+
+
+def _rows(names: Iterable[str], values: Iterable[float], unit: float) -> list[_Row]:
+    return [(name, value, unit) for name, value in zip(names, values, strict=True)]
 
 
 def _omni_camera(base: UnifiedCamera, values: dict[str, float]) -> UnifiedCamera:
@@ -112,8 +102,8 @@ def _ocam_camera(base: OmniCamera, values: dict[str, float]) -> OcamCamera:
     assert isinstance(base, OcamCamera)
     polynomial = tuple(values.get(f"a{power}", 0.0) for power in range(len(base.polynomial)))
     affine = (values["c"], values["d"], base.affine[2] + values["d"] - base.affine[1])
-    p1, p2 = (values.get(name, 0.0) for name in OCAM_TANGENTIAL_NAMES)
-    s1, s2 = (values.get(name, 0.0) for name in OCAM_ASTIGMATISM_NAMES)
+    p1, p2 = (values.get(name, 0.0) for name in TANGENTIAL_NAMES)
+    s1, s2 = (values.get(name, 0.0) for name in ASTIGMATISM_NAMES)
     wavefront = tuple(values.get(name, now) for name, now in zip(WAVEFRONT_NAMES, base.wavefront, strict=True))
     return replace(
         base,

@@ -28,6 +28,8 @@ from calib.models.camera import Array, OmniCamera
 
 View = Literal["mirror", "direct"]
 VIEWS: tuple[View, View] = ("mirror", "direct")
+# The tangential and the astigmatic terms, as files and results name them.
+TANGENTIAL_NAMES, ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 
 # The limit of the toolbox's own C reader.
 MAX_COEFFICIENTS = 64

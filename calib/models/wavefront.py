@@ -17,7 +17,9 @@ import numpy as np
 
 from calib.models.camera import Array
 
-TERMS = 5  # Number of terms, as many as files have names: w_a, w_b, w_x, w_y, w_s.
+# The terms a, b, c_x, c_y, s, as files and results name them.
+WAVEFRONT_NAMES = ("w_a", "w_b", "w_x", "w_y", "w_s")
+TERMS = len(WAVEFRONT_NAMES)
 # Largest coefficient [m]; a wavefront of larger ones is no small error of a mirror.
 MAX_COEFFICIENT_M = 0.1
 # Iterations of the direction: each reduces its error by the offset in parts of the distance, about 1 / 1000.

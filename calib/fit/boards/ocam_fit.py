@@ -10,11 +10,10 @@ from calib.errors import CalibError
 from calib.fit.boards.bundle import BundleResult, Observations, adjust_bundle
 from calib.fit.boards.ocam_linear import powers, solve_linear
 from calib.models.camera import Array
-from calib.models.ocam import OcamCamera, View
+from calib.models.ocam import TANGENTIAL_NAMES, OcamCamera, View
 
 # Degree of the polynomial at the start, as in the toolbox.
 DEGREE = 4
-TANGENTIAL_NAMES = ["p1", "p2"]
 
 
 def fit_ocam(observed: Observations, size: tuple[int, int], view: View = "mirror") -> BundleResult:
@@ -85,7 +84,7 @@ def ocam_parameters(
     """Return name, value and standard deviation of every parameter, in the units of the model's file."""
     conversion = _conversion(size, degree, tangential)
     names = [f"a{power}" for power in powers(degree)] + ["center_row", "center_column", "c", "d = e"]
-    names += TANGENTIAL_NAMES if tangential else []
+    names += TANGENTIAL_NAMES if tangential else ()
     values = fit.parameters * conversion + np.where([name == "c" for name in names], 1.0, 0.0)
     sigmas = np.sqrt(np.maximum(0, np.diag(fit.covariance))) * conversion
     return [(name, float(value), float(sigma)) for name, value, sigma in zip(names, values, sigmas, strict=True)]

@@ -12,12 +12,13 @@ from calib.boards.board import CalibrationBoard
 from calib.boards.print_shape import PrintShape
 from calib.fit.boards.bundle import Observations, Prior
 from calib.fit.boards.relative_pose import ViewPair
-from calib.fit.parameterisation import WAVEFRONT_NAMES, CameraParameterisation, parameterise
+from calib.fit.parameterisation import CameraParameterisation, parameterise
 from calib.models.camera import Array, OmniCamera
-from calib.models.ocam import has_wavefront, project_near
+from calib.models.ocam import ASTIGMATISM_NAMES, has_wavefront, project_near
+from calib.models.wavefront import WAVEFRONT_NAMES
 
 # Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre.
-MIRROR_NAMES, MIRROR_SIGMA_STEPS = ("s1", "s2", *WAVEFRONT_NAMES), 1.0
+MIRROR_NAMES, MIRROR_SIGMA_STEPS = (*ASTIGMATISM_NAMES, *WAVEFRONT_NAMES), 1.0
 # The lower and the upper camera.
 Sides = tuple[OmniCamera, OmniCamera]
 # A board, and the shape of its print whose free modes are fitted.

@@ -10,11 +10,10 @@ from calib import se3
 from calib.fit.boards.bundle import BundleResult, Observations, adjust_bundle
 from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
-from calib.models.unified import UnifiedCamera
+from calib.models.unified import OMNI_NAMES, UnifiedCamera
 
 # Numbers of distortion coefficients that may be solved for: none, k1 and k2, all.
 DISTORTION_TERMS = (0, 2, 4)
-NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
 # Start values of xi: pinhole (0), hyperbolic mirrors, parabolic mirrors (1), fisheye lenses.
 START_XI = np.linspace(0.0, 3.0, 31)
 # Least cos(angle) + xi at which the projection is well defined: less would be 100 focal lengths from the centre.
@@ -83,5 +82,5 @@ def unified_parameters(fit: BundleResult, size: tuple[int, int], terms: int = 0)
     sigmas = np.sqrt(np.maximum(0, np.diag(fit.covariance))) * conversion
     return [
         (name, float(value), float(sigma))
-        for name, value, sigma in zip(NAMES[: 5 + terms], fit.parameters * conversion, sigmas, strict=True)
+        for name, value, sigma in zip(OMNI_NAMES[: 5 + terms], fit.parameters * conversion, sigmas, strict=True)
     ]

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib import se3
-from calib.fit.parameterisation import WAVEFRONT_NAMES, WAVEFRONT_UNIT_M, CameraParameterisation, parameterise
+from calib.fit.parameterisation import WAVEFRONT_UNIT_M, CameraParameterisation, parameterise
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import OcamCamera, wavefront_of
+from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.fit.drive.rig_parameters import TIME_UNITS, TRANSFORM_NAMES, RigParameters
-from calib.fit.parameterisation import WAVEFRONT_NAMES
 from calib.models.camera import Array
+from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import Rig
 
 # A nominal rig: mirror data sheet, rim of the mirror in the images, baseline by ruler.
