@@ -102,7 +102,7 @@ def calibrate_consistent(
         bad = outlier_views(solved.fit)
         if not bad.any():
             break
-        rejected += [_rejected_view(seen, solved.fit, k) for k, seen in enumerate(good) if bad[k]]
+        rejected += [rejected_view(seen.name, solved.fit, k) for k, seen in enumerate(good) if bad[k]]
         good = [seen for k, seen in enumerate(good) if not bad[k]]
         _require(len(good), "consistent views", rejected)
         solved = fit_model(model, observations(good, board, shape), size, view)
@@ -175,9 +175,10 @@ def outlier_views(fit: BundleResult) -> NDArray[np.bool_]:
     return np.asarray(bad)
 
 
-def _rejected_view(view: BoardView, fit: BundleResult, k: int) -> RejectedView:
+def rejected_view(name: str, fit: BundleResult, k: int) -> RejectedView:
+    """Return view k of a fit, which has that name, as one that is an outlier."""
     errors = np.nanmedian(fit.errors_px, axis=1)
-    return RejectedView(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
+    return RejectedView(name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
 
 
 def _warnings(solved: FittedModel, observed: Observations) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from calib.boards.corner_refinement import refine_with_camera
 from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
 from calib.fit.boards.bundle import BundleResult, adjust_bundle
-from calib.fit.boards.camera_fit import RejectedView, outlier_views
+from calib.fit.boards.camera_fit import RejectedView, outlier_views, rejected_view
 from calib.fit.boards.cross_validation import cross_validated_px
 from calib.fit.boards.print_shape_fit import find_print_shape
 from calib.fit.boards.relative_pose import RelativePoseInitialisation, initialise_relative_pose
@@ -106,7 +106,7 @@ def fit_rig(
         bad = outlier_views(fit)
         if not bad.any():
             break
-        rejected += [_rejected_view(good[k], fit, k) for k in np.flatnonzero(bad).tolist()]
+        rejected += [rejected_view(good[k].name, fit, k) for k in np.flatnonzero(bad).tolist()]
         good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
         _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
         found = unknowns.camera(fit.parameters)
@@ -218,11 +218,6 @@ def rig_held_out_px(found: RigCalibration) -> float:
         rig_observations(found.views, (found.board, found.shape), fixed=True),
         unknowns.prior,
     )
-
-
-def _rejected_view(view: PairView, fit: BundleResult, k: int) -> RejectedView:
-    errors = np.nanmedian(fit.errors_px, axis=1)
-    return RejectedView(view.name, f"its corners are {errors[k]:.2f} px off, the others {np.median(errors):.2f} px")
 
 
 def _rig_calibration(
