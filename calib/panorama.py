@@ -132,33 +132,8 @@ def fit_cylinder(
 
     width_px: columns of a full turn; 0: the resolution of the images, scaled.
     """
-    low, high = np.tan(np.deg2rad(elevation_deg))
-    slopes: Array = np.linspace(low, high, SLOPES)
-    sector = _shared_sector(rig, slopes)
-    if sector is None:
-        raise CalibError(
-            f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
-            "of elevation; check the intrinsics, the transforms and the masks"
-        )
-    # 1. Slopes that both cameras see over most of the sector.
-    seen = [
-        _seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE for mounted in (rig.lower, rig.upper)
-    ]
-    both = seen[0] & seen[1]
-    if not both.any():
-        raise CalibError(
-            f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no "
-            f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
-            "the transforms and the masks"
-        )
-    slopes = slopes[both]
-    shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
-    if shared_deg < MIN_SHARED_DEG:
-        raise CalibError(
-            f"rig: the cameras share {shared_deg:.0f} degrees of elevation about the line through both "
-            f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
-            "check the transforms and the masks"
-        )
+    # 1. The sector of azimuth, and the slopes, that both cameras see.
+    sector, slopes = _shared_view(rig, elevation_deg)
     # 2. Columns.
     turn = width_px
     if not turn:
@@ -188,6 +163,39 @@ def _too_large(found: str) -> CalibError:
         f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or "
         "set panorama.width_px"
     )
+
+
+def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector, Array]:
+    """Return the sector that both cameras share, and the slopes z/r (S,) that both see over most of it.
+
+    Raise CalibError where they share too little.
+    """
+    low, high = np.tan(np.deg2rad(elevation_deg))
+    slopes: Array = np.linspace(low, high, SLOPES)
+    sector = _shared_sector(rig, slopes)
+    if sector is None:
+        raise CalibError(
+            f"rig: the cameras share no view between {elevation_deg[0]} and {elevation_deg[1]} degrees "
+            "of elevation; check the intrinsics, the transforms and the masks"
+        )
+    lower, upper = (
+        _seen(rig, mounted, slopes, _azimuths(sector)).mean(axis=1) >= MIN_VISIBLE for mounted in (rig.lower, rig.upper)
+    )
+    slopes = slopes[lower & upper]
+    if not len(slopes):
+        raise CalibError(
+            f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no "
+            f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
+            "the transforms and the masks"
+        )
+    shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
+    if shared_deg < MIN_SHARED_DEG:
+        raise CalibError(
+            f"rig: the cameras share {shared_deg:.0f} degrees of elevation about the line through both "
+            f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
+            "check the transforms and the masks"
+        )
+    return sector, slopes
 
 
 def _shared_sector(rig: Rig, slopes: Array) -> _Sector | None:
