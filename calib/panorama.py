@@ -159,9 +159,8 @@ def fit_cylinder(
 
 def _too_large(found: str) -> CalibError:
     return CalibError(
-        f"rig: a panorama with the resolution of its images would have {found}, expected at most "
-        f"{MAX_WIDTH_PX} columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or "
-        "set panorama.width_px"
+        f"rig: a panorama with the resolution of its images would have {found}, expected at most {MAX_WIDTH_PX} "
+        f"columns and {MAX_PIXELS} pixels; check the intrinsics and the transforms, or set panorama.width_px"
     )
 
 
@@ -184,9 +183,8 @@ def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector,
     slopes = slopes[lower & upper]
     if not len(slopes):
         raise CalibError(
-            f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no "
-            f"elevation between {elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check "
-            "the transforms and the masks"
+            f"rig: the cameras share {math.degrees(sector.span_rad):.0f} degrees of azimuth, but no elevation between "
+            f"{elevation_deg[0]} and {elevation_deg[1]} degrees in half of them; check the transforms and the masks"
         )
     shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
     if shared_deg < MIN_SHARED_DEG:

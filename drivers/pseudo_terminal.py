@@ -38,9 +38,8 @@ class TerminalCheck:
         known = self._known
         if known is not None and found.terminal != known.terminal and found.links == known.links:
             raise DriverError(
-                f"port {self._name!r}: the pseudo-terminal behind it has ended, and {found.path} belongs "
-                "to another program now; start the first one again, and make a new link to its terminal "
-                "or name that"
+                f"port {self._name!r}: the pseudo-terminal behind it has ended, and {found.path} belongs to another "
+                "program now; start the first one again, and make a new link to its terminal or name that"
             )
         self._known = found
 

@@ -107,9 +107,8 @@ class OcamCamera:
         c, d, e = self.affine
         if self.polynomial[0] >= 0 or abs(c - d * e) < MIN_DETERMINANT or min(self.size) < 1 or self.view not in VIEWS:
             raise CalibError(
-                "ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, "
-                f"found a0 {self.polynomial[0]}, affine {self.affine}, size {self.size}, "
-                f"view {self.view!r}"
+                "ocam camera: expected a0 < 0, an invertible affine, a size and view mirror or direct, found a0 "
+                f"{self.polynomial[0]}, affine {self.affine}, size {self.size}, view {self.view!r}"
             )
 
     @property

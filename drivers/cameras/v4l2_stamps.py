@@ -47,9 +47,8 @@ class StampValidator:
             self._state.restamped += 1
             self._report_once(
                 "stamp",
-                f"a stamp is {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not "
-                "after the stamp before; the time of arrival, less the usual delay, is used for such images, "
-                "which are counted",
+                f"a stamp is {(stamp_ns - arrival_ns) / 1e6:.3f} ms after the arrival, or not after the stamp before; "
+                "the time of arrival, less the usual delay, is used for such images, which are counted",
             )
             stamp_ns = arrival_ns - usual_ns
         self._last_ns = max(stamp_ns, self._last_ns + 1)

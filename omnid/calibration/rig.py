@@ -266,9 +266,8 @@ def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | 
     )
     if not low <= found.baseline_m <= high:
         raise OmnidError(
-            f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found "
-            f"{baseline_mm:.4g} mm; it is proportional to {option}, which is {length_mm:g}: "
-            "measure the board"
+            f"calibrate rig: expected a baseline of {low * 1e3:.0f} to {high * 1e3:.0f} mm, found {baseline_mm:.4g} "
+            f"mm; it is proportional to {option}, which is {length_mm:g}: measure the board"
         )
     if expected_m is None:
         return []

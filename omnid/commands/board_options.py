@@ -27,9 +27,8 @@ def add_board_options(parser: argparse.ArgumentParser) -> None:
         "--board",
         choices=sorted(NEEDED),
         default="checkerboard",
-        help="checkerboard (default); "
-        "charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. Boards with "
-        "markers may be half hidden",
+        help="checkerboard (default); charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. "
+        "Boards with markers may be half hidden",
     )
     board.add_argument(
         "--corners",

@@ -35,9 +35,8 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         "--rig",
         type=Path,
         metavar="FILE",
-        help="the rig.toml to start from; a nominal one will do: "
-        "mirror data sheet, centre of the images, baseline by ruler; default: the one attached to the "
-        "first log",
+        help="the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images, baseline by "
+        "ruler; default: the one attached to the first log",
     )
     add_topics(parser, "the {camera} camera's topic")
     parser.add_argument(

@@ -31,10 +31,9 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser = actions.add_parser(
         "live",
         help="images of a board, with its coverage so far and what is missing",
-        description="Search the board in the images of both cameras as they come. Pairs in "
-        "which it stands still at a new place are written to DIR; the terminal and the page "
-        "(`omnid web`) show where it has been, what is missing, and when it is enough. Stop "
-        "the daemon first: it holds the cameras. Exit code 1: not enough yet.",
+        description="Search the board in the images of both cameras as they come. Pairs in which it stands still at a "
+        "new place are written to DIR; the terminal and the page (`omnid web`) show where it has been, what is "
+        "missing, and when it is enough. Stop the daemon first: it holds the cameras. Exit code 1: not enough yet.",
     )
     parser.add_argument(
         "images",

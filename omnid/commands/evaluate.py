@@ -32,17 +32,15 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--align",
         choices=("origin", "rigid", "scale"),
-        help="the first pose "
-        "(default), as evo's --align_origin; rigid: all positions, as its --align; scale: these and "
-        "the estimate's scale, which is printed, as its --align --correct_scale",
+        help="the first pose (default), as evo's --align_origin; rigid: all positions, as its --align; scale: these "
+        "and the estimate's scale, which is printed, as its --align --correct_scale",
     )
     parser.add_argument(
         "--score",
         choices=("hilti", "kitti"),
-        help="a score by which others compare. hilti: 100 "
-        "exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree cameras, 0 where more than 1 %% of "
-        "the truth's poses are missing, with --align rigid unless another one is given; kitti: drift "
-        "over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m",
+        help="a score by which others compare. hilti: 100 exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree "
+        "cameras, 0 where more than 1 %% of the truth's poses are missing, with --align rigid unless another one is "
+        "given; kitti: drift over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m",
     )
     parser.add_argument(
         "--live",

@@ -14,9 +14,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser(
         "install-service",
         help="install omnid as a systemd service",
-        description="Install the systemd unit for this program, example udev rules, a "
-        "minimal configuration and the user that it runs as. Files that people edit are "
-        "kept where they exist.",
+        description="Install the systemd unit for this program, example udev rules, a minimal configuration and the "
+        "user that it runs as. Files that people edit are kept where they exist.",
     )
     parser.add_argument(
         "--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine only"

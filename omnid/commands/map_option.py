@@ -17,9 +17,8 @@ def add_map(parser: argparse.ArgumentParser) -> None:
         "--map",
         type=Path,
         metavar="FILE.omap",
-        help="localise in a map of places and extend it at "
-        "the end; a file that does not exist is made; the points of the 3-D map are written by "
-        "`omnid replay --cloud FILE.ply`",
+        help="localise in a map of places and extend it at the end; a file that does not exist is made; the points of "
+        "the 3-D map are written by `omnid replay --cloud FILE.ply`",
     )
     group.add_argument("--localize-only", action="store_true", help="leave the map as it is")
     add_tags_option(group)

@@ -52,8 +52,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         choices=("here", "start"),
         default="here",
         dest="begin",
-        help="here: from where the "
-        "robot is on the route, anywhere within 1.5 m of it; start: the whole route, refused "
+        help="here: from where the robot is on the route, anywhere within 1.5 m of it; start: the whole route, refused "
         "elsewhere; default %(default)s",
     )
     repeat.add_argument("--no-wait", action="store_true", help="end as soon as the robot has accepted it")

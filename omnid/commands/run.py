@@ -45,9 +45,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         parser.add_argument(
             f"--{camera}",
             metavar="DEVICE|TOPIC",
-            help=f"device of the {camera} camera; default: "
-            f"cameras.{camera} of the settings; with --log the topic of its images, default: found by "
-            "name",
+            help=f"device of the {camera} camera; default: cameras.{camera} of the settings; with --log the topic of "
+            "its images, default: found by name",
         )
     parser.add_argument(
         "--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"

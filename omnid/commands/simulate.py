@@ -41,9 +41,8 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--speed",
         choices=(AUTO, REAL_TIME),
         default=AUTO,
-        help="auto: simulated time waits for the "
-        "daemon, and is never faster than real time; 1.0: real time, as on a robot: what the computer "
-        "cannot do in time is dropped; default %(default)s",
+        help="auto: simulated time waits for the daemon, and is never faster than real time; 1.0: real time, as on a "
+        "robot: what the computer cannot do in time is dropped; default %(default)s",
     )
     parser.add_argument("--seed", type=int, default=1, help="of textures and noise; default %(default)s")
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig")

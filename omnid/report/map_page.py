@@ -79,10 +79,9 @@ def _figure(places: PlaceMap, rig: PlaceRig, driven: Sequence[MappedDrive]) -> s
         )
     )
     return (
-        f"<figure class='sheet'><figcaption>{keys}</figcaption><svg viewBox='{box}' role='img' "
-        f"aria-label='Map of places'>{''.join(parts)}</svg><small>Dots: keyframes. Behind them what "
-        "their range scans saw: free floor has the shade of the page, what is occupied stands out, "
-        "what lies between is unknown.</small></figure>"
+        f"<figure class='sheet'><figcaption>{keys}</figcaption><svg viewBox='{box}' role='img' aria-label='Map of "
+        f"places'>{''.join(parts)}</svg><small>Dots: keyframes. Behind them what their range scans saw: free floor has "
+        "the shade of the page, what is occupied stands out, what lies between is unknown.</small></figure>"
     )
 
 

@@ -27,10 +27,9 @@ def timeline(spans: Spans, gaps: Sequence[Point], events: Sequence[Event], clock
         parts += _lane(source, 42 + _LANE * row, [e for e in events if e.source == source], px)
     parts += time_ticks(clock.axis(_LEFT, _RIGHT), float(height), clock)
     return (
-        f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption>"
-        f"<svg viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events' "
-        f"data-x='{_LEFT} {_RIGHT}'>{''.join(parts)}</svg>"
-        "</figure>"
+        f"<figure class='lanes'><figcaption><b>States and events</b> {_keys(events, bool(sources))}</figcaption><svg "
+        f"viewBox='0 0 1040 {height + 34}' role='img' aria-label='States and events' data-x='{_LEFT} "
+        f"{_RIGHT}'>{''.join(parts)}</svg></figure>"
     )
 
 

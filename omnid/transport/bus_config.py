@@ -60,9 +60,8 @@ class BusConfig:
     command_users: tuple[str, ...] = knob((), "users that may send commands; with neither: all that can connect")
     command_clock: str = knob(
         "synchronised",
-        "synchronised: stamps of commands must be within "
-        "controller.deadlines.command_s of this machine's clock; arrival: for senders with "
-        "another clock, stamps must only rise",
+        "synchronised: stamps of commands must be within controller.deadlines.command_s of this machine's clock; "
+        "arrival: for senders with another clock, stamps must only rise",
         choices=("synchronised", "arrival"),
     )
     ros2: str = knob(

@@ -83,9 +83,8 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
         if not local and settings.tls is None:
             log_unlimited(
                 logging.WARNING,
-                "the page can be reached from the network without encryption: everyone who "
-                "can listen there learns the token, and may arm the robot; use --tls-certificate and "
-                "--tls-key, or a network that you trust",
+                "the page can be reached from the network without encryption: everyone who can listen there learns the "
+                "token, and may arm the robot; use --tls-certificate and --tls-key, or a network that you trust",
             )
         asyncio.run(_run(server, follow, listener))
 

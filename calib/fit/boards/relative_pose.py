@@ -112,9 +112,8 @@ def _consensus(candidates: Array) -> tuple[Array, Array]:
     others = cost[apart[best].ravel() > MAX_INLIER_DISTANCE]
     if candidates.shape[1] > 1 and others.size and others.min() < max(MIN_COST_RATIO * cost[best], MIN_INLIER_DISTANCE):
         raise CalibError(
-            "calibrate rig: a board with two even or two odd sides looks the same upside down, and its "
-            "orientation is ambiguous in these pairs; hold it at more places, or use a board with one odd "
-            "and one even side"
+            "calibrate rig: a board with two even or two odd sides looks the same upside down, and its orientation is "
+            "ambiguous in these pairs; hold it at more places, or use a board with one odd and one even side"
         )
     return flat[best], apart[best]
 
