@@ -149,16 +149,16 @@ def odometry_cdr(
     return message_cdr(message, ODOMETRY_SCHEMA)
 
 
-def pose_stamped_cdr(stamp_ns: int, T_frame_body: Array, frame: str = "odom") -> bytes:
-    """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in `frame`."""
-    message = ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, frame), pose_message(T_frame_body))
+def pose_stamped_cdr(stamp_ns: int, T_odom_body: Array) -> bytes:
+    """Encode a geometry_msgs/msg/PoseStamped: the pose of a body in odom."""
+    message = ros.geometry_msgs__msg__PoseStamped(header_message(stamp_ns, "odom"), pose_message(T_odom_body))
     return message_cdr(message, POSE_SCHEMA)
 
 
-def pose_with_covariance_cdr(stamp_ns: int, T_frame_body: Array, covariance: Array, frame: str = "map") -> bytes:
-    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in `frame`, covariance in its axes."""
-    pose = ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_frame_body), _covariance(covariance))
-    message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, frame), pose)
+def pose_with_covariance_cdr(stamp_ns: int, T_map_body: Array, covariance: Array) -> bytes:
+    """Encode a geometry_msgs/msg/PoseWithCovarianceStamped: the pose of a body in the map, covariance in its axes."""
+    pose = ros.geometry_msgs__msg__PoseWithCovariance(pose_message(T_map_body), _covariance(covariance))
+    message = ros.geometry_msgs__msg__PoseWithCovarianceStamped(header_message(stamp_ns, "map"), pose)
     return message_cdr(message, MAP_POSE_SCHEMA)
 
 
@@ -241,9 +241,9 @@ def clock_cdr(stamp_ns: int) -> bytes:
     return message_cdr(ros.rosgraph_msgs__msg__Clock(time_message(stamp_ns)), CLOCK_SCHEMA)
 
 
-def header_cdr(stamp_ns: int, frame: str = "") -> bytes:
+def header_cdr(stamp_ns: int) -> bytes:
     """Encode a std_msgs/msg/Header, which is the message of cmd/arm."""
-    return message_cdr(header_message(stamp_ns, frame), HEADER_SCHEMA)
+    return message_cdr(header_message(stamp_ns, ""), HEADER_SCHEMA)
 
 
 def stamp_from_cdr(payload: bytes) -> int:
