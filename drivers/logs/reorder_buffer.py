@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from drivers.frame import Camera, Frame
-from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import RosImage
 
 MAX_HELD_BYTES = 256 * 2**20
@@ -62,4 +61,4 @@ class ReorderBuffer:
         else:
             self._newest_ns = self._last_ns[oldest.camera] = oldest.stamp_ns
             self._counts[oldest.camera] += 1
-            yield frame_of(oldest.image, oldest.camera, self._counts[oldest.camera] - 1)
+            yield oldest.image.frame(oldest.camera, self._counts[oldest.camera] - 1)

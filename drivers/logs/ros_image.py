@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.errors import FrameDecodeError
+from drivers.frame import Camera, Frame
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -43,6 +44,11 @@ class RosImage:
     height: int = 0  # px
     step: int = 0  # bytes from row to row
     bigendian: bool = False
+
+    def frame(self, camera: Camera = "lower", seq: int = 0) -> Frame:
+        """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters."""
+        layout = self.width, self.height, self.step, self.bigendian
+        return Frame(seq, self.stamp_ns, camera, self.encoding, self.data, *layout)
 
 
 def parse_image(schema_name: str, message: memoryview, *, aligned: bool = True) -> RosImage:

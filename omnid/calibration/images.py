@@ -23,7 +23,6 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.image_log import ImageLog, LoggedImage, images_of
 from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
 from drivers.logs.mcap_records import RecordError
-from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import IMAGE_TYPES
 from omnid.errors import OmnidError
 
@@ -185,6 +184,6 @@ def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image
         if number % stride:
             continue
         try:
-            yield f"frame{number:06d}", gray(frame_of(logged.read(), seq=number))
+            yield f"frame{number:06d}", gray(logged.read().frame(seq=number))
         except (FrameDecodeError, RecordError):
             continue

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frame import gray
-from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import RosImage
 
 COMPRESSED: Final = ("jpeg", "png")
@@ -25,4 +24,4 @@ def compressed(image: RosImage) -> tuple[bytes, str]:
     """Return compressed bytes and their kind; raw images become grey JPEG. Raise FrameDecodeError where damaged."""
     if image.encoding in COMPRESSED:
         return bytes(image.data), image.encoding
-    return jpeg(gray(frame_of(image))), "jpeg"
+    return jpeg(gray(image.frame())), "jpeg"
