@@ -81,6 +81,22 @@ class PrintShape:
         plane = np.column_stack([drawn[:, :2], np.ones(len(drawn))])
         return float(np.ptp(heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]))
 
+    def notes(self, drawn: Array) -> list[str]:
+        """Return a line for each difference of the print from its drawing (N, 3)."""
+        notes = []
+        if any(self.bends_m):
+            notes.append(
+                f"your board is bent by {1e3 * self.sag_m(drawn):.2g} mm, which the calibration allows for; mount it "
+                "on glass or aluminium for the next one"
+            )
+        if self.stretch:
+            longer, other = ("y (down the rows)", "x") if self.stretch > 0 else ("x (along the columns)", "y")
+            notes.append(
+                f"your print is {100 * abs(self.stretch):.2g} % longer along {longer} than along {other}, which the "
+                "calibration allows for: give the mean of both sides of the squares as their length"
+            )
+        return notes
+
 
 AS_DRAWN = PrintShape()
 

@@ -28,7 +28,6 @@ from calib.rig_file import write_file
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, is_log, read_images, repeat_notes, repeats
-from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.view_guess import ViewChoice, view_notes, view_of_images
 
@@ -58,7 +57,7 @@ class CameraResult:
         found = self.calibration
         return [
             *misfit_warning("camera", camera_structure(found)),
-            *print_shape_notes(found.shape, found.board),
+            *found.shape.notes(found.board.points),
             *self.notes,
             *found.warnings,
             *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),

@@ -33,7 +33,6 @@ from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_wa
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
 from omnid.calibration.images import Images, brightest
-from omnid.calibration.print_notes import print_shape_notes
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
 from omnid.calibration.rig_report import rig_report_html
@@ -69,12 +68,12 @@ class RigResult:
     @property
     def warnings(self) -> list[str]:
         """Limits of the result, one line each."""
-        shape = print_shape_notes(self.calibration.shape, self.calibration.board)
+        found = self.calibration
         return [
-            *accuracy_warnings([self.calibration.structure(side) for side in range(len(SIDES))], self.drives),
-            *shape,
+            *accuracy_warnings([found.structure(side) for side in range(len(SIDES))], self.drives),
+            *found.shape.notes(found.board.points),
             *self.notes,
-            *(f"left out {bad.name}: {bad.reason}" for bad in self.calibration.rejected),
+            *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
         ]
 
     def __str__(self) -> str:
