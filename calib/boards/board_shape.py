@@ -137,12 +137,8 @@ def outline(image: Grey, corners: Array) -> tuple[bool, bool]:
     that ring. Bounded: no second ring surrounds them; the first may be hidden.
     """
     around, beyond = _outer_steps(image, corners)
-    is_bounded = not _goes_on(beyond)
+    is_bounded = max(_fraction_above(side, BEYOND_STEP) for side in beyond) <= MAX_BEYOND
     return is_bounded and _fraction_above(around, MIN_STEP) >= MIN_AROUND, is_bounded
-
-
-def _goes_on(beyond: Sequence[Sequence[Array]]) -> bool:
-    return max(_fraction_above(side, BEYOND_STEP) for side in beyond) > MAX_BEYOND
 
 
 def _outer_steps(image: Grey, corners: Array) -> tuple[list[Array], list[list[Array]]]:

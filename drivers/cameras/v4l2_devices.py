@@ -97,7 +97,8 @@ def _device(root: Path, entry: Path) -> CaptureDevice | None:
         bus,
         by_path,
         by_id,
-        _id_path(by_path or _sibling_link(root, entry)),
+        # udev's ID_PATH is a part of the link's name (60-persistent-v4l.rules).
+        re.sub(r"-video-index\d+$", "", (by_path or _sibling_link(root, entry)).rpartition("/")[2]),
         offered,
         problem,
         exposure,
@@ -146,11 +147,6 @@ def _sibling_link(root: Path, entry: Path) -> str:
     siblings = [other for other in entry.parent.glob("video*") if (other / "device").resolve() == port]
     links = (_link(root, "by-path", root / "dev" / other.name) for other in siblings)
     return next(filter(None, links), "") if (entry / "device").exists() else ""
-
-
-def _id_path(by_path: str) -> str:
-    """Return udev's ID_PATH, which is a part of the link's name (60-persistent-v4l.rules)."""
-    return re.sub(r"-video-index\d+$", "", by_path.rpartition("/")[2])
 
 
 def _in(root: Path, path: Path) -> str:

@@ -40,7 +40,7 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
             if search.view is not None:
                 views.append(search.view)
             if search.grid_size != (0, 0):
-                other_grids[_sorted(search.grid_size)] += 1
+                other_grids[min(search.grid_size), max(search.grid_size)] += 1
             progress(f"[{number}/{len(images)}] {name}: {_outcome(search, board)}")
     if views and max(other_grids.values(), default=0) > len(views):
         progress(f"the board was found in {len(views)}, {_grid_hint(other_grids)}")
@@ -48,10 +48,6 @@ def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Pr
         hint = _grid_hint(other_grids) if isinstance(board, Board) else _marker_hint(images, board)
         raise OmnidError(f"calibrate: no {board} in any of {len(images)} images; {hint}")
     return views
-
-
-def _sorted(sides: tuple[int, int]) -> tuple[int, int]:
-    return min(sides), max(sides)
 
 
 def _outcome(search: BoardSearch, board: AnyBoard) -> str:

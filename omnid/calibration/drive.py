@@ -154,7 +154,8 @@ def calibrate_drive(
         found,
         scores,
         observation_sigma(before, found, drives.fixed),
-        _length_change(before, adjusted, found),
+        # By the rays of the adjustment, and by the length of the baseline.
+        scale_change(found, before) + float(np.log(adjusted.baseline_m / before.baseline_m)),
         drive_structure(found),
         level_rad,
         drives,
@@ -216,11 +217,6 @@ def _finished_rig(before: Rig, found: DriveAdjustment, drives: Drives) -> tuple[
         if turn is not None:
             rig, level_rad = turned_about_lower(rig, turn), float(np.linalg.norm(se3.rotation_log(turn)))
     return replace(rig, covariance=RigCovariance.of_matrix([*names, "baseline"], matrix)), level_rad
-
-
-def _length_change(before: Rig, rig: Rig, found: DriveAdjustment) -> float:
-    """Return the relative change of lengths by the rays of an adjustment and by the length of the baseline."""
-    return scale_change(found, before) + float(np.log(rig.baseline_m / before.baseline_m))
 
 
 def _with_times(rig: Rig, kept: tuple[str, ...]) -> Rig:

@@ -23,7 +23,7 @@ from omnid.core.rig.rig_health import RigHealth
 from omnid.core.rig.rig_state import RigState
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
-from omnid.messages import FramePair, OdometryUpdate, Panoramas
+from omnid.messages import FramePair, OdometryUpdate
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
@@ -142,7 +142,8 @@ class DriveCollector:
         self._landmarks.add(View(seen.lower, seen.upper, seen.visible, disparity, T_odom_rect))
         self._T_rig_odom.append(se3.inverse(update.T_odom_rig))
         self._twists.append(twist)
-        self._delays_s.append(_stamp_delay_s(seen, place.rig))
+        # Upper minus lower stamp; the rig's delay of the exposures is a parameter of its own.
+        self._delays_s.append(seen.times.skew_s - place.rig.times.upper_delay_s)
 
     def drives(self, T_odom_last: Array) -> Drives:
         """Return the observations; T_odom_last (4, 4): pose of the last pair."""
@@ -153,11 +154,6 @@ class DriveCollector:
         motion = KeyframeMotion(np.array(self._twists), np.array(self._delays_s))
         state = DriveState(np.array(self._T_rig_odom), found.points[used], np.zeros(0), motion)
         return Drives(state, observations, (0,), self._T_rig_odom[-1] @ T_odom_last)
-
-
-def _stamp_delay_s(seen: Panoramas, rig: Rig) -> float:
-    """Return the upper minus the lower stamp of a pair; the rig's delay of the exposures is a separate parameter."""
-    return seen.times.skew_s - rig.times.upper_delay_s
 
 
 def _spacing(reader: LogReader, most: int) -> int:

@@ -162,13 +162,10 @@ def _refine(rig: Rig, pairs: list[FramePair], found: RigCheckResult, path: Path)
             raise OmnidError("calibrate check: too few points match to refine the rig; calibrate it again with a board")
         rig = apply_drift(rig, found.finding.drift)
         found = check_rig(pairs, rig, Config().panorama)
-        if found.finding.turn_deg < 2 * np.rad2deg(np.linalg.norm(_sigma(found.finding))):
+        sigma_rad = 0.0 if found.finding.drift is None else np.linalg.norm(found.finding.drift.turn_sigma)
+        if found.finding.turn_deg < 2 * np.rad2deg(sigma_rad):
             break
     write_rig(path, rig)
     print(f"{path}: {found.finding.summary}\n{NOT_OBSERVABLE}")
     if recalibrate or found.finding.state is not RigState.FITS:
         print(RECALIBRATE)
-
-
-def _sigma(finding: RigFinding) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return np.zeros(3) if finding.drift is None else finding.drift.turn_sigma

@@ -68,7 +68,7 @@ def _figure(places: PlaceMap, rig: PlaceRig, driven: Sequence[MappedDrive]) -> s
         *(polyline([px(T[:2, 3]) for T in drive.T_by_odometry], "class='before'") for drive in driven),
         *(polyline([px(T[:2, 3]) for T in drive.T_map_base], "class='after'") for drive in driven),
         *_keyframes(places, at),
-        *_scale(px_per_m),
+        f"<rect x='10' y='20' width='{coord(px_per_m)}' height='4'/><text x='10' y='15'>1 m</text>",
     ]
     box = f"0 0 {coord(float(high[0] - low[0]) * px_per_m)} {coord(float(high[1] - low[1]) * px_per_m)}"
     keys = "".join(
@@ -111,11 +111,6 @@ def _keyframes(places: PlaceMap, at: Mapping[int, Point]) -> Iterator[str]:
             f"<circle class='keyframe' cx='{coord(x)}' cy='{coord(y)}' r='2.5'><title>keyframe {id}, session "
             f"{keyframe.session}, {keyframe.features.count} features</title></circle>"
         )
-
-
-def _scale(px_per_m: float) -> Iterator[str]:
-    """Yield a bar of one metre."""
-    yield f"<rect x='10' y='20' width='{coord(px_per_m)}' height='4'/><text x='10' y='15'>1 m</text>"
 
 
 def _corrections(places: PlaceMap, driven: Sequence[MappedDrive]) -> str:

@@ -15,7 +15,6 @@ from calib.errors import CalibError
 from calib.panorama import fit_cylinder, remap_tables
 from calib.rig import Rig
 from drivers.errors import DriverError
-from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.errors import OmnidError
 from omnid.report.page import Image
@@ -51,9 +50,6 @@ def _found(path: Path, rig: Rig, wanted: Sequence[WantedImages]) -> Iterator[tup
         for frame in islice(reader.frames(), MAX_FRAMES):
             if not left:
                 return
-            if _fits(frame, left[0]) and (image := decode(frame)) is not None:
+            is_next = frame.camera == "lower" and frame.stamp_ns >= left[0].stamp_ns
+            if is_next and (image := decode(frame)) is not None:
                 yield left.pop(0).caption, image
-
-
-def _fits(frame: Frame, wanted: WantedImages) -> bool:
-    return frame.camera == "lower" and frame.stamp_ns >= wanted.stamp_ns
