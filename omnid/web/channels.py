@@ -46,6 +46,19 @@ class Newest:
         return self._encoded[1]
 
 
+class Stored(Newest):
+    """A channel of messages that are encoded as they come."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name, lambda: self._message)
+        self._message: Encoded = ""
+
+    def set(self, message: Encoded) -> None:
+        """Take the newest message."""
+        self._message = message
+        self.changed()
+
+
 class _PathPoint(NamedTuple):
     x_m: float
     y_m: float

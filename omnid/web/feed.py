@@ -24,7 +24,7 @@ from omnid.transport.decode import Pose, decode_map, decode_map_pose, decode_nav
 from omnid.transport.scan_codec import decode_scan
 from omnid.transport.topics import MAP_POSE, PANORAMA, SCAN
 from omnid.web.browsers import Browsers
-from omnid.web.channels import Encoded, LivePath, Newest, with_header
+from omnid.web.channels import LivePath, Newest, Stored, with_header
 from omnid.web.snapshot import (
     MOST_CELLS,
     PATH_FRAME,
@@ -70,21 +70,15 @@ class RobotFeed:
         self.robot: Robot | None = None
         self.link = "not connected yet"  # why there is no connection; empty with one
         self.inbox = Inbox()
-        self._map: Encoded = b""
-        self._panorama: Encoded = b""
         self._panorama_s = -PANORAMA_S  # when the newest one was taken
-        self._scan: Encoded = ""
         self._poses: deque[Pose] = deque(maxlen=MOST_POSES)
-        self._navigation: Encoded = ""
         self._map_in_odom: list[float | None] | None = None
         self._large: dict[str, bytes] = {}  # newest map, panorama ... that are not processed yet
         self._wake, self._large_wake = asyncio.Event(), asyncio.Event()
         self._state_channel = Newest("state", self._encode_state)
         self._parts_channel = Newest("parts", lambda: parts_message(self.state))
-        self._map_channel = Newest("map", lambda: self._map)
-        self._panorama_channel = Newest(PANORAMA, lambda: self._panorama)
-        self._scan_channel = Newest(SCAN, lambda: self._scan)
-        self._navigation_channel = Newest(NAVIGATION, lambda: self._navigation)
+        self._map_channel, self._panorama_channel = Stored("map"), Stored(PANORAMA)
+        self._scan_channel, self._navigation_channel = Stored(SCAN), Stored(NAVIGATION)
         self._end_panorama: Callable[[], None] | None = None
         self.browsers = Browsers(
             (
@@ -196,18 +190,14 @@ class RobotFeed:
         self.path.clear()
         self._poses.clear()
         self._map_in_odom = None
-        if self._map:
-            self._map = no_map_message(PATH_FRAME)
-            self._map_channel.changed()
-        if self._scan:
-            self._scan = no_scan_message()
-            self._scan_channel.changed()
-        if self._navigation:
-            self._navigation = navigation_message(NavigationReport(0, "", "", "", 0, math.nan, "", ""))
-            self._navigation_channel.changed()
-        if self._panorama:
-            self._panorama = with_header({"type": PANORAMA, "stamp_ms": 0}, b"")
-            self._panorama_channel.changed()
+        if self._map_channel.version:
+            self._map_channel.set(no_map_message(PATH_FRAME))
+        if self._scan_channel.version:
+            self._scan_channel.set(no_scan_message())
+        if self._navigation_channel.version:
+            self._navigation_channel.set(navigation_message(NavigationReport(0, "", "", "", 0, math.nan, "", "")))
+        if self._panorama_channel.version:
+            self._panorama_channel.set(with_header({"type": PANORAMA, "stamp_ms": 0}, b""))
 
     async def _process_large(self) -> None:
         """Encode maps and panoramas; they take longer than a pose may wait."""
@@ -223,23 +213,19 @@ class RobotFeed:
     async def _take_large(self, topic: str, payload: bytes) -> None:
         try:
             if topic == SCAN:
-                self._scan = scan_message(decode_scan(payload), self._poses)
-                self._scan_channel.changed()
+                self._scan_channel.set(scan_message(decode_scan(payload), self._poses))
             elif topic == NAVIGATION:
-                self._navigation = navigation_message(decode_navigation(payload))
-                self._navigation_channel.changed()
+                self._navigation_channel.set(navigation_message(decode_navigation(payload)))
             elif topic == "map":
                 await self._take_map(await asyncio.to_thread(decode_map, payload))
             elif time.monotonic() >= self._panorama_s + PANORAMA_S:
-                self._panorama = _panorama_message(payload)
-                self._panorama_channel.changed()
+                self._panorama_channel.set(_panorama_message(payload))
                 self._panorama_s = time.monotonic()
         except (OmnidError, FrameDecodeError):
             self.state.broken += 1
 
     async def _take_map(self, grid: Map) -> None:
-        self._map = await asyncio.to_thread(map_message, grid)
-        self._map_channel.changed()
+        self._map_channel.set(await asyncio.to_thread(map_message, grid))
 
     async def _follow_requests(self, robot: Robot, receive: Receiver) -> None:
         """Subscribe to the panorama while a browser shows it: it takes bandwidth that the robot may need."""
