@@ -65,9 +65,10 @@ class PacketReader:
 class WitMotionGyro:
     """The gyro on a serial port; its rate and baud rate are those that it was set to by its maker's program.
 
-    A sample's stamp is the time of its arrival (CLOCK_MONOTONIC). Of samples that arrive together, those before the
-    last are as much earlier as samples usually are apart. What arrived before the first read is dropped: nothing tells
-    its time. A port that is gone is opened again, but no pseudo-terminal that another program has since.
+    The stamp of a sample is the time of its arrival (CLOCK_MONOTONIC). Where several samples arrive together, the last
+    one has that stamp, and each one before it an earlier stamp by the usual period. What arrived before the first read
+    is dropped, because its time is not known. A port that disappears is opened again, unless it is a pseudo-terminal
+    that belongs to another program by then.
     """
 
     def __init__(self, port: str, baud: int = DEFAULT_BAUD, on_event: Callable[[str], None] = lambda _: None) -> None:

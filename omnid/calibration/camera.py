@@ -29,7 +29,7 @@ from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse
 from omnid.calibration.camera_report import camera_report_html
 from omnid.calibration.images import Images, is_log, read_images, repeat_notes, repeats
 from omnid.calibration.progress import Progress, silent
-from omnid.calibration.view_guess import ViewChoice, view_notes, view_of_images
+from omnid.calibration.view_guess import ViewChoice, view_of_images
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +117,7 @@ def calibrate_camera(
     # 2. Find the board in each. Of a log the views that differ most are used.
     views = find_boards(images, board, thorough=not many, progress=progress)
     views = select_diverse_views(views) if many else views
-    seen = view_of_images(view, [(images.values(), views)], board, progress)
-    notes = (*left_out, *view_notes(view, [(images.values(), views)], board))
+    seen, shown = view_of_images(view, [(images.values(), views)], board, progress)
     # 3. Fit the models, and select the one with the least error at views that it was not fitted to.
     height, width = images[views[0].name].shape
     selected = select_calibration(views, board, (width, height), model, seen)
@@ -131,7 +130,8 @@ def calibrate_camera(
         report_scores(bent, "camera, with the shape of the print", progress)
     # 6. Find what never shows the world.
     center = bent.calibration.camera.center
-    return CameraResult(bent, find_mask(list(images.values()), center) if with_mask else None, images, notes)
+    mask = find_mask(list(images.values()), center) if with_mask else None
+    return CameraResult(bent, mask, images, (*left_out, *shown))
 
 
 def report_scores(selected: SelectedCalibration, name: str, progress: Progress) -> None:

@@ -166,7 +166,7 @@ class KeyframeChoice:
     """Chooses the poses that are far enough apart to add information."""
 
     def __init__(self, apart: int = 1, apart_m: float = KEYFRAME_M, apart_rad: float = KEYFRAME_RAD) -> None:
-        """apart: pairs at least; and one of metres and radians."""
+        """Keyframes are at least `apart` pairs apart, and either apart_m or apart_rad."""
         self._apart, self._apart_m, self._apart_rad = apart, apart_m, apart_rad
         self._last: Array | None = None
         self._since = 0

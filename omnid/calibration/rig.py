@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -32,11 +32,11 @@ from calib.rig_frame import is_turned_over, rig_between
 from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
-from omnid.calibration.images import Images, brightest
+from omnid.calibration.images import Image, Images, brightest
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
 from omnid.calibration.rig_report import rig_report_html
-from omnid.calibration.view_guess import ViewChoice, view_notes, view_of_images
+from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
 
 # The board scales the rig: a baseline outside this range, from smaller than any mirror to larger than any vehicle,
@@ -126,41 +126,37 @@ def calibrate_rig(
     """
     # 1. Read the images, each once.
     images = _read(Path(source), topics, areas, cameras)
-    _require_sizes(images, cameras)
     # 2. Find the board in all of them.
     for line in images.notes:
         progress(line)
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
     if cameras is None:
-        sides = [
-            (side.values(), [seen for seen in own if seen is not None])
-            for side, own in zip(images.sides, zip(*(pair.seen for pair in views), strict=True), strict=True)
-        ]
-        choice = model, view_of_images(view, sides, board, progress)
-        shown = view_notes(view, sides, board)
+        direction, shown = view_of_images(view, _by_camera(images, views), board, progress)
+        choice = model, direction
         single = fit_cameras(views, images, board, (*choice, AS_DRAWN), progress)
     else:
         single, shown = FittedCameras.known(cameras, views), []
     # 4. Fit the transform between the cameras, and the cameras with it.
     refined = cameras is None or refine_cameras
+    rejected = [] if refined else _views_of_one_camera(views)
     found = _fit_rig(single.views, single, board, refined, AS_DRAWN, progress)
     # 5. Refine the corners with the cameras, and fit the rig again.
     found = refine_rig_calibration(found, images.sides, refined)
-    rejected = (*single.rejected, *found.rejected)
+    rejected += [*single.rejected, *found.rejected]
     # 6. If the print differs from its drawing, fit the cameras and the rig again with its shape.
     shape = rig_print_shape(found, refined)
     if not shape.is_as_drawn:
         progress("the board is not as drawn: once more with its shape")
         if cameras is None:
             single = fit_cameras(list(found.views), images, board, (*choice, shape), progress)
-            rejected = (*rejected, *single.rejected)
+            rejected += single.rejected
         found = _fit_rig(single.views if cameras is None else found.views, single, board, refined, shape, progress)
-        rejected = (*rejected, *found.rejected)
-    alone = () if refined else _views_of_one_camera(views)
-    found = replace(found, rejected=(*alone, *rejected))
-    # 7. Compare the baseline with what it can be, and build the rig with masks and covariance.
+        rejected += found.rejected
+    found = replace(found, rejected=tuple(rejected))
+    # 7. Compare the baseline with what it can be.
     notes = _check_baseline(found, board, expected_baseline_m)
+    # 8. Build the rig with masks and covariance, and predict the errors of drives.
     rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig) if refined else None
@@ -175,9 +171,12 @@ def _read(
     areas: tuple[ImageArea, ImageArea] | None,
     cameras: GivenCameras | None,
 ) -> PairedImages:
-    """Return the images of both cameras, or both views of the images of one."""
+    """Return the images of both cameras, or both views of the images of one; OmnidError if cameras do not fit them."""
     if areas is None:
-        return read_pairs(source, *topics)
+        images = read_pairs(source, *topics)
+        if cameras is not None:
+            _require_sizes(images, cameras)
+        return images
     if cameras is not None:
         raise OmnidError("calibrate rig: expected no camera files beside the areas of both views: they are fitted")
     named = sorted({topic for topic in topics if topic})
@@ -203,10 +202,8 @@ def _fit_rig(
     return selected.calibration
 
 
-def _require_sizes(images: PairedImages, cameras: GivenCameras | None) -> None:
+def _require_sizes(images: PairedImages, cameras: GivenCameras) -> None:
     """Raise OmnidError if known cameras are not those of the images."""
-    if cameras is None:
-        return
     if sees_directly(cameras[0].camera) != sees_directly(cameras[1].camera):
         raise OmnidError(
             "calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
@@ -245,6 +242,14 @@ def _find_side(
     except OmnidError as error:
         raise OmnidError(f"{name} camera: {error}") from error
     return {view.name: view for view in views}
+
+
+def _by_camera(images: PairedImages, views: Sequence[PairView]) -> list[tuple[Iterable[Image], list[BoardView]]]:
+    """Return the images of each camera, and its views of the board."""
+    return [
+        (own.values(), [seen for view in views if (seen := view.seen[side]) is not None])
+        for side, own in enumerate(images.sides)
+    ]
 
 
 def _views_of_one_camera(views: list[PairView]) -> list[RejectedView]:

@@ -58,16 +58,21 @@ def view_of_images(
     cameras: Sequence[tuple[Iterable[Image], Sequence[BoardView]]],
     board: Board | MarkerBoard,
     progress: Progress,
-) -> View:
+) -> tuple[View, list[str]]:
     """Return the chosen view, or the one that the images of a rig's cameras and their views of the board show.
 
-    Raises OmnidError where none of them shows it, or where they contradict each other.
+    With it comes a warning where the images show another view than the chosen one: the world would be its mirror image.
+    Raises OmnidError for "auto" where the images show no view, or where they contradict each other.
     """
     if choice not in VIEW_CHOICES:
         raise OmnidError(f"view: expected one of {', '.join(VIEW_CHOICES)}, found {choice!r}")
-    if choice != "auto":
-        return choice
     shown = _views_shown(cameras, board)
+    if choice != "auto":
+        warning = (
+            f"the view is given as {choice}, but the images do not look like that: where it is wrong, left and right "
+            "are exchanged in all that follows; leave --view out unless you are sure"
+        )
+        return choice, [] if shown <= {choice} else [warning]
     if len(shown) != 1:
         found = "no markers, no mirror's rim with a hub, no lines that are straight as only a lens shows them"
         if shown:
@@ -77,21 +82,8 @@ def view_of_images(
             f"{found}): add --view mirror or --view direct"
         )
     (view,) = shown
-    assert view is not None
     progress(f"view: {view}, as the images show")
-    return view
-
-
-def view_notes(
-    choice: ViewChoice, cameras: Sequence[tuple[Iterable[Image], Sequence[BoardView]]], board: Board | MarkerBoard
-) -> list[str]:
-    """Return a warning where the images show another view than the chosen one: the world would be its mirror image."""
-    if choice == "auto" or _views_shown(cameras, board) <= {choice}:
-        return []
-    return [
-        f"the view is given as {choice}, but the images do not look like that: where it is wrong, left and right are "
-        "exchanged in all that follows; leave --view out unless you are sure"
-    ]
+    return view, []
 
 
 def _views_shown(

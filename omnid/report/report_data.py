@@ -31,7 +31,7 @@ from omnid.transport.topics import MAP_POSE
 
 Array = NDArray[np.float64]
 
-_WAITING: Final = 256  # poses of odometry that wait for that in the map: it comes from a stage behind
+_WAITING: Final = 256  # Most poses of odometry that are kept until a later stage gives the pose in the map.
 _NO_STATE: Final = 0
 MAX_EARLY: Final = 64  # status messages before the first pose
 MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging

@@ -69,8 +69,8 @@ class StatusHistory:
     def __init__(self, events: Events, poses: PoseHistory) -> None:
         """poses: told where the daemon was started again."""
         self._events, self._poses = events, poses
-        # Of the periodic reports, which have the length of the path (True), and of those of a new state (False): each
-        # kind comes in its own order.
+        # The newest numbers of the periodic reports (True), which have the length of the path, and of the reports of a
+        # new state (False). The reports of each kind arrive in order.
         self._progress: dict[bool, _RunProgress] = {}
         self._counts: dict[tuple[str, str], int] = {}
         self._messages: dict[str, str] = {}

@@ -169,8 +169,10 @@ class CommandReceiver:
         return Answer(False, text)
 
     def _touch(self, request: Request) -> None:
-        """Pass a contact on: only a Bool of False, with a fresh stamp that is not older than a contact's, says that
-        there is none: messages may overtake each other.
+        """Pass the state of a contact on.
+
+        A contact ends only by a Bool of False with a fresh stamp, which is not older than that of the contact, because
+        messages may overtake each other. All other messages are a contact.
         """
         holds = True
         try:

@@ -108,8 +108,8 @@ def parts_message(state: RobotState) -> str:
 def map_message(grid: Map) -> bytes:
     """Return the message `map`: cells of 0 unknown, 1 free, 2 occupied, row by row from low to high y, deflated.
 
-    Without cells if the grid is neither in the frame of the path, odom, nor in map, of which the state says where it
-    lies in odom.
+    It has no cells unless the grid is in odom, which is the frame of the path, or in map, whose place in odom is part
+    of the message `state`.
     """
     if not all(map(math.isfinite, (grid.cell_m, *grid.corner))) or not grid.cells.size or grid.frame not in FRAMES:
         return no_map_message(grid.frame)
@@ -135,8 +135,8 @@ def no_map_message(frame: str) -> bytes:
 def scan_message(scan: Scan, poses: Iterable[Pose]) -> str:
     """Return the message `scan`: the nearest obstacles around the robot, in odom, and the nearest of all.
 
-    poses: the last ones; that nearest in time to the scan is its place. Without points if there is none, or if the scan
-    is not in the robot's own frame.
+    poses: the newest ones. The scan is drawn at the pose that is nearest in time. The message has no points where there
+    is no pose, or where the scan is not in the robot's own frame.
     """
     place = min(poses, key=lambda pose: abs(pose.stamp_ns - scan.stamp_ns), default=None)
     seen = np.isfinite(scan.ranges_m) & (scan.ranges_m > 0) & (scan.ranges_m < _LARGEST_M)

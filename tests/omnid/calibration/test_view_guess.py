@@ -11,7 +11,7 @@ from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
 from calib.boards.marker_finder import find_marker_board
 from omnid.calibration.progress import silent
-from omnid.calibration.view_guess import view_notes, view_of_images
+from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
 from tests.simulation.boards import board_pose
 from tests.simulation.marker_boards import print_of
@@ -49,7 +49,7 @@ def seen_boards(focal_px: float, xi: float, k: float = 0.0, *, sigma_px: float =
 
 
 def guess(*cameras: Camera) -> str:
-    return view_of_images("auto", cameras, CHECKERBOARD, silent)
+    return view_of_images("auto", cameras, CHECKERBOARD, silent)[0]
 
 
 @pytest.mark.parametrize("board", [CharucoBoard(7, 5, 0.06, 0.045, "4X4_50"), AprilGrid(5, 4, 0.08, 0.3)])
@@ -62,7 +62,7 @@ def test_markers_are_reflected_by_a_mirror(board: MarkerBoard, view: str) -> Non
         found = find_marker_board(turned, board)
         assert found is not None
         seen.append((rim(0.0)[0], [found]))
-    assert view_of_images("auto", seen, board, silent) == view
+    assert view_of_images("auto", seen, board, silent) == (view, [])
 
 
 def test_a_rim_with_a_hub_is_a_mirror() -> None:
@@ -90,17 +90,19 @@ def test_lines_that_stay_straight_are_seen_by_a_lens(focal_px: float, k: float) 
 def test_what_the_images_leave_open_is_asked_for(cameras: list[Camera], found: str) -> None:
     with pytest.raises(OmnidError, match=rf"\(found {found}.*add --view mirror or --view direct"):
         guess(*cameras)
-    assert view_of_images("direct", cameras, CHECKERBOARD, silent) == "direct"
-    if found == "no markers":
-        assert not view_notes("direct", cameras, CHECKERBOARD)
+    chosen, warnings = view_of_images("direct", cameras, CHECKERBOARD, silent)
+    assert chosen == "direct" and len(warnings) == (found != "no markers")
+
+
+def warnings_about(view: ViewChoice, *cameras: Camera) -> str:
+    return "".join(view_of_images(view, cameras, CHECKERBOARD, silent)[1])
 
 
 def test_a_view_that_the_images_contradict_is_a_warning() -> None:
     mirror, lens = rim(25.0), seen_boards(600, 0.0)
-    assert "given as direct" in view_notes("direct", [mirror, rim(0.0)], CHECKERBOARD)[0]
-    assert "given as mirror" in view_notes("mirror", [lens], CHECKERBOARD)[0]
-    assert not view_notes("mirror", [mirror], CHECKERBOARD) and not view_notes("direct", [lens], CHECKERBOARD)
-    assert not view_notes("auto", [mirror], CHECKERBOARD)
+    assert "given as direct" in warnings_about("direct", mirror, rim(0.0))
+    assert "given as mirror" in warnings_about("mirror", lens)
+    assert not warnings_about("mirror", mirror) and not warnings_about("direct", lens) and not warnings_about("auto", mirror)
 
 
 def test_an_unknown_view_is_refused() -> None:
