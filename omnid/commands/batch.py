@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import settings_of
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
 from omnid.errors import OmnidError
 
@@ -45,7 +45,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "the logs of the last batch",
     )
     parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
-    add_topics(parser)
+    add_cameras(parser)
     parser.add_argument("--config", type=Path, metavar="FILE", help="configuration (TOML) of all replays")
     parser.add_argument(
         "--set",

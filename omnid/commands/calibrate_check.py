@@ -16,7 +16,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.image_pairs import SIDES, open_log
 from omnid.calibration.rig_check import RigCheckResult, check_rig, moving_rig_finding, read_rig_pairs
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.config import Config
 from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.core.rig.rig_state import RigState
@@ -44,7 +44,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser = actions.add_parser("check", help="compare a rig with its file, without a board")
     parser.add_argument("log", type=Path, metavar="LOG", help="a log of ordinary driving")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    add_topics(parser, "the {camera} camera's topic")
+    add_cameras(parser, "the {camera} camera's topic")
     parser.add_argument(
         "--refine", action="store_true", help="also correct the upper camera's pose, and write that rig"
     )

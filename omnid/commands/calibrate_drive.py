@@ -14,7 +14,7 @@ import numpy as np
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig_file import read_rig, write_rig
 from omnid.commands.height_option import add_height, height_of, with_height
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -38,7 +38,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
         help="the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images, baseline by "
         "ruler; default: the one attached to the first log",
     )
-    add_topics(parser, "the {camera} camera's topic")
+    add_cameras(parser, "the {camera} camera's topic")
     parser.add_argument(
         "--distance-m",
         type=float,

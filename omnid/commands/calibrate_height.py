@@ -8,7 +8,7 @@ from pathlib import Path
 
 from calib.rig_file import read_rig
 from omnid.commands.height_option import height, height_of
-from omnid.commands.log_options import add_topics, attached_rig_of
+from omnid.commands.log_options import add_cameras, attached_rig_of
 from omnid.sinks.files import check_outputs
 
 
@@ -17,7 +17,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser = actions.add_parser("height", help="the height of the cameras above the floor, and their tilt, from a log")
     parser.add_argument("log", type=Path, metavar="LOG", help="a log in which the floor is seen all around")
     parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    add_topics(parser, "the {camera} camera's topic")
+    add_cameras(parser, "the {camera} camera's topic")
     parser.add_argument("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the file of --rig"

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from omnid.commands.board_options import add_board_options, board_of, options_of
 from omnid.commands.config import add_settings, settings_of
+from omnid.commands.log_options import add_cameras
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -47,13 +48,11 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument(
         "--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are only judged"
     )
-    for camera in ("lower", "upper"):
-        parser.add_argument(
-            f"--{camera}",
-            metavar="DEVICE|TOPIC",
-            help=f"device of the {camera} camera; default: "
-            f"cameras.{camera} of the settings; of --log the topic, default: found by name",
-        )
+    text = (
+        "device of the {camera} camera; default: cameras.{camera} of the settings; of --log the topic, default: found "
+        "by name"
+    )
+    add_cameras(parser, text, "DEVICE|TOPIC")
     add_settings(parser)
     parser.set_defaults(run=run)
 

@@ -14,7 +14,7 @@ from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.board_options import add_board_options, board_of
 from omnid.commands.calibrate_camera import MODEL_HELP, print_result, progress_of
 from omnid.commands.height_option import add_height, height_of, with_height
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -40,7 +40,7 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     )
     parser.add_argument("--upper-camera", type=Path, metavar="FILE", help="the same for the upper camera")
     parser.add_argument("--refine-cameras", action="store_true", help="adjust the given cameras as well")
-    add_topics(parser, "a log's topic of the {camera} camera")
+    add_cameras(parser, "a log's topic of the {camera} camera")
     for side in ("lower", "upper"):
         parser.add_argument(
             f"--{side}-area",

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings, settings_of
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the list loads none of these
@@ -39,7 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     parser.add_argument("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png")
     parser.add_argument("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log")
-    add_topics(parser, "of --log: images of the {camera} camera; default: by name")
+    add_cameras(parser, "of --log: images of the {camera} camera; default: by name")
     add_settings(parser)
     parser.set_defaults(run=run)
 

@@ -1,4 +1,4 @@
-"""The options --lower and --upper, topics of a log, and the rig that is attached to it."""
+"""The options --lower and --upper, which name the cameras, and the rig that is attached to a log."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ if TYPE_CHECKING:  # the help does not load it
     from calib.rig import Rig
 
 
-def add_topics(
-    parser: argparse._ActionsContainer, text: str = "images of the {camera} camera; default: found by name"
+def add_cameras(
+    parser: argparse._ActionsContainer,
+    text: str = "images of the {camera} camera; default: found by name",
+    metavar: str = "TOPIC",
 ) -> None:
-    """Add --lower and --upper. text: the help of each."""
+    """Add --lower and --upper. text: the help of each. metavar: what they name."""
     for camera in ("lower", "upper"):
-        parser.add_argument(f"--{camera}", metavar="TOPIC", help=text.format(camera=camera))
+        parser.add_argument(f"--{camera}", metavar=metavar, help=text.format(camera=camera))
 
 
 def attached_rig_of(args: argparse.Namespace) -> Rig:

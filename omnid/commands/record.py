@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings, settings_of
+from omnid.commands.log_options import add_cameras
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
@@ -23,10 +24,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument(
         "--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it exists"
     )
-    for camera in ("lower", "upper"):
-        parser.add_argument(
-            f"--{camera}", metavar="DEVICE", help=f"the {camera} camera; default: cameras.{camera} of the settings"
-        )
+    add_cameras(parser, "the {camera} camera; default: cameras.{camera} of the settings", "DEVICE")
     add_settings(parser)
     parser.set_defaults(run=run)
 

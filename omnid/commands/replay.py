@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from omnid.commands.config import add_settings, settings_of
 from omnid.commands.json_output import add_json, print_json
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.commands.map_option import add_map, map_settings
 from omnid.errors import OmnidError
 
@@ -31,7 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "one or with its parts, or a folder with a folder of stamped images for each camera",
     )
     parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    add_topics(parser)
+    add_cameras(parser)
     parser.add_argument("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
     parser.add_argument("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end")
     _add_outputs(parser)

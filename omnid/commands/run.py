@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings, settings_of
-from omnid.commands.log_options import attached_rig_of
+from omnid.commands.log_options import add_cameras, attached_rig_of
 from omnid.commands.map_option import add_map, map_settings
 from omnid.errors import OmnidError
 
@@ -41,13 +41,11 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="use the images of a log instead of cameras, for a "
         "trial: in real time, forwards and backwards until it is stopped",
     )
-    for camera in ("lower", "upper"):
-        parser.add_argument(
-            f"--{camera}",
-            metavar="DEVICE|TOPIC",
-            help=f"device of the {camera} camera; default: cameras.{camera} of the settings; with --log the topic of "
-            "its images, default: found by name",
-        )
+    text = (
+        "device of the {camera} camera; default: cameras.{camera} of the settings; with --log the topic of its images, "
+        "default: found by name"
+    )
+    add_cameras(parser, text, "DEVICE|TOPIC")
     parser.add_argument(
         "--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from omnid.commands.config import add_settings, settings_of
 from omnid.commands.listen import add_robot, check_seconds, config_of
-from omnid.commands.log_options import add_topics
+from omnid.commands.log_options import add_cameras
 from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
@@ -56,7 +56,7 @@ def _add_log(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several")
     group.add_argument("--replay", action="store_true", help="compute again from the images of a recording")
     group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    add_topics(group)
+    add_cameras(group)
     group.add_argument("--quiet", action="store_true", help="do not show the progress")
 
 

@@ -102,7 +102,11 @@ def test_a_view_that_the_images_contradict_is_a_warning() -> None:
     mirror, lens = rim(25.0), seen_boards(600, 0.0)
     assert "given as direct" in warnings_about("direct", mirror, rim(0.0))
     assert "given as mirror" in warnings_about("mirror", lens)
-    assert not warnings_about("mirror", mirror) and not warnings_about("direct", lens) and not warnings_about("auto", mirror)
+    assert (
+        not warnings_about("mirror", mirror)
+        and not warnings_about("direct", lens)
+        and not warnings_about("auto", mirror)
+    )
 
 
 def test_an_unknown_view_is_refused() -> None:
