@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import cv2
@@ -193,35 +193,33 @@ def camera_text(name: str, camera: OmniCamera, topic: str) -> str:
 def intrinsics_text(name: str, camera: OmniCamera) -> str:
     """Return the table of the intrinsics within a camera's table."""
     if isinstance(camera, UnifiedCamera):
-        values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
-        named = [f"{key} = {number_text(value)}" for key, value in zip(OMNI_NAMES, values, strict=True)]
+        lines = _lines(OMNI_NAMES, (camera.xi, *camera.focal, *camera.center, *camera.distortion))
     elif isinstance(camera, OcamCamera):
-        numbers = (*camera.center_row_column, *camera.affine)
-        named = [f"polynomial = [{', '.join(map(number_text, camera.polynomial))}]"]
-        named += [f"{key} = {number_text(value)}" for key, value in zip(OCAM_KEYS[1:], numbers, strict=True)]
-        for keys, terms in ((TANGENTIAL_NAMES, camera.tangential), (ASTIGMATISM_NAMES, camera.astigmatism)):
-            if any(terms):
-                named += [f"{key} = {number_text(value)}" for key, value in zip(keys, terms, strict=True)]
-        if any(camera.wavefront):
-            named += [
-                f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]",
-                f"distance_m = {number_text(camera.distance_m)}",
-            ]
+        lines = _ocam_lines(camera)
     elif isinstance(camera, EquirectangularCamera):
-        named = [
-            f"{key} = {number_text(value)}"
-            for key, value in zip(PINHOLE_KEYS, (*camera.focal, *camera.center), strict=True)
-        ]
+        lines = _lines(PINHOLE_KEYS, (*camera.focal, *camera.center))
     elif isinstance(camera, LensCamera):
-        lens = zip(
-            (*LENS_KEYS[model_name(camera)], *PINHOLE_KEYS),
-            (*lens_parameters(camera), *camera.focal, *camera.center),
-            strict=True,
-        )
-        named = [f"{key} = {number_text(value)}" for key, value in lens]
+        keys = (*LENS_KEYS[model_name(camera)], *PINHOLE_KEYS)
+        lines = _lines(keys, (*lens_parameters(camera), *camera.focal, *camera.center))
     else:
         raise CalibError(f"rig file: {name}: expected a camera of a known model, found {type(camera).__name__}")
-    return "\n".join(["", f"[{name}.intrinsics]", *named]) + "\n"
+    return "\n".join(["", f"[{name}.intrinsics]", *lines]) + "\n"
+
+
+def _ocam_lines(camera: OcamCamera) -> list[str]:
+    """Return the lines of an ocam camera's intrinsics; optional terms that are 0 are left out."""
+    lines = [f"polynomial = [{', '.join(map(number_text, camera.polynomial))}]"]
+    lines += _lines(OCAM_KEYS[1:], (*camera.center_row_column, *camera.affine))
+    for keys, terms in ((TANGENTIAL_NAMES, camera.tangential), (ASTIGMATISM_NAMES, camera.astigmatism)):
+        lines += _lines(keys, terms) if any(terms) else []
+    if any(camera.wavefront):
+        lines.append(f"wavefront = [{', '.join(map(number_text, camera.wavefront))}]")
+        lines.append(f"distance_m = {number_text(camera.distance_m)}")
+    return lines
+
+
+def _lines(keys: Sequence[str], values: Sequence[float]) -> list[str]:
+    return [f"{key} = {number_text(value)}" for key, value in zip(keys, values, strict=True)]
 
 
 def mask_text(name: str, mask: Mask, image: str) -> str:
