@@ -109,8 +109,8 @@ def _end(args: argparse.Namespace, robot: PacedRobot | RealtimeRobot, code: int)
     from omnid.engine.logging_setup import log
 
     if args.truth:
-        _write_truth(args.truth, robot.truth, robot.offset_ns)
-    log(logging.INFO, f"contacts with obstacles: {robot.contacts}")
+        _write_truth(args.truth, robot.drive.truth, robot.offset_ns)
+    log(logging.INFO, f"contacts with obstacles: {robot.drive.contacts}")
     return code
 
 

@@ -1,16 +1,19 @@
-"""Distance of a robot's outline, a disc, from the objects in its world."""
+"""Distance of a robot's outline, a disc, from the objects in its world; the record of its true poses and contacts."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.motors.simulated.simulated_base import Pose
 from omnid.simulation.rendering.surfaces import Rectangle
 
 Array = NDArray[np.float64]
 FLOOR_M = 0.02  # what is lower than this is driven over
+MOST_POSES: Final = 200_000  # Most poses that are kept, of five hours; the oldest ones are dropped.
 
 
 def footprints(rectangles: Sequence[Rectangle], height_m: float) -> Array:
@@ -37,3 +40,28 @@ def clearance_m(segments: Array, place: tuple[float, float], radius_m: float) ->
     to_place = np.asarray(place) - a
     share = np.clip((to_place * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
     return float(np.linalg.norm(to_place - share[:, None] * along, axis=1).min()) - radius_m
+
+
+class DriveRecord:
+    """The true poses of a drive, in bounded memory, and its contacts with obstacles."""
+
+    def __init__(self, report: Callable[[str], None] | None) -> None:
+        """report: takes a line at each contact."""
+        self.truth: dict[int, Pose] = {}  # of the base in the world, by their stamps
+        self.contacts = 0
+        self._report, self._touches = report, False
+
+    def add_pose(self, stamp_ns: int, pose: Pose) -> None:
+        """Keep a pose."""
+        if len(self.truth) >= MOST_POSES:
+            del self.truth[next(iter(self.truth))]
+        self.truth[stamp_ns] = pose
+
+    def add_clearance(self, distance_m: float, pose: Pose) -> None:
+        """Count and report a contact when it begins; distance_m: from the nearest obstacle, see clearance_m."""
+        touches = distance_m <= 0
+        if touches and not self._touches:
+            self.contacts += 1
+            if self._report is not None:
+                self._report(f"contact with an obstacle at {pose[0]:.2f}, {pose[1]:.2f} m in the world")
+        self._touches = touches

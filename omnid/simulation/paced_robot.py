@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample
-from drivers.motors.simulated.simulated_base import Pose
 from omnid.config import Config
 from omnid.controller.link import DriveLink
 from omnid.controller.statistics import TickReport
@@ -29,9 +28,10 @@ from omnid.engine.graph import Graph, Stream
 from omnid.engine.telemetry import StageStats
 from omnid.runs.session import Session
 from omnid.simulation.cameras import SimulatedCameras
+from omnid.simulation.clearance import DriveRecord
 from omnid.simulation.lockstep import STOPPING_NS, with_masks
 from omnid.simulation.paced_link import Delivery, PacedLink
-from omnid.simulation.realtime import MOST_POSES, SAMPLES
+from omnid.simulation.realtime import SAMPLES
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Tick, Vehicle
 from omnid.simulation.world import World
@@ -81,7 +81,7 @@ class PacedRobot:
     ) -> None:
         """report: takes a line at each contact with an obstacle."""
         self.rig = with_masks(robot.rig)
-        self._world, self._robot, self._config, self._seed, self._report = world, robot, config, seed, report
+        self._world, self._robot, self._config, self._seed = world, robot, config, seed
         self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
         self._period_ns = round(1e9 / robot.rate_hz)
         self._start_ns = time.monotonic_ns()
@@ -91,9 +91,8 @@ class PacedRobot:
         self.offset_ns = 0  # from the simulated time to Unix time
         self._states = {camera: CameraState(mode="simulated") for camera in CAMERAS}
         self._pace = RealTimeFactor(1.0 / robot.rate_hz)
-        self._touches = self._closed = self._ends = False
-        self.contacts = 0
-        self.truth: dict[int, Pose] = {}  # of the base in the world, by the stamps of the pairs
+        self._closed = self._ends = False
+        self.drive = DriveRecord(report)  # with the stamps of the pairs
 
     def clock_ns(self) -> int:
         """Return the simulated time; it begins with that of the computer, and never runs ahead of it."""
@@ -142,7 +141,7 @@ class PacedRobot:
         values = {
             str(Key.REAL_TIME_FACTOR): f"{self._pace.value:.2f}",
             "time_s": f"{time_s:.1f}",
-            "contacts": str(self.contacts),
+            "contacts": str(self.drive.contacts),
         }
         return DiagnosticStatus(SIMULATION, OK, "its time waits for the daemon", values)
 
@@ -157,7 +156,7 @@ class PacedRobot:
                 self._advance(vehicle, link, stamp_ns, ticks_then=False)
                 # 2. The images, while the daemon works on those before.
                 pair = [self._frame(vehicle, camera, seq, stamp_ns) for camera in CAMERAS]
-                self._keep(stamp_ns, vehicle.twin.base.pose)
+                self.drive.add_pose(stamp_ns, vehicle.twin.base.pose)
                 # 3. The daemon's answers, which take effect with the tick of now.
                 settle()
                 self._advance(vehicle, link, stamp_ns)
@@ -199,18 +198,8 @@ class PacedRobot:
         state.frames += 1
         return self._rendered.frame(camera, seq, stamp_ns, vehicle.T_world_base @ self.rig.T_base_rig, vehicle.people)
 
-    def _keep(self, stamp_ns: int, pose: Pose) -> None:
-        """Keep the truth."""
-        if len(self.truth) >= MOST_POSES:
-            del self.truth[next(iter(self.truth))]
-        self.truth[stamp_ns] = pose
-
     def _take_tick(self, tick: Tick, report: TickReport) -> None:
         """Pass a tick on, and report a contact."""
         assert self._link is not None
         self._link.take(report)
-        touches = tick.clearance_m <= 0
-        if touches and not self._touches:
-            self.contacts += 1
-            self._report(f"contact with an obstacle at {tick.pose[0]:.2f}, {tick.pose[1]:.2f} m in the world")
-        self._touches = touches
+        self.drive.add_clearance(tick.clearance_m, tick.pose)

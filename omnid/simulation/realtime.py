@@ -26,7 +26,7 @@ from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_base import Pose
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.clearance import clearance_m, footprints
+from omnid.simulation.clearance import DriveRecord, clearance_m, footprints
 from omnid.simulation.lockstep import with_masks
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
@@ -36,7 +36,6 @@ Array = NDArray[np.float64]
 POLL_S: Final = 0.002  # Time between two checks whether the motion up to an exposure is known.
 LONGEST_WAIT_S: Final = 0.2  # Longest wait for the motion up to an exposure; then the newest pose is taken.
 SAMPLES: Final = 1  # per pixel and axis: textures are filtered, only edges of surfaces are not
-MOST_POSES: Final = 200_000  # kept of the truth: five hours; older ones give way
 
 
 class RealtimeRobot:
@@ -53,7 +52,7 @@ class RealtimeRobot:
     ) -> None:
         """Open the terminal. report: takes a line at each contact with an obstacle."""
         self.rig = with_masks(robot.rig)
-        self._robot, self._world, self._report = robot, world, report
+        self._robot, self._world = robot, world
         controller = SIMULATED_CONTROLLERS[protocol](drive)
         base = controller.base
         base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
@@ -66,9 +65,7 @@ class RealtimeRobot:
         self.imu_port = self._imu.port if self._imu else ""
         self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
         self._standing = footprints(world.standing, robot.height_m)
-        self._touches = False
-        self.contacts = 0
-        self.truth: dict[int, Pose] = {}  # of the base in the world, by the stamps of the lower camera
+        self.drive = DriveRecord(report)  # with the stamps of the lower camera
 
     def open_camera(self, camera: Camera, clock: LogClock) -> SimulatedCamera:
         """Return a camera; clock: start of both cameras."""
@@ -119,28 +116,16 @@ class RealtimeRobot:
         pose = self.pose_at(stamp_ns)
         people.advance(time_s, pose[:2])
         if camera == "lower":
-            self._keep(stamp_ns, pose, people)
+            walking = footprints(people.faces(), self._robot.height_m)
+            clearances_m = [clearance_m(one, pose[:2], self._robot.radius_m) for one in (self._standing, walking)]
+            self.drive.add_pose(stamp_ns, pose)
+            self.drive.add_clearance(min(clearances_m), pose)
         T_world_base = se3.transform(se3.rotation_exp([0.0, 0.0, pose[2]]), [pose[0], pose[1], 0.0])
         return self._rendered.frame(camera, seq, stamp_ns, T_world_base @ self.rig.T_base_rig, people)
 
     def walkers(self) -> Walkers:
         """Return the people at the start; each camera has its own copies, which walk in the same way."""
         return Walkers(self._world.people)
-
-    def _keep(self, stamp_ns: int, pose: Pose, people: Walkers) -> None:
-        """Keep the truth, and report a contact."""
-        if len(self.truth) >= MOST_POSES:
-            del self.truth[next(iter(self.truth))]
-        self.truth[stamp_ns] = pose
-        walking = footprints(people.faces(), self._robot.height_m)
-        touches = (
-            min(clearance_m(segments, pose[:2], self._robot.radius_m) for segments in (self._standing, walking)) <= 0
-        )
-        if touches and not self._touches:
-            self.contacts += 1
-            if self._report is not None:
-                self._report(f"contact with an obstacle at {pose[0]:.2f}, {pose[1]:.2f} m in the world")
-        self._touches = touches
 
 
 class SimulatedCamera:

@@ -41,14 +41,14 @@ def test_commands_on_the_serial_port_move_the_cameras() -> None:
             while any(thread.is_alive() for thread in threads):
                 motor.send(VelocityCommand(0, 0.4, 0.0, 0.0))
                 time.sleep(0.02)
-        truth = list(robot.truth.items())
+        truth = list(robot.drive.truth.items())
     start_ns = clock.epoch_ns()
     for taken in frames.values():
         assert all((frame.stamp_ns - start_ns) % PERIOD_NS == 0 for frame in taken)
         assert (taken[0].data != taken[-1].data).mean() > 0.5  # type: ignore[union-attr]
     assert [stamp for stamp, _ in truth] == [frame.stamp_ns for frame in frames["lower"]]
     assert truth[-1][1][0] - truth[0][1][0] > 0.1
-    assert robot.contacts == 0
+    assert robot.drive.contacts == 0
 
 
 def test_the_gyro_measures_the_turn_of_the_base() -> None:
