@@ -268,11 +268,11 @@ class LineProtocol:
     def drive(self, command: VelocityCommand, now_s: float) -> Transaction[MotorStatus]:
         """Send one velocity line and return the status with the same seq."""
         velocity_mps, yaw_rate_radps = self._drive.limited(command)
-        heading_rad = _wrapped(command.heading_rad - self._zero_rad)
+        heading_rad = math.remainder(command.heading_rad - self._zero_rad, math.tau)
         seq, self._seq = self._seq, (self._seq + 1) % SEQ_COUNT
         line = encode(VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps)))
         reply = yield from request(line, lambda frame: self._status(frame, seq))
-        self._heading_rad = _wrapped(reply.status.heading_rad + self._zero_rad)
+        self._heading_rad = math.remainder(reply.status.heading_rad + self._zero_rad, math.tau)
         return replace(reply.status, heading_rad=self._heading_rad)
 
     def _watchdog(self, frame: bytes) -> WatchdogReply | None:
@@ -289,7 +289,3 @@ class LineProtocol:
         except ProtocolError:
             self.bad_frames += 1
             return None
-
-
-def _wrapped(angle_rad: float) -> float:
-    return math.remainder(angle_rad, math.tau)

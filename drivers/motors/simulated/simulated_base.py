@@ -162,7 +162,7 @@ class SimulatedBase:
         """Return the yaw rate towards the goal heading; the commanded one without a goal, or where the base stops."""
         if self.goal_heading_rad is None or self.commanded_mps == [0.0, 0.0]:
             return yaw_rate_radps
-        return self.limits.heading_gain_hz * _wrap(self.goal_heading_rad - self.pose[2])
+        return self.limits.heading_gain_hz * math.remainder(self.goal_heading_rad - self.pose[2], math.tau)
 
     def _move(self, dt_s: float) -> None:
         """Move the pose along the chord of the arc that the wheels travel over the ground."""
@@ -174,7 +174,7 @@ class SimulatedBase:
         distance_m, rotation_rad = self._twist(*self.traction(dt_s, *rims_m))
         chord_rad = heading_rad + rotation_rad / 2
         x_m, y_m = x_m + distance_m * math.cos(chord_rad), y_m + distance_m * math.sin(chord_rad)
-        self.pose = (x_m, y_m, _wrap(heading_rad + rotation_rad))
+        self.pose = (x_m, y_m, math.remainder(heading_rad + rotation_rad, math.tau))
 
     def _twist(self, left_mps: float, right_mps: float) -> tuple[float, float]:
         return (left_mps + right_mps) / 2, (right_mps - left_mps) / self.drive.track_m
@@ -190,7 +190,3 @@ def reply_to(base: SimulatedBase, framer: Framer, handle: Callable[[bytes], byte
 
 def _clamp(value: float, magnitude: float) -> float:
     return max(-magnitude, min(magnitude, value))
-
-
-def _wrap(angle_rad: float) -> float:
-    return math.remainder(angle_rad, math.tau)
