@@ -22,6 +22,11 @@ def model_name(camera: OmniCamera) -> str:
     return "equidistant" if isinstance(camera, EquidistantCamera) else "omni"
 
 
+def model_in_words(camera: OmniCamera) -> str:
+    """Return the name of a camera's model, and the view of one that may be a mirror's or a lens's."""
+    return f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else model_name(camera)
+
+
 def sees_directly(camera: OmniCamera) -> bool:
     """True for a camera without a mirror, of whichever model: its image has no hub and need not have a rim."""
     if isinstance(camera, OcamCamera):

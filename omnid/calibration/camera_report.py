@@ -9,8 +9,7 @@ import numpy as np
 
 from calib.fit.boards.camera_fit import CameraCalibration
 from calib.models.camera import Mask
-from calib.models.names import model_name
-from calib.models.ocam import OcamCamera
+from calib.models.names import model_in_words
 from omnid.calibration.figures import (
     ARROW,
     Image,
@@ -61,10 +60,9 @@ def camera_report_html(
 
 def _head(found: CameraCalibration) -> str:
     camera, board = found.camera, found.board
-    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else model_name(camera)
     used = int(np.isfinite(found.fit.errors_px).sum())
     return (
-        f"<h1>Camera calibration</h1><p>Model {model}, {camera.size[0]}x{camera.size[1]} px. "
+        f"<h1>Camera calibration</h1><p>Model {model_in_words(camera)}, {camera.size[0]}x{camera.size[1]} px. "
         f"{escape(f'{board}')}, {board.square_m * 1e3:g} mm. "
         f"{len(found.views)} views, {used} corners. <b>Mean reprojection error {found.fit.mean_px:.3f} px</b>.</p>"
     )

@@ -10,8 +10,7 @@ import numpy as np
 
 from calib import se3
 from calib.bounded_toml import parse_toml
-from calib.models.names import model_name
-from calib.models.ocam import OcamCamera
+from calib.models.names import model_in_words
 from calib.rig import MountedCamera, Rig
 from omnid.config import Config
 from omnid.report.page import facts, note, table
@@ -73,8 +72,8 @@ def _rig_rows(rig: Rig) -> list[tuple[str, str]]:
 
 def _camera(mounted: MountedCamera) -> str:
     camera = mounted.camera
-    model = f"ocam, {camera.view} view" if isinstance(camera, OcamCamera) else model_name(camera)
-    return f"{model}, {camera.size[0]}x{camera.size[1]} px, {'with a' if mounted.mask else 'without a'} mask"
+    size, mask = f"{camera.size[0]}x{camera.size[1]} px", "with a mask" if mounted.mask else "without a mask"
+    return f"{model_in_words(camera)}, {size}, {mask}"
 
 
 def _changed(settings: bytes) -> list[tuple[str, str, str]] | None:
