@@ -25,15 +25,20 @@ MAX_LOG_VIEWS = 40
 HINT_IMAGES = 3
 
 
+def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: bool) -> BoardSearch:
+    """Search a board of any kind in an image; name: of the view that is found. thorough: see `find_board`."""
+    if isinstance(board, Board):
+        return find_board(image, board, name, thorough=thorough)
+    return BoardSearch(find_marker_board(image, board, name, thorough=thorough))
+
+
 def find_boards(images: Images, board: AnyBoard, *, thorough: bool, progress: Progress = silent) -> list[BoardView]:
     """Find the views of a board in images, on all cores; raises OmnidError if there is none, naming other boards."""
     views, other_grids = list[BoardView](), Counter[tuple[int, int]]()
 
     def search_of(named: tuple[str, Image]) -> tuple[str, BoardSearch]:
         name, image = named
-        if isinstance(board, Board):
-            return name, find_board(image, board, name, thorough=thorough)
-        return name, BoardSearch(find_marker_board(image, board, name, thorough=thorough))
+        return name, search_board(image, board, name, thorough=thorough)
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         for number, (name, search) in enumerate(pool.map(search_of, images.items()), 1):

@@ -9,12 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from calib.boards.board import Board, BoardView
-from calib.boards.board_finder import find_board
-from calib.boards.marker_finder import find_marker_board
+from calib.boards.board import BoardView
 from calib.masks.rim import find_rim
 from calib.models.camera import Mask
-from omnid.calibration.board_search import AnyBoard
+from omnid.calibration.board_search import AnyBoard, search_board
 from omnid.calibration.coverage import NEEDED_PAIRS, NEW_VIEW_PART, STILL_PART, CameraCoverage, moved
 from omnid.calibration.image_pairs import SIDES
 from omnid.calibration.images import Image, middle_px
@@ -70,7 +68,7 @@ class LiveBoards:
         """
         # 1. Search the board.
         self._update_rims(images)
-        lower, upper = self._pool.map(self._search, images)
+        lower, upper = self._pool.map(lambda image: search_board(image, self._board, thorough=False).view, images)
         before, self._before, self.views = self._before, (lower, upper), (lower, upper)
         # 2. Leave out what says nothing new.
         if lower is None and upper is None:
@@ -92,11 +90,6 @@ class LiveBoards:
     def close(self) -> None:
         """End the threads of the search."""
         self._pool.shutdown()
-
-    def _search(self, image: Image) -> BoardView | None:
-        if isinstance(self._board, Board):
-            return find_board(image, self._board, thorough=False).view
-        return find_marker_board(image, self._board, "", thorough=False)
 
     def _near(self, a: Views, b: Views, part: float) -> bool:
         """True if both boards are nearly at the same places in both views, as parts of the rims' radii."""
