@@ -176,7 +176,7 @@ def _beside(values: ValidatedTable, source: str, folder: Path | None) -> bytes:
 
 
 def png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image (H, W) uint8 as the bytes of a PNG."""
+    """Return an image (H, W) or (H, W, 3) uint8 as the bytes of a PNG."""
     return cv2.imencode(".png", image)[1].tobytes()
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib.camera_file import CameraFile, Quality, camera_toml
+from calib.camera_table import png
 from calib.fit.boards.camera_fit import CameraCalibration
 from calib.fit.boards.camera_selection import (
     ModelChoice,
@@ -76,7 +76,7 @@ class CameraResult:
     def save(self, path: Path, mask_path: Path | None = None) -> None:
         """Write the camera.toml, and the mask to a PNG in the same folder, which the camera.toml names."""
         if mask_path is not None and self.mask is not None and self.mask.image is not None:
-            write_file(mask_path, cv2.imencode(".png", self.mask.image)[1].tobytes())
+            write_file(mask_path, png(self.mask.image))
         found = self.calibration
         quality = Quality(found.fit.mean_px, len(found.views), found.parameters)
         file = CameraFile(found.camera, self.mask)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion
 from calib.rig import Rig
+from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.image_pairs import open_log
 from omnid.config import Config
@@ -233,8 +234,7 @@ def require_motion(T_rig_odom: Array, drives: int) -> None:
             "the spot show nothing from near and from far; take a longer drive"
         )
     heading = se3.yaw(T_odom_rig)
-    change = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
-    if np.ptp(np.concatenate([[0.0], np.cumsum(change)])) < MIN_TURN_RAD:
+    if np.ptp(np.concatenate([[0.0], np.cumsum(wrapped(np.diff(heading)))])) < MIN_TURN_RAD:
         raise OmnidError(
             f"calibrate drive: {drives} drive(s) turn by less than {np.rad2deg(MIN_TURN_RAD):.0f} deg; on "
             "a straight line some errors of the rig look like motion: take a drive with turns"

@@ -171,12 +171,11 @@ class _Progress:
 
 
 def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:
-    import cv2
-
+    from calib.camera_table import png
     from calib.rig_file import write_file
 
     for side, image in zip(("lower", "upper"), pair, strict=True):
-        write_file(folder / f"{side}_{number:03d}.png", cv2.imencode(".png", image)[1].tobytes())
+        write_file(folder / f"{side}_{number:03d}.png", png(image))
 
 
 def _finish(args: argparse.Namespace, boards: LiveBoards) -> int:

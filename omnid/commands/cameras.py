@@ -71,8 +71,7 @@ def _list() -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    import cv2
-
+    from calib.camera_table import png
     from calib.rig_file import write_file
     from omnid.calibration.snapshot import annotated, described, view_of, warnings
 
@@ -83,7 +82,7 @@ def _snapshot(args: argparse.Namespace) -> int:
     views: dict[str, CameraView] = {name: view_of(images) for name, images in _images(args)}
     for name, view in views.items():
         path = args.snapshot / f"{name}.png"
-        write_file(path, cv2.imencode(".png", annotated(name, view))[1].tobytes())
+        write_file(path, png(annotated(name, view)))
         print(f"{path}: {described(view)}")
     problems = list(warnings(views))
     for problem in problems:

@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.camera_table import png
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid, known_part
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig
@@ -91,7 +91,7 @@ def _image(cells: Grid, corner: Point, px_per_m: float) -> str:
     greys[cells.cells == OCCUPIED] = OCCUPIED_GREY
     rows, columns = greys.shape
     size = columns * cells.cell_m * px_per_m, rows * cells.cell_m * px_per_m
-    return pixel_image(cv2.imencode(".png", greys[::-1])[1].tobytes(), corner, size)
+    return pixel_image(png(greys[::-1]), corner, size)
 
 
 def _loops(places: PlaceMap, at: Mapping[int, Point]) -> Iterator[str]:
