@@ -126,9 +126,9 @@ def calibrate_rig(
     """
     # 1. Read the images, each once.
     images = _read(Path(source), topics, areas, cameras)
-    # 2. Find the board in all of them.
     for line in images.notes:
         progress(line)
+    # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
     if cameras is None:
