@@ -30,7 +30,6 @@ from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import FILE_BITS, bits_of_camera, deep_samples, upper_eight_bits
 from drivers.logs.image_log import LogDamage, LoggedImage
 from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
-from drivers.logs.ros_frame import frame_of
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, image_encoding
 
 SUFFIXES: Final = (".png", ".jpg", ".jpeg")
@@ -274,7 +273,7 @@ def _bits_of_camera(files: Sequence[_StampedFile]) -> int:
     largest = 0
     for file in files[:: max(1, len(files) // _BITS_IMAGES)]:
         with suppress(RecordError, FrameDecodeError):
-            deep = deep_samples(frame_of(_read(file, FILE_BITS)))
+            deep = deep_samples(_read(file, FILE_BITS).frame())
             if deep is None:
                 return FILE_BITS
             largest = max(largest, int(deep.max()))
@@ -291,7 +290,7 @@ def _read(file: _StampedFile, bits: int) -> RosImage:
     if bits == FILE_BITS:
         return image
     with suppress(FrameDecodeError):  # who decodes the file says what is wrong with it
-        deep = deep_samples(frame_of(image))
+        deep = deep_samples(image.frame())
         if deep is not None:
             pixels = memoryview(upper_eight_bits(deep, bits).tobytes())
             return RosImage(file.stamp_ns, "mono8", pixels, deep.shape[1], deep.shape[0])

@@ -11,7 +11,6 @@ import pytest
 from drivers.frame import gray
 from drivers.logs.image_folder import ImageFolder, parse_stamp
 from drivers.logs.image_log import images_of
-from drivers.logs.ros_frame import frame_of
 
 
 @pytest.mark.parametrize(
@@ -45,7 +44,7 @@ def test_stamps_are_exact(text: str, stamp_ns: int | None) -> None:
 
 
 def read_by_log(folder: Path) -> list[np.ndarray]:
-    return [gray(frame_of(image.read())) for image in images_of(ImageFolder(folder, [folder / "lower"]))]
+    return [gray(image.read().frame()) for image in images_of(ImageFolder(folder, [folder / "lower"]))]
 
 
 @pytest.mark.parametrize(("bits", "read_bits"), [(10, 10), (12, 12), (13, 16), (16, 16)])
