@@ -52,6 +52,10 @@ OTHERS_PX: Final = (12, 25)  # lower and higher disparities than the floor's tha
 EDGE_M: Final = 0.05  # least fall of the floor that is an edge; lower ones the base's wheels pass
 LEVEL_STEP_PX: Final = 0.75  # Step between planes next to the floor: matching resolves half of it.
 LEVEL_STEPS: Final = 3  # enough at all disparities to where others are compared
+DEEP_STEP_PX: Final = 0.375  # Step between planes deep below the floor: one that is missed is no evidence against it.
+# Log-likelihood by which the best of those planes may fit better than the floor by noise, 1.5 in the mean of a plain
+# floor. With 3, by trial, bases stood on boards of 10 cm that are nearly alike.
+DEEP_NOISE: Final = 10.0
 EVEN_SHARE: Final = 0.33  # Share of the least height and fall by which a floor is uneven: two more planes are floor.
 LEVEL_RATIO: Final = 1.5  # log-likelihood by a sigma: that of single directions by three that are no more alike
 NEAR_M: Final = 1.15  # nearer than this on the floor, a direction is as wide there: mirrors show less detail
@@ -181,7 +185,8 @@ class Columns:
         """Return the log-likelihood ratios (2, K, DIRECTIONS) of the floor against planes just above and below it."""
         level, scale = np.empty((2, self.bins, DIRECTIONS), np.float32), np.float32(LEVEL_RATIO / 64 / UNITS)
         compared = views.lower, views.upper, self._plane_rows, views.live
-        kernels.level_evidence(*compared, self._floor_bins, self._offsets, OUTLIER, scale, level)
+        noise = np.float32(DEEP_NOISE)
+        kernels.level_evidence(*compared, self._floor_bins, self._offsets, OUTLIER, scale, noise, level)
         return level
 
     def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -252,13 +257,14 @@ class Columns:
             lowest = self._plane_rows[first:end].max() + self._offsets[:, k] + 1 > self._height - 1
             highest = self._plane_rows[first:end].min() + self._offsets[:, k] < 0
             self._offsets[:, k][lowest | highest] = np.nan
-            if np.isnan(self._offsets[:, k, 0]).any():
+            if np.isnan(self._offsets[:3, k, 0]).any():
                 self._floor_bins[k] = 0
 
     def _made_offsets(self) -> Floats:
         """Return the differences of disparity of kernels.level_evidence."""
         h = self._plane.height_m
-        offsets = np.full((3, self.bins, LEVEL_STEPS), np.nan, np.float32)
+        steps = math.ceil(OTHERS_PX[0] / DEEP_STEP_PX)
+        offsets = np.full((4, self.bins, steps), np.nan, np.float32)
         for k in range(self.bins):
             up, down = (z * (k + 0.5) / (h - z) for z in (self._heights_m[0], -EDGE_M))
             offsets[0, k, :3] = 0.0, EVEN_SHARE * up, EVEN_SHARE * down
@@ -267,6 +273,10 @@ class Columns:
                 for kind, offset in ((1, up + step), (2, down - step)):
                     if j == 0 or abs(offset) < FLOOR_PX + 1:
                         offsets[kind, k, j] = offset
+            # Planes deep below, to the lowest disparity that the floor is compared with: one has the floor's period.
+            deeper = down - DEEP_STEP_PX * np.arange(steps)
+            is_deep = (deeper <= -FLOOR_PX - 1) & (deeper > -min(OTHERS_PX[0], k))
+            offsets[3, k, is_deep] = deeper[is_deep]
         return offsets
 
     def _made_strips(self) -> Tables:

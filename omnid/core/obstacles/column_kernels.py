@@ -92,7 +92,7 @@ def lower_to(values: Words, into: Words) -> None:
 
 
 @compiled(
-    "(u1[:, ::1], u1[:, ::1], f4[::1], u1[:, ::1], i4[:, ::1], f4[:, :, ::1], u1, f4, f4[:, :, ::1])",
+    "(u1[:, ::1], u1[:, ::1], f4[::1], u1[:, ::1], i4[:, ::1], f4[:, :, ::1], u1, f4, f4, f4[:, :, ::1])",
     writes=("ratios",),
 )
 def level_evidence(
@@ -104,23 +104,28 @@ def level_evidence(
     offsets: Floats,
     outlier: np.uint8,
     scale: np.float32,
+    fit_of_noise: np.float32,
     ratios: Floats,
 ) -> None:
     """Write the log-likelihood ratios (2, K, W) of the floor to the best level patch above it, and to one below it.
 
+    Where one of many deeper patches fits as well as the floor there is no evidence for it: a floor that repeats itself,
+    and falls deep at an edge, fits at some range by another period. Against it counts what is beyond the fit of noise.
+
     lower, upper (H, W): normalised panoramas; plane (H,): row of the upper one that shows the floor of a row. live,
-    bins: as for floor_evidence. offsets (3, K, J): differences of disparity of patches of the floor, above and below,
-    NaN: no more; scale: logarithm of the likelihood by a unit of difference, by 64.
+    bins: as for floor_evidence. offsets (4, K, J): differences of disparity of patches of the floor, above, just below
+    and deeper, NaN: no more; scale: logarithm of the likelihood by a unit of difference, by 64; fit_of_noise:
+    log-likelihood by which the best of the deeper patches may fit better by noise.
     """
     width = lower.shape[1]
     sums, wide = np.zeros(width, np.uint16), np.empty(width, np.uint16)
-    best = np.empty((3, width), np.uint16)
+    best = np.empty((4, width), np.uint16)
     ratios[:] = NOTHING
     for k in range(len(bins)):
         if bins[k, FLOOR_END] <= bins[k, FLOOR_FIRST]:
             continue
         best[:] = LARGEST
-        for kind in range(3):
+        for kind in range(4):
             for j in range(offsets.shape[2]):
                 if math.isnan(offsets[kind, k, j]):
                     continue
@@ -134,9 +139,14 @@ def level_evidence(
                 spread(wide, sums)
                 spread(sums, wide)
                 lower_to(wide, best[kind])
-        for kind in range(2):
-            for u in range(width):
-                ratios[kind, k, u] = scale * (np.float32(best[kind + 1, u]) - np.float32(best[0, u]))
+        for u in range(width):
+            floor = np.float32(best[0, u])
+            ratios[0, k, u] = scale * (np.float32(best[1, u]) - floor)
+            below, deep = np.float32(best[2, u]) - floor, np.float32(best[3, u]) - floor
+            against = scale * deep + fit_of_noise
+            deep = scale * deep if deep > NOTHING else (against if against < NOTHING else NOTHING)
+            below = scale * below
+            ratios[1, k, u] = deep if below > deep else below
 
 
 @compiled(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -30,6 +31,11 @@ def worn(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
         120.0
         + 3.0 * (np.sin(31 * x_m + 3) * np.sin(23 * y_m) + np.sin(17 * x_m - 29 * y_m) + np.sin(13 * x_m + 37 * y_m))
     )
+
+
+def ribbed(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of ribs of 11 cm that are all alike, across each direction."""
+    return np.asarray(120.0 + 50.0 * np.sign(np.sin(math.tau * np.hypot(x_m, y_m) / 0.11)))
 
 
 def stains(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     Pattern,
     panoramas,
     plain,
+    ribbed,
     stains,
     striped,
     worn,
@@ -80,6 +81,22 @@ def test_low_steps_are_not_the_floor(columns: Columns, drop_m: float, others: in
     near, far = int(columns.at_1m / 1.2), int(columns.at_1m / 1.8)
     level, step = (evidence(columns, stains, striped, drop).level[:, far:near] for drop in (0.0, drop_m))
     assert (level.mean(axis=2) > 1).all() and (step[others].mean(axis=1) < -1).all()
+
+
+def test_a_floor_that_repeats_itself_and_falls_deep_is_no_floor_where_its_period_fits(columns: Columns) -> None:
+    """Ribs of 11 cm that lie 0.5 m lower fit as the floor does 1 to 1.25 m away; 1.3 m and farther they do not."""
+    found = evidence(columns, ribbed, striped, 0.5)
+    fits = slice(int(columns.at_1m / 1.25), int(columns.at_1m / 1.0))
+    farther = slice(int(columns.at_1m / 1.6), int(columns.at_1m / 1.3))
+    assert np.nanmean(found.floor[fits]) > 1
+    assert found.level[1, fits].mean() < 1.5 and found.level[1, farther].mean() < -10
+
+
+def test_noise_of_a_plain_floor_shows_no_step(columns: Columns) -> None:
+    """The best of thirty planes fits noise better than the floor does."""
+    found = evidence(columns, plain, plain)
+    seen = slice(int(columns.at_1m / 1.6), int(columns.at_1m / 1.0))
+    assert (np.abs(found.level[:, seen].mean(axis=(1, 2))) < 0.6).all()
 
 
 def test_lost_pixels_are_no_evidence(columns: Columns) -> None:
