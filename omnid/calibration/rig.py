@@ -54,9 +54,7 @@ class RigResult:
     rig: Rig
     calibration: RigCalibration
     images: PairedImages
-    notes: tuple[
-        str, ...
-    ]  # about repeated images, the baseline, the view, the order of the cameras, and masks that were not found
+    notes: tuple[str, ...]  # about repeated images, baseline, view, order of the cameras, and masks that are missing
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras were given
 
     @property
