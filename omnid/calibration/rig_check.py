@@ -18,7 +18,7 @@ from omnid.calibration.image_pairs import SIDES, TOLERANCE_NS, open_log, paired
 from omnid.calibration.images import brightest
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import RigFinding, judge
-from omnid.core.rig.column_matches import Matches, match, together
+from omnid.core.rig.column_matches import Matches, is_motion_unknown, match, together
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.rig.rig_state import RigState
 from omnid.errors import OmnidError
@@ -97,7 +97,7 @@ def moving_rig_finding(log: Path, rig: Rig, topics: Topics, config: Config) -> R
         stride = max(1, (reader.pair_estimate() or 0) // PAIRS)
         for update in tracked_updates(reader, front_end, config, log):
             exposure, seen = update.depth.exposure, update.depth.panoramas
-            if exposure is None or not exposure.is_known:
+            if is_motion_unknown(seen, exposure):
                 continue
             if number % stride == 0:
                 found.append(match(seen.lower, seen.upper, seen.visible, exposure))
