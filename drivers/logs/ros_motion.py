@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from drivers.errors import FrameDecodeError
 from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
-from drivers.logs.ros_image import MemberReader, cdr_members, header
+from drivers.logs.ros_members import MemberReader, cdr_members, header
 from drivers.motion import GyroSample, MotionSample, WheelSample
 
 ODOMETRY = "nav_msgs/msg/Odometry"
