@@ -61,6 +61,21 @@ def test_trajectory_and_map_are_right(omnid: Command, tmp_path: Path, scene: Pat
     assert cv2.imread(str(plan)) is not None
 
 
+def test_a_plan_shows_nothing_lower_than_the_floor_whose_height_the_rig_states(
+    omnid: Command, tmp_path: Path, scene: Path
+) -> None:
+    """With cameras 0.3 m above the floor the lower part of the walls is below it."""
+    rig, dark = read_rig(scene / "rig.toml"), {}
+    for height_m in (0.0, 0.3):  # 0: not stated
+        T_base_rig = rig.T_base_rig.copy()
+        T_base_rig[2, 3] = height_m
+        path, plan = tmp_path / f"{height_m}.toml", tmp_path / f"{height_m}.png"
+        write_rig(path, replace(rig, T_base_rig=T_base_rig))
+        assert omnid.replay(scene / "log.mcap", *FEW, "--plan", plan, rig=path).code == 0
+        dark[height_m] = float(np.mean(255 - cv2.imread(str(plan), cv2.IMREAD_GRAYSCALE).astype(float)))
+    assert 0 < dark[0.3] < dark[0.0], dark
+
+
 def assert_corridor(points: np.ndarray, T_world_odom: np.ndarray) -> None:
     """Check that the map lies on floor, ceiling and walls of the rendered corridor, whose floor is z = 0."""
     z = se3.apply(T_world_odom, points.astype(float))[:, 2]
