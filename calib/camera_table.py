@@ -26,6 +26,7 @@ from calib.models.ocam import (
     View,
 )
 from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.png import png
 from calib.validation import ValidatedTable, read_bytes
 
 # Signature, length and name of the first chunk, then width and height. Source: PNG 1.2, sections 3.1 and 4.1.1.
@@ -173,11 +174,6 @@ def _beside(values: ValidatedTable, source: str, folder: Path | None) -> bytes:
     if folder is None or "\0" in source:
         values.fail("image", "an embedded image, because there is no folder to read a file from")
     return read_bytes(folder / source)
-
-
-def png(image: NDArray[np.uint8]) -> bytes:
-    """Return an image (H, W) or (H, W, 3) uint8 as the bytes of a PNG."""
-    return cv2.imencode(".png", image)[1].tobytes()
 
 
 def camera_text(name: str, camera: OmniCamera, topic: str) -> str:

@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from calib import se3
-from calib.camera_table import camera_text, intrinsics_text, mask_text, number_text, png, read_camera_table
+from calib.camera_table import camera_text, intrinsics_text, mask_text, number_text, read_camera_table
 from calib.covariance_table import covariance_text, read_covariance
 from calib.errors import CalibError
 from calib.models.camera import Array
+from calib.png import png
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.validation import ValidatedTable, read_bytes, require_schema, toml_table
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from calib.camera_file import CameraFile, Quality, camera_toml
-from calib.camera_table import png
 from calib.fit.boards.camera_fit import CameraCalibration
 from calib.fit.boards.camera_selection import (
     ModelChoice,
@@ -24,6 +23,7 @@ from calib.fit.boards.camera_selection import (
 from calib.fit.residual_structure import ResidualStructure
 from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
+from calib.png import png
 from calib.rig_file import write_file
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.camera_report import camera_report_html

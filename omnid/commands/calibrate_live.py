@@ -171,7 +171,7 @@ class _Progress:
 
 
 def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:
-    from calib.camera_table import png
+    from calib.png import png
     from calib.rig_file import write_file
 
     for side, image in zip(("lower", "upper"), pair, strict=True):

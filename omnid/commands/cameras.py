@@ -71,7 +71,7 @@ def _list() -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    from calib.camera_table import png
+    from calib.png import png
     from calib.rig_file import write_file
     from omnid.calibration.snapshot import annotated, described, view_of, warnings
 

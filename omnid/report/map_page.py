@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.camera_table import png
+from calib.png import png
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid, known_part
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig

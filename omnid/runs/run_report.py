@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.logs.log_reader import LogReader
+from omnid.core.control.motion_monitor import ADVICE
 from omnid.core.places.place_map import PlaceMap
 from omnid.diagnostics.input_warnings import input_warnings
 from omnid.diagnostics.motion_status import motion_status
@@ -63,8 +64,12 @@ class RunReport:
         yield from self._reader.warnings
         statistics = self._session.statistics
         if statistics.poses or not self._session.signal:
-            if self._has_motion and self._motion().message:
-                yield f"wheels and gyro: {self._motion().message}"
+            fault = self._stages.front_end.odometry.last_fault
+            if fault.reason:
+                yield f"{fault.reason} {fault.detail}; {ADVICE}"
+            message = self._motion().message if self._has_motion else ""
+            if message and not (fault.reason and message.startswith(fault.reason)):
+                yield f"wheels and gyro: {message}"
             if self._stages.floor is not None and self._stages.floor.summary():
                 yield self._stages.floor.summary()
             health = self._stages.front_end.health

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import OdometryConfig
-from omnid.core.control.motion_monitor import Witness
+from omnid.core.control.motion_monitor import AGREE, Witness
 from omnid.core.odometry.contradiction import Contradiction, contradiction_after
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
@@ -57,6 +57,7 @@ class OdometryStage:
         self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
         self._to_base = se3.adjoint(self._T_base_rect)
         self.sensors, self._agreement = MotionSensors(se3.inverse(self._T_base_rect)), MotionAgreement()
+        self.last_fault = AGREE  # the last disagreement that was more than a doubt
         self._contradiction: Contradiction | None = None  # of all poses so far by wheels and gyro
 
     def _features(self) -> float:
@@ -94,6 +95,8 @@ class OdometryStage:
             self.sensors.observe(*estimate.step, last_ns, pair.stamp_ns)
             seen = self._to_base @ se3.log(estimate.step[0])
             self._agreement.add_step(last_ns, pair.stamp_ns, *map(float, seen[[0, 5, 1]]))
+            if self.witness.is_fault:
+                self.last_fault = self.witness
         covariance_rect = estimate.covariance + self._contradicted(estimate.T_odom_rect, pair.stamp_ns)
         # 4. The message, in the frame of the rig.
         earlier = self._earlier(pair, estimate)

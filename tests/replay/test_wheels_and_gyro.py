@@ -222,6 +222,8 @@ def test_a_pose_that_the_wheels_contradict_is_degraded_and_its_sigma_covers_thei
         run(saved(tmp_path / f"{name}.mcap", scene, [entry(sample) for sample in log]), scene)
         for name, log in (("honest", samples), ("faster", faster))
     )
+    assert any("images and wheels disagree" in line for line in contradicted.warnings)
+    assert not any("images and wheels disagree" in line for line in honest.warnings)
     assert contradicted.states[-1] == TrackingState.DEGRADED and honest.states[-1] == TrackingState.TRACKING
     sigma_m, honest_m = (np.sqrt(np.diag(result.covariances[-1])[:3].max()) for result in (contradicted, honest))
     travelled_m = float(np.linalg.norm(contradicted.T_odom_rig[-1, :3, 3]))

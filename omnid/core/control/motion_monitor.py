@@ -64,8 +64,8 @@ class Witness(NamedTuple):
     reason: str = ""  # one of WITNESSES; empty: all agree
     detail: str = ""  # size of the disagreement, in words
     is_fault: bool = False  # False: a doubt
-    distance: Difference = Difference()
-    turn: Difference = Difference()
+    distance: Difference = Difference()  # of the wheels; empty where they agree, or are late
+    turn: Difference = Difference()  # of the gyro, else of the wheels
 
     @property
     def contradicts_images(self) -> bool:
