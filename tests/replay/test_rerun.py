@@ -31,6 +31,8 @@ PUBLISHED = {
     *IMAGES,
 }
 AGREE = "the runs agree: no difference is larger than 20 mm or 0.5 deg"
+# Where a busy computer has dropped a pair of the recording.
+AGREE_IN_PART = AGREE.replace("agree:", "agree in what could be compared:")
 COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
 
@@ -126,7 +128,7 @@ def test_a_replay_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, 
     if stamps[0] == stamps[1]:
         assert code == 0 and "bit-identical" in out, out + err
     else:  # A busy computer dropped pairs: odometry may say `degraded` after a gap that the replay does not have.
-        assert out.splitlines()[-1] in {AGREE, "the runs differ: states"}, out + err
+        assert out.splitlines()[-1] in {AGREE, AGREE_IN_PART, "the runs differ: states"}, out + err
 
 
 def test_diff_finds_a_setting_that_matters(omnid: Command, tmp_path: Path, recording: Path) -> None:
