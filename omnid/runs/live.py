@@ -69,7 +69,7 @@ class LiveRun:
             prepare_kernels()
             self._connected = True
             run_places = RunPlaces(self._config, geometry, session.warn)
-            LiveWiring(session, geometry, self._refined, self._report).wire(self._robot, run_places)
+            LiveWiring(session, geometry, self._refined, self._robot, self._report).wire(run_places)
             if self._show is not None:
                 from omnid.runs.live_status import add_terminal_ticker
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 from calib.rig_file import rig_toml
+from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.controller.link import DriveLink
 from omnid.core.control.command_sources import PLANNER
@@ -18,18 +18,19 @@ from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.places_status import places_status
 from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.diagnostics.threads_status import ThreadsStatus
-from omnid.engine.graph import NEWEST, Sink
+from omnid.engine.graph import NEWEST, Sink, Stream
 from omnid.engine.logging_setup import Report
 from omnid.formats.route_file import RouteFolder
 from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
+from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate
 from omnid.refinement.refined_file import RefinedRigFile
 from omnid.runs.live_commands import NO_PLANNER, LiveCommands
 from omnid.runs.live_robot import LiveRobot
 from omnid.runs.live_status import add_status_tickers
 from omnid.runs.map_saver import MapSaver
-from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks, wheel_state, wire
+from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
 from omnid.runs.rig_checks import LiveRig, live_health
@@ -44,92 +45,125 @@ from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.places import Places
 from omnid.stages.synchronise import Synchronise
-from omnid.transport.bus import Bus
 from omnid.transport.navigation_commands import RequestQueue
 
 
 class LiveWiring:
     """Joins the parts of one run."""
 
-    def __init__(self, session: Session, geometry: Geometry, refined: RefinedRigFile | None, report: Report) -> None:
-        """refined: the file of the refined rig; None where the rig is not refined."""
-        self._session, self._geometry, self._refined, self._report = session, geometry, refined, report
-        self._latency = Latency(session.clock_ns)
+    def __init__(
+        self, session: Session, geometry: Geometry, refined: RefinedRigFile | None, robot: LiveRobot, report: Report
+    ) -> None:
+        """Connect the wheels, the bus, the samples of wheels and gyro, and the recording.
 
-    def wire(self, robot: LiveRobot, run_places: RunPlaces) -> None:
+        refined: the file of the refined rig; None where the rig is not refined.
+        """
+        config = session.config
+        self._session, self._geometry, self._robot, self._report = session, geometry, robot, report
+        self._latency, self._ladder = Latency(session.clock_ns), LoadLadder()
+        self._controller = robot.connect(session)
+        self._bus = session.open_bus(geometry.rig, gives_time=robot.waits)
+        self._pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
+        self._sensors = SensorSources(
+            config, self._pairing.motion, session, self._controller, report, with_images=robot.brings_samples
+        )
+        self._recorder = self._open_recorder() if config.record.enabled else None
+        self._front_end = FrontEnd(geometry, config, live_health(geometry, config, refined), load=self._load)
+        self._rig = LiveRig(session, self._front_end, self._ladder, refined)
+
+    def wire(self, run_places: RunPlaces) -> None:
         """Join the robot, stages, sinks and tickers."""
-        session, geometry, rig = self._session, self._geometry, self._geometry.rig
+        session, robot = self._session, self._robot
         config, graph = session.config, session.graph
-        # 1. Connections: the wheels, the bus, wheels' and gyro's samples, the recording.
-        controller = robot.connect(session)
-        bus = session.open_bus(rig, gives_time=robot.waits)
-        pairing = Synchronise(rig, config.pair, config.motion.R_base_imu)
-        sensors = SensorSources(
-            config, pairing.motion, session, controller, self._report, with_images=robot.brings_samples
-        )
-        sensors.add_to(graph)
-        recorder = self._recorder() if config.record.enabled else None
-        # 2. From the cameras to pairs.
-        frames = robot.sources(graph, pairing.motion.add)
-        pairs = graph.stage("pair", pairing, *frames)
-        states = robot.states()
-        exposure = ExposureControl(UsefulArea(rig, geometry.cylinder), config.cameras, states)
+        # 1. From the cameras to pairs.
+        self._sensors.add_to(graph)
+        frames = robot.sources(graph, self._pairing.motion.add)
+        pairs = graph.stage("pair", self._pairing, *frames)
+        area = UsefulArea(self._geometry.rig, self._geometry.cylinder)
+        exposure = ExposureControl(area, config.cameras, robot.states())
         graph.sink("exposure", exposure, pairs, policy=NEWEST, depth=1)
-        # 3. From pairs to poses, maps and setpoints.
-        ladder, requests = LoadLadder(), RequestQueue()
-        halts = (lambda: controller.statistics.state.halts) if controller else (lambda: 0)
-        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), requests.put, halts=halts)
-        front_end = FrontEnd(geometry, config, live_health(geometry, config, self._refined), load=lambda: ladder.level)
-        live_rig = LiveRig(session, front_end, ladder, self._refined)
-        sinks = self._sinks(live_rig, bus, own_time=robot.waits)
-        if recorder is not None:
-            sinks = replace(sinks, recording=RecordingSink(recorder, tuple(frames), config.record.queue))
+        # 2. From pairs to poses, maps and setpoints.
+        requests = RequestQueue()
+        files = RouteFiles(RouteFolder(Path(config.navigation.routes)), requests.put, halts=self._halts)
         self._warn_of_unstated_height()
-        parts = run_places.known_to(
-            RunParts(
-                load=lambda: ladder.level,
-                map_every_s=config.live.cloud_s,
-                map_is_read=lambda: recorder is not None or bus.is_received("cloud"),
-            )
-        )
-        if controller:
-            sinks.rings["controller-ring"] = RingToController(controller)
-            parts = replace(
-                parts,
-                drive=LiveDrive(controller, rig.T_base_rig, requests.end),
-                navigation=self._navigation(controller, requests, bus, files),
-            )
-        stages = wire(graph, pairs, front_end, config, sinks, parts)
+        parts = run_places.known_to(self._parts(requests, files))
+        stages = wire(graph, pairs, self._front_end, config, self._sinks(frames), parts)
         if config.live.shed_load and not robot.waits:
-            graph.ticker("load", PERIOD_S, partial(ladder.observe, graph.telemetry.of("pair")))
+            graph.ticker("load", PERIOD_S, partial(self._ladder.observe, graph.telemetry.of("pair")))
         graph.bound("pair", "odometry")  # images that odometry has no time for are dropped before they are decoded
-        saver = self._saver(run_places, stages.places, bus)
-        if controller:
+        # 3. Files of maps and routes.
+        saver = self._saver(run_places, stages.places)
+        if self._controller:
             graph.ticker("routes", files.PERIOD_S, files)
         if stages.places:
             files.save_map = stages.places.want_copy
         # 4. From the bus: commands, requests, samples.
-        received = LiveCommands(session, bus, controller, files.put, self._report)
-        received.subscribe(recorder, sensors, saver)
+        received = LiveCommands(session, self._bus, self._controller, files.put, self._report)
+        received.subscribe(self._recorder, self._sensors, saver)
         # 5. Status.
-        images = ImagesStatus(geometry, session.statistics, partial(self._report, logging.WARNING))
+        self._add_status(stages, exposure, received, saver)
+
+    def _load(self) -> LoadLevel:
+        """Return the level of load shedding now."""
+        return self._ladder.level
+
+    def _halts(self) -> int:
+        """Return how often a stop or a fault has made cmd/arm necessary."""
+        return self._controller.statistics.state.halts if self._controller else 0
+
+    def _parts(self, requests: RequestQueue, files: RouteFiles) -> RunParts:
+        """Return the parts of a run that has no map yet."""
+        controller = self._controller
+        return RunParts(
+            drive=LiveDrive(controller, self._geometry.rig.T_base_rig, requests.end) if controller else None,
+            navigation=self._navigation(controller, requests, files) if controller else None,
+            load=self._load,
+            map_every_s=self._session.config.live.cloud_s,
+            map_is_read=lambda: self._recorder is not None or self._bus.is_received("cloud"),
+        )
+
+    def _sinks(self, frames: list[Stream[Frame]]) -> Sinks:
+        """Return the sinks; frames: the streams of the cameras, which a recording takes."""
+        session, config, bus = self._session, self._session.config, self._bus
+        poses: dict[str, Sink[OdometryUpdate]] = {}
+        if config.bus.panorama_hz:
+            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
+        recorder, controller = self._recorder, self._controller
+        return Sinks(
+            poses={**poses, **self._rig.pose_sinks},
+            rings={"controller-ring": RingToController(controller)} if controller else {},
+            counters={"statistics": session.statistics, "latency": self._latency},
+            bus=BusSink(
+                bus,
+                session.encoder(self._geometry.rig, config.live.cloud_points),
+                clock=VelocityCommand if self._robot.waits else None,  # ticks of its wheels give the time
+            ),
+            recording=RecordingSink(recorder, tuple(frames), config.record.queue) if recorder else None,
+        )
+
+    def _add_status(
+        self, stages: WiredStages, exposure: ExposureControl, received: LiveCommands, saver: MapSaver | None
+    ) -> None:
+        """Publish and record the status of all parts."""
+        session, controller, sensors = self._session, self._controller, self._sensors
+        images = ImagesStatus(self._geometry, session.statistics, partial(self._report, logging.WARNING))
         status = [
-            ladder.status,
+            self._ladder.status,
             ThreadsStatus(),
             images,
             exposure.status,
-            live_rig.status,
+            self._rig.status,
             *([received.navigation.status] if controller else ()),
-            motion_status(front_end.odometry, pairing.motion, sensors.receiver, sensors.gyro),
+            motion_status(self._front_end.odometry, self._pairing.motion, sensors.receiver, sensors.gyro),
             *([partial(places_status, stages.places)] if stages.places else ()),
             *([partial(floor_status, stages.floor)] if stages.floor else ()),
-            *robot.status,
-            *(part.status for part in (bus, recorder, saver) if part),
+            *self._robot.status,
+            *(part.status for part in (self._bus, self._recorder, saver) if part),
         ]
         sources = StatusSources(
-            graph.telemetry,
-            states,
-            pairing,
+            session.graph.telemetry,
+            self._robot.states(),
+            self._pairing,
             session.statistics,
             self._latency.to_pose,
             controller.statistics if controller else None,
@@ -138,23 +172,7 @@ class LiveWiring:
             tuple(status),
             session.clock_ns,
         )
-        add_status_tickers(session, StatusCollector(sources), bus, recorder)
-
-    def _sinks(self, live_rig: LiveRig, bus: Bus, *, own_time: bool) -> Sinks:
-        """Return the sinks of a run that neither drives nor records; own_time: ticks of its wheels give the time."""
-        session, config = self._session, self._session.config
-        poses: dict[str, Sink[OdometryUpdate]] = {}
-        if config.bus.panorama_hz:
-            poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
-        return Sinks(
-            poses={**poses, **live_rig.pose_sinks},
-            counters={"statistics": session.statistics, "latency": self._latency},
-            bus=BusSink(
-                bus,
-                session.encoder(self._geometry.rig, config.live.cloud_points),
-                clock=VelocityCommand if own_time else None,
-            ),
-        )
+        add_status_tickers(session, StatusCollector(sources), self._bus, self._recorder)
 
     def _warn_of_unstated_height(self) -> None:
         """Warn where the rig does not state its height: until the images show the floor, nothing is called free."""
@@ -164,15 +182,15 @@ class LiveWiring:
                 f"until it is found, map, grid and obstacles call nothing free; {ADVICE}"
             )
 
-    def _saver(self, run_places: RunPlaces, places: Places | None, bus: Bus) -> MapSaver | None:
+    def _saver(self, run_places: RunPlaces, places: Places | None) -> MapSaver | None:
         """Return what saves the map of places now and then; None where it stays as it is."""
         if places is None or not run_places.is_extended:
             return None
-        saver = MapSaver(run_places, places, self._session.config.places.save_s, bus.answer)
+        saver = MapSaver(run_places, places, self._session.config.places.save_s, self._bus.answer)
         self._session.graph.ticker("save", saver.PERIOD_S, saver)
         return saver
 
-    def _recorder(self) -> Recorder:
+    def _open_recorder(self) -> Recorder:
         session, rig = self._session, self._geometry.rig
         encode = session.encoder(rig, session.config.record.cloud_points)
         recorder = open_recorder(
@@ -181,9 +199,7 @@ class LiveWiring:
         session.outputs.callback(recorder.close)
         return recorder
 
-    def _navigation(
-        self, controller: DriveLink, requests: RequestQueue, bus: Bus, files: RouteFiles
-    ) -> NavigationParts | None:
+    def _navigation(self, controller: DriveLink, requests: RequestQueue, files: RouteFiles) -> NavigationParts | None:
         """Return the surroundings of the navigation; None, with a warning, where its source may not drive."""
         config = self._session.config
         if PLANNER not in config.controller.sources.names:
@@ -192,6 +208,6 @@ class LiveWiring:
         return NavigationParts(
             requests,
             lambda: wheel_state(controller.statistics.state),
-            PlannerDrive(controller, bus.answer, files),
+            PlannerDrive(controller, self._bus.answer, files),
             config.places.map,
         )
