@@ -87,6 +87,27 @@ def evidence_table(floor: Floats, surface: Floats, level: Floats, table: Floats)
             table[u, k, SURFACE] = math.exp(surface[k, u]) if surface[k, u] != 0.0 else 1.0
 
 
+@inner
+def mean_surface(table: Floats, ends: tuple[int, int], disparities: tuple[int, int]) -> float:
+    """Return the log of the mean likelihood of a surface in a cell: `log mean exp` of the evidence.
+
+    table (W, K, 4): of `evidence_table`; ends: first and last direction; disparities: first and last.
+    """
+    width, likelihood = len(table), 0.0
+    for u in range(ends[0], ends[1] + 1):
+        at_u = wrapped(u, width)
+        for k in range(disparities[0], disparities[1] + 1):
+            likelihood += table[at_u, k, SURFACE]
+    count = (ends[1] - ends[0] + 1) * (disparities[1] - disparities[0] + 1)
+    return math.log(likelihood / count) if likelihood != count else 0.0
+
+
+@inner
+def wrapped(u: int, width: int) -> int:
+    """Return the direction u, which may lie up to a turn outside, as an index of the table."""
+    return u + width if u < 0 else (u - width if u >= width else u)
+
+
 @compiled("(f4[:, ::1], f4[:, ::1], f4[:, :, ::1], f8[::1], f8, f8, f8, f8, f4[:, :, ::1])", writes=("cells",))
 def gather(
     floor: Floats,
@@ -103,11 +124,10 @@ def gather(
     floor against planes above and below it; an upright surface anywhere in it; the mean of the floor.
 
     floor, surface (K, W), level (2, K, W): log-likelihood ratios by disparity and direction, NaN where nothing is
-    compared.
-    origin (6,): place of the middle of cell (0, 0) in the frame of the columns, cosine and sine of its axes there, and
-    by how much [m] a surface at the viewpoint's height appears nearer than its foot along x and y, as the rig leans;
-    at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest
-    obstacle, whose directions count together.
+    compared. origin (6,): place of the middle of cell (0, 0) in the frame of the columns, cosine and sine of its axes
+    there, and by how much [m] a surface at the viewpoint's height appears nearer than its foot along x and y, as the
+    rig leans. at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest obstacle,
+    whose directions count together.
     """
     bins, width = floor.shape
     table, found = np.empty((width, bins, 4), np.float32), np.empty(PLACES, np.float64)
@@ -119,46 +139,39 @@ def gather(
             n = j % LANES
             if n == 0:
                 places(i, j, origin, scale, found)
-            cells[0, i, j], cells[1, i, j], cells[2, i, j], cells[3, i, j], cells[4, i, j] = (
-                np.nan,
-                0.0,
-                0.0,
-                0.0,
-                np.nan,
-            )
+            cells[0, i, j] = cells[4, i, j] = np.nan
+            cells[1, i, j] = cells[2, i, j] = cells[3, i, j] = 0.0
             r = found[RANGE + n]
-            # The second: nearer than the last disparity that is compared.
+            # At the viewpoint, too far away, and nearer than the last disparity that is compared nothing is known.
             if r < cell_m or r > reach_m or found[FAR + n] > found[NEAR + n]:
                 continue
-            near, far, last_surface = int(found[NEAR + n]), int(found[FAR + n]), int(found[LAST_SURFACE + n])
-            first_surface = min(int(found[FIRST_SURFACE + n]), last_surface)
-            first, last = directions(found[X + n], found[Y + n], found[AT + n], found[HALF + n], by_angle)
-            least, sum_floor, likelihood, above, below = np.inf, 0.0, 0.0, 0.0, 0.0
-            run = max(min(round(thin_m / r * by_angle), last - first + 1), 1)
-            for u in range(first, last + 1):
-                at_u = u + width if u < 0 else (u - width if u >= width else u)
-                for k in range(first_surface, last_surface + 1):
-                    likelihood += table[at_u, k, SURFACE]
-                total = 0.0
+            ends = directions(found[X + n], found[Y + n], found[AT + n], found[HALF + n], by_angle)
+            count = ends[1] - ends[0] + 1
+            # Floor and planes: the mean of the disparities, the sum of the directions that something thin would hide.
+            far, near = int(found[FAR + n]), int(found[NEAR + n])
+            run = max(min(round(thin_m / r * by_angle), count), 1)
+            weakest, sum_floor, above, below = np.inf, 0.0, 0.0, 0.0
+            for u in range(ends[0], ends[1] + 1):
+                at_u, total = wrapped(u, width), 0.0
                 for k in range(far, near + 1):
                     above += table[at_u, k, ABOVE]
                     below += table[at_u, k, BELOW]
                     sum_floor += table[at_u, k, FLOOR]
                     total += table[at_u, k, FLOOR]
-                if u + run <= last + 1:
-                    # The mean of the disparities, the sum of the directions that something thin would hide.
+                if u + run <= ends[1] + 1:
                     for m in range(u + 1, u + run):
                         for k in range(far, near + 1):
-                            total += table[(m + width) % width, k, FLOOR]
+                            total += table[wrapped(m, width), k, FLOOR]
                     # One direction in which nothing can be seen makes the cell such, whichever it is.
-                    if not math.isnan(least) and not total >= least:
-                        least = total
-            cells[0, i, j] = least / (near - far + 1)
-            patches = (last - first + 1) * (near - far + 1)
+                    if not math.isnan(weakest) and not total >= weakest:
+                        weakest = total
+            patches = count * (near - far + 1)
+            cells[0, i, j], cells[4, i, j] = weakest / (near - far + 1), sum_floor * run / patches
             cells[1, i, j], cells[2, i, j] = above / patches, below / patches
-            count = (last - first + 1) * (last_surface - first_surface + 1)
-            cells[3, i, j] = math.log(likelihood / count) if likelihood != count else 0.0
-            cells[4, i, j] = sum_floor * run / patches  # in units of what something thin would hide, as the weakest
+            # A surface: at the disparities that it has at any of its heights.
+            last_surface = int(found[LAST_SURFACE + n])
+            first_surface = min(int(found[FIRST_SURFACE + n]), last_surface)
+            cells[3, i, j] = mean_surface(table, ends, (first_surface, last_surface))
 
 
 @compiled("(u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1])", writes=("hit", "free"))

@@ -48,6 +48,16 @@ def half_sums(
 
 
 @inner
+def floor_sums(
+    lower: Bytes, plane: Bytes, live: Bytes, rows: tuple[int, int], part: slice, outlier: np.uint8, sums: Words
+) -> None:
+    """Write the sums (PART,) of differences to the image on the floor's plane, over the rows from one to another."""
+    sums[:] = 0
+    for v in range(rows[0], rows[1]):
+        add_differences(lower[v, part], plane[0, v, part], plane[1, v, part], live[v, part], outlier, sums)
+
+
+@inner
 def add_halves(one: Bytes, other: Bytes, into: Words, best: Words) -> None:
     """Write the sums (W,) of both halves of a strip, and lower `best` to them."""
     for u in range(len(into)):
@@ -100,6 +110,30 @@ def add_run(
         value = value if value > NOTHING else NOTHING
         run[u] = value
         best[u] = value if value > best[u] else best[u]
+
+
+@inner
+def add_runs(
+    value: Floats,
+    total: Floats,
+    disparities: tuple[int, int],
+    floor_weight: np.float32,
+    bound: np.float32,
+    prior: np.float32,
+    run: Floats,
+    part: slice,
+    surface: Floats,
+) -> None:
+    """Go on with the runs (K, PART) of a strip's disparities from the first to the end, and raise `surface` to them.
+
+    value (K + 2, PART): likelihoods with a border; floor_weight: 0 where the floor is no explanation; part: of surface
+    (K, W), a row of which is contiguous only where it is cut here. Others as for `add_run`.
+    """
+    fourth = math.pow((disparities[1] + floor_weight - 3.0) / 3.0, 0.25)
+    blank = np.float32(2.0 * (fourth - 1.0 / fourth))
+    for d in range(disparities[0], disparities[1]):
+        if has_run(value[d], value[d + 1], value[d + 2], total, run[d]):
+            add_run(value[d], value[d + 1], value[d + 2], total, blank, bound, prior, run[d], surface[d, part])
 
 
 @inner
@@ -164,10 +198,7 @@ def surface_evidence(
                 add_halves(halves[0, d], halves[1, d], sums[d], best)
             # 2. The likelihoods of the floor and of all disparities.
             if strips[n, STRIP_FLOOR] > 0:
-                floor[:] = 0
-                for v in range(first, end):
-                    least, most = plane[0, v, part], plane[1, v, part]
-                    add_differences(lower[v, part], least, most, live[v, part], outlier, floor)
+                floor_sums(lower, plane, live, (first, end), part, outlier, floor)
                 lower_to(floor, best)
                 likelihoods(floor, best, scale, plain)
                 add(plain, floor_weight, total)
@@ -175,10 +206,6 @@ def surface_evidence(
                 likelihoods(sums[d], best, scale, value[d + 1])
                 add(value[d + 1], ONE, total)
             # 3. The runs.
-            fourth = math.pow((last + strips[n, STRIP_FLOOR] * floor_weight - 3.0) / 3.0, 0.25)
-            blank = np.float32(2.0 * (fourth - 1.0 / fourth))
-            for d in range(mine, last):
-                if has_run(value[d], value[d + 1], value[d + 2], total, run[d]):
-                    near = value[d], value[d + 1], value[d + 2]
-                    add_run(*near, total, blank, bound, prior, run[d], surface[d, part])
+            weight = floor_weight if strips[n, STRIP_FLOOR] > 0 else NOTHING
+            add_runs(value, total, (mine, last), weight, bound, prior, run, part, surface)
     keep_peaks(surface)

@@ -232,6 +232,29 @@ def invert(normal: Array, prior: float, inverse: Array) -> None:
 
 
 @inner
+def write_window_products(design: Floats, cell: Floats, reach: int, x: float, y: float, lanes: Floats) -> None:
+    """Write the products of the bilinear window at a shift x, y with the three parts of the design, with 1 and with
+    itself: (5 LANES,), by column.
+    """
+    left, top = min(int(np.floor(x)), reach - 1), min(int(np.floor(y)), reach - 1)
+    fx, fy = x - left, y - top
+    nw, ne = np.float32((1 - fy) * (1 - fx)), np.float32((1 - fy) * fx)
+    sw, se = np.float32(fy * (1 - fx)), np.float32(fy * fx)
+    for k in range(5 * LANES):
+        lanes[k] = ZERO
+    for row in range(WINDOW_PX):
+        of_row, above = design[row * LANES :], cell[reach + top + row, reach + left :]
+        below = cell[reach + top + row + 1, reach + left :]
+        for lane in range(LANES):
+            grey = nw * above[lane] + ne * above[lane + 1] + sw * below[lane] + se * below[lane + 1]
+            lanes[lane] += of_row[lane] * grey
+            lanes[lane + LANES] += of_row[lane + PART] * grey
+            lanes[lane + 2 * LANES] += of_row[lane + 2 * PART] * grey
+            lanes[lane + 3 * LANES] += grey
+            lanes[lane + 4 * LANES] += grey * grey
+
+
+@inner
 def solve(
     design: Floats,
     cell: Floats,
@@ -252,22 +275,7 @@ def solve(
     for _ in range(ITERATIONS):
         # 1. The bilinear window at the shift, and its products with the design and with itself.
         x, y = min(max(dx, -reach), reach), min(max(dy, -reach), reach)
-        left, top = min(int(np.floor(x)), reach - 1), min(int(np.floor(y)), reach - 1)
-        fx, fy = x - left, y - top
-        nw, ne = np.float32((1 - fy) * (1 - fx)), np.float32((1 - fy) * fx)
-        sw, se = np.float32(fy * (1 - fx)), np.float32(fy * fx)
-        for k in range(5 * LANES):
-            lanes[k] = ZERO
-        for row in range(WINDOW_PX):
-            of_row, above = design[row * LANES :], cell[reach + top + row, reach + left :]
-            below = cell[reach + top + row + 1, reach + left :]
-            for lane in range(LANES):
-                grey = nw * above[lane] + ne * above[lane + 1] + sw * below[lane] + se * below[lane + 1]
-                lanes[lane] += of_row[lane] * grey
-                lanes[lane + LANES] += of_row[lane + PART] * grey
-                lanes[lane + 2 * LANES] += of_row[lane + 2 * PART] * grey
-                lanes[lane + 3 * LANES] += grey
-                lanes[lane + 4 * LANES] += grey * grey
+        write_window_products(design, cell, reach, x, y, lanes)
         total, energy = 0.0, 0.0
         for lane in range(WINDOW_PX):
             total += lanes[lane + 3 * LANES]

@@ -122,6 +122,23 @@ def gauss_newton(
 
 
 @inner
+def apply_whitening(W: Array, J: Array, e: Array, J_white: Array, e_white: Array) -> float:
+    """Write W J (3, K) and W e (3,), W a lower triangle; return the squared length of W e."""
+    total = 0.0
+    for row in range(3):
+        e_white[row] = 0.0
+        for inner_row in range(row + 1):
+            e_white[row] += W[row, inner_row] * e[inner_row]
+        for k in range(J.shape[1]):
+            J_white[row, k] = W[row, 0] * J[0, k]
+        for inner_row in range(1, row + 1):
+            for k in range(J.shape[1]):
+                J_white[row, k] += W[row, inner_row] * J[inner_row, k]
+        total += e_white[row] * e_white[row]
+    return total
+
+
+@inner
 def accumulate(
     landmarks: Array,
     views: Array,
@@ -151,20 +168,8 @@ def accumulate(
             for row in range(3):
                 J[row, k] = -derivatives[n, row, k - 6]
                 e[row] += derivatives[n, row, k - 6] * error[k - 6]
-        # Whitening: W is a lower triangle.
-        total = 0.0
-        for row in range(3):
-            e_white[row] = 0.0
-            for inner_row in range(row + 1):
-                e_white[row] += W[n, row, inner_row] * e[inner_row]
-            for k in range(size):
-                J_white[row, k] = W[n, row, 0] * J[0, k]
-            for inner_row in range(1, row + 1):
-                for k in range(size):
-                    J_white[row, k] += W[n, row, inner_row] * J[inner_row, k]
-            total += e_white[row] * e_white[row]
-        squared[n] = total
-        weight = robust_weight(total)
+        squared[n] = apply_whitening(W[n], J, e, J_white, e_white)
+        weight = robust_weight(squared[n])
         for row in range(3):
             for a in range(size):
                 weighted = weight * J_white[row, a]

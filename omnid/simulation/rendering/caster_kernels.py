@@ -133,6 +133,31 @@ def turn(poses: Doubles, row: Numbers, rays: Floats, origins: Floats, turned: Fl
             moved[k, i] = T[k, 0] * a + T[k, 1] * b + T[k, 2] * c + T[k, 3]
 
 
+@inner
+def shade(
+    nearest: Numbers,
+    places: Rows,
+    surfaces: Floats,
+    pyramids: Whole,
+    levels: Whole,
+    texels: NDArray[np.uint8],
+    pixels: Numbers,
+    image: Floats,
+) -> None:
+    """Add the greys of rays (N,) to their pixels; places: u, v and footprint [texels] on the nearest rectangle."""
+    across, down, footprints = places
+    for i in range(len(nearest)):
+        k = nearest[i]
+        if k < 0:
+            continue
+        # The level whose texels are about as large as the footprint: half of its logarithm to base 2, rounded.
+        footprint, level, last = footprints[i], pyramids[k, 0], pyramids[k, 0] + pyramids[k, 1] - 1
+        while footprint > FOOTPRINT and level < last:
+            footprint, level = footprint * QUARTER, level + 1
+        size = (levels[level, 1], levels[level, 2])
+        image[pixels[i]] += surfaces[k, 12] * bilinear(texels, levels[level, 0], size, (across[i], down[i]))
+
+
 @compiled(
     "(f4[:, ::1], f4[:, ::1], f4[::1], i4[:, ::1], i8[::1], f8[:, :, ::1], b1[:, ::1], f4[:, ::1], "
     "i8[:, ::1], i8[:, ::1], u1[::1], f4[::1])",
@@ -173,30 +198,27 @@ def cast(
     for tile in range(len(starts) - 1):
         low, high = starts[tile], starts[tile + 1]
         count = high - low
+        # 1. The rays in the frame of the first pose.
         ray = rays[0, low:high], rays[1, low:high], rays[2, low:high]
         origin = moved[0, :count], moved[1, :count], moved[2, :count]
         if moving:
-            turn(
-                poses,
-                index[1, low:high],
-                rays[:, low:high],
-                origins[:, low:high] if origins.shape[1] > 1 else origins,
-                turned,
-                moved,
-            )
+            begin = origins[:, low:high] if origins.shape[1] > 1 else origins
+            turn(poses, index[1, low:high], rays[:, low:high], begin, turned, moved)
             ray = turned[0, :count], turned[1, :count], turned[2, :count]
+        # 2. The nearest rectangle of each ray, and the place on it.
         for i in range(count):
             nearest[i], distance[i] = -1, FAR_M
-        # The nearest rectangle comes first, so that none can be met any more once it is farther than all rays reach.
         hit = 0
         for k in range(len(surfaces)):
             if not seen[tile, k]:
                 continue
+            # Rectangles are sorted by least distance: none can be met any more once it is farther than all rays reach.
             if farther(distance[:count], surfaces[k, 14]) == 0:
                 break
             if take_nearer(np.int32(k), surfaces[k], ray, origin, nearest[:count], distance[:count]) > 0:
                 found[hit] = k
                 hit += 1
+        place = places[0, :count], places[1, :count], places[2, :count]
         for n in range(hit):
             place_on(
                 np.int32(found[n]),
@@ -206,17 +228,7 @@ def cast(
                 spacing[low:high],
                 nearest[:count],
                 distance[:count],
-                (places[0, :count], places[1, :count], places[2, :count]),
+                place,
             )
-        for i in range(count):
-            k = nearest[i]
-            if k < 0:
-                continue
-            # The level whose texels are about as large as the footprint: half of its logarithm to base 2, rounded.
-            footprint, level, last = places[2, i], pyramids[k, 0], pyramids[k, 0] + pyramids[k, 1] - 1
-            while footprint > FOOTPRINT and level < last:
-                footprint, level = footprint * QUARTER, level + 1
-            size = (levels[level, 1], levels[level, 2])
-            image[index[0, low + i]] += surfaces[k, 12] * bilinear(
-                texels, levels[level, 0], size, (places[0, i], places[1, i])
-            )
+        # 3. Its grey there.
+        shade(nearest[:count], place, surfaces, pyramids, levels, texels, index[0, low:high], image)
