@@ -8,7 +8,7 @@ from enum import StrEnum
 class NavigationState(StrEnum):
     """State of a goal, a path or a route. The values are the words used on the bus and in logs."""
 
-    IDLE = "idle"  # there is nothing to do since the start
+    IDLE = "idle"  # nothing has been asked for since the start
     DRIVING = "driving"
     AVOIDING = "avoiding"  # off the path, around an obstacle
     BLOCKED = "blocked"  # waits for the way to become free

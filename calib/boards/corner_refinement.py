@@ -54,13 +54,12 @@ def refine_corners(image: NDArray[np.uint8], corners: Array) -> Array:
 
 
 def refine_with_camera(
-    image: NDArray[np.uint8], camera: OmniCamera, T_cam_board: Array, view: tuple[CalibrationBoard, Array]
+    image: NDArray[np.uint8], pixels: Array, board: CalibrationBoard, camera: OmniCamera, T_cam_board: Array
 ) -> Array:
-    """Move the pixels (N, 2) of a view (board, pixels) onto the image's corners, with a camera as the mapping."""
-    (board, pixels), grey = view, image.astype(np.float32)
-    refined = pixels.copy()
+    """Move the pixels (N, 2) of a board's corners onto those of the image, with a camera as the mapping."""
+    grey, refined = image.astype(np.float32), pixels.copy()
     for index in np.flatnonzero(np.isfinite(pixels[:, 0])):
-        to_image = _camera_mapping(camera, T_cam_board, (board, board.points[index]))
+        to_image = _camera_mapping(camera, T_cam_board, board.points[index], board.square_m)
         moved = to_image(_converged_shift(grey, to_image, board.window)[None])[0]
         if np.linalg.norm(moved - pixels[index]) < MAX_MOVE * _square_px(to_image) + MAX_MOVE_PX:
             refined[index] = moved
@@ -79,12 +78,11 @@ def _converged_shift(grey: Grey, to_image: ToImage, window: float) -> Array:
     return shift
 
 
-def _camera_mapping(camera: OmniCamera, T_cam_board: Array, origin: tuple[CalibrationBoard, Array]) -> ToImage:
-    """Return the camera's mapping from the board about an origin (board, point (3,)) to the image."""
-    board, point = origin
+def _camera_mapping(camera: OmniCamera, T_cam_board: Array, point: Array, square_m: float) -> ToImage:
+    """Return the camera's mapping from the board, in squares about a point (3,) [m] of it, to the image."""
 
     def to_image(xy: Array) -> Array:
-        offset = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1) * board.square_m
+        offset = np.concatenate([xy, np.zeros((*xy.shape[:-1], 1))], axis=-1) * square_m
         return project_near(camera, se3.apply(T_cam_board, (point + offset).reshape(-1, 3))).reshape(xy.shape)
 
     return to_image

@@ -21,8 +21,9 @@ from drivers.logs.mcap_records import (
 )
 
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_SCAN_BYTES = 64 * 2**20
-_SCAN_MESSAGES = 2000
+# A channel is defined before its first message. Within this part of a log, some seconds of both cameras and a gyro,
+# each topic has had one.
+_SCAN_BYTES, _SCAN_MESSAGES = 64 * 2**20, 2000
 
 
 class LogMessage(NamedTuple):

@@ -41,8 +41,8 @@ def different_rig(parameters: RigParameters, steps: Array, *, tracked: bool = Tr
     limit = MAX_NOMINAL_TURN_RAD if is_nominal(parameters.rig) else MAX_TURN_RAD
     if max(turn, lean) > limit:
         return (
-            f"the upper camera stands {np.rad2deg(turn):.1f} deg turned and {np.rad2deg(lean):.1f} deg aside of "
-            f"the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
+            f"the upper camera is turned by {np.rad2deg(turn):.1f} deg and its baseline by {np.rad2deg(lean):.1f} deg "
+            f"against the rig's file, expected {np.rad2deg(limit):.1f} deg at most"
         )
     away = np.abs(steps / nominal_sigmas(parameters))[:first]
     worst = int(np.argmax(away))

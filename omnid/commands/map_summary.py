@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
-    """Yield the lines."""
+    """Yield a line for each property: its name, padded to 12 characters, and its value."""
     per_keyframe = path.stat().st_size / max(1, sizes.keyframes)
     yield f"map          {path}"
     yield f"size         {path.stat().st_size / 1e6:.1f} MB, {per_keyframe / 1e3:.0f} kB a keyframe"

@@ -64,7 +64,7 @@ class Controller:
         return self._due_ns
 
     @property
-    def stands(self) -> bool:
+    def is_at_rest(self) -> bool:
         """True if the last command was the stop, or if the motor controller failed and stops the wheels by itself."""
         return self._law.motion == STOP or self.state.failed
 

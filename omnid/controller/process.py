@@ -28,7 +28,7 @@ from omnid.engine.signals import STOP_SIGNALS
 
 THREAD_NAME: Final = "controller"
 MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel
-START_MESSAGE_S: Final = 10.0
+START_MESSAGE_S: Final = 10.0  # Time within which a daemon that is not broken sends its first message, at any load.
 ABORTING: Final = signal.SIGABRT  # systemd ends a daemon that does not respond by this, and all its processes
 
 
@@ -48,7 +48,7 @@ class ControllerLoop:
             self._channel.send(report)
 
     def _ended(self) -> bool:
-        return bool(self._until_ns) and (self._controller.stands or time.monotonic_ns() > self._until_ns)
+        return bool(self._until_ns) and (self._controller.is_at_rest or time.monotonic_ns() > self._until_ns)
 
     def _receive_until_due(self) -> None:
         """Take all messages until the tick is due, and those that wait then."""

@@ -108,7 +108,7 @@ def visits_by_standing(path: Trajectory, distance_m: float) -> list[Visit]:
     """Return the visits of the marks at which the robot rested; A is where it rested first.
 
     Places far from both marks are left out, as the robot may wait. Raises OmnidError where no round is found, and
-    where a wait may be taken for a mark: two stands apart that may both be one mark.
+    where a wait may be taken for a mark: two stops apart that may both be on one mark.
     """
     found = list[Visit]()
     for time_s, T in _stands(path):
@@ -119,7 +119,7 @@ def visits_by_standing(path: Trajectory, distance_m: float) -> list[Visit]:
                 mark = "B"
             elif moved_m > NEAR_PART * distance_m:
                 continue
-        # Of several stands on one mark the last one counts for the first A, the first one for all others.
+        # Of several stops on one mark the last one counts for the first A, the first one for all others.
         if found and mark == found[-1].mark:
             _require_one_place(found[-1], time_s, T)
             if len(found) == 1:
@@ -139,7 +139,7 @@ def _require_one_place(visit: Visit, time_s: float, T: Array) -> None:
     apart_m = _distance_m(visit.T, T)
     if apart_m > ONE_PLACE_M:
         raise OmnidError(
-            f"expected one place of mark {visit.mark}, found stands {apart_m:.2f} m apart, at {visit.time_s:.1f} and "
+            f"expected one place of mark {visit.mark}, found stops {apart_m:.2f} m apart, at {visit.time_s:.1f} and "
             f"{time_s:.1f} s; give the times of the marks: --marks 12.5 60 110"
         )
 

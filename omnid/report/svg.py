@@ -34,7 +34,8 @@ patternTransform="rotate(45)"><rect width="7" height="7" fill="#fff"/>
 <path d="M0 0V7" stroke="#a8a8a8" stroke-width="1.6"/></pattern>
 <pattern id="gone" width="5" height="5" patternUnits="userSpaceOnUse">
 <rect width="5" height="5" fill="#d2d2d2"/><path d="M0 0L5 5M5 0L0 5" stroke="#8a8a8a" stroke-width=".9"/></pattern>"""
-_BREAK: Final = 6.0  # times the median distance of points in time, across which a line is interrupted
+# A line is interrupted between points that are farther apart in time than this many median steps.
+_GAP_STEPS: Final = 6.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +64,7 @@ class Axis:
 
 
 def axis_for(values: Sequence[float], px: tuple[float, float], *, log: bool, zero: bool) -> Axis:
-    """Return an axis that holds all values and a margin; zero: it holds 0 as well."""
+    """Return an axis from px[0] to px[1] that holds all values and a margin; zero: it holds 0 as well."""
     if log:
         first, last = math.floor(math.log10(min(values))), math.ceil(math.log10(max(values)))
         return Axis(10.0**first, 10.0 ** max(last, first + 1), *px, log=True)
@@ -105,7 +106,7 @@ def polyline(points: Sequence[Point], style: str) -> str:
 def pieces(points: Sequence[Point]) -> Iterator[Sequence[Point]]:
     """Yield the points [s, value] in pieces, split where they are much further apart in time than their median."""
     steps = sorted(b[0] - a[0] for a, b in pairwise(points))
-    limit_s = _BREAK * steps[len(steps) // 2] if len(steps) > 2 and steps[len(steps) // 2] > 0 else math.inf
+    limit_s = _GAP_STEPS * steps[len(steps) // 2] if len(steps) > 2 and steps[len(steps) // 2] > 0 else math.inf
     start = 0
     for k in range(1, len(points)):
         if points[k][0] - points[k - 1][0] > limit_s:

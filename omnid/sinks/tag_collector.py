@@ -21,7 +21,7 @@ from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
 
-NOISE_PX: Final = 0.1  # Noise of a corner of odometry: not used for tags.
+NOISE_PX: Final = 0.1  # Noise of the odometry's corners in the stereo model, which the search of tags does not use.
 MOVED_M: Final = 0.1  # Motion between two frames that are searched.
 MOVED_RAD: Final = math.radians(10)
 MAX_VIEWS: Final = 1000  # Most views of a tag.
@@ -30,7 +30,7 @@ MAX_VIEWS: Final = 1000  # Most views of a tag.
 MOST_RECENT: Final = 8
 
 
-class _Sighting(NamedTuple):
+class _TagView(NamedTuple):
     """A tag in a pair."""
 
     seq: int
@@ -40,13 +40,13 @@ class _Sighting(NamedTuple):
 
 
 class TagCollector:
-    """A sink of all messages of a run."""
+    """A sink of a run: searches tags in its frames, and keeps the poses in the map at which it found some."""
 
     def __init__(self, geometry: Geometry, sizes_m: Mapping[int, float]) -> None:
         """sizes_m: edge of the black square of each tag, by its id."""
         self._finder = TagFinder(geometry.model(NOISE_PX), sizes_m)
         self._T_base_rig, self._T_rig_rect = geometry.rig.T_base_rig, geometry.T_rig_rect
-        self._seen: dict[int, list[_Sighting]] = {}
+        self._seen: dict[int, list[_TagView]] = {}
         self._poses: dict[int, PlaceUpdate | None] = {}  # in the map, by the pairs in which a tag was seen
         self._recent: deque[PlaceUpdate] = deque(maxlen=MOST_RECENT)
         self._keyframes: MapKeyframes | None = None  # as they were last
@@ -58,23 +58,31 @@ class TagCollector:
         return self._finder.refused
 
     def process(self, message: Outgoing) -> None:
-        """Search a frame where the rig has moved."""
+        """Take a pose in the map, or search a frame where the rig has moved."""
         if isinstance(message, PlaceUpdate):
-            self._keyframes = message.keyframes
-            pose = replace(message, scans=None, keyframes=None)
-            self._recent.append(pose)
-            if message.seq in self._poses:
-                self._poses[message.seq] = pose
+            self._keep_pose(message)
         elif isinstance(message, OdometryUpdate) and message.state is TrackingState.TRACKING and self._is_due(message):
-            self._last_T = message.T_odom_rig
-            panoramas = message.depth.panoramas
-            for tag in self._finder.process(panoramas.lower, panoramas.upper):
-                views = self._seen.setdefault(tag.id, [])
-                if len(views) < MAX_VIEWS:
-                    T_rig_tag = self._T_rig_rect @ tag.T_rect_tag
-                    views.append(_Sighting(message.seq, T_rig_tag, in_tag_axes(tag), message.T_odom_rig))
-                    known = (pose for pose in self._recent if pose.seq == message.seq)
-                    self._poses.setdefault(message.seq, next(known, None))
+            self._search(message)
+
+    def _keep_pose(self, update: PlaceUpdate) -> None:
+        """Keep the pose of a pair in the map: for its views, and for a while, as its frame may come later."""
+        self._keyframes = update.keyframes
+        pose = replace(update, scans=None, keyframes=None)
+        self._recent.append(pose)
+        if update.seq in self._poses:
+            self._poses[update.seq] = pose
+
+    def _search(self, odometry: OdometryUpdate) -> None:
+        """Search tags in a frame, and keep the views of those that have not too many yet."""
+        self._last_T = odometry.T_odom_rig
+        panoramas = odometry.depth.panoramas
+        for tag in self._finder.process(panoramas.lower, panoramas.upper):
+            views = self._seen.setdefault(tag.id, [])
+            if len(views) < MAX_VIEWS:
+                T_rig_tag = self._T_rig_rect @ tag.T_rect_tag
+                views.append(_TagView(odometry.seq, T_rig_tag, in_tag_axes(tag), odometry.T_odom_rig))
+                known = (pose for pose in self._recent if pose.seq == odometry.seq)
+                self._poses.setdefault(odometry.seq, next(known, None))
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
         if self._last_T is None:
@@ -97,7 +105,7 @@ class TagCollector:
         }
         return {id: tag for id, tag in found.items() if tag.rejected <= MOST_REJECTED * len(self._seen[id])}
 
-    def _T_map_rig(self, view: _Sighting) -> Array:
+    def _T_map_rig(self, view: _TagView) -> Array:
         """Return the pose of the rig at a view as the map knows it at the end; without a map that in odom."""
         pose = self._poses[view.seq]
         if pose is None:

@@ -16,7 +16,7 @@ class MapGrid:
     """Draw the map periodically and at the end, where it has changed: it moves when a loop closes."""
 
     def __init__(self, cell_m: float, T_base_rect: Array, every_s: float = 0.0, load: Load = full_load) -> None:
-        """every_s: between two grids, by the stamps; 0: one, at the end."""
+        """cell_m: side of a cell. every_s: time between two grids, by the stamps; 0: one grid, at the end."""
         self._grid, self._T_base_rect = KeyframeGrid(cell_m), T_base_rect
         self._every_ns, self._given_ns = round(every_s * 1e9), 0
         self._load = load

@@ -1,4 +1,4 @@
-"""CDR of the messages of the navigation: goals, paths and words."""
+"""CDR of the messages of the navigation: goals, paths and strings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from omnid.transport import ros_types as ros
 PATH_SCHEMA: Final = "nav_msgs/msg/Path"
 STRING_SCHEMA: Final = "std_msgs/msg/String"
 MAX_PATH_POSES: Final = 10_000
-_TILT: Final = 0.05  # x and y of a quaternion that turns about z alone
+_MOST_TILT: Final = 0.05  # Largest x and y of a quaternion that counts as a turn about z: a tilt of 6 degrees.
 _PATH_FRAME: Final = "odom"
 # A PoseStamped of this frame: 17 bytes of header, padded to the 8 bytes of doubles, and 7 doubles.
 _POSE: Final = np.dtype(
@@ -58,7 +58,7 @@ def goal_cdr(goal: PlanarGoal) -> bytes:
 
 
 def goal_from_cdr(payload: bytes) -> PlanarGoal:
-    """Decode a goal. Raise OmnidError for bytes that are none, numbers that are not finite, and a tilted pose."""
+    """Decode a PoseStamped. Raise OmnidError for other bytes, numbers that are not finite, and a tilted pose."""
     message = codec.message_from_cdr(payload, codec.POSE_SCHEMA)
     assert isinstance(message, ros.geometry_msgs__msg__PoseStamped)
     x_m, y_m = _position(message.pose)
@@ -120,7 +120,7 @@ def _heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
     q = (pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w)
     if not any(q):
         return None
-    if not abs(math.hypot(*q) - 1.0) < codec.QUATERNION_TOLERANCE or max(abs(q[0]), abs(q[1])) > _TILT:
+    if not abs(math.hypot(*q) - 1.0) < codec.QUATERNION_TOLERANCE or max(abs(q[0]), abs(q[1])) > _MOST_TILT:
         raise OmnidError(f"orientation {q}: expected a unit quaternion about z, or all zeros; check the sender")
     return float(se3.yaw(se3.transform(se3.rotation(q), (0.0, 0.0, 0.0))))
 

@@ -43,7 +43,7 @@ LEGEND: Final = f"""
 
 **Panorama**: dots are inliers, crosses are features that do not agree with the pose, squares are new.
 
-**Ellipsoid**: {style.SIGMAS:g} sigma of the position; its label tells by how many times it is magnified.
+**Ellipsoid**: {style.SIGMAS:g} sigma of the position; its label says by how many times it is magnified.
 
 **Obstacles**: red dots around the base; grey ones mark directions that are unknown.
 

@@ -124,7 +124,7 @@ def refine_camera_calibration(
 ) -> CameraCalibration:
     """Refine the corners with the calibrated camera, and calibrate it again; images by the views' names."""
     views = [
-        replace(seen, pixels=refine_with_camera(images[seen.name], found.camera, T, (found.board, seen.pixels)))
+        replace(seen, pixels=refine_with_camera(images[seen.name], seen.pixels, found.board, found.camera, T))
         for seen, T in zip(found.views, found.fit.T_cam_board, strict=True)
     ]
     again = fit_camera(views, found.board, found.camera.size, model, view, found.shape)

@@ -101,7 +101,8 @@ def fit_rig(
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
     good, T_lower_board = _reordered_views(views, initial, refined)
     # 2. Bundle adjustment, repeated without the views that fit much worse than the others.
-    fit, unknowns = _solve(good, (board, shape), (cameras, refined), (initial.T_upper_lower, T_lower_board))
+    printed = board, shape
+    fit, unknowns = _solve(good, printed, cameras, initial.T_upper_lower, T_lower_board, refined=refined)
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(fit)
         if not bad.any():
@@ -110,18 +111,14 @@ def fit_rig(
         good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
         _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
         found = unknowns.camera(fit.parameters)
-        fit, unknowns = _solve(
-            good,
-            (board, shape),
-            ((found.lower, found.upper) if refined else cameras, refined),
-            (found.T_upper_lower, fit.T_cam_board[~bad]),
-        )
+        start = (found.lower, found.upper) if refined else cameras
+        fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], refined=refined)
     if fit.mean_px > MAX_MEAN_PX:
         raise CalibError(
             f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
             "at most; did the cameras see the board at the same time, are their files the right ones?"
         )
-    return _rig_calibration(good, (board, shape), (fit, unknowns), rejected)
+    return _rig_calibration(good, printed, fit, unknowns, rejected)
 
 
 def refine_rig_calibration(
@@ -136,7 +133,7 @@ def refine_rig_calibration(
     views = []
     for k, view in enumerate(found.views):
         lower, upper = (
-            seen and _refined_view(seen, images[side][view.name], cameras[side], (poses[side][k], found.board))
+            seen and _refined_view(seen, images[side][view.name], found.board, cameras[side], poses[side][k])
             for side, seen in enumerate(view.seen)
         )
         views.append(PairView(view.name, (lower, upper)))
@@ -145,10 +142,9 @@ def refine_rig_calibration(
 
 
 def _refined_view(
-    seen: BoardView, image: NDArray[np.uint8], camera: OmniCamera, posed_board: tuple[Array, CalibrationBoard]
+    seen: BoardView, image: NDArray[np.uint8], board: CalibrationBoard, camera: OmniCamera, T_cam_board: Array
 ) -> BoardView:
-    T_cam_board, board = posed_board
-    return replace(seen, pixels=refine_with_camera(image, camera, T_cam_board, (board, seen.pixels)))
+    return replace(seen, pixels=refine_with_camera(image, seen.pixels, board, camera, T_cam_board))
 
 
 def _is_pair(view: PairView) -> bool:
@@ -189,11 +185,16 @@ def _with_reordered_upper(view: PairView, order: NDArray[np.intp] | None) -> Pai
 
 
 def _solve(
-    good: Sequence[PairView], printed: Printed, given: tuple[Sides, bool], start: tuple[Array, Array]
+    good: Sequence[PairView],
+    printed: Printed,
+    cameras: Sides,
+    T_upper_lower: Array,
+    T_lower_board: Array,
+    *,
+    refined: bool,
 ) -> tuple[BundleResult, RigParameterisation]:
-    """Adjust both cameras, the transform between them, and one pose of the board for every view."""
-    T_upper_lower, T_lower_board = start
-    unknowns = rig_unknowns(printed[0], given, T_upper_lower, T_lower_board)
+    """Adjust the cameras if refined, the transform between them, and a pose T_lower_board (K, 4, 4) for every view."""
+    unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, refined=refined)
     observed = rig_observations(good, printed)
     fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, observed, prior=unknowns.prior)
     return fit, unknowns
@@ -201,16 +202,14 @@ def _solve(
 
 def rig_print_shape(found: RigCalibration, refined: bool) -> PrintShape:
     """Return the significant part of the print's shape, of a rig that was fitted to a board as drawn."""
-    unknowns = rig_unknowns(
-        found.board, ((found.lower, found.upper), refined), found.T_upper_lower, found.fit.T_cam_board
-    )
+    unknowns = _unknowns_about(found, refined=refined)
     observed = rig_observations(found.views, (found.board, AS_DRAWN))
     return find_print_shape(unknowns.camera, unknowns.ends[-1], observed, found.fit.T_cam_board, unknowns.prior)
 
 
 def rig_held_out_px(found: RigCalibration) -> float:
     """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
-    unknowns = rig_unknowns(found.board, ((found.lower, found.upper), True), found.T_upper_lower, found.fit.T_cam_board)
+    unknowns = _unknowns_about(found, refined=True)
     return cross_validated_px(
         unknowns.camera,
         unknowns.ends[-1],
@@ -220,13 +219,18 @@ def rig_held_out_px(found: RigCalibration) -> float:
     )
 
 
+def _unknowns_about(found: RigCalibration, *, refined: bool) -> RigParameterisation:
+    cameras = found.lower, found.upper
+    return rig_unknowns(found.board, cameras, found.T_upper_lower, found.fit.T_cam_board, refined=refined)
+
+
 def _rig_calibration(
     good: Sequence[PairView],
     printed: Printed,
-    solved: tuple[BundleResult, RigParameterisation],
+    fit: BundleResult,
+    unknowns: RigParameterisation,
     rejected: Sequence[RejectedView],
 ) -> RigCalibration:
-    fit, unknowns = solved
     found, (lower, upper, _) = unknowns.camera(fit.parameters), unknowns.ends
     sigma = np.sqrt(np.maximum(0, np.diag(fit.covariance)))
     parts = ((0, lower), (lower, upper))

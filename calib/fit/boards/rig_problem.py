@@ -89,10 +89,13 @@ class RigParameterisation:
 
 
 def rig_unknowns(
-    board: CalibrationBoard, given: tuple[Sides, bool], T_upper_lower: Array, T_lower_board: Array
+    board: CalibrationBoard, cameras: Sides, T_upper_lower: Array, T_lower_board: Array, *, refined: bool
 ) -> RigParameterisation:
-    """Return the parameterisation about cameras (given: and whether they are refined) and T_upper_lower."""
-    (lower, upper), refined = given
+    """Return the parameterisation about cameras, which stay as they are unless refined, and T_upper_lower.
+
+    T_lower_board (K, 4, 4): poses of the board, whose median distance gives the size of a step.
+    """
+    lower, upper = cameras
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
     # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
     units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)

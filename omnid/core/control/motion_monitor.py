@@ -100,7 +100,7 @@ class Motion(NamedTuple):
     yaw_rate_sigma_radps: float = 0.0
 
 
-class _Account(NamedTuple):
+class _TimedMotion(NamedTuple):
     """A motion at a time."""
 
     at_ns: int
@@ -131,8 +131,8 @@ class MotionMonitor:
 
     def __init__(self, settings: MotionSettings) -> None:
         self._settings = settings
-        self._commanded: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
-        self._reported: deque[_Account] = deque(maxlen=MOST_ACCOUNTS)
+        self._commanded: deque[_TimedMotion] = deque(maxlen=MOST_ACCOUNTS)
+        self._reported: deque[_TimedMotion] = deque(maxlen=MOST_ACCOUNTS)
         self._driven_ns: int | None = None  # the newest tick with a commanded motion
         self._last_seen_ns = self._last_report_ns = 0
         self._wheels_report = False  # they have reported a motion: some controllers never do
@@ -140,7 +140,7 @@ class MotionMonitor:
         self.reason = ""  # the disagreement for which the base must stop, until it has stood for REST_S
 
     @property
-    def doubtful(self) -> bool:
+    def is_doubtful(self) -> bool:
         """True if some motion is unexplained: the base is to slow down."""
         return any(
             metres > self._settings.slow_m or radians > self._settings.slow_rad
@@ -151,7 +151,7 @@ class MotionMonitor:
         """Add the motion that was commanded at this tick."""
         if not self._settings.check:
             return
-        self._commanded.append(_Account(now_ns, motion.velocity_mps, motion.yaw_rate_radps))
+        self._commanded.append(_TimedMotion(now_ns, motion.velocity_mps, motion.yaw_rate_radps))
         if motion != STOP:
             self._driven_ns = now_ns
         if self._driven_ns is None or (now_ns - self._driven_ns) * S_PER_NS > REST_S:
@@ -177,7 +177,7 @@ class MotionMonitor:
         self._wheels_report |= reported.velocity_mps != 0.0 or turn_radps != 0.0
         if not self._wheels_report or not math.isfinite(reported.velocity_mps):
             return
-        self._reported.append(_Account(now_ns, reported.velocity_mps, turn_radps))
+        self._reported.append(_TimedMotion(now_ns, reported.velocity_mps, turn_radps))
         if not self._drives_at(now_ns):
             return
         dt_s = _passed_s(before_ns, now_ns)
@@ -190,7 +190,7 @@ class MotionMonitor:
         """True if a motion was commanded within the delay before a time."""
         return any(entry.velocity_mps or entry.yaw_rate_radps for entry in self._recent(self._commanded, at_ns))
 
-    def _recent(self, accounts: deque[_Account], at_ns: int) -> list[_Account]:
+    def _recent(self, accounts: deque[_TimedMotion], at_ns: int) -> list[_TimedMotion]:
         """Return the accounts within the delay before a time, the newest first."""
         since_ns = at_ns - self._settings.delay_s / S_PER_NS
         return [
@@ -199,7 +199,7 @@ class MotionMonitor:
             if entry.at_ns <= at_ns
         ]
 
-    def _bands(self, explained: list[_Account], found: Motion) -> tuple[_Band, _Band]:
+    def _bands(self, explained: list[_TimedMotion], found: Motion) -> tuple[_Band, _Band]:
         """Return the plausible velocities and yaw rates."""
         limits = self._settings
         speeds, rates = [one.velocity_mps for one in explained], [one.yaw_rate_radps for one in explained]

@@ -39,7 +39,7 @@ class Plausibility:
         """The reason to drive slowly; empty without one."""
         if self._degraded:
             return POSE_DEGRADED
-        return MOTION_DOUBTFUL if self._monitor.doubtful else self.witness.reason
+        return MOTION_DOUBTFUL if self._monitor.is_doubtful else self.witness.reason
 
     def add_pose(self, stamp_ns: int, state: str, seen: Motion, resets: int, witness: Witness = AGREE) -> None:
         """Take the next pose; a lost one says nothing about the motion."""

@@ -35,7 +35,7 @@ PERSON_M: Final = 0.4  # width of a person: the rest of a narrower cluster may b
 START_MPS: Final = 1.0  # sigma of the velocity of a new track. By judgement; not measured.
 LEAST_MPS: Final = 0.2  # Least speed of a moving obstacle. By judgement; not measured.
 SPEED_SIGMAS: Final = 1.5  # Sigmas by which the speed must exceed its noise. By judgement; not measured.
-NEW_LOOKS: Final = 3  # Pairs after which a new object counts as moving at any speed: it was not there before.
+NEW_UPDATES: Final = 3  # Pairs after which a new object counts as moving at any speed: it was not there before.
 CONFIRMED: Final = 2  # Pairs that must have seen it: a single one may be noise.
 FORGOTTEN_S: Final = 0.9  # A track without a cluster ends after this time. By judgement; not measured.
 
@@ -52,7 +52,7 @@ class _Cluster:
 class _Track:
     def __init__(self, stamp_ns: int, cluster: _Cluster) -> None:
         self.stamp_ns = self.seen_ns = stamp_ns
-        self.looks, self.radius_m = 1, cluster.radius_m
+        self.updates, self.radius_m = 1, cluster.radius_m
         self._filter = kalman_filter(dim_x=4, dim_z=2)
         self._filter.H = np.eye(2, 4)
         self._filter.x = np.concatenate([cluster.middle, [0.0, 0.0]])[:, None]
@@ -80,15 +80,15 @@ class _Track:
     def update(self, cluster: _Cluster) -> None:
         self._filter.update(cluster.middle[:, None], R=cluster.covariance)
         self.seen_ns, self.radius_m = self.stamp_ns, 0.7 * self.radius_m + 0.3 * cluster.radius_m
-        self.looks += 1
+        self.updates += 1
 
     def obstacle(self) -> MovingObstacle | None:
         """Return the track as a moving obstacle; None where it does not move or is not confirmed."""
         x, y, vx, vy = self._filter.x[:, 0].tolist()
         P = (self._filter.P + self._filter.P.T) / 2
         speed_mps, sigma_mps = math.hypot(vx, vy), math.sqrt(max(P[2, 2], P[3, 3]))
-        stands = self.looks > NEW_LOOKS and speed_mps < max(LEAST_MPS, SPEED_SIGMAS * sigma_mps)
-        if self.looks < CONFIRMED or stands:
+        is_at_rest = self.updates > NEW_UPDATES and speed_mps < max(LEAST_MPS, SPEED_SIGMAS * sigma_mps)
+        if self.updates < CONFIRMED or is_at_rest:
             return None
         return MovingObstacle(x, y, vx, vy, P, self.radius_m)
 

@@ -78,7 +78,7 @@ class FrameExposures:
         is_sudden = self._motion.is_sudden(T_prev_curr, dt_s)
         velocity = UNKNOWN_VELOCITY if is_sudden else self._motion.after(T_prev_curr, refined.covariance, dt_s)
         settled = Exposure.of(frame.times, velocity, self._model)
-        coarse = self._frame_to_map.again(frame, coarse, refined.T_odom_rect, settled)
+        coarse = self._frame_to_map.estimate_again(frame, coarse, refined.T_odom_rect, settled)
         return self._frame_to_map.refine(frame, coarse, settled)
 
     def map_started(self, frame: StereoFrame) -> None:

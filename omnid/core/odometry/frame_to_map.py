@@ -52,7 +52,7 @@ VIEW_DIMENSIONS = 3
 class CoarsePose:
     """Pose from the tracks, and the inliers among them."""
 
-    T_curr_odom: Array
+    T_curr_odom: Array  # (4, 4)
     landmarks: Indices  # (M,) rows of the local map
     disparity: Array  # (M,) px between the images of this frame, NaN: not found in the upper panorama
     variance: Array  # (M,) px^2 of the disparity by noise
@@ -101,8 +101,14 @@ class FrameToMap:
         chosen = np.flatnonzero(is_inlier)[kept]
         return CoarsePose(solution.T, landmarks[kept], disparity[chosen], variance[chosen], tracks)
 
-    def again(self, frame: StereoFrame, coarse: CoarsePose, T_odom_rect: Array, exposure: Exposure) -> CoarsePose:
-        """Return the tracks' inliers at a refined pose whose velocity is known better, where few were inliers."""
+    def estimate_again(
+        self, frame: StereoFrame, coarse: CoarsePose, T_odom_rect: Array, exposure: Exposure
+    ) -> CoarsePose:
+        """Return the coarse pose at a refined one (4, 4), whose exposure has a better velocity.
+
+        Where few tracks were inliers, the old velocity may be the reason: then the pose is estimated again, and the new
+        estimate is returned if it has more inliers.
+        """
         found = None
         if len(coarse.landmarks) < FEW_RATIO * len(coarse.tracks.landmarks):
             found = self.estimate(frame, coarse.tracks, T_odom_rect, exposure)

@@ -280,7 +280,7 @@ def test_continues_the_ramp_after_a_late_answer(driving: Bench) -> None:
     send, driving.wheels.send = driving.wheels.send, late  # type: ignore[method-assign]
     driving.controller.end()
     driving.tick()
-    assert not driving.controller.stands
+    assert not driving.controller.is_at_rest
     driving.wheels.send = send  # type: ignore[method-assign]
     driving.tick()
     assert driving.last.velocity_mps == pytest.approx(0.3 - 2 * LIMITS.deceleration_mps2 * PERIOD_S)
@@ -401,15 +401,15 @@ def test_a_simulated_motor_that_holds_headings_follows_headings_and_rates(setpoi
 
 def test_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:
     driving.controller.end()
-    assert not driving.controller.stands
+    assert not driving.controller.is_at_rest
     slows_down(driving, lambda: send_both(driving))
-    assert driving.controller.stands and driving.controller.state.reason == safety_rules.ENDS
+    assert driving.controller.is_at_rest and driving.controller.state.reason == safety_rules.ENDS
 
 
 def test_needs_no_ramp_where_the_motor_controller_failed(driving: Bench) -> None:
     driving.wheels.silent = True
     driving.tick()
-    assert driving.controller.stands
+    assert driving.controller.is_at_rest
 
 
 def test_reports_each_tick(driving: Bench) -> None:

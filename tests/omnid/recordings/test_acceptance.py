@@ -117,7 +117,7 @@ def with_stops(*stops_m: float) -> Trajectory:
     [((10.5, 12.0, 0.0), "B"), ((12.0, 11.0, 0.0), "B"), ((12.0, 2.0, 0.0), "A"), ((1.0, 12.0, 0.0), "A")],
 )
 def test_a_wait_near_a_mark_is_not_taken_for_it(stops_m: tuple[float, ...], mark: str) -> None:
-    with pytest.raises(OmnidError, match=rf"one place of mark {mark}, found stands .* s; give the times .*--marks"):
+    with pytest.raises(OmnidError, match=rf"one place of mark {mark}, found stops .* s; give the times .*--marks"):
         visits_by_standing(with_stops(*stops_m), DISTANCE_M)
 
 

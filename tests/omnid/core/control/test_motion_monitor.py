@@ -65,7 +65,7 @@ def run(
             waiting.append((now_s, world.seen(now_s, noisy)))
         for stamp_s, motion in [entry for entry in waiting if now_s - TICK_S < entry[0] + DELAY_S <= now_s]:
             monitor.add_seen(round(stamp_s * NS), motion)
-        history.append((now_s, monitor.doubtful, monitor.reason))
+        history.append((now_s, monitor.is_doubtful, monitor.reason))
     return monitor, history
 
 
@@ -195,7 +195,7 @@ def test_rest_forgets_what_was_unexplained() -> None:
 
     monitor, history = run(wish, 6.0 + REST_S + 1.0, World(seen=still))
     held_s = max(at_s for at_s, _, reason in history if reason)
-    assert held_s > 6.0 + 0.8 * REST_S and not monitor.reason and not monitor.doubtful
+    assert held_s > 6.0 + 0.8 * REST_S and not monitor.reason and not monitor.is_doubtful
 
 
 def test_recovers_where_the_contradiction_ends() -> None:

@@ -134,6 +134,6 @@ def test_the_monitor_is_its_description(seed: int) -> None:
                 monitor.add_seen(at_ns, Motion(*seen, *sigmas))
                 account.see(at_ns / NS, seen, sigmas)
             assert monitor.reason == account.reason, (seed, tick)
-            assert monitor.doubtful == account.doubtful, (seed, tick)
-            slowed, reasons = slowed + monitor.doubtful, reasons | {monitor.reason}
+            assert monitor.is_doubtful == account.doubtful, (seed, tick)
+            slowed, reasons = slowed + monitor.is_doubtful, reasons | {monitor.reason}
     assert slowed > 300 and reasons >= {"", NOT_SEEN, NOT_FOLLOWED}

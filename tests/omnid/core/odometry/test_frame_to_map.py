@@ -84,10 +84,10 @@ def test_tracks_that_a_wrong_velocity_made_outliers_are_inliers_again() -> None:
     tracks = local_map.track(frame.lower, np.eye(4))
     coarse = steps.estimate(frame, tracks, np.eye(4), believed)
     assert coarse is not None and len(coarse.landmarks) < 0.5 * len(tracks.landmarks)
-    again = steps.again(frame, coarse, np.eye(4), known)
+    again = steps.estimate_again(frame, coarse, np.eye(4), known)
     assert len(again.landmarks) > 0.9 * len(tracks.landmarks)
     T_turned = se3.exp([0.01, 0, 0, 0, 0, 0])
-    kept = steps.again(frame, again, T_turned, believed)
+    kept = steps.estimate_again(frame, again, T_turned, believed)
     assert kept.landmarks is again.landmarks, "enough were inliers"
     np.testing.assert_allclose(kept.T_curr_odom, se3.inverse(T_turned), atol=1e-12)
 
