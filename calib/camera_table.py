@@ -34,6 +34,7 @@ PNG_HEAD = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 PNG_FIRST_CHUNK = 8
 # Length, name and CRC. Source: PNG 1.2, section 3.2.
 PNG_CHUNK_BYTES = 12
+# Chunks before the pixels, so that the search ends; programs write about a dozen.
 MAX_PNG_CHUNKS = 1000
 EMBEDDED = "data:image/png;base64,"
 PINHOLE_KEYS = ("fu", "fv", "pu", "pv")

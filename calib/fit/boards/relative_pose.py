@@ -27,7 +27,7 @@ MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
 MIN_COST_RATIO = 3.0
 # Weight of the capped mean in a transform's cost, which breaks ties of the median; the cap.
 MEAN_WEIGHT, MEAN_CAP = 0.1, 1.0
-MIN_LENGTH_M = 1e-9
+MIN_LENGTH_M = 1e-9  # Least divisor, so that a transform without translation has a distance, too.
 ViewPair = tuple[BoardView | None, BoardView | None]
 
 
