@@ -10,8 +10,8 @@ from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEv
 MAX_BYTES: Final = 1 << 15  # enough for MAX_NODES of 16 characters
 # Values and lists; a camera has about 60.
 MAX_NODES: Final = 2000
-MAX_DEPTH: Final = 16  # Lists and mappings within each other; those of a camera are four deep.
-MAX_SCALAR: Final = 1000  # Characters of a value; the longest ones are names of topics and paths.
+MAX_DEPTH: Final = 16  # Lists and mappings within each other: enough, as those of a camera are four deep.
+MAX_SCALAR: Final = 1000  # Characters of a value: enough for names of topics and paths.
 
 
 def parse_yaml(text: str) -> Any:

@@ -22,7 +22,7 @@ from calib.validation import read_bytes
 # Of the file of a rig and of an image, so that a wrong file is refused before it fills the memory: a rig has some
 # hundred bytes, an image of 16384 x 8192 px about 100 MB.
 MAX_BYTES, MAX_IMAGE_BYTES = 1 << 20, 1 << 28
-# Size of the images of Helvipad, and their first row in the whole image of 1920x960 px.
+# Size of the images of Helvipad, and their first row in the whole image. Source: Zayene et al. 2025.
 HELVIPAD_SIZE, HELVIPAD_TOP_PX = (1920, 512), 192
 SUFFIXES = (".png", ".jpg", ".jpeg")
 # The camera's z is ahead in the middle of the image: the rig's x; its x is the rig's -y, its y the rig's -z.

@@ -16,8 +16,8 @@ MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
 MAX_BASELINE_M = 5.0  # of two cameras on one robot: a number beyond it has another unit
 # A T_base_rig with the cameras on the floor states no height: as the identity, which it is where none was measured.
 LEAST_HEIGHT_M = 0.1
-MAX_HEIGHT_M = 10.0  # of cameras on a robot: a number beyond it has another unit
-# Numbers beyond these are in ms and us: a delay is less than a period of the images, a line less than 1 ms.
+MAX_HEIGHT_M = 10.0  # Of cameras on a robot: a number beyond it is refused, because it has another unit.
+# Numbers beyond these are refused, because they are in ms and us.
 MAX_UPPER_DELAY_S, MAX_LINE_TIME_S = 1.0, 1e-3
 
 

@@ -12,7 +12,7 @@ from calib.models.camera import Array
 
 # Inner corners along one side: fewer do not determine a pose well, more are a misread option.
 MIN_SIDE, MAX_SIDE = 3, 60
-# Squares beyond these are a length in another unit.
+# Squares beyond these are refused, because they are lengths in another unit.
 MIN_SQUARE_M, MAX_SQUARE_M = 1e-4, 10.0
 # Half side of the window about a checkerboard's corner [squares], less than a half, so that neighbours share no pixel.
 WINDOW = 0.42

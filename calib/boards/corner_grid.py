@@ -31,7 +31,7 @@ RING_PART = 0.28
 MIN_RING_PX = 2.0
 # Smaller squares are not resolved.
 MIN_SPACING_PX = 3
-# A corner has a quality of MIN_RING_QUALITY to 1: one whose ring is nearly as odd as is allowed is left out.
+# A corner has a quality of MIN_RING_QUALITY to 1; one near the lower end is left out, because its ring is too odd.
 MIN_QUALITY = 0.15
 # Least contrast of a predicted corner, in parts of the grid's median contrast. By judgement; not measured.
 MIN_CONTRAST_PART = 0.25

@@ -25,7 +25,7 @@ INLIER_PX = 2.0
 MIN_SUPPORT = 0.6
 # Least part of the circle that lies in the image: less does not determine the centre.
 MIN_ARC = 0.4
-# If only 3 of 10 azimuths show the rim, 200 draws of three miss it once in 240 images.
+# Enough: if only 3 of 10 azimuths show the rim, 200 draws of three miss it once in 240 images.
 RANSAC_ROUNDS = 200
 # Least squares repetitions on the inliers after RANSAC. By judgement; not measured.
 REFINEMENTS = 3

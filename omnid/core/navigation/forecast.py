@@ -31,7 +31,7 @@ MEETING_S: Final = np.array([-0.6, 0.0, 0.6])
 SLOWEST_MPS: Final = 0.1  # Lower bound of the speed of approach, so that the time until a meeting is bounded.
 # 30 degrees apart, enough: a radius of 0.3 m errs by 1 cm between two.
 CIRCLE: Final = np.linspace(0.0, 2 * np.pi, 12, endpoint=False)
-LEAST_MPS: Final = 0.01  # A slower base counts as standing, which needs less room.
+LEAST_MPS: Final = 0.01  # A slower base counts as standing, because it needs no more room than that.
 # Cosine of the direction beyond which one is behind the base; 120 degrees; by trial on development seeds.
 BEHIND_SHARE: Final = -0.5
 
