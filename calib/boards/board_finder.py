@@ -106,14 +106,14 @@ def find_board(image: Image, board: Board, name: str = "", *, thorough: bool = T
         grids = [grow_grid(blurred, candidate, _most_corners(board)) for candidate in _grids(searched, board)]
         floors += [grid for grid in grids if _is_floor(grid, board)]
         for grid in grids:
-            found = _detection(image, blurred, (grid, floors), board)
+            found = _detection(image, blurred, grid, floors, board)
             if found is not None and (
                 found.is_complete or (thorough and _is_confirmed(image, found, board, unconfirmed))
             ):
                 return BoardSearch(found.view(name))
             partial = max(partial, grid, key=lambda one: _likeness(one, board))
             largest = max(largest, largest_rectangle(grid), key=lambda sides: sides[0] * sides[1])
-    view = _opencv_view(image, blurred, (board, partial, floors), name) if thorough else None
+    view = _opencv_view(image, blurred, board, partial, floors, name) if thorough else None
     is_hint = view is None and min(largest) >= MIN_HINT_SIDE and largest[0] * largest[1] >= MIN_HINT_CORNERS
     return BoardSearch(view, largest if is_hint else (0, 0))
 
@@ -133,22 +133,22 @@ def _likeness(grid: Grid, board: Board) -> float:
     return min(part, 1 / part) if PARTIAL < part < 1 / PARTIAL else 0.0
 
 
-def _opencv_view(image: Image, blurred: Grey, shown: tuple[Board, Grid, list[Grid]], name: str) -> BoardView | None:
-    """Return the view of the board that OpenCV's detectors find, at last around a grid that shows a part of it.
+def _opencv_view(
+    image: Image, blurred: Grey, board: Board, partial: Grid, floors: list[Grid], name: str
+) -> BoardView | None:
+    """Return the view of the board that OpenCV's detectors find, at last around a partial grid of it.
 
     A board without an outline is accepted if two find it, or if one does and it has many corners, all of them good.
-    shown: the board, the grid that shows a part of it, and the grids of floors.
     """
-    board, partial, floors = shown
     detected = list[Grid]()
     nearby = grids_nearby(image, partial, board) if _likeness(partial, board) else ()
     for grid in chain(opencv_grids(image, board), nearby):
-        found = _detection(image, blurred, (grow_grid(blurred, grid, _most_corners(board)), floors), board)
+        found = _detection(image, blurred, grow_grid(blurred, grid, _most_corners(board)), floors, board)
         if found is not None and found.is_complete:
             return found.view(name)
         detected.append(grid)
     for number, grid in enumerate(detected):
-        found = _detection(image, blurred, (grid, floors), board)
+        found = _detection(image, blurred, grid, floors, board)
         agree = any(are_same(grid, other) for other in detected[number + 1 :])
         if found is not None and (
             agree or (found.is_bounded and found.part >= MIN_LONE_PART and found.corners.size // 2 >= FEW_CORNERS)
@@ -188,13 +188,12 @@ def _to_source_pixels(grid: Grid, searched: DerivedImage) -> Grid:
     return with_clockwise_axes(dict(zip(grid, pixels, strict=True)))
 
 
-def _detection(image: Image, blurred: Grey, linked: tuple[Grid, list[Grid]], board: Board) -> _Detection | None:
+def _detection(image: Image, blurred: Grey, grid: Grid, floors: list[Grid], board: Board) -> _Detection | None:
     """Return the board in a grid, its corners refined; None if they are too few or the squares no checkerboard.
 
-    linked: the grid, and those of floors in the image. Floors are torn where their squares do not fit together, so that
-    a part may look like a board with a few corners too many.
+    Floors are torn where their squares do not fit together, so that a part may look like a board with a few corners too
+    many.
     """
-    grid, floors = linked
     placed = None if floors and len(grid) > board.columns * board.rows else select_board_window(grid, board)
     if placed is None or any(shared_part(array_to_grid(placed), floor) > MAX_SHARED for floor in floors):
         return None

@@ -135,7 +135,7 @@ def calibrate_drive(
     steps = straightened(paths[0], parameters, topics, config, progress)
     require_same_rig(parameters, steps, tracked=False)
     # 3. Track and adjust in rounds, until lengths change no more.
-    found, drives = _in_rounds(paths, (parameters, steps), topics, config, progress)
+    found, drives = _in_rounds(paths, parameters, steps, topics, config, progress)
     # 4. Choose the distortion terms by landmarks held out, and the times of exposure that differ from none.
     scores = tuple(_score(found, drives, terms, waves) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():
@@ -163,10 +163,12 @@ def calibrate_drive(
 
 
 def _in_rounds(
-    logs: Sequence[Path], start: tuple[RigParameters, Array], topics: Topics, config: Config, progress: Progress
+    logs: Sequence[Path], parameters: RigParameters, steps: Array, topics: Topics, config: Config, progress: Progress
 ) -> tuple[DriveAdjustment, Drives]:
-    """Track and adjust until lengths change no more: each round tracks in panoramas of the rig of the one before."""
-    parameters, steps = start
+    """Track and adjust until lengths change no more: each round tracks in panoramas of the rig of the one before.
+
+    steps (P,): of the parameters, to start from.
+    """
     rig = parameters.at(steps)
     for number in range(1, MAX_ROUNDS + 1):
         drives = collect(logs, rig, topics, config)

@@ -131,8 +131,7 @@ def calibrate_rig(
     # 3. Fit each camera to all its views, unless the cameras are known.
     if cameras is None:
         direction, shown = view_of_images(view, _by_camera(images, views), board, progress)
-        choice = model, direction
-        single = fit_cameras(views, images, board, (*choice, AS_DRAWN), progress)
+        single = fit_cameras(views, images, board, model, direction, AS_DRAWN, progress)
     else:
         single, shown = FittedCameras.known(cameras, views), []
     # 4. Fit the transform between the cameras, and the cameras with it.
@@ -147,7 +146,7 @@ def calibrate_rig(
     if not shape.is_as_drawn:
         progress("the board is not as drawn: once more with its shape")
         if cameras is None:
-            single = fit_cameras(list(found.views), images, board, (*choice, shape), progress)
+            single = fit_cameras(list(found.views), images, board, model, direction, shape, progress)
             rejected += single.rejected
         found = _fit_rig(single.views if cameras is None else found.views, single, board, refined, shape, progress)
         rejected += found.rejected

@@ -35,14 +35,15 @@ def fit_cameras(
     views: list[PairView],
     images: PairedImages,
     board: AnyBoard,
-    choice: tuple[ModelChoice, View, PrintShape],
+    model: ModelChoice,
+    direction: View,
+    shape: PrintShape,
     progress: Progress,
 ) -> FittedCameras:
     """Fit each camera to all its views; views that do not fit their camera are rejected.
 
     The corners are refined with the cameras the first time, when the print is taken to be as drawn.
     """
-    model, direction, shape = choice
     cameras, polynomials, rejected = [], list[OcamCamera](), list[RejectedView]()
     for side, name in enumerate(SIDES):
         seen = [own for view in views if (own := view.seen[side]) is not None]

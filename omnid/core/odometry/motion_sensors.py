@@ -115,7 +115,7 @@ class MotionSensors:
         if wheels is None and gyro is None:
             return None
         # 2. At rest the motion is zero.
-        if wheels is not None and self._stands(start_s, end_s):
+        if wheels is not None and self._is_at_rest(start_s, end_s):
             return self._in_rect(np.zeros(6), np.repeat([STILL_M, STILL_RAD], 3), np.zeros((6, 7)), complete=True)
         # 3. Wheels whose turn differs from that of the gyro slip.
         disagree = wheels is not None and gyro is not None and self._disagree(wheels, gyro, dt_s)
@@ -182,7 +182,7 @@ class MotionSensors:
         if wheels is not None:
             self._learn_wheels(wheels, seen, variance)
         if gyro is not None:
-            self._learn_gyro(gyro, seen[3:], variance[3:], dt_s)
+            self._learn_gyro(*gyro, seen[3:], variance[3:], dt_s)
 
     def _seconds(self, stamp_ns: int) -> float:
         """Return the time since the first stamp: a number of seconds since 1970 has too few digits."""
@@ -216,10 +216,12 @@ class MotionSensors:
         if ratio < RATIO_LIMIT:
             self._noise_factors[state] = max(1.0, self._noise_factors[state] * (1.0 + NOISE_GAIN * (ratio - 1.0)))
 
-    def _learn_gyro(self, gyro: tuple[Array, Array], seen: Array, variance: Array, dt_s: float) -> None:
-        """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,)."""
+    def _learn_gyro(self, turned: Array, change: Array, seen: Array, variance: Array, dt_s: float) -> None:
+        """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,).
+
+        turned (3,): rotation by the gyro; change (3,): of its rates in that time.
+        """
         agree = True
-        turned, change = gyro
         for axis in range(3):
             H = np.zeros(len(START))
             H[BIAS.start + axis], H[GYRO_OFFSET] = -dt_s, -change[axis]
@@ -255,7 +257,7 @@ class MotionSensors:
         offset_s = self.values[GYRO_OFFSET]
         return self._gyro.integral(start_s - offset_s, end_s - offset_s)
 
-    def _stands(self, start_s: float, end_s: float) -> bool:
+    def _is_at_rest(self, start_s: float, end_s: float) -> bool:
         """True if wheels, and the gyro if there is one, are at rest in a step and STILL_BEFORE_S before it."""
         wheels = self._wheels.largest(start_s - STILL_BEFORE_S, end_s, np.zeros(2))
         gyro = self._gyro.largest(start_s - STILL_BEFORE_S, end_s, self.values[BIAS])

@@ -71,7 +71,7 @@ class PlaceSearch:
         near = apart_m < NEAR_M + np.array(list(expected.error_m.values()))
         ids = [known[n] for n in np.flatnonzero(near).tolist()]
         enough = ENOUGH_INLIERS if expected.recognised else FEATURES + 1
-        found = supported(self._compare(small, features, (places, ids), NEAR_EFFORT, enough), near=True)
+        found = supported(self._compare(small, features, places, ids, NEAR_EFFORT, enough), near=True)
         best = self._unambiguous(found, places.poses)
         if best is not None and not _is_expected(best, places.poses, expected):
             self.refused += 1
@@ -90,7 +90,7 @@ class PlaceSearch:
 
         T_map_rect: the pose by other evidence, which decides between several similar places.
         """
-        found = supported(self._compare(small, features, (places, ids), FAR_EFFORT, FEATURES + 1))
+        found = supported(self._compare(small, features, places, ids, FAR_EFFORT, FEATURES + 1))
         if T_map_rect is not None:
             found = [
                 place for place in found if not is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)
@@ -112,12 +112,12 @@ class PlaceSearch:
         self,
         small: NDArray[np.int8],
         features: PlaceFeatures,
-        among: tuple[PlaceMap, list[int]],
+        places: PlaceMap,
+        ids: list[int],
         effort: Effort,
         enough: int,
     ) -> list[Recognition]:
         """Return the recognitions among the keyframes of a map (ids); it ends at one with enough inliers."""
-        places, ids = among
         self.compared, self._seen = {}, []
         if not ids:
             return []

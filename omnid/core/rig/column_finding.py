@@ -88,7 +88,7 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     offsets = [abs(median) for _, median, count in residuals if count >= MIN_IN_SECTOR]
     left_px = float(np.median(offsets)) if offsets else float("nan")
     return RigFinding(
-        _state(drift, left_px, (len(shifts), found.clear)),
+        _state(drift, left_px, len(shifts), found.clear),
         len(shifts),
         found.tried,
         offset,
@@ -99,8 +99,8 @@ def judge(found: Matches, cylinder: Cylinder) -> RigFinding:
     )
 
 
-def _state(drift: RigDrift | None, left_px: float, counts: tuple[int, int]) -> RigState:
-    matches, clear = counts
+def _state(drift: RigDrift | None, left_px: float, matches: int, clear: int) -> RigState:
+    """Return the state by the drift, the residuals that it leaves, and the matches of points with clear contrast."""
     if clear >= MIN_CONTRAST_POINTS and matches < MIN_MATCHED_PART * clear:
         return RigState.BROKEN
     if drift is None:
