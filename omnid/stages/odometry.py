@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from omnid.core.odometry.motion_sensors import BIAS, MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
+from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import OdometryUpdate, Panoramas, StereoDepth
@@ -53,7 +54,7 @@ class OdometryStage:
         self._T_rig_rect = geometry.T_rig_rect
         self._to_rig = se3.adjoint(self._T_rig_rect)
         self._last_ns: int | None = None
-        self._keyframe: tuple[Panoramas, OdometryEstimate] | None = None  # the last one, at a pose known well
+        self._keyframe: _LastKeyframe | None = None
         self._T_base_rect = geometry.rig.T_base_rig @ self._T_rig_rect
         self._to_base = se3.adjoint(self._T_base_rect)
         self.sensors, self._agreement = MotionSensors(se3.inverse(self._T_base_rect)), MotionAgreement()
@@ -132,11 +133,11 @@ class OdometryStage:
         is_known = estimate.state is TrackingState.TRACKING
         before = self._keyframe
         if estimate.is_keyframe:
-            self._keyframe = (pair, estimate) if is_known else None
-        if before is None or not is_known or before[1].resets != estimate.resets:
+            self._keyframe = _LastKeyframe(pair.lower, pair.usable, estimate) if is_known else None
+        if before is None or not is_known or before.estimate.resets != estimate.resets:
             return None
-        T_earlier_now = se3.inverse(before[1].T_odom_rect) @ estimate.T_odom_rect
-        return EarlierView(before[0].lower, before[0].usable, T_earlier_now, _moving(before[1].exposure))
+        T_earlier_now = se3.inverse(before.estimate.T_odom_rect) @ estimate.T_odom_rect
+        return EarlierView(before.lower, before.usable, T_earlier_now, _moving(before.estimate.exposure))
 
     def _disparity(self, pair: Panoramas, exposure: Exposure | None) -> NDArray[np.float32]:
         """Return the disparities (H, W) of a pair for a motion during its exposures."""
@@ -154,6 +155,14 @@ class OdometryStage:
     def _in_rig(self, covariance: Array) -> Array:
         """Return the covariance (6, 6) of a small motion of the rectified frame as one of the rig frame."""
         return np.asarray(self._to_rig @ covariance @ self._to_rig.T)
+
+
+class _LastKeyframe(NamedTuple):
+    """The last keyframe whose pose was known well, without what else its pair holds, such as the dense depth."""
+
+    lower: PaddedPanorama
+    usable: NDArray[np.bool_]  # (H, W)
+    estimate: OdometryEstimate
 
 
 def _moving(exposure: Exposure | None) -> Exposure | None:

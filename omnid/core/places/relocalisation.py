@@ -33,7 +33,7 @@ class Relocaliser:
         """Keep a frame and its keyframe; one near the last keyframe replaces it. It is described when it is needed."""
         if self._kept and _distance_m(self._kept[-1][1], keyframe) < KEYFRAMES_APART_M:
             self._kept.pop()
-        self._kept.append((frame, keyframe))
+        self._kept.append((frame.packed(), keyframe))
 
     def clear(self) -> None:
         """Remove all keyframes."""

@@ -97,6 +97,13 @@ def test_a_keyframe_is_described_once_and_only_for_a_search(
     assert described == [nearby.seq, 11, 12, nearby.seq]
 
 
+def test_a_packed_frame_has_the_same_disparities_for_the_motion_it_was_packed_for(keyframe: StereoFrame) -> None:
+    image = keyframe.disparity
+    packed = replace(keyframe, disparities=lambda exposure: image if exposure is None else image[:0]).packed()
+    assert packed.disparity.tobytes() == image.tobytes() and 0 < np.isfinite(image).mean() < 1
+    assert packed.disparities is not image
+
+
 def test_of_two_places_that_look_the_same_none_is_chosen(
     cameras: RenderedCameras, keyframe: StereoFrame, nearby: StereoFrame
 ) -> None:
