@@ -20,7 +20,7 @@ from omnid.engine.bounded_call import started
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
-from omnid.engine.realtime import ThreadStart, name_thread, prepare, priorities
+from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare, priorities
 from omnid.errors import OmnidError
 from omnid.refinement.refined_file import RefinedRigFile
 from omnid.runs.live_robot import LiveRobot
@@ -67,6 +67,7 @@ class LiveRun:
             from omnid.runs.place_maps import RunPlaces
 
             prepare_kernels()
+            give_back_code("llvmlite")  # which has loaded the compiled functions, and does nothing else in a run
             self._connected = True
             run_places = RunPlaces(self._config, geometry, session.warn)
             LiveWiring(session, geometry, self._refined, self._robot, self._report).wire(run_places)

@@ -246,3 +246,28 @@ print(json.dumps({"kept_mb": resident_mb() - before}))
 def test_freed_memory_of_a_thread_returns_to_the_kernel_though_locked() -> None:
     """The thread frees 42 MB, which a malloc arena of its own would keep."""
     assert answer("use_one_malloc_arena()" + ALLOCATING_THREAD).kept_mb < 10
+
+
+GIVEN_BACK = """
+import llvmlite.binding as llvm
+from omnid.engine.realtime import give_back_code
+def code_kb():
+    kb, is_code = 0, False
+    for line in Path("/proc/self/smaps").read_text().splitlines():
+        words = line.split()
+        if "-" in words[0]:
+            is_code = words[1] == "r-xp" and "llvmlite" in line
+        kb += int(words[1]) if is_code and words[0] == "Rss:" else 0
+    return kb
+llvm.initialize_native_target()
+before_kb = code_kb()
+give_back_code("llvmlite")
+after_kb = code_kb()
+llvm.parse_assembly("define void @f() { ret void }").verify()
+print(json.dumps({"before_kb": before_kb, "after_kb": after_kb, "again_kb": code_kb()}))
+"""
+
+
+def test_code_that_was_given_back_is_read_again_where_it_is_run() -> None:
+    found = answer(GIVEN_BACK)
+    assert found.before_kb > 1000 and found.after_kb == 0 < found.again_kb
