@@ -1,4 +1,4 @@
-"""What the threads of a replay do, a pair: `python -m tests.benchmark.replay_threads FOLDER [--hz 30] [--small]`.
+"""Times of the threads of a replay, a pair: `python -m tests.benchmark.replay_threads FOLDER [--hz 30] [--small]`.
 
 The folder holds log.mcap and a rig.toml or camchain.yaml; its pairs are read to and fro. A thread computes, waits for a
 processor that others use, waits for messages or until the next stage takes its own, or waits for a result that another
