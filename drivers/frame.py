@@ -24,6 +24,7 @@ _TAIL_BYTES = 16  # before the padding; longer than any end marker
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
 _END_MARKER = {"jpeg": b"\xff\xd9", "png": b"IEND\xaeB`\x82"}
 _PNG_HEADER = slice(12, 26)  # chunk IHDR: name, width, height, bit depth, colour type (PNG 1.2, 4.1.1)
+_PNG_DEPTH = slice(24, 25)
 _PNG_FIRST_CHUNK = 8
 _PNG_CHUNK_BYTES = 12  # length, name and CRC
 _MAX_PNG_CHUNKS = 1000
@@ -84,14 +85,17 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
 
 
 def deep_samples(frame: Frame) -> NDArray[np.uint16] | None:
-    """Return the grey samples (H, W) of a compressed image of 16 bits a sample, None for one of eight.
+    """Return the grey samples (H, W) of an image of 16 bits a sample, mono16 or PNG, None for one of eight.
 
     Raises FrameDecodeError as `gray` does.
     """
     try:
-        image = _decompress(frame, cv2.IMREAD_ANYDEPTH)
-        return image if image.dtype == np.uint16 else None
-    except (cv2.error, ValueError) as error:
+        if frame.encoding == "mono16":
+            return _pixels(frame).astype(np.uint16)
+        if frame.encoding != "png" or bytes(frame.data[_PNG_DEPTH]) != bytes([FILE_BITS]):
+            return None
+        return np.asarray(_decompress(frame, cv2.IMREAD_ANYDEPTH), np.uint16)
+    except (cv2.error, ValueError, TypeError, BufferError) as error:
         raise _decode_error(frame, " ".join(str(error).split())[:_MAX_REASON]) from error
 
 

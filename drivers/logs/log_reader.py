@@ -16,6 +16,7 @@ from drivers.logs.log_formats import open_image_log
 from drivers.logs.mcap_records import RecordError
 from drivers.logs.reorder_buffer import ReorderBuffer
 from drivers.logs.ros_image import RosImage
+from drivers.logs.sample_bits import SampleBits
 from drivers.logs.topic_choice import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
@@ -149,6 +150,7 @@ class LogReader:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
         self.warnings: list[str] = [self._motion.warning] if self._motion.warning else []
         self.truncated = False
+        self._bits = SampleBits()
         self._fault = ""  # of the first message without a valid image
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
         self._other_joints = 0  # messages of joints without the wheels
@@ -160,7 +162,7 @@ class LogReader:
         The image is copied out of its chunk, so that a frame that is held back does not keep the chunk in memory.
         """
         try:
-            image = logged.read()
+            image = self._bits.applied(logged.topic, logged.read())
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken"] += 1
             self._fault = self._fault or str(error)

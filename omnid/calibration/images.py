@@ -24,6 +24,7 @@ from drivers.logs.image_log import ImageLog, LoggedImage, images_of
 from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
 from drivers.logs.mcap_records import RecordError
 from drivers.logs.ros_image import IMAGE_TYPES
+from drivers.logs.sample_bits import SampleBits
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
@@ -180,10 +181,11 @@ def _images(log: ImageLog, topic: str) -> Iterator[LoggedImage]:
 
 def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
     """Yield every stride-th image, named by its number, without those that cannot be decoded."""
+    bits = SampleBits()
     for number, logged in enumerate(_images(log, topic)):
         if number % stride:
             continue
         try:
-            yield f"frame{number:06d}", gray(logged.read().frame(seq=number))
+            yield f"frame{number:06d}", gray(bits.applied(topic, logged.read()).frame(seq=number))
         except (FrameDecodeError, RecordError):
             continue

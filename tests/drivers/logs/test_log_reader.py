@@ -16,6 +16,7 @@ from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from drivers.logs import mcap_index
 from drivers.logs.log_reader import LogReader
+from omnid.calibration.images import read_images
 from tests.drivers.logs.mcap_logs import (
     BARE,
     COMPRESSED,
@@ -120,6 +121,40 @@ def test_sixteen_bits_in_both_byte_orders(tmp_path: Path, order: str, bigendian:
     data = image_message(START_NS, "mono16", values.astype(order), bigendian)
     frames, _ = read(write_log(tmp_path / "log.mcap", [Entry(t, IMAGE, data, 0) for t in ("/a/lower", "/a/upper")]))
     np.testing.assert_array_equal(gray(frames[0]), values >> 8)
+
+
+def deep_log(folder: Path, kind: str, images: list[NDArray[np.uint16]]) -> Path:
+    """Write a log with images of the lower camera; kind: byte order of mono16, or png."""
+    entries = []
+    for index, pixels in enumerate(images):
+        stamp_ns = START_NS + index * 10**8
+        if kind == "png":
+            data, kind_of_message = compressed(stamp_ns, cv2.imencode(".png", pixels)[1].tobytes(), "png"), COMPRESSED
+        else:
+            data, kind_of_message = image_message(stamp_ns, "mono16", pixels.astype(kind), int(kind == ">u2")), IMAGE
+        entries += [Entry(topic, kind_of_message, data, stamp_ns) for topic in (LOWER, UPPER)]
+    return write_log(folder / "log.mcap", entries)
+
+
+@pytest.mark.parametrize("kind", ["<u2", ">u2", "png"])
+@pytest.mark.parametrize(("bits", "read_bits"), [(10, 10), (12, 12), (13, 16), (16, 16)])
+def test_samples_of_ten_or_twelve_bits_in_sixteen_are_as_bright_as_those_of_eight(
+    tmp_path: Path, kind: str, bits: int, read_bits: int
+) -> None:
+    whole = np.linspace(0, 2**bits - 1, 48 * 64).reshape(48, 64).astype(np.uint16)
+    images = [whole, whole // 200, whole[::-1]]
+    path = deep_log(tmp_path, kind, images)
+    expected = [(one >> (read_bits - 8)).tolist() for one in images]
+    assert [gray(frame).tolist() for frame in read(path)[0] if frame.camera == "lower"] == expected
+    assert [one.tolist() for one in read_images([str(path)], topic=LOWER).values()] == expected
+
+
+def test_a_camera_of_twelve_bits_that_begins_in_the_dark_is_read_by_them_from_its_first_larger_sample_on(
+    tmp_path: Path,
+) -> None:
+    images = [np.full((4, 4), value, np.uint16) for value in (1000, 4000, 1000)]
+    frames = [frame for frame in read(deep_log(tmp_path, "<u2", images))[0] if frame.camera == "upper"]
+    assert [int(gray(frame)[0, 0]) for frame in frames] == [250, 250, 62]
 
 
 @pytest.mark.parametrize(
