@@ -21,7 +21,7 @@ _Row = tuple[str, float, float]
 
 @dataclass(frozen=True, slots=True)
 class CameraParameterisation:
-    """Local parameterisation of a camera by steps (P,): camera_at() makes a camera, values() lists its parameters."""
+    """Local parameterisation of a camera by steps (P,): camera_at() makes a camera, plain_values() its parameters."""
 
     base: OmniCamera
     names: tuple[str, ...]
@@ -30,15 +30,18 @@ class CameraParameterisation:
 
     def camera_at(self, steps: Array) -> OmniCamera:
         """Return the camera at the steps; raises CalibError if its parameters are not those of a camera."""
-        values = dict(zip(self.names, (self.start + steps * self.units).tolist(), strict=True))
+        values = dict(zip(self.names, self.plain_values(steps).tolist(), strict=True))
         if isinstance(self.base, UnifiedCamera):
             return _omni_camera(self.base, values)
         return _ocam_camera(self.base, values)
 
-    def values(self, steps: Array, sigmas: Array) -> list[tuple[str, float, float]]:
-        """Return name, value and standard deviation of every parameter, for steps (P,) and their sigmas (P,)."""
-        found = zip(self.names, self.start + steps * self.units, sigmas * self.units, strict=True)
-        return [(name, float(value), float(sigma)) for name, value, sigma in found]
+    def plain_values(self, steps: Array) -> Array:
+        """Return the parameters (P,) at the steps in their own units."""
+        return self.start + steps * self.units
+
+    def plain_by_steps(self, steps: Array) -> Array:
+        """Return the derivatives (P, P) of the plain values by the steps."""
+        return np.diag(self.units)
 
 
 def parameterise(

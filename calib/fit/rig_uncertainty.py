@@ -77,7 +77,7 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
     """
     if rig.covariance is None:
         return None
-    points = _seen_points(rig)
+    points = seen_points(rig)
     if len(points) < MIN_POINTS:
         return None
     names, sigmas = rig.covariance.names, np.maximum(rig.covariance.sigmas, np.finfo(float).tiny)
@@ -93,7 +93,7 @@ def drive_uncertainty(rig: Rig) -> DriveUncertainty | None:
     return DriveUncertainty(scale, heading_rad_m)
 
 
-def _seen_points(rig: Rig) -> Array:
+def seen_points(rig: Rig) -> Array:
     """Return points (N, 3) in the rectified frame, on walls around the rig, that both cameras see."""
     azimuth, slope, distance = (
         part.ravel() for part in np.meshgrid(2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS, SLOPES, WALLS_M)

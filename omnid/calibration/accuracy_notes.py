@@ -14,12 +14,14 @@ from omnid.calibration.image_pairs import SIDES
 MISFIT_PART, GOOD_PART = 0.003, 0.001
 
 
-def accuracy_warnings(structures: Sequence[ResidualStructure], drives: DriveUncertainty | None) -> list[str]:
+def accuracy_warnings(
+    structures: Sequence[ResidualStructure], drives: DriveUncertainty | None, missing: str
+) -> list[str]:
     """Return the warnings, none for a rig that is accurate enough.
 
-    A camera whose residuals are more than noise has a line; where both have noise only, one line asks for more pairs if
-    the drives are inaccurate nevertheless. structures: those of the residuals of the lower and the upper camera.
-    drives: the error of drives that follows from the rig's covariance; None: it is not known.
+    A camera whose residuals are more than noise has a line; where both have noise only, one line asks for more pairs.
+    structures: those of the residuals of the lower and the upper camera. drives: the error of drives that follows from
+    the rig's covariance; None: it is not known. missing: which pairs to add.
     """
     misfits = [(name, structure) for name, structure in zip(SIDES, structures, strict=True) if structure.is_misfit]
     if drives is None:
@@ -35,6 +37,4 @@ def accuracy_warnings(structures: Sequence[ResidualStructure], drives: DriveUnce
         f"{name} camera: the camera model does not describe this camera: {structure}; {cost}{advice}"
         for name, structure in misfits
     ]
-    if not misfits and drives.length_part >= MISFIT_PART:
-        lines = [f"the images leave much open: {cost}; add pairs with the board near, tilted, and on all sides"]
-    return lines
+    return lines or [f"the images leave something open: {cost}; {missing}"]

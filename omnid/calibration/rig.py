@@ -33,6 +33,7 @@ from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_wa
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
 from omnid.calibration.images import Image, Images, brightest
+from omnid.calibration.missing_views import missing_views
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
 from omnid.calibration.rig_report import rig_report_html
@@ -56,6 +57,7 @@ class RigResult:
     images: PairedImages
     notes: tuple[str, ...]  # about repeated images, baseline, view, order of the cameras, and masks that are missing
     drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras were given
+    missing: str  # which pairs to add
 
     @property
     def is_misfit(self) -> bool:
@@ -68,7 +70,7 @@ class RigResult:
         """Limits of the result, one line each."""
         found = self.calibration
         return [
-            *accuracy_warnings([found.structure(side) for side in range(len(SIDES))], self.drives),
+            *accuracy_warnings([found.structure(side) for side in range(len(SIDES))], self.drives, self.missing),
             *found.shape.notes(found.board.points),
             *self.notes,
             *(f"left out {bad.name}: {bad.reason}" for bad in found.rejected),
@@ -152,14 +154,15 @@ def calibrate_rig(
         rejected += found.rejected
     found = replace(found, rejected=tuple(rejected))
     # 7. Compare the baseline with what it can be.
-    notes = _check_baseline(found, board, expected_baseline_m)
+    notes = [*images.notes, *_check_baseline(found, board, expected_baseline_m), *shown]
     # 8. Build the rig with masks and covariance, and predict the errors of drives.
     rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig) if refined else None
+    missing = missing_views(found.views, rig) if drives else ""
     if images.one_image is not None:
         rig = images.one_image.of_whole_image(rig)
-    return RigResult(rig, found, images, (*images.notes, *notes, *shown, *_order_notes(rig), *unmasked), drives)
+    return RigResult(rig, found, images, (*notes, *_order_notes(rig), *unmasked), drives, missing)
 
 
 def _read(
@@ -171,9 +174,7 @@ def _read(
     """Return the images of both cameras, or both views of the images of one; OmnidError if cameras do not fit them."""
     if areas is None:
         images = read_pairs(source, *topics)
-        if cameras is not None:
-            _require_sizes(images, cameras)
-        return images
+        return images if cameras is None else _of_sizes(images, cameras)
     if cameras is not None:
         raise OmnidError("calibrate rig: expected no camera files beside the areas of both views: they are fitted")
     named = sorted({topic for topic in topics if topic})
@@ -199,8 +200,8 @@ def _fit_rig(
     return selected.calibration
 
 
-def _require_sizes(images: PairedImages, cameras: GivenCameras) -> None:
-    """Raise OmnidError if known cameras are not those of the images."""
+def _of_sizes(images: PairedImages, cameras: GivenCameras) -> PairedImages:
+    """Return the images; raise OmnidError if known cameras are not those of them."""
     if sees_directly(cameras[0].camera) != sees_directly(cameras[1].camera):
         raise OmnidError(
             "calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
@@ -213,6 +214,7 @@ def _require_sizes(images: PairedImages, cameras: GivenCameras) -> None:
                 f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
                 f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera"
             )
+    return images
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:

@@ -25,6 +25,7 @@ import numpy as np
 import omnid
 from calib import se3
 from calib.boards.board import Board
+from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.drive import calibrate_drive
@@ -42,6 +43,8 @@ BOARD = Board(9, 6, 0.05)
 SENSOR = Sensor(noise_sigma=2.0)
 SIZE, PAIRS, DRIVE, ROOM = 768, 24, "two_walls", "rooms"
 DISTANCE_M = (0.3, 0.7)
+# Pairs that the hint of `calibrate rig` asks for (--high): where the upper image is near its rim.
+HIGH_SEED, HIGH_DISTANCE_M, HIGH_ELEVATION_DEG = 5000, (0.6, 0.8), (100.0, 125.0)
 REMARKS = (
     "24 pairs of a 9x6 board of 50 mm, 768 px, noise 2, JPEG; `calibrate rig` with all defaults; then a drive of 5 m "
     "with a turn of 94 degrees (99 pairs). Real mirrors: ray-traced, up to 1.5 % off shape, cameras tilted by 0.7 "
@@ -55,7 +58,17 @@ def board_rig(seed: int, amount: float) -> tuple[Rig, Rig]:
     return (with_real_mirrors(perfect, seed, amount) if amount else perfect), perfect
 
 
-def render_boards(seed: int, amount: float, folder: Path) -> None:
+def board_poses(perfect: Rig, seed: int, high: int) -> list[Array]:
+    """Return the poses T_rig_board (4, 4) of the pairs of a seed, and of so many with higher boards."""
+    poses = board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)
+    if high:
+        poses += board_poses_around_rig(
+            perfect, BOARD, high, seed=seed + HIGH_SEED, distance_m=HIGH_DISTANCE_M, elevation_deg=HIGH_ELEVATION_DEG
+        )
+    return poses
+
+
+def render_boards(seed: int, amount: float, folder: Path, high: int = 0) -> None:
     """Write pairs of images as lower_*.jpg, upper_*.jpg, and the true corners as corners.npy (pairs, 2, N, 2)."""
     if (folder / "corners.npy").exists():
         return
@@ -64,7 +77,7 @@ def render_boards(seed: int, amount: float, folder: Path) -> None:
     sides = (("lower", rig.lower), ("upper", rig.upper))
     renderers = {name: BoardRenderer(BOARD, mounted) for name, mounted in sides}
     corners = []
-    for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
+    for k, T in enumerate(board_poses(perfect, seed, high)):
         made = {name: one.render_board(T, seed=1000 * seed + k, sensor=SENSOR) for name, one in renderers.items()}
         for name, mounted in sides:
             jpeg = MountedSensor.of(SENSOR, mounted.visible, mounted.camera.size).jpeg(made[name].image)
@@ -145,6 +158,7 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--folder", type=Path, required=True)
     parser.add_argument("--amount", type=float, default=1.0, help="part of tilt and shape; 0: perfect mirrors")
     parser.add_argument("--drives", action="store_true", help="self-calibrate as well")
+    parser.add_argument("--high", type=int, default=0, help="further pairs in the outer part of the images")
     parser.add_argument("--only", choices=("boards", "drive"), help="render and stop")
     parser.add_argument("--options", nargs="*", default=[], help="further words for `calibrate rig`, like model=omni")
     args = parser.parse_args(arguments)
@@ -158,11 +172,13 @@ def main(arguments: Sequence[str]) -> int:
         Column("stated sigma of the length", "%", 3),
     )
     table = ResultTable("boards_chain", "calibration", "Boards, rig, drive", columns, REMARKS)
+    suffix = f"_high{args.high}" if args.high else ""
     mirrors = "real" if args.amount else "perfect"
     for seed in args.seeds:
         boards, log = (args.folder / f"{kind}_a{args.amount:g}_s{seed}" for kind in ("boards", "drive"))
+        boards = boards.with_name(boards.name + suffix)
         if args.only != "drive":
-            render_boards(seed, args.amount, boards)
+            render_boards(seed, args.amount, boards, args.high)
         if args.only != "boards":
             render_drive(DRIVE, seed, args.amount, log)
         if args.only:

@@ -23,6 +23,7 @@ import numpy as np
 from calib import se3
 from calib.boards.board import BoardView
 from calib.fit.boards.camera_selection import select_calibration
+from calib.fit.boards.rig_covariance import rig_covariance
 from calib.fit.boards.rig_fit import RigCalibration
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
@@ -33,7 +34,6 @@ from calib.fit.rig_uncertainty import (
     WALLS_M,
     drive_uncertainty,
     perturbed_rig,
-    rig_covariance,
 )
 from calib.models import wavefront
 from calib.models.camera import Array, OmniCamera

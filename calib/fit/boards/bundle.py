@@ -92,6 +92,7 @@ class BundleResult:
     T_cam_board: Array  # (K, 4, 4)
     residuals: Array  # (K, N, 2)
     covariance: Array  # (P, P), with the misfit of the model
+    cost: float = 0.0  # of the robust residuals and the prior [px^2]
     misfit_px: float = 0.0  # size of the smooth error of the model, most of which the parameters absorb
     board_steps: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of the modes of the board's shape
     board_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (S, S), with the misfit of the model
@@ -265,6 +266,7 @@ def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:
         state.poses,
         state.residuals,
         covariance[:P, :P],
+        problem.cost(state, problem.kernel_px),
         misfit_px,
         state.board_steps,
         covariance[P:, P:],

@@ -25,6 +25,7 @@ from calib.fit.boards.rig_problem import (
     rig_observations,
     rig_unknowns,
 )
+from calib.fit.boards.telecentric_mirror import TelecentricMirror
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array, OmniCamera
 
@@ -55,6 +56,7 @@ class RigCalibration:
     covariance: Array  # (P, P) of the cameras' parameters, if refined, and of T_upper_lower (as motion_sigma)
     rejected: tuple[RejectedView, ...] = ()
     shape: PrintShape = AS_DRAWN
+    telecentric: bool = False  # True if the cameras were fitted as mirrors below telecentric lenses
 
     @property
     def baseline_m(self) -> float:
@@ -88,12 +90,14 @@ def fit_rig(
     cameras: Sides,
     refined: bool = True,
     shape: PrintShape = AS_DRAWN,
+    telecentric: bool = False,
 ) -> RigCalibration:
     """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
 
     cameras: start values, or the fixed cameras if not refined. shape: start value of the print's shape, whose free
-    modes are fitted. The terms of real mirrors (MIRROR_NAMES) are fitted if a start value has a wavefront. Raises
-    CalibError if fewer than MIN_PAIRS pairs are consistent, or if the order of the board's corners is ambiguous.
+    modes are fitted. The terms of real mirrors (MIRROR_NAMES) are fitted if a start value has a wavefront, each for
+    itself or, if telecentric, as those of mirrors below telecentric lenses. Raises CalibError if fewer than MIN_PAIRS
+    pairs are consistent, or if the order of the board's corners is ambiguous.
     """
     # 1. Relative pose initialisation; inconsistent views are rejected.
     _require(sum(_is_pair(view) for view in views), "instants at which both cameras saw the board")
@@ -101,8 +105,8 @@ def fit_rig(
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
     good, T_lower_board = _reordered_views(views, initial, refined)
     # 2. Bundle adjustment, repeated without the views that fit much worse than the others.
-    printed = board, shape
-    fit, unknowns = _solve(good, printed, cameras, initial.T_upper_lower, T_lower_board, refined=refined)
+    printed, fitted = (board, shape), {"refined": refined, "telecentric": telecentric}
+    fit, unknowns = _solve(good, printed, cameras, initial.T_upper_lower, T_lower_board, **fitted)
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(fit)
         if not bad.any():
@@ -112,7 +116,7 @@ def fit_rig(
         _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
         found = unknowns.camera(fit.parameters)
         start = (found.lower, found.upper) if refined else cameras
-        fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], refined=refined)
+        fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], **fitted)
     if fit.mean_px > MAX_MEAN_PX:
         raise CalibError(
             f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
@@ -137,7 +141,7 @@ def refine_rig_calibration(
             for side, seen in enumerate(view.seen)
         )
         views.append(PairView(view.name, (lower, upper)))
-    again = fit_rig(views, found.board, cameras, refined, found.shape)
+    again = fit_rig(views, found.board, cameras, refined, found.shape, found.telecentric)
     return replace(again, rejected=found.rejected + again.rejected)
 
 
@@ -192,9 +196,10 @@ def _solve(
     T_lower_board: Array,
     *,
     refined: bool,
+    telecentric: bool,
 ) -> tuple[BundleResult, RigParameterisation]:
     """Adjust the cameras if refined, the transform between them, and a pose T_lower_board (K, 4, 4) for every view."""
-    unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, refined=refined)
+    unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, refined=refined, telecentric=telecentric)
     observed = rig_observations(good, printed)
     fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, observed, prior=unknowns.prior)
     return fit, unknowns
@@ -220,8 +225,14 @@ def rig_held_out_px(found: RigCalibration) -> float:
 
 
 def _unknowns_about(found: RigCalibration, *, refined: bool) -> RigParameterisation:
-    cameras = found.lower, found.upper
-    return rig_unknowns(found.board, cameras, found.T_upper_lower, found.fit.T_cam_board, refined=refined)
+    return rig_unknowns(
+        found.board,
+        (found.lower, found.upper),
+        found.T_upper_lower,
+        found.fit.T_cam_board,
+        refined=refined,
+        telecentric=found.telecentric,
+    )
 
 
 def _rig_calibration(
@@ -231,16 +242,14 @@ def _rig_calibration(
     unknowns: RigParameterisation,
     rejected: Sequence[RejectedView],
 ) -> RigCalibration:
-    found, (lower, upper, _) = unknowns.camera(fit.parameters), unknowns.ends
-    sigma = np.sqrt(np.maximum(0, np.diag(fit.covariance)))
-    parts = ((0, lower), (lower, upper))
+    found = unknowns.camera(fit.parameters)
+    J = unknowns.plain_by_steps(fit.parameters)
+    covariance = J @ fit.covariance @ J.T
+    sigmas = iter(np.sqrt(np.maximum(0, np.diag(covariance))).tolist())
     parameters = tuple(
-        tuple(side.values(fit.parameters[a:b], sigma[a:b])) if unknowns.refined else ()
-        for side, (a, b) in zip(unknowns.parameterisations, parts, strict=True)
+        tuple((name, value, next(sigmas)) for name, value in side) for side in unknowns.plain_values(fit.parameters)
     )
-    units = np.concatenate([*(side.units for side in unknowns.parameterisations if unknowns.refined), unknowns.units])
-    covariance = fit.covariance * np.outer(units, units)
-    motion = covariance[upper:, upper:]
+    motion = covariance[-6:, -6:]
     along = found.T_upper_lower[:3, 3] / np.linalg.norm(found.T_upper_lower[:3, 3])
     return RigCalibration(
         found.lower,
@@ -255,4 +264,5 @@ def _rig_calibration(
         covariance,
         tuple(rejected),
         printed[1].moved(fit.board_steps),
+        isinstance(unknowns.parameterisations[0], TelecentricMirror),
     )

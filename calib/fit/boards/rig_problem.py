@@ -6,21 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from calib import se3
 from calib.boards.board import CalibrationBoard
 from calib.boards.print_shape import PrintShape
 from calib.fit.boards.bundle import Observations, Prior
 from calib.fit.boards.relative_pose import ViewPair
+from calib.fit.boards.telecentric_mirror import RADIUS_NAME, TelecentricMirror
 from calib.fit.parameterisation import CameraParameterisation, parameterise
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, has_wavefront, project_near
 from calib.models.wavefront import WAVEFRONT_NAMES
 
-# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre.
-MIRROR_NAMES, MIRROR_SIGMA_STEPS = (*ASTIGMATISM_NAMES, *WAVEFRONT_NAMES), 1.0
+# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre, or by what a
+# TelecentricMirror says.
+MIRROR_NAMES, MIRROR_SIGMA_STEPS = (*ASTIGMATISM_NAMES, *WAVEFRONT_NAMES, RADIUS_NAME), 1.0
 # The lower and the upper camera.
 Sides = tuple[OmniCamera, OmniCamera]
+SideParameterisation = CameraParameterisation | TelecentricMirror
 # A board, and the shape of its print whose free modes are fitted.
 Printed = tuple[CalibrationBoard, PrintShape]
 
@@ -54,7 +58,7 @@ class PairCamera:
 class RigParameterisation:
     """Parameterisation of a rig: steps of both cameras, if they are refined, and of the transform between them."""
 
-    parameterisations: tuple[CameraParameterisation, CameraParameterisation]
+    parameterisations: tuple[SideParameterisation, SideParameterisation]
     refined: bool
     T_upper_lower: Array
     units: Array  # (6,) one step of the transform [m, rad]
@@ -87,19 +91,45 @@ class RigParameterisation:
             lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]), T_upper_lower, self.corners
         )
 
+    def plain_values(self, steps: Array) -> list[tuple[tuple[str, float], ...]]:
+        """Return names and values of the parameters of the lower and the upper camera at the steps; none if fixed."""
+        lower_end, upper_end, _ = self.ends
+        parts = (steps[:lower_end], steps[lower_end:upper_end]) if self.refined else ()
+        found = [
+            tuple(zip(side.names, side.plain_values(part).tolist(), strict=False))
+            for side, part in zip(self.parameterisations, parts, strict=False)
+        ]
+        return found or [(), ()]
+
+    def plain_by_steps(self, steps: Array) -> Array:
+        """Return the derivatives of the plain values and of the transform's twist [m, rad] by the steps."""
+        lower_end, upper_end, _ = self.ends
+        parts = (steps[:lower_end], steps[lower_end:upper_end]) if self.refined else ()
+        sides = [side.plain_by_steps(part) for side, part in zip(self.parameterisations, parts, strict=False)]
+        return np.asarray(scipy.linalg.block_diag(*sides, np.diag(self.units)))
+
 
 def rig_unknowns(
-    board: CalibrationBoard, cameras: Sides, T_upper_lower: Array, T_lower_board: Array, *, refined: bool
+    board: CalibrationBoard,
+    cameras: Sides,
+    T_upper_lower: Array,
+    T_lower_board: Array,
+    *,
+    refined: bool,
+    telecentric: bool,
 ) -> RigParameterisation:
     """Return the parameterisation about cameras, which stay as they are unless refined, and T_upper_lower.
 
-    T_lower_board (K, 4, 4): poses of the board, whose median distance gives the size of a step.
+    telecentric: cameras are refined as mirrors below telecentric lenses. T_lower_board (K, 4, 4): poses of the board, whose median distance gives the size of a step.
     """
     lower, upper = cameras
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
     # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
     units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)
-    sides = [parameterise(camera, wavefront=has_wavefront(camera)) for camera in (lower, upper)]
+    sides = [
+        TelecentricMirror.about(camera) if telecentric else parameterise(camera, wavefront=has_wavefront(camera))
+        for camera in (lower, upper)
+    ]
     return RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
 
 

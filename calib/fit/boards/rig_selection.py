@@ -26,6 +26,10 @@ RADII = 60
 START_M, START_TANGENTIAL = 1e-9, (1e-12, 1e-12)
 # The more general rig is selected if its held-out error is lower by this part. By judgement; not measured.
 MIN_IMPROVEMENT = 0.01
+# Mirrors below telecentric lenses are selected if their cost is larger by less, in variances of a coordinate: the sum
+# of squares of ten normal values, of the five terms of both wavefronts, is larger once in twenty times. Ray-traced
+# paraboloids had 5, hyperboloids of xi = 0.97 had 23 with twelve pairs.
+MAX_MORE_VARIANCES = 18.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +73,31 @@ def select_rig(
         general = fit_rig(central.views, board, (mirror_start(mirrors[0]), mirror_start(mirrors[1])), shape=shape)
     except (CalibError, np.linalg.LinAlgError):
         return SelectedRig(central, (_score("central cameras", central, np.nan),))
+    general = telecentric_if_as_good(general)
     if not _may_be_better(central, general):
-        scores = (_score("central cameras", central, np.nan), _score("non-central cameras", general, np.nan))
+        scores = (_score("central cameras", central, np.nan), _score(_name(general), general, np.nan))
         return SelectedRig(central, scores)
     scores = (
         _score("central cameras", central, rig_held_out_px(central)),
-        _score("non-central cameras", general, rig_held_out_px(general)),
+        _score(_name(general), general, rig_held_out_px(general)),
     )
     if scores[1].held_out_px < (1 - MIN_IMPROVEMENT) * scores[0].held_out_px:
         return SelectedRig(replace(general, rejected=(*central.rejected, *general.rejected)), scores[::-1])
     return SelectedRig(central, scores)
+
+
+def telecentric_if_as_good(general: RigCalibration) -> RigCalibration:
+    """Return the rig of mirrors below telecentric lenses if that explains the corners as well, else the one given."""
+    try:
+        found = fit_rig(
+            general.views, general.board, (general.lower, general.upper), shape=general.shape, telecentric=True
+        )
+    except (CalibError, np.linalg.LinAlgError):
+        return general
+    freedom = 2 * int(np.isfinite(general.fit.errors_px).sum()) - len(general.fit.parameters) - 6 * len(general.views)
+    more = (found.fit.cost - general.fit.cost) / (general.fit.cost / max(1, freedom))
+    is_as_good = len(found.views) == len(general.views) and more < MAX_MORE_VARIANCES
+    return replace(found, rejected=general.rejected) if is_as_good else general
 
 
 def mirror_start(camera: OcamCamera) -> OcamCamera:
@@ -106,6 +125,10 @@ def _may_be_better(central: RigCalibration, general: RigCalibration) -> bool:
     more = len(general.fit.parameters) - len(central.fit.parameters)
     count = 2 * int(np.isfinite(general.fit.errors_px).sum())
     return len(general.views) >= len(central.views) and squares[1] < squares[0] * (1 - 2 * max(0, more) / count)
+
+
+def _name(general: RigCalibration) -> str:
+    return "cameras below paraboloids" if general.telecentric else "non-central cameras"
 
 
 def _score(name: str, found: RigCalibration, held_out: float) -> RigScore:

@@ -15,11 +15,11 @@ NOISE, MISFIT = ResidualStructure(0.01, 0.2), ResidualStructure(0.14, 0.2)
 
 def lines(scale: float | None, *structures: ResidualStructure) -> list[str]:
     drives = None if scale is None else DriveUncertainty(scale, math.radians(0.01))
-    return accuracy_warnings(structures, drives)
+    return accuracy_warnings(structures, drives, "add 6 pairs with the board higher")
 
 
-def test_a_misfit_that_costs_nothing_is_no_warning() -> None:
-    assert lines(0.0005, MISFIT, MISFIT) == [] and lines(0.001, NOISE, NOISE) == []
+def test_what_costs_nothing_is_no_warning() -> None:
+    assert lines(0.0005, MISFIT, MISFIT) == [] and lines(0.0005, NOISE, NOISE) == []
 
 
 @pytest.mark.parametrize(("scale", "part"), [(0.001, "0.2 %"), (0.0015, "0.3 %"), (0.01, "2 %")])
@@ -30,9 +30,11 @@ def test_a_misfit_is_named_by_what_it_costs(scale: float, part: str) -> None:
     assert line.endswith("do not use it where that matters") == (scale >= 0.0015)
 
 
-def test_noise_that_costs_as_much_asks_for_more_images() -> None:
-    (line,) = lines(0.002, NOISE, NOISE)
-    assert line.startswith("the images leave much open: drives may be wrong by 0.4 %") and "add pairs" in line
+@pytest.mark.parametrize(("scale", "part"), [(0.0006, "0.12 %"), (0.002, "0.4 %")])
+def test_noise_that_costs_more_than_a_thousandth_says_which_views_are_missing(scale: float, part: str) -> None:
+    (line,) = lines(scale, NOISE, NOISE)
+    assert line.startswith(f"the images leave something open: drives may be wrong by {part}")
+    assert line.endswith("; add 6 pairs with the board higher")
 
 
 def test_given_cameras_are_judged_by_their_residuals() -> None:
