@@ -1,4 +1,4 @@
-"""Which boards a calibration of a rig lacks: where a drive looks and no board was."""
+"""Boards that a calibration of a rig lacks: where a drive looks and none was."""
 
 from __future__ import annotations
 

@@ -120,7 +120,8 @@ def rig_unknowns(
 ) -> RigParameterisation:
     """Return the parameterisation about cameras, which stay as they are unless refined, and T_upper_lower.
 
-    telecentric: cameras are refined as mirrors below telecentric lenses. T_lower_board (K, 4, 4): poses of the board, whose median distance gives the size of a step.
+    telecentric: they are refined as mirrors below telecentric lenses. T_lower_board (K, 4, 4): poses of the board,
+    whose median distance gives the size of a step.
     """
     lower, upper = cameras
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))

@@ -1,4 +1,4 @@
-"""Which views are missing: the camera whose boards do not reach the elevations of a drive, and where to hold them."""
+"""Views that are missing: the camera whose boards do not reach the elevations of a drive, and where to hold them."""
 
 from __future__ import annotations
 
