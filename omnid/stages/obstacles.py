@@ -16,9 +16,10 @@ from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.floor import Floor
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.column import FOCAL_PX, NEAREST_M, Columns, floor_plane
+from omnid.core.obstacles.column import NEAREST_M, Columns, floor_plane
 from omnid.core.obstacles.grid import ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.pair_views import FOCAL_PX
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas

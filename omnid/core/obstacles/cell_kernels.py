@@ -31,6 +31,9 @@ LIMIT: Final = np.float32(6.0)  # Limit of all log-odds: a change is believed af
 FLOOR_LOW: Final = np.float32(
     -3.0
 )  # Least log-odds of the floor: what was hidden for long is free again after few pairs.
+# Least log-odds against an edge: it stays where it is. With -3, three pairs in which ribs beyond it fit as floor by
+# another period outweighed all those before.
+EDGE_LOW: Final = np.float32(-12.0)
 TAKEN_ODDS: Final = np.float32(0.0)  # Log-odds of a surface from which a cell is occupied.
 # Of the floor, of a cell and a pair: the errors of pairs that follow each other are alike, so that a few count.
 MOST_RATIO: Final = np.float32(3.0)
@@ -176,7 +179,7 @@ def add_pair(
         add_shown(floor, beside[i], surface_shown[i], weights[2], shown[at, row])
         add_floor(floor, surface, lost[at, row], usual[at, row], weight, odds[FLOOR, at, row])
         add_bounded(cells[ABOVE, i], weight, MOST_RATIO, FLOOR_LOW, LIMIT, odds[ABOVE, at, row])
-        add_bounded(cells[BELOW, i], weight, MOST_RATIO, FLOOR_LOW, LIMIT, odds[BELOW, at, row])
+        add_bounded(cells[BELOW, i], weight, MOST_RATIO, EDGE_LOW, LIMIT, odds[BELOW, at, row])
         add_surface(floor, surface, weights, odds[SURFACE, at, row])
         add_bounded(lost[at, row], -weight, MOST_VISIBLE, LEAST_VISIBLE, VISIBLE_PRIOR, odds[VISIBLE, at, row])
         for j in range(size):

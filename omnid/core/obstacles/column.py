@@ -4,7 +4,7 @@ An epipolar line is a column, so each direction is a problem of its own, whose f
 the row. Each patch of a column is explained by one disparity. Where there is no texture all of them are as likely, and
 the logarithm of the ratio is 0. README.md has the equations.
 
-Panoramas are brought to one working size, so that no parameter depends on the size of the images.
+Panoramas are brought to one working size (pair_views.py), so that no parameter depends on the size of the images.
 """
 
 from __future__ import annotations
@@ -12,14 +12,13 @@ from __future__ import annotations
 import math
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles import column_kernels as kernels
-from omnid.core.obstacles import panorama_kernels as panoramas
+from omnid.core.obstacles.pair_views import DIRECTIONS, FOCAL_PX, UNITS, Views, WorkingPanoramas
 from omnid.core.obstacles.surface_kernels import surface_evidence
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -33,16 +32,7 @@ Tables = NDArray[np.int32]
 # narrower, and the robot sees past them as it moves.
 UNSEEN_RUN: Final = 20
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
-DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
-FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian: that of images of 512 px
 FLOOR_FOCAL_PX: Final = 100.0  # rows of panoramas in a radian: with 104 all of 4 goals were reached, with 87 not
-FINE_PX: Final = 0.8  # sigmas of the band-pass along columns
-COARSE_ROWS: Final = 17  # Rows of the coarse mean, which is taken twice: like a sigma of 7 rows.
-TEXTURE_SHARE: Final = 0.3  # Difference between two views of a surface, by the local contrast; noise is added to it.
-CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
-BAND_NOISE: Final = 0.5  # noise of the band-pass, as a share of a panorama's
-UNITS: Final = 12.0  # Units of a normalised image in one sigma.
-ZERO: Final = 128.5  # level of a normalised image where there is no texture, and half a level to round
 LEAST_SEEN: Final = 0.5  # Share of the rows of a patch that must be in view. By judgement; not measured.
 OUTLIER: Final = np.uint8(48)  # Most units by which a pixel differs; a larger difference counts as this one.
 DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 would be that of independent pixels
@@ -58,8 +48,6 @@ DEEP_STEP_PX: Final = 0.375  # Step between planes deep below the floor: one tha
 DEEP_NOISE: Final = 10.0
 EVEN_SHARE: Final = 0.33  # Share of the least height and fall by which a floor is uneven: two more planes are floor.
 LEVEL_RATIO: Final = 1.5  # log-likelihood by a sigma: that of single directions by three that are no more alike
-NEAR_M: Final = 1.15  # nearer than this on the floor, a direction is as wide there: mirrors show less detail
-NEAR_SHARE: Final = 0.3  # Share of the ratio that a difference over four times as many columns adds.
 ADJACENT_PX: Final = 4.0  # An object often hides the floor near itself: decay of the prior with the disparity ...
 DISTANT_SHARE: Final = 0.1  # ... and the share of the prior that is left far away.
 STRIP_ROWS, STRIP_OVERLAP = 4, 2  # Rows of a strip of a surface, and rows that two strips share.
@@ -87,16 +75,6 @@ class ColumnEvidence(NamedTuple):
     shown: Flags  # (DIRECTIONS,) that show anything: what hides others is wide
 
 
-class _Views(NamedTuple):
-    """Normalised panoramas (H, DIRECTIONS) of a pair, as the kernels compare them."""
-
-    lower: Bytes
-    upper: Bytes
-    upright: Bytes  # (2, H, DIRECTIONS) least and most of the upper one within half a row of each pixel
-    plane: Bytes  # the same of the upper one on the plane of the floor
-    live: Bytes  # 255 where pixels may be compared, else 0
-
-
 def floor_plane(T_rect_floor: Array) -> FloorPlane:
     """Return the floor's plane z = 0 of a level frame, from which T_rect_floor (4, 4) leads to the rectified one."""
     T = se3.inverse(T_rect_floor)
@@ -119,25 +97,18 @@ class Columns:
         and farthest; visible (H, W): pixels of a panorama that both cameras see."""
         self._baseline_m, self._plane, self._heights_m = baseline_m, plane, heights_m
         self._floor_slope = baseline_m / plane.height_m
-        # A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others nothing is seen.
-        self._shown = (
-            np.arange(DIRECTIONS * cylinder.width // cylinder.turn_px) + DIRECTIONS * cylinder.first // cylinder.turn_px
-        ) % DIRECTIONS
-        self._height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
-        self._row0 = (cylinder.row0 + 0.5) * self._height / cylinder.height - 0.5
+        self._panoramas = WorkingPanoramas(cylinder, (plane.a, plane.b), self._floor_slope)
+        self._height, self._row0 = self._panoramas.height, self._panoramas.row0
+        self._plane_rows = self._panoramas.plane_rows
         self.at_1m = FOCAL_PX * baseline_m  # disparity
         self.bins = math.ceil(self.at_1m / ranges_m[0])
         self._first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))
-        self._visible = self._working(visible * np.uint8(255)) > 127
+        self._visible = self._panoramas.sized(visible * np.uint8(255)) > 127
         self._live = self._visible * np.uint8(255)
-        in_view = self._visible[:, self._shown].mean(axis=1)
+        in_view = self._visible[:, self._panoramas.shown].mean(axis=1)
         self._first_row, self._last_row = (int(row) for row in np.flatnonzero(in_view > 0.5)[[0, -1]])
         self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
-        self._maps = self._made_maps()
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
-        rows = np.arange(self._height)
-        self._plane_rows = (rows + self._floor_slope * np.maximum(rows - self._row0, 0.0)).astype(np.float32)
-        self._plane_steps = np.rint(self._plane_rows * panoramas.STEPS_PER_ROW).astype(np.int32)
         self._offsets = self._made_offsets()
         self._leave_out_cut_planes()
         self._prior = np.exp(-np.arange(self.bins) / ADJACENT_PX).astype(np.float32) + np.float32(DISTANT_SHARE)
@@ -147,33 +118,23 @@ class Columns:
 
     def evidence(self, lower: PaddedPanorama, upper: PaddedPanorama, lost: Flags | None = None) -> ColumnEvidence:
         """Return the evidence of a pair; lost (H, W): pixels that are no evidence, None: all in view are."""
-        # 1. Normalised panoramas, the upper one with the bounds of half a row about each pixel.
-        noise = BAND_NOISE * max(lower.noise_grey, upper.noise_grey)
-        one, two = self._normalised(lower, noise), self._normalised(upper, noise)
-        if self._plane.a or self._plane.b:
-            one, two = self._levelled(one), self._levelled(two)
         live = self._live
         if lost is not None:
-            live = np.where(self._working(lost * np.uint8(255)) == 0, live, np.uint8(0))
-        upright, plane = np.empty((2, 2, *two.shape), np.uint8)
-        panoramas.bounds(two, upright)
-        panoramas.bounds_on_plane(two, self._plane_steps, plane)
-        views = _Views(one, two, upright, plane, live)
-        # 2. Each explanation against all others.
-        ratios = self._floor(views), self._surface(views), self._level(views)
+            live = np.where(self._panoramas.sized(lost * np.uint8(255)) == 0, live, np.uint8(0))
+        surfaces, floor = self._panoramas.views(lower, upper, live)
+        ratios = self._floor(floor), self._surface(surfaces), self._level(floor)
         return ColumnEvidence(*ratios, self.nearest_floor_m, ~self._unseen)
 
-    def _floor(self, views: _Views) -> Floats:
+    def _floor(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (K, DIRECTIONS) of the floor against all other disparities."""
         others, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
-        near = np.float32(NEAR_SHARE) * scale
         compared = views.lower, views.upright, views.plane, views.live
-        kernels.floor_evidence(*compared, self._floor_bins, OUTLIER, scale, near, self._prior, others)
+        kernels.floor_evidence(*compared, self._floor_bins, OUTLIER, scale, self._prior, others)
         floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
         floor[~self._compared] = np.nan
         return floor
 
-    def _surface(self, views: _Views) -> Floats:
+    def _surface(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (K, DIRECTIONS) of the best run of rows, where k fits best."""
         surface, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
         limits = np.float32(FLOOR_WEIGHT), np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
@@ -181,7 +142,7 @@ class Columns:
         surface_evidence(*compared, self._strips, OUTLIER, scale, *limits, surface)
         return surface
 
-    def _level(self, views: _Views) -> Floats:
+    def _level(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (2, K, DIRECTIONS) of the floor against planes just above and below it."""
         level, scale = np.empty((2, self.bins, DIRECTIONS), np.float32), np.float32(LEVEL_RATIO / 64 / UNITS)
         compared = views.lower, views.upper, self._plane_rows, views.live
@@ -189,40 +150,9 @@ class Columns:
         kernels.level_evidence(*compared, self._floor_bins, self._offsets, OUTLIER, scale, noise, level)
         return level
 
-    def _working(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
-        shown = cv2.resize(image, (len(self._shown), self._height), interpolation=cv2.INTER_AREA)
-        if len(self._shown) == DIRECTIONS:
-            return np.asarray(shown, np.uint8)
-        whole = np.zeros((self._height, DIRECTIONS), np.uint8)
-        whole[:, self._shown] = shown
-        return whole
-
-    def _normalised(self, panorama: PaddedPanorama, noise_grey: float) -> Bytes:
-        """Return the panorama less its mean along columns, in units of what two views of it differ by."""
-        image = self._working(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
-        smooth = cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX)
-        into = np.empty(smooth.shape, np.uint8)
-        limits = TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO
-        panoramas.normalise(np.asarray(smooth, np.float32), COARSE_ROWS, CONTRAST_ROWS, *limits, into)
-        return into
-
-    def _levelled(self, image: Bytes) -> Bytes:
-        """Return a panorama in which the floor's horizon is level."""
-        return np.asarray(cv2.remap(image, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
-
-    def _made_maps(self) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-        """Return the maps to a panorama in which the floor's horizon is level."""
-        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
-        tilt = self._plane.a * np.cos(azimuth) + self._plane.b * np.sin(azimuth)
-        rows = np.arange(self._height)[:, None]
-        columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self._height, DIRECTIONS))
-        places, shares = cv2.convertMaps(columns, (rows - FOCAL_PX * tilt).astype(np.float32), cv2.CV_16SC2)
-        return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
-
     def _made_floor_bins(self) -> Tables:
         """Return the table of kernels.floor_evidence."""
-        table = np.zeros((self.bins, 7), np.int32)
+        table = np.zeros((self.bins, 6), np.int32)
         for k in range(self._first_bin, self.bins):
             first, end = (math.ceil(self._row0 + n / self._floor_slope) for n in (k, k + 1))
             middle = self._floor_slope * ((first + end - 1) / 2 - self._row0)
@@ -237,7 +167,6 @@ class Columns:
                 math.floor(middle - FLOOR_PX),
                 math.ceil(middle + FLOOR_PX),
                 last,
-                self.at_1m / (k + 0.5) < NEAR_M,
             )
         return table
 

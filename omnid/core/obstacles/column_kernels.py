@@ -21,7 +21,7 @@ LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 # exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
-FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO, FLOOR_NEAR = 0, 1, 2, 3, 4, 5, 6
+FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO = 0, 1, 2, 3, 4, 5
 
 
 @inner
@@ -150,7 +150,7 @@ def level_evidence(
 
 
 @compiled(
-    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4[::1], f4[:, ::1])",
+    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4[::1], f4[:, ::1])",
     writes=("others",),
 )
 def floor_evidence(
@@ -161,7 +161,6 @@ def floor_evidence(
     bins: Numbers,
     outlier: np.uint8,
     scale: np.float32,
-    near_scale: np.float32,
     prior: Floats,
     others: Floats,
 ) -> None:
@@ -169,17 +168,16 @@ def floor_evidence(
 
     lower (H, W): normalised lower panorama; upright, plane (2, H, W): least and most of the upper one about each pixel,
     and on the plane of the floor. live (H, W): 255 where pixels may be compared, else 0.
-    bins (K, 7): first row and end of the rows of the floor at that disparity, 0 and 0 for none; of the disparities the
-    first, the last that is lower than the floor, the first that is higher, and the end; 1 where neighbouring directions
-    count, too.
-    outlier: most that a pixel differs; scale: logarithm of the likelihood by a unit of difference;
-    near_scale: where neighbours count. prior: weight of a disparity by its difference from the floor's.
+    bins (K, 6): first row and end of the rows of the floor at that disparity, 0 and 0 for none; of the disparities the
+    first, the last that is lower than the floor, the first that is higher, and the end.
+    outlier: most that a pixel differs; scale: logarithm of the likelihood by a unit of difference; prior: weight of a
+    disparity by its difference from the floor's.
     """
     width, deepest = lower.shape[1], 0
     for k in range(len(bins)):
         deepest = max(deepest, bins[k, FLOOR_TO])
     sums, floor = np.zeros((deepest + 1, width), np.uint16), np.zeros(width, np.uint16)
-    value, wide, wide_floor = np.empty(width, np.float32), np.empty(width, np.uint16), np.empty(width, np.uint16)
+    value = np.empty(width, np.float32)
     others[:] = ONE
     for k in range(len(bins)):
         first, end, low, high = bins[k, FLOOR_FIRST], bins[k, FLOOR_END], bins[k, FLOOR_LOW], bins[k, FLOOR_HIGH]
@@ -194,14 +192,9 @@ def floor_evidence(
                     add_differences(lower[v], upright[0, v + d], upright[1, v + d], live[v], outlier, sums[d])
         others[k] = NOTHING
         weights = NOTHING
-        spread(floor, wide_floor)
         for d in range(begin, last):
             if d <= low or d >= high:
-                if bins[k, FLOOR_NEAR] > 0:
-                    spread(sums[d], wide)
-                    likelihoods(wide, wide_floor, near_scale, value)
-                else:
-                    likelihoods(sums[d], floor, scale, value)
+                likelihoods(sums[d], floor, scale, value)
                 add(value, prior[abs(d - k)], others[k])
                 weights += prior[abs(d - k)]
         for u in range(width):

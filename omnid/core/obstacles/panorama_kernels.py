@@ -1,4 +1,4 @@
-"""Compiled loops over panoramas: normalised ones, and the bounds of half a row about each pixel.
+"""Compiled loops over panoramas: band-passes, normalised ones, and the bounds of half a row about each pixel.
 
 Means over rows are sums of 64 bits that go on from row to row, and rows beyond a border are those mirrored at it, as in
 OpenCV, with the same results.
@@ -50,6 +50,40 @@ def row_means(image: Floats, rows: int, sums: Doubles, into: Floats) -> None:
             sums[u] = total - old[u]
 
 
+@compiled("(f4[:, ::1], i8, f4[:, ::1])", writes=("band",))
+def band_pass(smooth: Floats, rows: int, band: Floats) -> None:
+    """Write an image (H, W) less its mean along columns, over an odd number of rows and taken twice."""
+    once, sums = np.empty_like(smooth), np.empty(smooth.shape[1], np.float64)
+    row_means(smooth, rows, sums, once)
+    row_means(once, rows, sums, band)
+    for v in range(len(band)):
+        mine, band_row = smooth[v], band[v]
+        for u in range(len(band_row)):
+            band_row[u] = mine[u] - band_row[u]
+
+
+@inner
+def add_bounded(mine: Floats, other: Floats, most: np.float32, sums: Floats) -> None:
+    """Add to sums (W,) by how much a row exceeds another one, at most `most` either way."""
+    for u in range(len(sums)):
+        above = mine[u] - other[u]
+        above = above if above < most else most
+        sums[u] += above if above > -most else -most
+
+
+@compiled("(f4[:, ::1], i8, f4, f4[:, ::1])", writes=("band",))
+def bounded_band_pass(smooth: Floats, rows: int, most: np.float32, band: Floats) -> None:
+    """Write by how much the pixels of an image (H, W) exceed those of their column, in the mean of an odd number of
+    rows, of which each counts `most` at most: a strong edge hides no weak texture around it."""
+    height, half = len(smooth), rows // 2
+    for v in range(height):
+        band[v] = NOTHING
+        for other in range(v - half, v + half + 1):
+            add_bounded(smooth[v], smooth[mirrored(other, height)], most, band[v])
+        for u in range(band.shape[1]):
+            band[v, u] /= np.float32(rows)
+
+
 @inner
 def add_three(row: Floats, sums: Doubles) -> None:
     """Add to sums (W,) those of three neighbours of a row (W + 2,)."""
@@ -58,41 +92,34 @@ def add_three(row: Floats, sums: Doubles) -> None:
 
 
 @inner
-def squares(smooth: Floats, coarse: Floats, into: Floats) -> None:
-    """Write the squares (W + 2,) of the difference of two rows (W,), mirrored at both ends."""
-    width = len(smooth)
+def squares(band: Floats, into: Floats) -> None:
+    """Write the squares (W + 2,) of a row (W,), mirrored at both ends."""
+    width = len(band)
     for u in range(width):
-        band = smooth[u] - coarse[u]
-        into[u + 1] = band * band
+        into[u + 1] = band[u] * band[u]
     into[0], into[width + 1] = into[2], into[width - 1]
 
 
-@compiled("(f4[:, ::1], i8, i8, f4, f4, f4, f4, u1[:, ::1])", writes=("into",))
-def normalise(
-    smooth: Floats, coarse_rows: int, rows: int, share2: float, noise2: float, units: float, zero: float, into: Bytes
-) -> None:
-    """Write a panorama (H, W) less its mean along columns, in units of what two views of it differ by.
+@compiled("(f4[:, ::1], i8, f4, f4, f4, f4, u1[:, ::1])", writes=("into",))
+def normalise(band: Floats, rows: int, share2: float, noise2: float, units: float, zero: float, into: Bytes) -> None:
+    """Write a band-pass (H, W) in units of what two views of it differ by.
 
-    coarse_rows: of the mean, which is taken twice; rows: of the contrast. The difference of two views has the variance
-    share2 * contrast^2 + noise2; zero: level without texture, units: levels in one sigma.
+    rows: of its contrast. The difference of two views has the variance share2 * contrast^2 + noise2; zero: level
+    without texture, units: levels in one sigma.
     """
-    height, width = smooth.shape
-    once, coarse, sums = np.empty_like(smooth), np.empty_like(smooth), np.empty(width, np.float64)
-    row_means(smooth, coarse_rows, sums, once)
-    row_means(once, coarse_rows, sums, coarse)
-    band2 = np.empty((height, width + 2), np.float32)
+    height, width = band.shape
+    band2, sums = np.empty((height, width + 2), np.float32), np.zeros(width, np.float64)
     for v in range(height):
-        squares(smooth[v], coarse[v], band2[v])
+        squares(band[v], band2[v])
     half, scale = rows // 2, 1.0 / (3 * rows)
-    sums[:] = 0.0
     for v in range(-half, half):
         add_three(band2[mirrored(v, height)], sums)
     for v in range(height):
         add_three(band2[mirrored(v + half, height)], sums)
-        fine, mean, found = smooth[v], coarse[v], into[v]
+        mine, found = band[v], into[v]
         for u in range(width):
             contrast2 = np.float32(sums[u] * scale)
-            level = (fine[u] - mean[u]) * units / np.float32(math.sqrt(contrast2 * share2 + noise2)) + zero
+            level = mine[u] * units / np.float32(math.sqrt(contrast2 * share2 + noise2)) + zero
             level = level if level > NOTHING else NOTHING
             found[u] = np.uint8(np.int32(level if level < GREYEST else GREYEST))
         old = band2[mirrored(v - half, height)]

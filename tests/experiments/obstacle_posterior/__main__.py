@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import Config
 from omnid.core.mapping.range_scan import azimuths
-from omnid.core.obstacles.column import FOCAL_PX, NEAREST_M, Columns, floor_plane
+from omnid.core.obstacles.column import NEAREST_M, Columns, floor_plane
 from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
 from omnid.core.obstacles.grid_ring import GridRing
+from omnid.core.obstacles.pair_views import FOCAL_PX
 from omnid.core.obstacles.settings import RingSettings
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import FramePair, Panoramas

@@ -33,6 +33,11 @@ def worn(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     )
 
 
+def worn_with_line(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of such a floor with a white line of 10 cm around the robot, 1.5 m away."""
+    return np.where(np.abs(np.hypot(x_m, y_m) - 1.55) < 0.05, 230.0, worn(x_m, y_m))
+
+
 def ribbed(x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
     """Return grey levels of ribs of 11 cm that are all alike, across each direction."""
     return np.asarray(120.0 + 50.0 * np.sign(np.sin(math.tau * np.hypot(x_m, y_m) / 0.11)))

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnid.core.obstacles.column import DIRECTIONS, NEAREST_M, ColumnEvidence, Columns, floor_plane
+from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
+from omnid.core.obstacles.pair_views import DIRECTIONS
 from omnid.core.obstacles.surface_kernels import PART
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
@@ -19,6 +20,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     stains,
     striped,
     worn,
+    worn_with_line,
 )
 
 WALL_M = 2.0
@@ -61,6 +63,14 @@ def test_floor_of_weak_texture_is_weak_evidence_for_the_floor(columns: Columns) 
     """Stains of 3 grey levels with noise of 1 say less than strong ones, and the right thing."""
     weak, strong = (floor_at(columns, evidence(columns, floor, striped), 1.1, 1.6) for floor in (worn, stains))
     assert 1.0 < weak.mean() < 0.8 * strong.mean() and (weak < -1).mean() < 0.01
+
+
+def test_a_line_painted_on_the_floor_hides_no_weak_texture_around_it(columns: Columns) -> None:
+    """Before and behind the line the evidence is that of the floor without it."""
+    bare, painted = (evidence(columns, floor, striped) for floor in (worn, worn_with_line))
+    for near_m, far_m in ((1.2, 1.4), (1.65, 1.8)):
+        without, beside = (floor_at(columns, found, near_m, far_m) for found in (bare, painted))
+        assert beside.mean() > 0.75 * without.mean() > 0.75
 
 
 def test_plain_wall_and_plain_floor_are_no_evidence(columns: Columns) -> None:

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 import pytest
 
-from omnid.core.obstacles.column import DIRECTIONS
 from omnid.core.obstacles.grid_kernels import gather
+from omnid.core.obstacles.pair_views import DIRECTIONS
 
 AT_1M: Final = 8.0  # disparity
 CELL_M: Final = 0.1

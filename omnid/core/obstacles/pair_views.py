@@ -1,0 +1,124 @@
+"""Panoramas of a pair in one working size, in units of what two views of one place differ by.
+
+Matching compares a pixel with what another view shows there, so an image is given by how it differs from its column
+around: of surfaces by a band-pass, and of the floor by one in which no strong edge hides the weak texture next to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.panorama import Cylinder
+from omnid.core.obstacles import panorama_kernels as kernels
+from omnid.core.types.panorama import PaddedPanorama
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+BandPass = Callable[[Floats, float], Floats]  # of a smooth panorama, and the noise [grey levels]
+
+DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
+FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian: that of images of 512 px
+FINE_PX: Final = 0.8  # Sigma of the smoothing along columns, because views differ by parts of a row.
+COARSE_ROWS: Final = 17  # Rows of the coarse mean, which is taken twice: like a sigma of 7 rows.
+TEXTURE_SHARE: Final = 0.3  # Difference between two views of a surface, by the local contrast; noise is added to it.
+CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
+BAND_NOISE: Final = 0.5  # Noise of a smooth image by that of a panorama, because the mean of some rows has less.
+UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
+ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
+NEAR_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
+# Most that one of them counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
+# texture of the floor around it. With 5 to 20 bases passed such a line; with no limit they stood before it.
+NEAR_SIGMAS: Final = 10.0
+
+
+class Views(NamedTuple):
+    """Normalised panoramas (H, DIRECTIONS) of a pair, as the kernels compare them."""
+
+    lower: Bytes
+    upper: Bytes
+    upright: Bytes  # (2, H, DIRECTIONS) least and most of the upper one within half a row of each pixel
+    plane: Bytes  # the same of the upper one on the plane of the floor
+    live: Bytes  # 255 where pixels may be compared, else 0
+
+
+class WorkingPanoramas:
+    """Brings panoramas to the working size, with the floor's horizon level."""
+
+    def __init__(self, cylinder: Cylinder, tilt: tuple[float, float], floor_slope: float) -> None:
+        """tilt: slopes of the floor in the rectified frame; floor_slope: change of its disparity from row to row."""
+        # A sector has a whole number of directions (calib.panorama.SECTOR_STEPS); in the others nothing is seen.
+        self.shown = (
+            np.arange(DIRECTIONS * cylinder.width // cylinder.turn_px) + DIRECTIONS * cylinder.first // cylinder.turn_px
+        ) % DIRECTIONS
+        self.height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
+        self.row0 = (cylinder.row0 + 0.5) * self.height / cylinder.height - 0.5
+        rows = np.arange(self.height)
+        self.plane_rows = (rows + floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
+        self._plane_steps = np.rint(self.plane_rows * kernels.STEPS_PER_ROW).astype(np.int32)
+        self._maps = self._made_maps(*tilt) if any(tilt) else None
+
+    def sized(self, image: Bytes) -> Bytes:
+        """Return a panorama (H, W) in the working size of a full turn, 0 in directions that it does not show."""
+        shown = cv2.resize(image, (len(self.shown), self.height), interpolation=cv2.INTER_AREA)
+        if len(self.shown) == DIRECTIONS:
+            return np.asarray(shown, np.uint8)
+        whole = np.zeros((self.height, DIRECTIONS), np.uint8)
+        whole[:, self.shown] = shown
+        return whole
+
+    def views(self, lower: PaddedPanorama, upper: PaddedPanorama, live: Bytes) -> tuple[Views, Views]:
+        """Return the views of a pair for surfaces, and for the floor; live (H, DIRECTIONS): 255 where it is seen."""
+        noise_grey = BAND_NOISE * max(lower.noise_grey, upper.noise_grey)
+        images = self._smooth(lower), self._smooth(upper)
+        surfaces, floor = (self._views(*images, noise_grey, band, live) for band in (_band_pass, _bounded_band_pass))
+        return surfaces, floor
+
+    def _smooth(self, panorama: PaddedPanorama) -> Floats:
+        """Return a panorama (H, DIRECTIONS) in the working size, smoothed along columns."""
+        image = self.sized(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
+        return np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
+
+    def _views(self, lower: Floats, upper: Floats, noise_grey: float, band_pass: BandPass, live: Bytes) -> Views:
+        """Return the views of two smooth panoramas (H, DIRECTIONS)."""
+        one, two = (self._normalised(band_pass(image, noise_grey), noise_grey) for image in (lower, upper))
+        upright, plane = np.empty((2, 2, *two.shape), np.uint8)
+        kernels.bounds(two, upright)
+        kernels.bounds_on_plane(two, self._plane_steps, plane)
+        return Views(one, two, upright, plane, live)
+
+    def _normalised(self, band: Floats, noise_grey: float) -> Bytes:
+        """Return a band-pass (H, DIRECTIONS) in units of what two views differ by, with the floor's horizon level."""
+        into = np.empty(band.shape, np.uint8)
+        kernels.normalise(band, CONTRAST_ROWS, TEXTURE_SHARE**2, noise_grey**2, UNITS, ZERO, into)
+        if self._maps is None:
+            return into
+        return np.asarray(cv2.remap(into, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+
+    def _made_maps(self, a: float, b: float) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
+        """Return the maps to a panorama in which the horizon of a floor with the slopes a, b is level."""
+        azimuth = math.pi - (np.arange(DIRECTIONS) + 0.5) * (math.tau / DIRECTIONS)
+        tilt = a * np.cos(azimuth) + b * np.sin(azimuth)
+        rows = np.arange(self.height)[:, None]
+        columns = np.broadcast_to(np.arange(DIRECTIONS, dtype=np.float32), (self.height, DIRECTIONS))
+        places, shares = cv2.convertMaps(columns, (rows - FOCAL_PX * tilt).astype(np.float32), cv2.CV_16SC2)
+        return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
+
+
+def _band_pass(smooth: Floats, _noise_grey: float) -> Floats:
+    """Return a panorama (H, DIRECTIONS) less its coarse mean along columns."""
+    band = np.empty_like(smooth)
+    kernels.band_pass(smooth, COARSE_ROWS, band)
+    return band
+
+
+def _bounded_band_pass(smooth: Floats, noise_grey: float) -> Floats:
+    """Return by how much a panorama (H, DIRECTIONS) exceeds its columns around, where no row counts much."""
+    band = np.empty_like(smooth)
+    kernels.bounded_band_pass(smooth, NEAR_ROWS, np.float32(NEAR_SIGMAS * noise_grey), band)
+    return band
