@@ -1,13 +1,12 @@
 """The README's test command again and again: `python -m tests.stability` runs it on the idle machine and on a busy one.
 
-Prints a table in Markdown, one row for each run, and returns 1 where a test failed. With --json the rows so far are
-kept in a file after each run. What follows `--` goes to pytest: `python -m tests.stability --idle 2 -- tests/drivers`.
+Measures a table, one row for each run, and returns 1 where a test failed. What follows `--` goes to pytest:
+`python -m tests.stability --idle 2 -- tests/drivers`.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import resource
 import shlex
@@ -18,17 +17,25 @@ import tempfile
 import time
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from tests.benchmark.results import Column, ResultTable, commit
 from tests.busy import busy_processes
 
 ROOT: Final = Path(__file__).parents[1]
 COMMAND: Final = re.compile(r"-e '\.\[test\]' && \S+/python (-m pytest .*)$", re.MULTILINE)
-HEADER: Final = (
-    "| run | busy processes | passed | failed | skipped | time, s | processor time, s | failures |\n"
-    "|---|---|---|---|---|---|---|---|"
+COLUMNS: Final = (
+    Column("commit"),
+    Column("run"),
+    Column("busy processes"),
+    Column("passed"),
+    Column("failed"),
+    Column("skipped"),
+    Column("time", "s", 0),
+    Column("processor time", "s", 0),
+    Column("failures"),
 )
 
 
@@ -46,13 +53,11 @@ class Run:
     exit_code: int  # of pytest; -9 after the timeout
     failures: dict[str, str]  # names of tests and the first lines of what failed
 
-    def row(self) -> str:
-        """Return the row of the table."""
+    def cells(self) -> tuple[str | float, ...]:
+        """Return the row of the table, without the commit."""
         what = ", ".join(f"`{name}`" for name in self.failures) or ("" if self.is_good else f"exit {self.exit_code}")
-        return (
-            f"| {self.number} | {self.busy} | {self.passed} | {self.failed} | {self.skipped} | {self.took_s:.0f} "
-            f"| {self.processor_s:.0f} | {what} |"
-        )
+        counts = (self.number, self.busy, self.passed, self.failed, self.skipped)
+        return (*counts, self.took_s, self.processor_s, what)
 
     @property
     def is_good(self) -> bool:
@@ -121,18 +126,15 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=4, metavar="K", help="busy processes; default: 4")
     parser.add_argument("--background", action="store_true", help="with SIGINT ignored, as a script's `&` starts them")
     parser.add_argument("--timeout-s", type=float, default=3600.0, help="of one run; default: an hour")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the rows in this file")
     parser.add_argument("words", nargs="*", metavar="WORD", help="arguments of pytest, after --")
     args = parser.parse_args()
     runs: list[Run] = []
-    print(HEADER, flush=True)
+    table = ResultTable("test_runs", "faults", "Whole runs of the tests", COLUMNS)
     for number, busy in enumerate([0] * args.idle + [args.processes] * args.busy, 1):
         runs.append(one_run(number, busy, args.words, args.timeout_s, background=args.background))
-        print(runs[-1].row(), flush=True)
+        table.add(commit(), *runs[-1].cells())
         for name, reason in runs[-1].failures.items():
             print(f"{name}: {reason}", file=sys.stderr, flush=True)
-        if args.json:
-            args.json.write_text(json.dumps([asdict(run) for run in runs], indent=1) + "\n")
     bad = sum(not run.is_good for run in runs)
     print(f"\n{len(runs)} runs, {bad} with failures", flush=True)
     return int(bad > 0)

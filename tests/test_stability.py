@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from tests.benchmark.results import FOLDER_VARIABLE, read_result
 from tests.stability import ROOT, outcomes, readme_command
 
 REPORT = """<testsuites><testsuite><testcase classname="tests.a" name="good"/>
@@ -20,7 +22,7 @@ def test_reads_the_command_and_the_outcomes() -> None:
     assert outcomes(REPORT) == (1, {"tests/a.py::bad": "no"}, 1)
 
 
-def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path) -> None:
+def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "test_one.py").write_text("def test_good():\n    pass\n\ndef test_bad():\n    assert False\n")
     command = [
         sys.executable,
@@ -32,8 +34,6 @@ def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path) -> None:
         "1",
         "--processes",
         "1",
-        "--json",
-        str(tmp_path / "rows.json"),
         "--",
         "-n",
         "0",
@@ -43,9 +43,10 @@ def test_a_failure_is_reported_and_is_the_exit_code(tmp_path: Path) -> None:
         "testpaths=",
         str(tmp_path / "test_one.py"),
     ]
+    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1 and "2 runs, 2 with failures" in done.stdout, done.stderr
-    rows = json.loads((tmp_path / "rows.json").read_text())
-    assert [(row["busy"], row["passed"], row["failed"]) for row in rows] == [(0, 1, 1), (1, 1, 1)]
-    assert [(name.endswith("::test_bad"), why) for name, why in rows[0]["failures"].items()] == [(True, "assert False")]
+    rows = read_result(tmp_path / "test_runs.json")["rows"]
+    assert [row[1:5] for row in rows] == [[1, 0, 1, 1], [2, 1, 1, 1]]
+    assert rows[0][-1].endswith("test_one.py::test_bad`")
     assert "::test_bad: assert False" in done.stderr

@@ -1,7 +1,7 @@
 """Pages of the published results: `python -m tests.benchmark.pages` writes docs/results/*.md, one for each question.
 
-The figures are those of tests/benchmark/results/*.json, the words before them those of questions.toml. A test checks
-that the pages are what this module makes.
+The figures are those of tests/benchmark/results/*.json, the words before them those of questions.toml; the page of
+faults has the attacks of tests/faults/attacks.toml, too. A test checks that the pages are what this module makes.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.benchmark.results import PUBLISHED, QUESTIONS, ROOT, Column, read_result
+from tests.faults import attacks
 
 PAGES: Final = ROOT / "docs" / "results"
 QUESTIONS_FILE: Final = Path(__file__).with_name("questions.toml")
 INDEX: Final = "README.md"
+ATTACKED: Final = "faults"  # the question whose page has the attacks
 
 
 def page_name(question: str) -> str:
@@ -31,6 +33,7 @@ def pages(published: Path = PUBLISHED) -> dict[str, str]:
         page_name(question): _page(words[question], [one for one in results if one[1]["question"] == question])
         for question in QUESTIONS
     }
+    made[page_name(ATTACKED)] += "\n" + "\n\n".join(attacks.sections()) + "\n"
     return made | {INDEX: _index(words, results)}
 
 
@@ -95,6 +98,8 @@ def _index(words: dict[str, dict[str, str]], results: list[tuple[str, dict[str, 
             for _, result in results
             if result["question"] == question
         ]
+        if question == ATTACKED:
+            titles += [f"[{title}]({page_name(question)}#{_anchor(title)})" for title in attacks.titles()]
         lines.append(f"| [{words[question]['title']}]({page_name(question)}) | {', '.join(titles)} |")
     return f"# {words['index']['title']}\n\n" + "\n".join(lines) + "\n"
 

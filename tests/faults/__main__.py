@@ -1,4 +1,4 @@
-"""Attack the daemon: `python -m tests.faults [PART ...]` prints tables in Markdown and returns 1 where it did not hold.
+"""Attack the daemon: `python -m tests.faults [PART ...]` measures tables and returns 1 where it did not hold.
 
 Parts: trials (each fault once, its outcome), stops (times from a cause to wheels at rest), routes (the same in the
 midst of a route, in a closed loop), commands (mutated commands), files (mutated files), crowds (stops beside crowds of
@@ -11,15 +11,14 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
+from tests.benchmark.results import Column, ResultTable
 from tests.busy import busy_processes
 from tests.faults import crowds, floods, hostile_commands, hostile_files, images, route_stops, stop_times
 from tests.faults.trials import TRIALS, Outcome, Setting
 from tests.simulation import build, write_log
 
-Report = Callable[[str], None]
 BUSY_LOOP = "while True: pass"
 
 
@@ -30,9 +29,10 @@ def scene(folder: Path) -> Path:
     return folder
 
 
-def run_trials(recorded: Path, folder: Path, words: list[str], report: Report) -> int:
-    """Print the outcome of each trial whose name has one of the words; return the number of failures."""
-    report("| fault | process | wheels | status |\n|---|---|---|---|")
+def run_trials(recorded: Path, folder: Path, words: list[str]) -> int:
+    """Measure the outcome of each trial whose name has one of the words; return the number of failures."""
+    columns = (Column("fault"), Column("process"), Column("wheels"), Column("status"))
+    table = ResultTable("faults_trials", "faults", "Faults of a live robot", columns, continued=True)
     failed = 0
     for number, fault in enumerate(name for name in TRIALS if not words or any(word in name for word in words)):
         own = folder / f"trial-{number}" / "in"
@@ -42,7 +42,7 @@ def run_trials(recorded: Path, folder: Path, words: list[str], report: Report) -
         except AssertionError as error:
             failed += 1
             outcome = Outcome("FAILED", "", " ".join(str(error).split())[:200])
-        report(f"| {fault} | {' | '.join(outcome)} |")
+        table.add(fault, *outcome)
     return failed
 
 
@@ -73,25 +73,22 @@ def main() -> int:
     args = parser().parse_args()
     failed = 0
 
-    def report(line: str) -> None:
-        print(line, flush=True)
-
     with tempfile.TemporaryDirectory() as name, busy_processes(args.busy):
         recorded, folder = scene(Path(name) / "scene"), Path(name)
         if "trials" in args.parts:
-            failed += run_trials(recorded, folder, args.only, report)
+            failed += run_trials(recorded, folder, args.only)
         if "stops" in args.parts:
-            failed += stop_times.run(recorded, folder, args.only, args.stops, args.seed, report)
+            failed += stop_times.run(recorded, folder, args.only, args.stops, args.seed)
         if "routes" in args.parts:
-            failed += route_stops.run(folder, args.only, args.stops, args.seed, report)
+            failed += route_stops.run(folder, args.only, args.stops, args.seed)
         if "commands" in args.parts:
-            failed += hostile_commands.run(recorded, folder, args.commands, args.seed, report)
+            failed += hostile_commands.run(recorded, folder, args.commands, args.seed)
         if "files" in args.parts:
-            failed += hostile_files.run(folder, args.files, args.seed, report)
+            failed += hostile_files.run(folder, args.files, args.seed)
         if "crowds" in args.parts:
-            failed += crowds.run(recorded, folder, report)
+            failed += crowds.run(recorded, folder)
         if "floods" in args.parts:
-            failed += floods.run(recorded, folder, args.rate, args.only, report)
+            failed += floods.run(recorded, folder, args.rate, args.only)
         if "images" in args.parts:
             failed += images.run_all(args.only, args.images, args.seed)
     return int(failed > 0)

@@ -21,6 +21,7 @@ from urllib.parse import parse_qs, urlsplit
 
 from omnid.monitor.stopping import stop
 from omnid.transport.bus_config import BusConfig
+from tests.benchmark.results import Column, ResultTable
 from tests.replay.live import ROOT, robot
 
 SESSIONS: Final = 1000
@@ -153,18 +154,24 @@ def certificate(folder: Path) -> tuple[Path, Path]:
     return pem, key
 
 
-def run(recorded: Path, folder: Path, report: Callable[[str], None]) -> int:
-    """Print a row for each crowd; return the number of crowds that kept a stop out for more than LONGEST_STOP_S."""
+def run(recorded: Path, folder: Path) -> int:
+    """Measure a row for each crowd; return the number of crowds that kept a stop out for more than LONGEST_STOP_S."""
     failed, own = 0, folder / "crowds"
     own.mkdir()
-    report("| crowd | there | stop by | longest of 5, s |\n|---|---|---|---|")
+    table = ResultTable(
+        "faults_crowds",
+        "faults",
+        "Stops beside crowds of connections",
+        (Column("crowd"), Column("connections"), Column("stop by"), Column("longest of 5", "s", 2)),
+        remarks=("Connections that are closed are made again at once.",),
+    )
 
     def row(name: str, text: str, words: tuple[object, ...], way: str, timed: Callable[[], float]) -> None:
         nonlocal failed
         with crowd(text, *words) as there:
             longest_s = max(timed() for _ in range(STOPS))
         failed += longest_s > LONGEST_STOP_S
-        report(f"| {name} | {there} | {way} | {longest_s:.2f} |")
+        table.add(name, there, way, longest_s)
 
     with robot(recorded, own) as (daemon, _, _), ExitStack() as ends:
         plain, secure = Page(ends, daemon.port, None), Page(ends, daemon.port, certificate(own))

@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -19,6 +19,7 @@ from typing import Final
 import zenoh
 
 from omnid.transport.codec import twist_stamped_cdr
+from tests.benchmark.results import Column, ResultTable
 from tests.faults.crowds import timed_stop
 from tests.replay.live import ROOT, Operator, free_port, robot
 
@@ -27,6 +28,14 @@ SENDERS: Final = 2
 MEASURED_S: Final = 8.0
 LEAST_SHARE: Final = 0.9
 LONGEST_STOP_S: Final = 1.0
+COLUMNS: Final = (
+    Column("flood on"),
+    Column("poses before", "1/s", 1),
+    Column("flood at another process", "1/s", 1),
+    Column("flood here", "1/s", 1),
+    Column("share", "%", 0),
+    Column("stop", "s", 2),
+)
 FLOODER: Final = """
 import json, sys, time, zenoh
 endpoint, key, rate_hz, payload = sys.argv[1], sys.argv[2], float(sys.argv[3]), bytes.fromhex(sys.argv[4])
@@ -120,20 +129,22 @@ def pose_rate_hz(operator: Operator) -> float:
     return (len(operator.poses) - begin) / (time.monotonic() - begin_s)
 
 
-def run(recorded: Path, folder: Path, rate_hz: float, only: list[str], report: Callable[[str], None]) -> int:
-    """Print a row for each key; return the number of keys on which the poses or the stop suffered."""
+def run(recorded: Path, folder: Path, rate_hz: float, only: list[str]) -> int:
+    """Measure a row for each key; return the number of keys on which the poses or the stop suffered."""
     failed, own = 0, folder / "floods"
     own.mkdir()
     sink_port = free_port()
-    report(
-        f"reached by {SENDERS} senders asked for {rate_hz:.0f}/s, at a listener that only counts: "
-        f"{received_hz(free_port(), 'cmd/imu', rate_hz):.0f}/s\n"
+    reached_hz = received_hz(free_port(), "cmd/imu", rate_hz)
+    table = ResultTable(
+        "faults_floods",
+        "faults",
+        "Poses and stops beside floods of messages",
+        COLUMNS,
+        continued=True,
+        remarks=(
+            f"{SENDERS} senders are asked for {rate_hz:.0f}/s and reach {reached_hz:.0f}/s at a counting listener.",
+        ),
     )
-    report(
-        "| flood on | poses/s before | poses/s, the flood at another process | poses/s, the flood here | share | "
-        "stop, s |"
-    )
-    report("|---|---|---|---|---|---|")
     with robot(recorded, own) as (daemon, operator, _), started(SINK, f"tcp/127.0.0.1:{sink_port}"):
         for key in (key for key in KEYS if not only or any(word in key for word in only)):
             before_hz = pose_rate_hz(operator)
@@ -143,6 +154,6 @@ def run(recorded: Path, folder: Path, rate_hz: float, only: list[str], report: C
                 during_hz = pose_rate_hz(operator)
                 stop_s = timed_stop(daemon.port)
             share = during_hz / beside_hz
-            report(f"| `{key}` | {before_hz:.1f} | {beside_hz:.1f} | {during_hz:.1f} | {share:.0%} | {stop_s:.2f} |")
+            table.add(f"`{key}`", before_hz, beside_hz, during_hz, 100 * share, stop_s)
             failed += share < LEAST_SHARE or stop_s > LONGEST_STOP_S
     return failed

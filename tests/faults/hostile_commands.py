@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.transport import codec
+from tests.benchmark.results import Column, ResultTable
 from tests.faults.mutation import mutated
 from tests.replay.live import Operator, robot, wait_until
 
@@ -51,18 +52,19 @@ def attack(operator: Operator, rng: random.Random, count: int, topics: Sequence[
             wait_until(lambda sent=sent: counted(operator) >= before + sent, f"the count of {sent} commands")
 
 
-def run(recorded: Path, folder: Path, count: int, seed: int, report: Callable[[str], None]) -> int:
-    """Print a row for each attack; return the number of attacks that did not hold."""
+def run(recorded: Path, folder: Path, count: int, seed: int) -> int:
+    """Measure a row for each attack; return the number of attacks that did not hold."""
     rng, limits = random.Random(seed), VelocityLimits()
     own = folder / "commands"
     own.mkdir()
-    report("| mutated commands | sent | wheels | daemon |\n|---|---|---|---|")
+    columns = (Column("mutated commands"), Column("sent"), Column("wheels"))
+    table = ResultTable("faults_commands", "faults", "Mutated commands", columns)
     with robot(recorded, own, *MANUAL) as (daemon, operator, base):
         try:
             operator.drive()
             attack(operator, rng, count // 2, ("cmd/arm", *MOTIONS), OLD_S)
             assert not base.line.moved_since(0.0), "the wheels turned without a valid cmd/arm"
-            report(f"| an hour old, an operator sends, not armed | {count // 2} | never turned | alive, all counted |")
+            table.add("an hour old, an operator sends, not armed", count // 2, "never turn")
             wait_until(lambda: operator.arm() is None and base.drives, "motion")
             operator.stop_sending()
             attack(operator, rng, count // 2, MOTIONS, 0.0)
@@ -71,13 +73,11 @@ def run(recorded: Path, folder: Path, count: int, seed: int, report: Callable[[s
             wait_until(lambda: not base.drives, "the stop")
             time.sleep(SETTLE_S)
             assert not base.drives, "the wheels turn without a command"
-            report(
-                f"| of now, armed, the operator silent | {count // 2} | at most {fastest:.2f} m/s, stood afterwards "
-                "| alive, all counted |"
-            )
+            found = f"at most {fastest:.2f} m/s, then at rest"
+            table.add("of now, armed, the operator silent", count // 2, found)
             code, err = daemon.end()
             assert code == 0 and "Traceback" not in err, (code, err)
         except AssertionError as error:
-            report(f"| FAILED | | | {' '.join(str(error).split())[:200]} |")
+            table.add("FAILED", None, " ".join(str(error).split())[:200])
             return 1
     return 0

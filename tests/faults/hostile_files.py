@@ -36,6 +36,7 @@ from omnid.transport import codec
 from omnid.transport.decode import decode_diagnostics, decode_pose
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
+from tests.benchmark.results import Column, ResultTable
 from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import pairs
 from tests.faults.mutation import mutated
@@ -47,6 +48,13 @@ MEMORY_BYTES: Final = 1 << 30  # of address space: numpy, OpenCV and zenoh take 
 LONGEST_S: Final = 10.0  # for one file
 MOST_FAILURES: Final = 5
 EXPECTED: Final = (CalibError, DriverError, OmnidError)
+COLUMNS: Final = (
+    Column("mutated files"),
+    Column("number"),
+    Column("most memory", "MB"),
+    Column("time", "s", 0),
+    Column("result"),
+)
 OCAM: Final = b"4 -200 0 1e-3 1e-7\n3 1 2 3\n240 320\n1 0 0\n480 640\n"
 
 
@@ -193,17 +201,16 @@ def short_run(folder: Path) -> Path:
     return folder
 
 
-def run(folder: Path, count: int, seed: int, report: Callable[[str], None]) -> int:
-    """Print a row for each format; return the number of formats that did not hold."""
+def run(folder: Path, count: int, seed: int) -> int:
+    """Measure a row for each format; return the number of formats that did not hold."""
     short_run(folder / "short")
     failed = 0
-    report("| mutated files | number | most memory, MB | time, s | result |\n|---|---|---|---|---|")
+    table = ResultTable("faults_files", "faults", "Mutated files", COLUMNS)
     for name in FORMATS:
         begin_s = time.monotonic()
         memory_mb, found = attack(name, folder / "short", count, seed)
         failed += bool(found)
-        result = "; ".join(found) if found else "a result or one line, each"
-        report(f"| {name} | {count} | {memory_mb} | {time.monotonic() - begin_s:.0f} | {result} |")
+        table.add(name, count, memory_mb, time.monotonic() - begin_s, "; ".join(found) or "a result or one line, each")
     return failed
 
 

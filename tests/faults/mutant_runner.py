@@ -31,7 +31,7 @@ import pytest
 from _pytest.runner import runtestprotocol
 
 from omnid.engine import kernel_cache
-from tests.faults.mutants import SURVIVED, UNFINISHED, Mutant, Results
+from tests.faults.mutants import NOTICED, SURVIVED, TIMEOUT, UNFINISHED, Mutant, Results
 
 POLL_S: Final = 0.02
 UNFINISHED_CODE: Final = 77  # of a fork; pytest itself uses 0 to 5
@@ -298,8 +298,8 @@ def _computes(pid: int) -> bool:
 
 def _outcome(code: int | None) -> str:
     if code is None:
-        return "timeout"
-    return {0: SURVIVED, UNFINISHED_CODE: UNFINISHED}.get(code, "noticed")
+        return TIMEOUT
+    return {0: SURVIVED, UNFINISHED_CODE: UNFINISHED}.get(code, NOTICED)
 
 
 def main() -> int:

@@ -2,7 +2,7 @@
 
 Each mutant changes one operator, number or word of a folder in a copy of the repository, where the tests that call
 its function run (mutant_runner.py). Outcomes are kept in a file, so that a campaign may be stopped and go on later. A
-mutant that survives is a missing test, or changes nothing that matters: a person judges it (tests/faults/RESULTS.md).
+mutant that survives is a missing test, or changes nothing that matters: a person judges it (docs/notes/faults.md).
 """
 
 from __future__ import annotations
@@ -19,9 +19,21 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from tests.benchmark.results import Column, ResultTable
+
 ROOT: Final = Path(__file__).parents[2]
 COPIED: Final = ("omnid", "drivers", "calib", "tests", "systemd", "pyproject.toml")
 SURVIVED: Final = "survived"
+COLUMNS: Final = (
+    Column("folder"),
+    Column("mutants"),
+    Column("tried"),
+    Column("noticed"),
+    Column("survived"),
+    Column("unfinished, or ended by their time"),
+)
+NOTICED: Final = "noticed"
+TIMEOUT: Final = "timeout"  # the process did not end by itself
 UNFINISHED: Final = "unfinished"  # the limit of time was over before the last test: no test has failed so far
 CONTROL_TESTS: Final = (
     "tests/omnid/core/control",
@@ -279,12 +291,13 @@ def main() -> int:
         if named:
             try_mutants(tests, in_order(named), args.limit_s, path)
     outcomes = Results(path).outcomes
+    table = ResultTable("faults_mutants", "faults", "Mutants of the code", COLUMNS, continued=True)
     for folder, named in chosen.items():
         numbers = Counter(outcomes.get(name, "not tried") for name in named)
-        print(
-            f"{folder}: {len(named)} of {len(everything[folder])} mutants, seed {args.seed}: "
-            f"{', '.join(f'{number} {outcome}' for outcome, number in sorted(numbers.items()))}"
-        )
+        tried = len(named) - numbers["not tried"]
+        unfinished = numbers[UNFINISHED] + numbers[TIMEOUT]
+        counts = (len(everything[folder]), tried, numbers[NOTICED], numbers[SURVIVED], unfinished)
+        table.add(f"`{folder}`", *counts)
         print(
             "".join(f"  {outcomes[name]}: {name}\n" for name in named if outcomes.get(name) in (SURVIVED, UNFINISHED)),
             end="",

@@ -11,7 +11,7 @@ import random
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final
@@ -24,8 +24,20 @@ from omnid.simulation.world_file import load_world
 from omnid.transport import topics
 from omnid.transport.navigation_codec import string_cdr
 from omnid.transport.status_names import Key
+from tests.benchmark.results import ResultTable
 from tests.faults.simulated_daemon import SEED, SIZE_PX, WORLD, PoseFile, PoseWriter
-from tests.faults.stop_times import ARM_PERIOD_S, CAUSES, STILL_S, Cause, Robot, StopTime, measured, row
+from tests.faults.stop_times import (
+    ARM_PERIOD_S,
+    CAUSES,
+    COLUMNS,
+    STILL_S,
+    Cause,
+    Robot,
+    StopTime,
+    cells,
+    failed_cells,
+    measured,
+)
 from tests.replay.live import Base, Operator, answers, free_port, started, wait_until
 
 PATIENCE_S: Final = 120.0
@@ -164,19 +176,19 @@ def stop_times(site: Path, folder: Path, name: str, count: int, seed: int) -> li
     return times
 
 
-def run(folder: Path, words: list[str], count: int, seed: int, report: Callable[[str], None]) -> int:
-    """Print a row for each cause whose name has one of the words; return the number of causes that did not stop."""
+def run(folder: Path, words: list[str], count: int, seed: int) -> int:
+    """Measure a row for each cause whose name has one of the words; return the number of causes that did not stop."""
     site = folder / "site"
     site.mkdir()
     teach(site)
-    report("| in the midst of a route | stops | last command to move, p50 | p99 | max | at rest, p50 | p99 | max, ms |")
-    report("|---|---|---|---|---|---|---|---|")
+    title = "From a cause to wheels at rest, in the midst of a route"
+    table = ResultTable("faults_routes", "faults", title, COLUMNS, continued=True)
     failed = 0
     for number, name in enumerate(name for name in ROUTE_CAUSES if not words or any(word in name for word in words)):
         shown = RENAMED.get(name, name)
         try:
-            report(row(shown, stop_times(site, folder / f"route-{number}", name, count, seed)))
+            table.add(*cells(shown, stop_times(site, folder / f"route-{number}", name, count, seed)))
         except AssertionError as error:
             failed += 1
-            report(f"| {shown} | FAILED: {' '.join(str(error).split())[:200]} |")
+            table.add(*failed_cells(shown, error))
     return failed

@@ -13,10 +13,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from tests.benchmark.results import Column, ResultTable
 from tests.faults.trials.trial import FAULTY_DAEMON
 from tests.replay.live import Base, Daemon, Operator, robot, wait_until
 
@@ -25,6 +26,16 @@ POLL_S: Final = 0.002
 STILL_S: Final = 0.3  # wheels at rest must stay there for so long, while the cause lasts and after it
 ARM_PERIOD_S: Final = 0.2
 MANUAL: Final = ("--set", "controller.arming=manual")
+COLUMNS: Final = (
+    Column("cause"),
+    Column("stops"),
+    Column("last command to move, p50", "ms", 0),
+    Column("p99", "ms", 0),
+    Column("max", "ms", 0),
+    Column("at rest, p50", "ms", 0),
+    Column("p99", "ms", 0),
+    Column("max", "ms", 0),
+)
 PHASE_S: Final = 0.2  # span of the random moments
 
 
@@ -163,27 +174,29 @@ def started(recorded: Path, folder: Path) -> Iterator[Robot]:
         yield Robot(*parts)
 
 
-def row(name: str, times: list[StopTime]) -> str:
+def cells(name: str, times: list[StopTime]) -> list[Any]:
     """Return the row of a table, in ms."""
-    cells = [
-        f"{value:.0f}"
+    figures = [
+        value
         for column in zip(*times, strict=True)
         for value in (*np.percentile(1000 * np.array(column), (50, 99)), 1000 * max(column))
     ]
-    return f"| {name} | {len(times)} | {' | '.join(cells)} |"
+    return [name, len(times), *figures]
 
 
-def run(recorded: Path, folder: Path, words: list[str], count: int, seed: int, report: Callable[[str], None]) -> int:
-    """Print a row for each cause whose name has one of the words; return the number of causes that did not stop."""
-    report(
-        "| cause | stops | last command to move, p50 | p99 | max | at rest, p50 | p99 | max, ms |\n"
-        "|---|---|---|---|---|---|---|---|"
-    )
+def failed_cells(name: str, error: AssertionError) -> list[Any]:
+    """Return the row of a cause that did not stop the wheels."""
+    return [f"{name}, FAILED: {' '.join(str(error).split())[:200]}", None, *[None] * 6]
+
+
+def run(recorded: Path, folder: Path, words: list[str], count: int, seed: int) -> int:
+    """Measure a row for each cause whose name has one of the words; return the number of causes that did not stop."""
+    table = ResultTable("faults_stops", "faults", "From a cause to wheels at rest", COLUMNS, continued=True)
     failed = 0
     for number, name in enumerate(name for name in CAUSES if not words or any(word in name for word in words)):
         try:
-            report(row(name, stop_times(recorded, folder / f"stop-{number}", name, count, seed)))
+            table.add(*cells(name, stop_times(recorded, folder / f"stop-{number}", name, count, seed)))
         except AssertionError as error:
             failed += 1
-            report(f"| {name} | FAILED: {' '.join(str(error).split())[:200]} |")
+            table.add(*failed_cells(name, error))
     return failed
