@@ -133,7 +133,7 @@ def test_after_the_daemon_the_wheels_slow_down_to_a_stop(bench: Bench) -> None:
 
 def test_the_loop_ends_in_time_where_the_wheels_do_not_stop(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(process, "LONGEST_RAMP_S", 0.2)
-    monkeypatch.setattr(Controller, "stands", property(lambda _: False))
+    monkeypatch.setattr(Controller, "is_at_rest", property(lambda _: False))
     bench.thread.start()
     bench.end()
 
