@@ -275,13 +275,13 @@ def remap_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, pad_px: i
     u, v = np.empty(shape, np.float32), np.empty(shape, np.float32)
     for top in range(0, cylinder.height, BLOCK_ROWS):
         rows = np.arange(top, min(top + BLOCK_ROWS, cylinder.height))
-        u[rows], v[rows] = _block_tables(rig, mounted, cylinder, (rows, pad_px))
+        u[rows], v[rows] = _block_tables(rig, mounted, cylinder, rows, pad_px)
     return u, v
 
 
-def _block_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, block: tuple[NDArray[np.int_], int]) -> Maps:
-    """Return the tables of some rows; block: the rows and the padding [px]."""
-    columns, rows = np.meshgrid(np.arange(-block[1], cylinder.width + block[1]), block[0])
+def _block_tables(rig: Rig, mounted: MountedCamera, cylinder: Cylinder, block: NDArray[np.int_], pad_px: int) -> Maps:
+    """Return the tables of some rows (N,), with padding on either side."""
+    columns, rows = np.meshgrid(np.arange(-pad_px, cylinder.width + pad_px), block)
     pixels = _project(rig, mounted, cylinder.rays(np.column_stack([columns.ravel(), rows.ravel()]).astype(float)))
     pixels[~inside_image(mounted.camera, pixels)] = -1
     u, v = pixels.astype(np.float32).T.reshape(2, *columns.shape)

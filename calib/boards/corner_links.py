@@ -39,7 +39,7 @@ def link_neighbours(image: Grey, corners: CornerCandidates) -> tuple[NDArray[np.
     fits &= _left_is_light(corners, a, arm_a) == ~_left_is_light(corners, b, arm_b)
     a, b, arm_a, arm_b = (values[fits] for values in (a, b, arm_a, arm_b))
     length = length[fits]
-    seen = _edge_seen(image, corners, (a, b), arm_a)
+    seen = _edge_seen(image, corners, a, b, arm_a)
     order = np.flatnonzero(seen)[np.argsort(-length[seen], kind="stable")]
     # Of several neighbours the nearest is written last.
     neighbour[a[order], arm_a[order]] = b[order]
@@ -79,16 +79,16 @@ def _left_is_light(corners: CornerCandidates, index: NDArray[np.int64], arm: NDA
 
 
 def _edge_seen(
-    image: Grey, corners: CornerCandidates, pair: tuple[NDArray[np.int64], NDArray[np.int64]], arm: NDArray[np.int64]
+    image: Grey, corners: CornerCandidates, a: NDArray[np.int64], b: NDArray[np.int64], arm: NDArray[np.int64]
 ) -> NDArray[np.bool_]:
     """True (M,) if light and dark along the line from a to b lie on the same sides as at a's arm."""
-    start, step = corners.pixels[pair[0]], corners.pixels[pair[1]] - corners.pixels[pair[0]]
+    start, step = corners.pixels[a], corners.pixels[b] - corners.pixels[a]
     # Perpendicular to the line, towards larger angles.
     across = ASIDE * np.column_stack([-step[:, 1], step[:, 0]])
     middle = start[:, None] + ALONG[:, None] * step[:, None]
     difference = sample(image, middle + across[:, None]) - sample(image, middle - across[:, None])
-    signed = np.where(_left_is_light(corners, pair[0], arm), 1, -1)[:, None] * difference
-    contrast = np.minimum(corners.contrast[pair[0]], corners.contrast[pair[1]])
+    signed = np.where(_left_is_light(corners, a, arm), 1, -1)[:, None] * difference
+    contrast = np.minimum(corners.contrast[a], corners.contrast[b])
     return np.asarray(signed.min(axis=1) > MIN_EDGE * contrast)
 
 

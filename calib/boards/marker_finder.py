@@ -62,9 +62,10 @@ def find_marker_board(image: Image, board: MarkerBoard, name: str = "", *, thoro
     if not markers:
         return None
     on_board = dict(zip(layout.ids.tolist(), layout.corners / board.square_m, strict=True))
-    known = np.concatenate([on_board[number] for number in markers]), np.concatenate(list(markers.values()))
+    places = np.concatenate([on_board[number] for number in markers])
+    outlines = np.concatenate(list(markers.values()))
     points = board.points[:, :2] / board.square_m
-    pixels = _grown(smoothed(image, BLUR_PX), points, known, board.window)
+    pixels = _grown(smoothed(image, BLUR_PX), points, places, outlines, board.window)
     pixels = _refined(image.astype(np.float32), points, pixels, board.window)
     seen = np.isfinite(pixels[:, 0])
     if seen.sum() < MIN_CORNERS or not _is_spread(points[seen]):
@@ -72,13 +73,13 @@ def find_marker_board(image: Image, board: MarkerBoard, name: str = "", *, thoro
     return BoardView(name, pixels, float(seen.mean()))
 
 
-def _grown(image: Grey, points: Array, known: tuple[Array, Array], window: float) -> Array:
+def _grown(image: Grey, points: Array, places: Array, outlines: Array, window: float) -> Array:
     """Return the pixels (N, 2) of the board's points [squares] that the image shows, NaN for the others.
 
-    known: places (M, 2) [squares] and pixels (M, 2) of the markers' corners.
+    places (M, 2) [squares] and outlines (M, 2) [px]: the markers' corners.
     """
     pixels = np.full(points.shape, np.nan)
-    at, where = known
+    at, where = places, outlines
     refused = np.zeros(len(points), bool)
     for _ in range(ROUNDS):
         tried = np.flatnonzero(np.isnan(pixels[:, 0]) & ~refused)
@@ -92,8 +93,8 @@ def _grown(image: Grey, points: Array, known: tuple[Array, Array], window: float
         pixels[list(found)] = np.array(list(found.values()))
         new = np.isfinite(pixels[:, 0])
         # Corners are more accurate than the outlines of markers, which remain where there are no corners yet.
-        far = np.linalg.norm(known[0][:, None] - points[new], axis=2).min(axis=1) > REACH
-        at, where = np.vstack([points[new], known[0][far]]), np.vstack([pixels[new], known[1][far]])
+        far = np.linalg.norm(places[:, None] - points[new], axis=2).min(axis=1) > REACH
+        at, where = np.vstack([points[new], places[far]]), np.vstack([pixels[new], outlines[far]])
     return pixels
 
 

@@ -28,8 +28,9 @@ MARGIN_PART, WIDE_MARGIN_PART, MIN_MARGIN_PX = 0.3, 1.5, 20
 
 def opencv_grids(image: Image, board: Board) -> Iterator[Grid]:
     """Yield the grids of OpenCV's two detectors, of those that find the board."""
-    found = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=PLAIN)
-    yield from _grid(found, board)
+    is_found, corners = cv2.findChessboardCorners(image, (board.columns, board.rows), flags=PLAIN)
+    if is_found:
+        yield from _grid(corners, board)
     yield from _sector_grid(image, board, SECTOR)
 
 
@@ -48,13 +49,14 @@ def confirmed(image: Image, corners: Array, board: Board) -> bool:
 
 
 def _sector_grid(image: Image, board: Board, flags: int) -> Iterator[Grid]:
-    yield from _grid(cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags), board)
+    is_found, corners = cv2.findChessboardCornersSB(image, (board.columns, board.rows), flags=flags)
+    if is_found:
+        yield from _grid(corners, board)
 
 
-def _grid(detection: tuple[bool, NDArray[np.generic]], board: Board) -> Iterator[Grid]:
-    """Yield the grid of a detector's answer, if it found the board."""
-    found, corners = detection
-    if found and len(corners) == board.columns * board.rows:
+def _grid(corners: NDArray[np.generic], board: Board) -> Iterator[Grid]:
+    """Yield the grid of the corners (N, 1, 2) that a detector found, if they are all of the board."""
+    if len(corners) == board.columns * board.rows:
         yield with_clockwise_axes(array_to_grid(np.asarray(corners, float).reshape(board.rows, board.columns, 2)))
 
 

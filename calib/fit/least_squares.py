@@ -101,12 +101,12 @@ def minimise(problem: Problem[State], state: State, ending: Ending) -> State:
         scale = problem.scale(state)
         cost, system = problem.cost(state, scale), problem.normal_equations(state, scale)
         # 2. Raise the damping until a step lowers the cost.
-        trial, trial_cost = _trial(problem, state, system, (scale, damping))
+        trial, trial_cost = _trial(problem, state, system, scale, damping)
         while not trial_cost < cost:
             damping *= DAMPING_FACTOR
             if damping > MAX_DAMPING:
                 return state
-            trial, trial_cost = _trial(problem, state, system, (scale, damping))
+            trial, trial_cost = _trial(problem, state, system, scale, damping)
         # 3. Take the step. End if it gained little, else lower the damping.
         state = trial
         if cost - trial_cost < ending.gain * cost and damping < ending.damping:
@@ -116,10 +116,9 @@ def minimise(problem: Problem[State], state: State, ending: Ending) -> State:
 
 
 def _trial(
-    problem: Problem[State], state: State, system: ArrowSystem, scaled: tuple[float, float]
+    problem: Problem[State], state: State, system: ArrowSystem, scale: float, damping: float
 ) -> tuple[State, float]:
     """Return the state after a step, and its cost; infinite if the step leads to no camera."""
-    scale, damping = scaled
     try:
         moved = problem.moved(state, *system.step(damping))
     except np.linalg.LinAlgError:

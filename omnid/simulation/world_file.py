@@ -218,7 +218,7 @@ def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangl
     parts: list[Rectangle] = []
     for number, (a, b) in enumerate(pairwise(points)):
         chosen = str(rng.choice(KINDS)) if kind == RANDOM else kind
-        parts += _pieces(rng, chosen, (a, b), height_m, doors if number == 0 else [])
+        parts += _pieces(rng, chosen, a, b, height_m, doors if number == 0 else [])
     hung: list[Rectangle] = []
     for part in parts:
         if height_m >= CEILING_M - 0.2 and part.height_m > 0.8 * height_m and part.width_m > 0.6:
@@ -238,10 +238,10 @@ def _door(table: ValidatedTable) -> tuple[float, float, float]:
 
 
 def _pieces(
-    rng: Random, kind: str, ends: tuple[Point, Point], height_m: float, doors: list[tuple[float, float, float]]
+    rng: Random, kind: str, left: Point, right: Point, height_m: float, doors: list[tuple[float, float, float]]
 ) -> list[Rectangle]:
     """Return a straight wall between two points, left and right as seen from its front, without its doors."""
-    a, b = (np.array([*end, 0.0]) for end in ends)
+    a, b = np.array([*left, 0.0]), np.array([*right, 0.0])
     length_m = float(np.linalg.norm(b - a))
     along = (b - a) / max(length_m, 1e-9)
     pieces, begin_m = [], 0.0
@@ -251,14 +251,14 @@ def _pieces(
         begin_m = at_m + width_m
     pieces.append((begin_m, length_m, 0.0))
     return [
-        _upright(rng, kind, (a + left * along, a + min(right, length_m) * along), (low, height_m))
-        for left, right, low in pieces
-        if min(right, length_m) - left > 0.01 and height_m - low > 0.01
+        _upright(rng, kind, a + begin_m * along, a + min(end_m, length_m) * along, low_m, height_m)
+        for begin_m, end_m, low_m in pieces
+        if min(end_m, length_m) - begin_m > 0.01 and height_m - low_m > 0.01
     ]
 
 
-def _upright(rng: Random, kind: str, ends: tuple[Array, Array], heights_m: tuple[float, float]) -> Rectangle:
-    (a, b), (low_m, high_m) = ends, heights_m
+def _upright(rng: Random, kind: str, a: Array, b: Array, low_m: float, high_m: float) -> Rectangle:
+    """Return the upright rectangle between two points (3,) of the floor, left and right as seen from its front."""
     size = (float(np.linalg.norm(b - a)), high_m - low_m)
     up, texture = np.array([0.0, 0.0, 1.0]), painted(rng, kind, size, PX_PER_M)
     return Rectangle(a + high_m * up, b - a, (low_m - high_m) * up, texture, kind)

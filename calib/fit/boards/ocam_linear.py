@@ -46,13 +46,13 @@ def powers(degree: int) -> Array:
 def solve_linear(observed: Observations, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
     """Find the camera and poses of least ray error, with a search over the centre; size (width, height) [px]."""
     pixels, points = np.asarray(observed.pixels, float), np.asarray(observed.points, float)
-    return _solved((pixels.tobytes(), len(pixels)), points.tobytes(), size, degree, view)
+    return _solved(pixels.tobytes(), len(pixels), points.tobytes(), size, degree, view)
 
 
 @lru_cache(maxsize=2)  # the fit of a camera starts from what has shown that its views are consistent
-def _solved(seen: tuple[bytes, int], board: bytes, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
-    """Return the solution for pixels (K, N, 2), given with K, and points (N, 3)."""
-    pixels, points = np.frombuffer(seen[0]).reshape(seen[1], -1, 2), np.frombuffer(board).reshape(-1, 3)
+def _solved(seen: bytes, views: int, board: bytes, size: tuple[int, int], degree: int, view: View) -> LinearCamera:
+    """Return the solution for the bytes of pixels (views, N, 2) and of points (N, 3)."""
+    pixels, points = np.frombuffer(seen).reshape(views, -1, 2), np.frombuffer(board).reshape(-1, 3)
     observed = Observations(pixels, points)
     width, height = size
     problem = _LinearProblem(observed, degree, min(size) / 2)

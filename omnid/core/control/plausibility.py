@@ -45,7 +45,7 @@ class Plausibility:
         """Take the next pose; a lost one says nothing about the motion."""
         self.witness = witness if self._checks else AGREE
         self._degraded = state == TrackingState.DEGRADED
-        self._pose.add_pose(stamp_ns, (seen.velocity_sigma_mps, seen.yaw_rate_sigma_radps), resets)
+        self._pose.add_pose(stamp_ns, seen.velocity_sigma_mps, seen.yaw_rate_sigma_radps, resets)
         if state != TrackingState.LOST:
             self._monitor.add_seen(stamp_ns, seen)
 

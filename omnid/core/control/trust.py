@@ -55,11 +55,12 @@ class PoseTrust:
         since_ns = self._unsure_since_ns
         return since_ns is not None and (self._newest_ns - since_ns) * S_PER_NS >= self._settings.sigma_s
 
-    def add_pose(self, stamp_ns: int, sigmas: tuple[float, float], resets: int) -> None:
-        """Take the next pose: standard deviations of velocity [m/s] and yaw rate [rad/s], count of resets."""
+    def add_pose(self, stamp_ns: int, velocity_sigma_mps: float, yaw_rate_sigma_radps: float, resets: int) -> None:
+        """Take the next pose, with the standard deviations of its velocity and the count of resets."""
         settings = self._settings
-        limits = (settings.velocity_sigma_mps, settings.yaw_rate_sigma_radps)
-        high = any(limit != OFF and not sigma <= limit for sigma, limit in zip(sigmas, limits, strict=True))
+        high = (settings.velocity_sigma_mps != OFF and not velocity_sigma_mps <= settings.velocity_sigma_mps) or (
+            settings.yaw_rate_sigma_radps != OFF and not yaw_rate_sigma_radps <= settings.yaw_rate_sigma_radps
+        )
         if not high:
             self._unsure_since_ns = None
         elif self._unsure_since_ns is None:

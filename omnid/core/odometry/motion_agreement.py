@@ -84,6 +84,26 @@ class _Step(NamedTuple):
     aside_m: float
 
 
+class _Spans(NamedTuple):
+    """Steps of the cameras, from the oldest to the newest: arrays (N,)."""
+
+    starts_s: Array
+    ends_s: Array
+    ways_m: Array
+
+
+class _Quantity(NamedTuple):
+    """Limits of a distance [m] or a turn [rad] that is compared."""
+
+    step_noise: float
+    least: float  # sum that is a fault
+
+
+DISTANCE: Final = _Quantity(STEP_M, LEAST_M)
+WHEEL_TURN: Final = _Quantity(STEP_RAD, WHEEL_TURN_RAD)
+GYRO_TURN: Final = _Quantity(STEP_RAD, TURN_RAD)
+
+
 class _Finding(NamedTuple):
     """Comparison of one account with the images, or of wheels with the gyro."""
 
@@ -184,12 +204,12 @@ class MotionAgreement:
     def _compare(self, now_s: float) -> Witness:
         """Return the account that differs, and whether it is a fault."""
         starts_s, ends_s, seen_m, seen_rad, aside_m = np.array(self._steps).T
-        spans = starts_s, ends_s, seen_m
-        distance = self._finding(spans, seen_m, self._wheels_m, (STEP_M, LEAST_M, "m"))
-        of_wheels = self._finding(spans, seen_rad, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
-        of_gyro = self._finding(spans, seen_rad, self._gyro_rad, (STEP_RAD, TURN_RAD, "rad"))
+        spans = _Spans(starts_s, ends_s, seen_m)
+        distance = self._finding(spans, seen_m, self._wheels_m, DISTANCE)
+        of_wheels = self._finding(spans, seen_rad, self._wheels_rad, WHEEL_TURN)
+        of_gyro = self._finding(spans, seen_rad, self._gyro_rad, GYRO_TURN)
         by_gyro = self._gyro_rad.between(starts_s, ends_s)
-        between = self._finding(spans, by_gyro, self._wheels_rad, (STEP_RAD, WHEEL_TURN_RAD, "rad"))
+        between = self._finding(spans, by_gyro, self._wheels_rad, WHEEL_TURN)
         # The larger one of distance and turn of the wheels; a lag counts as a fault.
         wheels = max((distance, of_wheels), key=lambda found: (found.differs, found.excess, abs(found.lag_s)))
         if not wheels.differs and not of_gyro.differs:
@@ -213,23 +233,18 @@ class MotionAgreement:
         differences = (each.difference if each.differs else Difference() for each in (distance, turn))
         return Witness(reason, found.text, is_fault, *differences)
 
-    def _finding(
-        self, spans: tuple[Array, Array, Array], seen: Array, travel: _Travel, limits: tuple[float, float, str]
-    ) -> _Finding:
-        """Compare the motion seen (N,) in steps with that of a sensor.
-
-        spans: begins and ends [s] of the steps, and their ways [m]; limits: noise of a step, least sum, unit.
-        """
+    def _finding(self, spans: _Spans, seen: Array, travel: _Travel, quantity: _Quantity) -> _Finding:
+        """Compare the motion seen (N,) in steps with that of a sensor, both in metres or radians."""
         if travel.is_unknown:
             return _UNKNOWN
-        span_s, ways_m = spans[:2], spans[2]
-        noise, least, unit = limits
-        by_lag = travel.between(span_s[0] - self._lags_s[:, None], span_s[1] - self._lags_s[:, None])
+        starts_s, ends_s, ways_m = spans
+        is_distance = quantity is DISTANCE
+        by_lag = travel.between(starts_s - self._lags_s[:, None], ends_s - self._lags_s[:, None])
         near = int(np.argmin(np.abs(self._lags_s)))
         # 1. Delay; the newest steps have no samples of later times yet.
         known = np.isfinite(by_lag).all(axis=0) & np.isfinite(seen)
         if known.sum() >= LEAST_STEPS:
-            best, near, is_late = self._lag(by_lag[:, known], seen[known], noise)
+            best, near, is_late = self._lag(by_lag[:, known], seen[known], quantity.step_noise)
             if is_late:
                 lag_s = float(self._lags_s[best])
                 return _Finding(lag_s, 0.0, f"by {abs(lag_s):.1f} s")
@@ -239,30 +254,30 @@ class MotionAgreement:
             return _UNKNOWN
         moved, seen = by_lag[near, known][::-1], seen[known][::-1]  # the newest first
         path = np.cumsum(np.abs(moved))
-        count = int(np.searchsorted(path if unit == "m" else np.cumsum(np.abs(ways_m[known][::-1])), WINDOW_M)) + 1
+        count = int(np.searchsorted(path if is_distance else np.cumsum(np.abs(ways_m[known][::-1])), WINDOW_M)) + 1
         length = float(path[min(count, len(path)) - 1])
         apart = float((moved[:count] - seen[:count]).sum())
         difference = abs(apart)
-        is_whole = count <= len(path) or span_s[1][-1] - span_s[0][0] >= WINDOW_S - LEAST_STEPS * EVERY_S
+        is_whole = count <= len(path) or ends_s[-1] - starts_s[0] >= WINDOW_S - LEAST_STEPS * EVERY_S
         limit = (
-            max(SCALE_SHARE * (length if is_whole else WINDOW_M), least)
-            if unit == "m"
-            else max(SCALE_SHARE * length, least)
+            max(SCALE_SHARE * (length if is_whole else WINDOW_M), quantity.least)
+            if is_distance
+            else max(SCALE_SHARE * length, quantity.least)
         )
-        steps_s = span_s[1][known] - span_s[0][known]
+        steps_s = ends_s[known] - starts_s[known]
         duration_s = float(steps_s[::-1][:count].sum())
         limit += LAG_SIGMA_S * float((np.abs(seen[::-1]) / np.maximum(steps_s, LEAST_SAMPLE_S)).max())
-        if unit == "m":
-            soon = int(np.searchsorted(span_s[1][-1] - span_s[1][known][::-1], SOON_S))
+        if is_distance:
+            soon = int(np.searchsorted(ends_s[-1] - ends_s[known][::-1], SOON_S))
             lacking = abs(float((moved[:soon] - seen[:soon]).sum()))
             if lacking > max(SOON_M, SOON_SHARE * float(np.abs(moved[:soon]).sum())) and difference < limit:
                 text = f"by {lacking:.2f} m in {SOON_S:.0f} s"
                 return _Finding(0.0, max(DOUBT_SHARE, difference / limit), text, Difference(apart, duration_s))
-        shown = f"{difference:.2f} m in {length:.1f} m" if unit == "m" else f"{np.degrees(difference):.0f} degrees"
+        shown = f"{difference:.2f} m in {length:.1f} m" if is_distance else f"{np.degrees(difference):.0f} degrees"
         return _Finding(0.0, difference / limit, f"by {shown}", Difference(apart, duration_s))
 
     @staticmethod
-    def _aside(spans: tuple[Array, Array, Array], turns: Array, aside: Array) -> _Finding:
+    def _aside(spans: _Spans, turns: Array, aside: Array) -> _Finding:
         """Return the motion to the side (N,) in the straight part of the newest WINDOW_M."""
         starts_s, ends_s, ways_m = spans
         straight = (np.abs(turns) <= STRAIGHT_RADPM * np.abs(ways_m)) & (np.abs(aside) < np.abs(ways_m))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.kalman_filter import kalman_filter
-from omnid.core.odometry.sensed_motion import RateHistory, SensedMotion
+from omnid.core.odometry.sensed_motion import RateHistory, RateIntegral, SensedMotion
 
 Array = NDArray[np.float64]
 
@@ -127,7 +127,7 @@ class MotionSensors:
         # that of the gyro where there is one.
         twist, sigma, slopes = np.zeros(6), np.repeat([UNKNOWN_M, UNKNOWN_RAD], 3), np.zeros((6, 7))
         if wheels is not None:
-            distance, turn = wheels[0]
+            distance, turn = wheels.amounts
             twist[0], slopes[0, DISTANCE] = self.values[DISTANCE] * distance, distance
             rough = math.sqrt(self._noise_factors[DISTANCE])
             missing_s = self._wheels.missing_s(end_s - self.values[WHEEL_OFFSET])
@@ -143,18 +143,15 @@ class MotionSensors:
                 of_wheels = math.sqrt(self._noise_factors[TURN]) * math.hypot(TURN_SHARE * turn, WHEEL_RAD)
                 sigma[5] = math.hypot(of_wheels, NOT_YET_RADPS2 * missing_s**2 / 2)
         if gyro is not None:
-            twist[3:] = gyro[0] - self.values[BIAS] * dt_s
+            twist[3:] = gyro.amounts - self.values[BIAS] * dt_s
             missing_s = self._gyro.missing_s(end_s - self.values[GYRO_OFFSET])
             sigma[3:] = math.hypot(GYRO_RADPS_SQRT_S * math.sqrt(dt_s), NOT_YET_RADPS2 * missing_s**2 / 2)
             slopes[3:], slopes[3:, BIAS] = 0.0, -dt_s * np.eye(3)
         return self._in_rect(twist, sigma, slopes, complete=wheels is not None and sigma[5] < UNKNOWN_RAD)
 
-    def _disagree(self, wheels: tuple[Array, Array], gyro: tuple[Array, Array], dt_s: float) -> bool:
-        """True if wheels and gyro measure turns in a step that differ by more than their errors: a wheel slips.
-
-        wheels, gyro: their amounts in the step, and the change of their rates; see RateHistory.integral.
-        """
-        turn, turned = wheels[0][1], gyro[0][2]
+    def _disagree(self, wheels: RateIntegral, gyro: RateIntegral, dt_s: float) -> bool:
+        """True if wheels and gyro measure turns in a step that differ by more than their errors: a wheel slips."""
+        turn, turned = wheels.amounts[1], gyro.amounts[2]
         if not math.isfinite(turn):
             return False
         H = np.zeros(len(START))
@@ -163,7 +160,8 @@ class MotionSensors:
         of_wheels = self._noise_factors[TURN] * ((TURN_SHARE * turn) ** 2 + WHEEL_RAD**2)
         variance = of_wheels + GYRO_RADPS_SQRT_S**2 * dt_s + H @ self._filter.P @ H
         # The offsets of both clocks are not known exactly either: a turn begins in one before it does in the other.
-        variance += (self.sigmas[WHEEL_OFFSET] * wheels[1][1]) ** 2 + (self.sigmas[GYRO_OFFSET] * gyro[1][2]) ** 2
+        of_clocks = self.sigmas[WHEEL_OFFSET] * wheels.changes[1], self.sigmas[GYRO_OFFSET] * gyro.changes[2]
+        variance += of_clocks[0] ** 2 + of_clocks[1] ** 2
         return bool(difference**2 > OUTLIER_SIGMA**2 * variance)
 
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
@@ -182,7 +180,7 @@ class MotionSensors:
         if wheels is not None:
             self._learn_wheels(wheels, seen, variance)
         if gyro is not None:
-            self._learn_gyro(*gyro, seen[3:], variance[3:], dt_s)
+            self._learn_gyro(gyro, seen[3:], variance[3:], dt_s)
 
     def _seconds(self, stamp_ns: int) -> float:
         """Return the time since the first stamp: a number of seconds since 1970 has too few digits."""
@@ -190,7 +188,7 @@ class MotionSensors:
             self._zero_ns = stamp_ns
         return (stamp_ns - self._zero_ns) * 1e-9
 
-    def _learn_wheels(self, wheels: tuple[Array, Array], seen: Array, variance: Array) -> None:
+    def _learn_wheels(self, wheels: RateIntegral, seen: Array, variance: Array) -> None:
         """Learn scales and offset of the wheels from the cameras' twist (6,) with variances (6,)."""
         agree = True
         rows = (
@@ -198,7 +196,7 @@ class MotionSensors:
             (TURN, seen[5], variance[5], TURN_SHARE, WHEEL_RAD),
         )
         for number, (state, truth, noise, share, least) in enumerate(rows):
-            amount, change = wheels[0][number], wheels[1][number]
+            amount, change = wheels.amounts[number], wheels.changes[number]
             if not math.isfinite(amount):
                 continue
             H = np.zeros(len(START))
@@ -216,16 +214,13 @@ class MotionSensors:
         if ratio < RATIO_LIMIT:
             self._noise_factors[state] = max(1.0, self._noise_factors[state] * (1.0 + NOISE_GAIN * (ratio - 1.0)))
 
-    def _learn_gyro(self, turned: Array, change: Array, seen: Array, variance: Array, dt_s: float) -> None:
-        """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,).
-
-        turned (3,): rotation by the gyro; change (3,): of its rates in that time.
-        """
+    def _learn_gyro(self, gyro: RateIntegral, seen: Array, variance: Array, dt_s: float) -> None:
+        """Learn bias and offset of the gyro from the cameras' rotation (3,) with variances (3,)."""
         agree = True
         for axis in range(3):
             H = np.zeros(len(START))
-            H[BIAS.start + axis], H[GYRO_OFFSET] = -dt_s, -change[axis]
-            error = seen[axis] - (turned[axis] - self.values[BIAS][axis] * dt_s)
+            H[BIAS.start + axis], H[GYRO_OFFSET] = -dt_s, -gyro.changes[axis]
+            error = seen[axis] - (gyro.amounts[axis] - self.values[BIAS][axis] * dt_s)
             agree &= self._update(error, H, variance[axis] + GYRO_RADPS_SQRT_S**2 * dt_s)
         self.refused += not agree
         self._count(GyroSample, agree, np.array([GYRO_OFFSET, 4, 5, 6]))
@@ -247,13 +242,13 @@ class MotionSensors:
             self._filter.P[states] = self._filter.P[:, states] = 0.0
             self._filter.P[states, states] = LOST_SIGMA[states] ** 2
 
-    def _of_wheels(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
-        """Return distance and turn of the wheels in a time, and the change of their rates; see RateHistory.integral."""
+    def _of_wheels(self, start_s: float, end_s: float) -> RateIntegral | None:
+        """Return distance and turn of the wheels in a time."""
         offset_s = self.values[WHEEL_OFFSET]
         return self._wheels.integral(start_s - offset_s, end_s - offset_s)
 
-    def _of_gyro(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
-        """Return the rotation vector (3,) of the gyro in a time, and the change of its rates (3,)."""
+    def _of_gyro(self, start_s: float, end_s: float) -> RateIntegral | None:
+        """Return the rotation vector (3,) of the gyro in a time."""
         offset_s = self.values[GYRO_OFFSET]
         return self._gyro.integral(start_s - offset_s, end_s - offset_s)
 

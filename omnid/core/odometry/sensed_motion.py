@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,13 @@ Array = NDArray[np.float64]
 
 LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval. By judgement; not measured.
 MOST_SAMPLES = 512  # Samples that are kept, so that memory is bounded: two seconds of a sensor of 250 Hz.
+
+
+class RateIntegral(NamedTuple):
+    """Integral (size,) of the rates of a sensor over an interval, and their change (size,) from start to end."""
+
+    amounts: Array
+    changes: Array
 
 
 class RateHistory:
@@ -28,8 +36,8 @@ class RateHistory:
         rates = np.concatenate([rates, self._rates])[first]
         self._times, self._rates = times[-MOST_SAMPLES:], rates[-MOST_SAMPLES:]
 
-    def integral(self, start_s: float, end_s: float) -> tuple[Array, Array] | None:
-        """Return the integral (size,) of the rates over an interval, and their change (size,) from start to end.
+    def integral(self, start_s: float, end_s: float) -> RateIntegral | None:
+        """Return the integral of the rates over an interval.
 
         The rates are linear between samples. None where the samples leave a gap.
         """
@@ -44,7 +52,7 @@ class RateHistory:
         times = np.concatenate([[start_s], known[(known > start_s) & (known < end_s)], [end_s]])
         rates = np.column_stack([np.interp(times, known, column) for column in self._rates[inner].T])
         total = ((rates[1:] + rates[:-1]) / 2 * np.diff(times)[:, None]).sum(axis=0)
-        return total, rates[-1] - rates[0]
+        return RateIntegral(total, rates[-1] - rates[0])
 
     def missing_s(self, end_s: float) -> float:
         """Return the time before the end of an interval over which `integral` holds the rates of the last sample."""

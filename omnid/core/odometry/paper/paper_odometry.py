@@ -102,13 +102,13 @@ class PaperOdometry:
         M, is_inlier = consensus(X_a, X_b, np.random.default_rng(frame.seq), THRESHOLD_M)
         inliers = int(is_inlier.sum())
         if inliers < MIN_INLIERS:
-            return self._refuse(frame, dt_s, (len(X_a), inliers))
+            return self._refuse(frame, dt_s, len(X_a), inliers)
 
         # 3. Estimate the motion of the points by Gauss-Newton (section IV.C, eq. 9).
         motion = register(X_a[is_inlier], X_b[is_inlier], M)
 
         # 4. Refine the result by KLT, started where the estimated motion predicts the features.
-        motion = refine((reference.frame, frame), F_a, motion, self._model, self._klt)
+        motion = refine(reference.frame, frame, F_a, motion, self._model, self._klt)
 
         # 5. Filter the motion (section IV.D) and compose its inverse, the motion of the camera (eq. 12).
         self._move(reference, motion, dt_s)
@@ -148,8 +148,8 @@ class PaperOdometry:
         self._T_odom_rect = self._T_odom_rect @ T_prev_curr
         self._covariance = _moved_covariance(reference.covariance, T_ref_curr) + motion.covariance
 
-    def _refuse(self, frame: StereoFrame, dt_s: float, counts: tuple[int, int]) -> OdometryEstimate:
-        """Keep the pose: the paper does not treat this case. counts: tracked, inliers.
+    def _refuse(self, frame: StereoFrame, dt_s: float, tracked: int, inliers: int) -> OdometryEstimate:
+        """Keep the pose: the paper does not treat this case.
 
         Its covariance grows as under an unknown steady velocity.
         """
@@ -158,7 +158,7 @@ class PaperOdometry:
         growth = UNTRACKED_SPEED_SIGMA**2 * (self._untracked_s**2 - before_s**2)
         self._covariance = bounded(self._covariance + growth * np.eye(6))
         self._set_reference(frame)
-        return self._result(TrackingState.LOST, *counts)
+        return self._result(TrackingState.LOST, tracked, inliers)
 
     def _result(self, state: TrackingState, tracked: int, inliers: int) -> OdometryEstimate:
         return OdometryEstimate(
@@ -190,7 +190,12 @@ def locate(frame: StereoFrame, features: Array, model: StereoModel) -> Array:
 
 
 def refine(
-    frames: tuple[StereoFrame, StereoFrame], features: Array, motion: Registration, model: StereoModel, klt: KltSettings
+    previous: StereoFrame,
+    current: StereoFrame,
+    features: Array,
+    motion: Registration,
+    model: StereoModel,
+    klt: KltSettings,
 ) -> Registration:
     """Return the motion between two frames estimated again from all located features (N, 2): figure 5, step 4.
 
@@ -198,7 +203,6 @@ def refine(
     features are found that the first search missed or tracked badly; those within THRESHOLD_M of the motion take part
     in eq. (9) once more. With fewer than MIN_INLIERS of them the motion is returned as it is.
     """
-    previous, current = frames
     X_a = locate(previous, features, model)
     known = np.isfinite(X_a).all(axis=1)
     features, X_a = features[known], X_a[known]

@@ -17,7 +17,7 @@ def poses(*sigmas: tuple[float, float], settings: TrustSettings | None = None) -
     """Return the trust after poses 0.1 s apart."""
     trust = PoseTrust(settings or TrustSettings())
     for number, pair in enumerate(sigmas):
-        trust.add_pose(number * NS // 10, pair, 0)
+        trust.add_pose(number * NS // 10, *pair, 0)
     return trust
 
 
@@ -34,14 +34,14 @@ def test_levels_may_be_switched_off() -> None:
     assert not poses(*[(9.0, 9.0)] * 9, settings=off).unsure
     trust = PoseTrust(off)
     for resets in (0, 1):
-        trust.add_pose(resets, SURE, resets)
+        trust.add_pose(resets, *SURE, resets)
     assert not trust.take_reset()
 
 
 def test_a_reset_counts_once() -> None:
     trust = PoseTrust(TrustSettings())
     for number, (resets, expected) in enumerate([(3, False), (3, False), (4, True), (4, False)]):
-        trust.add_pose(number, SURE, resets)
+        trust.add_pose(number, *SURE, resets)
         assert trust.take_reset() is expected and not trust.take_reset()
 
 

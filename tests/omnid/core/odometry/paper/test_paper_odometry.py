@@ -113,7 +113,7 @@ def test_step_4_refines_a_rough_motion(cameras: RenderedCameras, frames: list[St
     truth = se3.inverse(PATH[2]) @ PATH[1]
     rough = truth @ se3.exp([0.01, -0.01, 0.0, 0.0, 0.0, 0.009])
     features = corners(pair[0].lower, pair[0].usable, FEATURES)
-    refined = refine(pair, features, Registration(rough, np.eye(6)), cameras.model, KltSettings())
+    refined = refine(*pair, features, Registration(rough, np.eye(6)), cameras.model, KltSettings())
     distance, angle = motion_errors(refined.M, truth)
     assert distance < 0.005 and angle < 0.002
     assert distance < 0.5 * motion_errors(rough, truth)[0]
@@ -124,8 +124,8 @@ def test_step_4_keeps_the_motion_where_no_features_are_found(
 ) -> None:
     motion = Registration(np.eye(4), np.eye(6))
     features = corners(frames[0].lower, frames[0].usable, FEATURES)
-    assert refine((frames[0], cameras.darkness(9)), features, motion, cameras.model, KltSettings()) is motion
-    assert refine((frames[0], frames[1]), np.zeros((0, 2)), motion, cameras.model, KltSettings()) is motion
+    assert refine(frames[0], cameras.darkness(9), features, motion, cameras.model, KltSettings()) is motion
+    assert refine(frames[0], frames[1], np.zeros((0, 2)), motion, cameras.model, KltSettings()) is motion
 
 
 @pytest.mark.parametrize("tracker", ["improved", "klt"])
