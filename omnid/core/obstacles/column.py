@@ -36,6 +36,7 @@ FLOOR_FOCAL_PX: Final = 100.0  # rows of panoramas in a radian: with 104 all of 
 LEAST_SEEN: Final = 0.5  # Share of the rows of a patch that must be in view. By judgement; not measured.
 OUTLIER: Final = np.uint8(48)  # Most units by which a pixel differs; a larger difference counts as this one.
 DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 would be that of independent pixels
+THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 BIN_ROWS: Final = 2  # Rows on either side of those in which the floor has a disparity.
 FLOOR_PX: Final = 1.3  # least difference of disparity by which something is not the floor
 OTHERS_PX: Final = (12, 25)  # lower and higher disparities than the floor's that may explain its rows
@@ -68,7 +69,10 @@ class FloorPlane(NamedTuple):
 class ColumnEvidence(NamedTuple):
     """Log-likelihood ratios of K disparities and DIRECTIONS directions of the rectified frame; k = 0 is far."""
 
-    floor: Floats  # (K, DIRECTIONS) of the floor from disparity k to k + 1, NaN where both cameras cannot see it
+    floor: (
+        Floats  # (K, DIRECTIONS) of the floor from disparity k to k + 1, of the directions from one on that something
+    )
+    # thin hides together; NaN where both cameras cannot see it
     surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
     level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
     nearest_floor_m: float  # nearest floor that both cameras see, 0: none
@@ -130,7 +134,8 @@ class Columns:
         others, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
         compared = views.lower, views.upright, views.plane, views.live
         kernels.floor_evidence(*compared, self._floor_bins, OUTLIER, scale, self._prior, others)
-        floor = -np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
+        together = self._floor_bins[:, kernels.FLOOR_THIN, None].astype(np.float32)
+        floor = -together * np.log(np.maximum(others, np.float32(LEAST_OTHERS)))
         floor[~self._compared] = np.nan
         return floor
 
@@ -152,7 +157,7 @@ class Columns:
 
     def _made_floor_bins(self) -> Tables:
         """Return the table of kernels.floor_evidence."""
-        table = np.zeros((self.bins, 6), np.int32)
+        table = np.zeros((self.bins, 7), np.int32)
         for k in range(self._first_bin, self.bins):
             first, end = (math.ceil(self._row0 + n / self._floor_slope) for n in (k, k + 1))
             middle = self._floor_slope * ((first + end - 1) / 2 - self._row0)
@@ -167,15 +172,18 @@ class Columns:
                 math.floor(middle - FLOOR_PX),
                 math.ceil(middle + FLOOR_PX),
                 last,
+                max(round(THIN_M * (k + 0.5) / self.at_1m * DIRECTIONS / math.tau), 1),
             )
         return table
 
     def _made_compared(self) -> Flags:
-        """Return the patches (K, DIRECTIONS) of the floor that are seen: a narrow strut hides them as a wide one."""
+        """Return the patches (K, DIRECTIONS) of the floor that are seen in all their directions, as struts are narrow."""
         found = np.zeros((self.bins, DIRECTIONS), bool)
         for k, (first, end, *_) in enumerate(self._floor_bins):
             if end:
-                found[k] = self._visible[first:end].mean(axis=0) >= LEAST_SEEN
+                seen = self._visible[first:end].mean(axis=0) >= LEAST_SEEN
+                together = range(self._floor_bins[k, kernels.FLOOR_THIN])
+                found[k] = np.logical_and.reduce([np.roll(seen, -shift) for shift in together])
         return found
 
     def _leave_out_cut_planes(self) -> None:

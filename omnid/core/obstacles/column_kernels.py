@@ -21,7 +21,7 @@ LARGEST = np.uint16(65535)  # The largest number of 16 bits: exact.
 ONE, NOTHING = np.float32(1.0), np.float32(0.0)
 # exp(x) is taken as (1 + x / 32)^32, since five products are faster: within 10 % from -2 to 2, and 0 below -32.
 EXP_SHARE = np.float32(1 / 32)
-FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO = 0, 1, 2, 3, 4, 5
+FLOOR_FIRST, FLOOR_END, FLOOR_FROM, FLOOR_LOW, FLOOR_HIGH, FLOOR_TO, FLOOR_THIN = 0, 1, 2, 3, 4, 5, 6
 
 
 @inner
@@ -75,6 +75,19 @@ def spread(sums: Words, into: Words) -> None:
         into[u] = np.uint16(sums[u - 1] + sums[u] + sums[u] + sums[u + 1])
     into[0] = np.uint16(sums[width - 1] + sums[0] + sums[0] + sums[1])
     into[width - 1] = np.uint16(sums[width - 2] + sums[width - 1] + sums[width - 1] + sums[0])
+
+
+@inner
+def add_next(sums: Words, count: int, into: Words) -> None:
+    """Write the sums (W,) of each direction and of those that follow it, so many together."""
+    width = len(sums)
+    for u in range(width):
+        into[u] = sums[u]
+    for m in range(1, count):
+        for u in range(width - m):
+            into[u] = np.uint16(into[u] + sums[u + m])
+        for u in range(width - m, width):
+            into[u] = np.uint16(into[u] + sums[u + m - width])
 
 
 @inner
@@ -168,8 +181,9 @@ def floor_evidence(
 
     lower (H, W): normalised lower panorama; upright, plane (2, H, W): least and most of the upper one about each pixel,
     and on the plane of the floor. live (H, W): 255 where pixels may be compared, else 0.
-    bins (K, 6): first row and end of the rows of the floor at that disparity, 0 and 0 for none; of the disparities the
-    first, the last that is lower than the floor, the first that is higher, and the end.
+    bins (K, 7): first row and end of the rows of the floor at that disparity, 0 and 0 for none; of the disparities the
+    first, the last that is lower than the floor, the first that is higher, and the end; the directions that something
+    thin hides: their mean is compared, of a direction and those that follow it.
     outlier: most that a pixel differs; scale: logarithm of the likelihood by a unit of difference; prior: weight of a
     disparity by its difference from the floor's.
     """
@@ -177,7 +191,7 @@ def floor_evidence(
     for k in range(len(bins)):
         deepest = max(deepest, bins[k, FLOOR_TO])
     sums, floor = np.zeros((deepest + 1, width), np.uint16), np.zeros(width, np.uint16)
-    value = np.empty(width, np.float32)
+    value, wide, wide_floor = np.empty(width, np.float32), np.empty(width, np.uint16), np.empty(width, np.uint16)
     others[:] = ONE
     for k in range(len(bins)):
         first, end, low, high = bins[k, FLOOR_FIRST], bins[k, FLOOR_END], bins[k, FLOOR_LOW], bins[k, FLOOR_HIGH]
@@ -192,9 +206,13 @@ def floor_evidence(
                     add_differences(lower[v], upright[0, v + d], upright[1, v + d], live[v], outlier, sums[d])
         others[k] = NOTHING
         weights = NOTHING
+        together = bins[k, FLOOR_THIN]
+        mean_scale = scale / np.float32(together)
+        add_next(floor, together, wide_floor)
         for d in range(begin, last):
             if d <= low or d >= high:
-                likelihoods(sums[d], floor, scale, value)
+                add_next(sums[d], together, wide)
+                likelihoods(wide, wide_floor, mean_scale, value)
                 add(value, prior[abs(d - k)], others[k])
                 weights += prior[abs(d - k)]
         for u in range(width):

@@ -18,7 +18,7 @@ from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.cell_kernels import FLOOR, LIMIT, MOST_RATIO, SURFACE, TAKEN_ODDS, VISIBLE, add_pair
-from omnid.core.obstacles.column import ColumnEvidence, floor_plane
+from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
 from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of, level_odds
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
 from omnid.core.obstacles.near_field import NearField
@@ -47,7 +47,6 @@ MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair; by trial, too
 
 APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.
 APART_S: Final = 0.2  # A pair from the same place counts in full after it, so that a base that stands sees what comes.
-THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
 END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
 
 

@@ -127,7 +127,7 @@ def gather(
     compared. origin (6,): place of the middle of cell (0, 0) in the frame of the columns, cosine and sine of its axes
     there, and by how much [m] a surface at the viewpoint's height appears nearer than its foot along x and y, as the
     rig leans. at_1m: disparity at 1 m; reach_m: farther cells are left out; thin_m: width of the thinnest obstacle,
-    whose directions count together.
+    whose directions are judged together.
     """
     bins, width = floor.shape
     table, found = np.empty((width, bins, 4), np.float32), np.empty(PLACES, np.float64)
@@ -147,7 +147,8 @@ def gather(
                 continue
             ends = directions(found[X + n], found[Y + n], found[AT + n], found[HALF + n], by_angle)
             count = ends[1] - ends[0] + 1
-            # Floor and planes: the mean of the disparities, the sum of the directions that something thin would hide.
+            # Floor and planes: the mean of the disparities. Evidence of the floor is that of something thin, which lies
+            # in the cell if it begins before the last directions.
             far, near = int(found[FAR + n]), int(found[NEAR + n])
             run = max(min(round(thin_m / r * by_angle), count), 1)
             weakest, sum_floor, above, below = np.inf, 0.0, 0.0, 0.0
@@ -158,15 +159,11 @@ def gather(
                     below += table[at_u, k, BELOW]
                     sum_floor += table[at_u, k, FLOOR]
                     total += table[at_u, k, FLOOR]
-                if u + run <= ends[1] + 1:
-                    for m in range(u + 1, u + run):
-                        for k in range(far, near + 1):
-                            total += table[wrapped(m, width), k, FLOOR]
-                    # One direction in which nothing can be seen makes the cell such, whichever it is.
-                    if not math.isnan(weakest) and not total >= weakest:
-                        weakest = total
+                # One direction in which nothing can be seen makes the cell such, whichever it is.
+                if u + run <= ends[1] + 1 and not math.isnan(weakest) and not total >= weakest:
+                    weakest = total
             patches = count * (near - far + 1)
-            cells[0, i, j], cells[4, i, j] = weakest / (near - far + 1), sum_floor * run / patches
+            cells[0, i, j], cells[4, i, j] = weakest / (near - far + 1), sum_floor / patches
             cells[1, i, j], cells[2, i, j] = above / patches, below / patches
             # A surface: at the disparities that it has at any of its heights.
             last_surface = int(found[LAST_SURFACE + n])

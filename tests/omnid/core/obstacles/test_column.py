@@ -76,7 +76,7 @@ def test_a_line_painted_on_the_floor_hides_no_weak_texture_around_it(columns: Co
 def test_plain_wall_and_plain_floor_are_no_evidence(columns: Columns) -> None:
     found = evidence(columns, plain, plain)
     inner = floor_at(columns, found, 1.0, 1.6)
-    assert abs(inner.mean()) < 0.3 and np.percentile(np.abs(inner), 95) < 2.0
+    assert abs(inner.mean()) < 0.3 and np.percentile(np.abs(inner), 95) < 3.0
     assert np.percentile(found.surface, 99.5) < 2
 
 
