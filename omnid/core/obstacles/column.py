@@ -177,7 +177,7 @@ class Columns:
         return table
 
     def _made_compared(self) -> Flags:
-        """Return the patches (K, DIRECTIONS) of the floor that are seen in all their directions, as struts are narrow."""
+        """Return the patches (K, DIRECTIONS) of the floor that are seen in all directions that are judged together."""
         found = np.zeros((self.bins, DIRECTIONS), bool)
         for k, (first, end, *_) in enumerate(self._floor_bins):
             if end:
