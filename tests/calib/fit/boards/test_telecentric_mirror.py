@@ -10,7 +10,7 @@ import pytest
 import scipy
 
 from calib import se3
-from calib.boards.board import BoardView
+from calib.boards.board import Board, BoardView
 from calib.fit.boards.rig_fit import RigCalibration, fit_rig
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import START_M, START_TANGENTIAL, telecentric_if_as_good
@@ -21,11 +21,12 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.models.wavefront import TERMS, WAVEFRONT_NAMES
 from calib.rig import Rig
-from tests.benchmark.boards_chain import BOARD, DISTANCE_M, board_rig
+from tests.benchmark.boards_chain import DISTANCE_M, board_rig
 from tests.simulation.boards import board_poses_around_rig
 from tests.simulation.mirrors import MirrorCamera
 
 RADIUS_M = 0.03
+BOARD = Board(5, 4, 0.08)  # as large as one of 9 x 6 corners, with fewer of them to fit
 
 
 def mirror(horizon_px: float, center: tuple[float, float], size: tuple[int, int], xi: float = 1.0) -> OcamCamera:
