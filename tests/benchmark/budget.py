@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.logs.log_reader import LogReader
-from omnid.config import load_config
-from omnid.engine.graph import Graph
+from omnid.config import Config, load_config
+from omnid.engine.graph import Graph, Sink
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
 from omnid.sinks.files import MapFile, TrajectoryFile
@@ -84,23 +84,31 @@ class ReferenceTimes:
         self.lk_ns.append(self._kernels.lucas_kanade_ns(before, lower))
 
 
-def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Budget:
-    """Run the stages inline over so many pairs, hz a second, to and fro through the log, and return the times."""
-    config = load_config(None, overrides)
+def run_replay(
+    graph: Graph, folder: Path, pairs: int, hz: float, config: Config, work: Path, sink: Sink[OdometryUpdate]
+) -> None:
+    """Run the stages of a replay over so many pairs, hz a second, to and fro through a log; sink: gets the poses, too.
+
+    work: folder for the files of the replay.
+    """
     frames = list(LogReader(folder / "log.mcap").frames())
     place = geometry(with_rims(rig_of(folder), frames), config.panorama)
     cv2.setNumThreads(config.graph.opencv_threads)
+    sinks = Sinks({"trajectory": TrajectoryFile(work / "t"), "measured": sink}, {"map": MapFile(work / "m")})
+    read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
+    paired = graph.stage("pair", Synchronise(place.rig, config.pair), read)
+    wire(graph, paired, FrontEnd(place, config), config, sinks)
+    graph.run()
+
+
+def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> Budget:
+    """Run the stages inline over so many pairs, hz a second, to and fro through the log, and return the times."""
+    config = load_config(None, overrides)
     clock = StepClock()
     reference = ReferenceTimes(clock)
     with TemporaryDirectory() as work, measured_steps(clock):
         graph = Graph(threaded=False)
-        sinks = Sinks(
-            {"trajectory": TrajectoryFile(Path(work) / "t"), "reference": reference}, {"map": MapFile(Path(work) / "m")}
-        )
-        read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        paired = graph.stage("pair", Synchronise(place.rig, config.pair), read)
-        wire(graph, paired, FrontEnd(place, config), config, sinks)
-        graph.run()
+        run_replay(graph, folder, pairs, hz, config, Path(work), reference)
     count = pairs - SKIPPED
     return Budget(
         {path: ns * 1e-6 / count for path, ns in clock.own_ns.items()},

@@ -22,9 +22,6 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 from unittest.mock import patch
 
-import cv2
-
-from drivers.logs.log_reader import LogReader
 from omnid.commands.config import PROFILES
 from omnid.config import load_config
 from omnid.engine.graph import Graph
@@ -33,14 +30,8 @@ from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.one_at_a_time import OneAtATime
 from omnid.engine.realtime import name_thread
 from omnid.messages import OdometryUpdate
-from omnid.runs.pipeline import Sinks, wire
-from omnid.sinks.files import MapFile, TrajectoryFile
-from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.synchronise import Synchronise
-from tests.benchmark.accuracy import rig_of
+from tests.benchmark.budget import run_replay
 from tests.benchmark.results import Column, ResultTable
-from tests.replay.test_memory import to_and_fro
 
 # Pairs left out: the first ones, in which caches, buffers and the first map are filled, and the last ones, as threads
 # end while others still compute.
@@ -104,20 +95,11 @@ def measured_waits() -> Iterator[Waited]:
 def measure(folder: Path, pairs: int, hz: float, overrides: tuple[str, ...]) -> tuple[Reading, Reading]:
     """Run the stages in threads over so many pairs, hz a second, and return the times of the threads."""
     config = load_config(None, overrides)
-    frames = list(LogReader(folder / "log.mcap").frames())
-    place = geometry(with_rims(rig_of(folder), frames), config.panorama)
-    cv2.setNumThreads(config.graph.opencv_threads)
     prepare_kernels()
     with TemporaryDirectory() as work, measured_waits() as waited:
         readings = Readings(waited, pairs)
         graph = Graph(depth=config.graph.depth, on_thread=name_thread)
-        sinks = Sinks(
-            {"trajectory": TrajectoryFile(Path(work) / "t"), "readings": readings}, {"map": MapFile(Path(work) / "m")}
-        )
-        read = graph.source("read", lambda: to_and_fro(frames, pairs, round(1e9 / hz)))
-        paired = graph.stage("pair", Synchronise(place.rig, config.pair), read)
-        wire(graph, paired, FrontEnd(place, config), config, sinks)
-        graph.run()
+        run_replay(graph, folder, pairs, hz, config, Path(work), readings)
     first, last = readings.readings
     return first, last
 

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from calib import se3
-from calib.boards.board import BoardView
+from calib.boards.board import Board, BoardView
 from calib.fit.boards.camera_selection import select_calibration
 from calib.fit.boards.rig_covariance import rig_covariance
 from calib.fit.boards.rig_fit import RigCalibration
@@ -61,14 +61,15 @@ NAMES = (
 )
 
 
-def projected_views(seed: int, amount: float, noise_px: float) -> list[PairView]:
-    """Return the corners of a seed's boards by the true mirrors."""
-    rig, perfect = board_rig(seed, amount)
-    rng, views = np.random.default_rng([seed, 17]), []
-    for k, T in enumerate(board_poses_around_rig(perfect, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M)):
+def projected_views(
+    rig: Rig, perfect: Rig, board: Board, pairs: int, noise_px: float, *, seed: int, noise_seed: Sequence[int]
+) -> list[PairView]:
+    """Return the corners of boards around a perfect rig by the cameras of another one."""
+    rng, views = np.random.default_rng(noise_seed), []
+    for k, T in enumerate(board_poses_around_rig(perfect, board, pairs, seed=seed, distance_m=DISTANCE_M)):
         sides = []
         for mounted in (rig.lower, rig.upper):
-            pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig @ T, BOARD.points))
+            pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig @ T, board.points))
             sides.append(BoardView(f"{k:02d}", pixels + rng.normal(0, noise_px, pixels.shape), 1.0))
         views.append(PairView(f"{k:02d}", (sides[0], sides[1])))
     return views
@@ -248,9 +249,10 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--folder", type=Path, help="rendered images, with names as those of boards_chain")
     args, found = parser.parse_args(arguments), list[dict[str, float]]()
     for seed in args.seeds:
-        truth, _ = board_rig(seed, args.amount)
+        truth, perfect = board_rig(seed, args.amount)
         if args.folder is None:
-            calibration = calibrated(projected_views(seed, args.amount, args.noise_px), truth.lower.camera.size)
+            views = projected_views(truth, perfect, BOARD, PAIRS, args.noise_px, seed=seed, noise_seed=[seed, 17])
+            calibration = calibrated(views, truth.lower.camera.size)
             rig, line = mounted_rig(calibration), f"{calibration.fit.mean_px:.4f} px"
         else:
             boards = args.folder / f"boards_a{args.amount:g}_s{seed}"

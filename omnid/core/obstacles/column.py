@@ -69,10 +69,9 @@ class FloorPlane(NamedTuple):
 class ColumnEvidence(NamedTuple):
     """Log-likelihood ratios of K disparities and DIRECTIONS directions of the rectified frame; k = 0 is far."""
 
-    floor: (
-        Floats  # (K, DIRECTIONS) of the floor from disparity k to k + 1, of the directions from one on that something
-    )
-    # thin hides together; NaN where both cameras cannot see it
+    # (K, DIRECTIONS) of the floor from disparity k to k + 1, in a direction and those that follow it which something
+    # thin hides together; NaN where both cameras cannot see it.
+    floor: Floats
     surface: Floats  # (K, DIRECTIONS) of the best run of rows within the robot's heights, where k fits best
     level: Floats  # (2, K, DIRECTIONS) of the floor against planes that are just above and below it
     nearest_floor_m: float  # nearest floor that both cameras see, 0: none

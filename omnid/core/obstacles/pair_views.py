@@ -7,7 +7,6 @@ around: of surfaces by a band-pass, and of the floor by one in which no strong e
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import cv2
@@ -20,7 +19,6 @@ from omnid.core.types.panorama import PaddedPanorama
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
-BandPass = Callable[[Floats, float], Floats]  # of a smooth panorama, and the noise [grey levels]
 
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
 FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian: that of images of 512 px
@@ -31,10 +29,10 @@ CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a co
 BAND_NOISE: Final = 0.5  # Noise of a smooth image by that of a panorama, because the mean of some rows has less.
 UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
 ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
-NEAR_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
+BOUNDED_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
 # Most that one of them counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
 # texture of the floor around it. With 5 to 20 bases passed such a line; with no limit they stood before it.
-NEAR_SIGMAS: Final = 10.0
+BOUNDED_SIGMAS: Final = 10.0
 
 
 class Views(NamedTuple):
@@ -75,8 +73,9 @@ class WorkingPanoramas:
     def views(self, lower: PaddedPanorama, upper: PaddedPanorama, live: Bytes) -> tuple[Views, Views]:
         """Return the views of a pair for surfaces, and for the floor; live (H, DIRECTIONS): 255 where it is seen."""
         noise_grey = BAND_NOISE * max(lower.noise_grey, upper.noise_grey)
-        images = self._smooth(lower), self._smooth(upper)
-        surfaces, floor = (self._views(*images, noise_grey, band, live) for band in (_band_pass, _bounded_band_pass))
+        one, two = self._smooth(lower), self._smooth(upper)
+        surfaces = self._views(_band_pass(one), _band_pass(two), noise_grey, live)
+        floor = self._views(_bounded_band_pass(one, noise_grey), _bounded_band_pass(two, noise_grey), noise_grey, live)
         return surfaces, floor
 
     def _smooth(self, panorama: PaddedPanorama) -> Floats:
@@ -84,9 +83,9 @@ class WorkingPanoramas:
         image = self.sized(np.ascontiguousarray(panorama.panorama)).astype(np.float32)
         return np.asarray(cv2.GaussianBlur(image, (1, 5), sigmaX=0.1, sigmaY=FINE_PX), np.float32)
 
-    def _views(self, lower: Floats, upper: Floats, noise_grey: float, band_pass: BandPass, live: Bytes) -> Views:
-        """Return the views of two smooth panoramas (H, DIRECTIONS)."""
-        one, two = (self._normalised(band_pass(image, noise_grey), noise_grey) for image in (lower, upper))
+    def _views(self, lower: Floats, upper: Floats, noise_grey: float, live: Bytes) -> Views:
+        """Return the views of the band-passes of a pair (H, DIRECTIONS)."""
+        one, two = (self._normalised(band, noise_grey) for band in (lower, upper))
         upright, plane = np.empty((2, 2, *two.shape), np.uint8)
         kernels.bounds(two, upright)
         kernels.bounds_on_plane(two, self._plane_steps, plane)
@@ -110,7 +109,7 @@ class WorkingPanoramas:
         return np.asarray(places, np.int16), np.asarray(shares, np.uint16)
 
 
-def _band_pass(smooth: Floats, _noise_grey: float) -> Floats:
+def _band_pass(smooth: Floats) -> Floats:
     """Return a panorama (H, DIRECTIONS) less its coarse mean along columns."""
     band = np.empty_like(smooth)
     kernels.band_pass(smooth, COARSE_ROWS, band)
@@ -120,5 +119,5 @@ def _band_pass(smooth: Floats, _noise_grey: float) -> Floats:
 def _bounded_band_pass(smooth: Floats, noise_grey: float) -> Floats:
     """Return by how much a panorama (H, DIRECTIONS) exceeds its columns around, where no row counts much."""
     band = np.empty_like(smooth)
-    kernels.bounded_band_pass(smooth, NEAR_ROWS, np.float32(NEAR_SIGMAS * noise_grey), band)
+    kernels.bounded_band_pass(smooth, BOUNDED_ROWS, np.float32(BOUNDED_SIGMAS * noise_grey), band)
     return band

@@ -10,9 +10,8 @@ import pytest
 import scipy
 
 from calib import se3
-from calib.boards.board import Board, BoardView
+from calib.boards.board import Board
 from calib.fit.boards.rig_fit import RigCalibration, fit_rig
-from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import START_M, START_TANGENTIAL, telecentric_if_as_good
 from calib.fit.boards.telecentric_mirror import RADIUS_LOG_SIGMA, RADIUS_NAME, TelecentricMirror, wavefront_parts
 from calib.fit.parameterisation import parameterise
@@ -21,8 +20,8 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.models.wavefront import TERMS, WAVEFRONT_NAMES
 from calib.rig import Rig
-from tests.benchmark.boards_chain import DISTANCE_M, board_rig
-from tests.simulation.boards import board_poses_around_rig
+from tests.benchmark.boards_chain import board_rig
+from tests.benchmark.rig_sigmas import projected_views
 from tests.simulation.mirrors import MirrorCamera
 
 RADIUS_M = 0.03
@@ -95,23 +94,13 @@ def test_the_parameterisation_starts_at_its_camera_and_gives_its_plain_parameter
     np.testing.assert_allclose(larger.wavefront, np.array(camera.wavefront) * np.exp(RADIUS_LOG_SIGMA), atol=1e-12)
 
 
-def views_of(rig: Rig, perfect: Rig, noise_px: float) -> list[PairView]:
-    rng, views = np.random.default_rng(3), []
-    for k, T in enumerate(board_poses_around_rig(perfect, BOARD, 12, seed=21, distance_m=DISTANCE_M)):
-        sides = []
-        for mounted in (rig.lower, rig.upper):
-            pixels = mounted.camera.project(se3.apply(mounted.T_cam_rig @ T, BOARD.points))
-            sides.append(BoardView(f"{k:02d}", pixels + rng.normal(0, noise_px, pixels.shape), 1.0))
-        views.append(PairView(f"{k:02d}", (sides[0], sides[1])))
-    return views
-
-
 def freely_fitted(rig: Rig, perfect: Rig, xi: float = 1.0) -> RigCalibration:
     starts = []
     for mounted in (perfect.lower, perfect.upper):
         assert isinstance(mounted.camera, UnifiedCamera)
         starts.append(mirror(abs(mounted.camera.focal[0]), mounted.camera.center, mounted.camera.size, xi))
-    return fit_rig(views_of(rig, perfect, 0.015), BOARD, (starts[0], starts[1]))
+    views = projected_views(rig, perfect, BOARD, 12, 0.015, seed=21, noise_seed=[3])
+    return fit_rig(views, BOARD, (starts[0], starts[1]))
 
 
 @cache

@@ -65,6 +65,13 @@ def test_floor_of_weak_texture_is_weak_evidence_for_the_floor(columns: Columns) 
     assert 1.0 < weak.mean() < 0.8 * strong.mean() and (weak < -1).mean() < 0.01
 
 
+def test_directions_together_show_weak_floor_beside_the_base(columns: Columns) -> None:
+    """Of single directions one in ten shows no floor nearer than 1.1 m, and the weakest ones of a cell count."""
+    found = evidence(columns, worn, striped)
+    assert np.percentile(floor_at(columns, found, 1.0, 1.1), 5) > 0.5
+    assert np.percentile(floor_at(columns, found, 1.15, 1.6), 5) > 2.0
+
+
 def test_a_line_painted_on_the_floor_hides_no_weak_texture_around_it(columns: Columns) -> None:
     """Before and behind the line the evidence is that of the floor without it."""
     bare, painted = (evidence(columns, floor, striped) for floor in (worn, worn_with_line))
