@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import planar
+from omnid.core.control.collision_geometry import Outline, sector_edges_m
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.drive import Navigation
@@ -35,7 +37,7 @@ from omnid.core.navigation.requests import (
     may_begin_motion,
 )
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import MapPosition, Situation, WheelState, refusal_to_drive
+from omnid.core.navigation.situation import NOWHERE, MapPosition, Situation, WheelState, refusal_to_drive
 from omnid.errors import OmnidError
 from omnid.messages import NavigationPlan, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate, RequestAnswer
 from omnid.stages.routes import KeyframeTie, Routes, refusal_while_teaching
@@ -46,6 +48,9 @@ NavigationInput: TypeAlias = (
 )
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
+# Ends of the floor that are nearer are obstacles to a base that was stopped by one; farther ones are where the floor is
+# no longer seen well. A base that stops for one has it 0.4 m ahead, by the defaults of its outline.
+UNKNOWN_M = 1.2
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
 FIRST_LEG_M = 1.0  # A path that begins farther from the robot is refused.
@@ -69,13 +74,15 @@ class NavigationStage:
         self._T_rig_base = se3.inverse(T_base_rig)
         self._wheels = wheels
         self._navigator = Navigator(settings, collision)
-        self._half_width_m = collision.half_width_m
+        self._outline = Outline(collision.front_m, collision.rear_m, collision.half_width_m)
+        self._stop_m = collision.stop_m
         self._now: Situation | None = None
         self._in_map: MapPosition | None = None
         self._tie: KeyframeTie | None = None
         self._reset_ns = -1  # stamp of the pose at which odometry began again
         self._ring: ObstacleRing | None = None
-        self._ring_points: Array = np.zeros((0, 2))  # (N, 2) positions in odom of what the ring shows
+        self._ring_points: Array = NOWHERE  # (N, 2) positions in odom of what the ring shows
+        self._unknown: Array = NOWHERE  # (N, 2) the same of near ends of the floor that it shows
         self._seq = 0
         self._halted = 0  # id of the newest request to halt: those from before it that come later begin nothing
         self._answers: deque[RequestAnswer] = deque(maxlen=MOST_ANSWERS)
@@ -92,7 +99,8 @@ class NavigationStage:
                 self._place(message)
                 return None
             case ObstacleRing():
-                self._ring, self._ring_points = message, _positions(message)
+                self._ring, self._ring_points = message, _positions(message, message.ranges_m)
+                self._unknown = _positions(message, self._near_ends(message))
                 return None
             case NavigationCommand():
                 return self._request(message)
@@ -109,7 +117,9 @@ class NavigationStage:
             self._in_map, self._reset_ns = None, odometry.stamp_ns
         pose, speed_mps = planar(T_odom_base), float(velocity[0])
         obstacles = self._obstacles(odometry.stamp_ns)
-        nearest_m = math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._half_width_m
+        nearest_m = (
+            math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._outline.half_width_m
+        )
         self._now = now = Situation(
             odometry.stamp_ns,
             pose,
@@ -121,6 +131,7 @@ class NavigationStage:
             self._in_map,
             obstacles,
             self._moving(odometry.stamp_ns),
+            self._unknown,
             nearest_m,
         )
         ended = self._routes.record(now, self._tie)
@@ -134,6 +145,15 @@ class NavigationStage:
         if ring is None or not 0 <= stamp_ns - ring.stamp_ns <= RING_NS:
             return None
         return self._ring_points
+
+    def _near_ends(self, ring: ObstacleRing) -> NDArray[np.float32]:
+        """Return the ranges (SECTORS,) of near ends of the floor that a ring shows, NaN in other sectors."""
+        ends_m = np.full(len(ring.free_m), np.nan, np.float32)
+        edges_m = sector_edges_m(self._outline, len(ends_m))
+        for sector, free_m, _ in unknown_ends(ring.ranges_m.tolist(), ring.free_m.tolist(), self._stop_m):
+            if free_m < UNKNOWN_M:
+                ends_m[sector] = max(free_m, edges_m[sector])
+        return ends_m
 
     def _moving(self, stamp_ns: int) -> Forecast | None:
         """Return where moving obstacles will be, from a time on; None without any."""
@@ -283,10 +303,10 @@ class NavigationStage:
         )
 
 
-def _positions(ring: ObstacleRing) -> Array:
-    """Return the positions (N, 2) in odom of what a ring shows."""
-    seen = np.isfinite(ring.ranges_m)
-    ranges_m, directions = ring.ranges_m[seen].astype(np.float64), azimuths()[seen]
+def _positions(ring: ObstacleRing, ranges_m: NDArray[np.float32]) -> Array:
+    """Return the positions (N, 2) in odom of what stands at finite ranges (SECTORS,) [m] of a ring."""
+    seen = np.isfinite(ranges_m)
+    ranges_m, directions = ranges_m[seen].astype(np.float64), azimuths()[seen]
     points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))])
     return np.asarray(se3.apply(ring.T_odom_base, points)[:, :2])
 

@@ -18,13 +18,13 @@ from omnid.core.control.collision_geometry import (
     Outline,
     contact_s,
     driven_over,
-    long_runs,
     sector_directions,
     sector_edges_m,
     within_reach,
 )
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
+from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.nanoseconds import S_PER_NS
 
 MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
@@ -36,8 +36,6 @@ ALONG_SLOPE: Final = 0.05
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
-FAR_M: Final = 5.0  # Floor that is seen so far is open; a ring may end nearer than that, and nothing is known beyond.
-UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
 BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
 MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
@@ -124,18 +122,13 @@ class CollisionMonitor:
         self._points = [
             (r * c, r * s) for r, (_, c, s) in zip(ring.ranges_m, directions, strict=True) if math.isfinite(r)
         ]
-        free = ring.free_m if len(ring.free_m) == count else [r if math.isfinite(r) else 0.0 for r in ring.ranges_m]
-        # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer.
-        has_gap = [math.isfinite(r) and r - f > self._settings.stop_m for r, f in zip(ring.ranges_m, free, strict=True)]
-        parts = zip(ring.ranges_m, free, has_gap, strict=True)
-        unknown = [gap or math.isnan(r) or (math.isinf(r) and 0.0 < f < FAR_M) for r, f, gap in parts]
         self._unknown, self._gaps, self._unwatched = [], [], []
         unwatched = ring.unwatched if len(ring.unwatched) == count else (False,) * count
         self._is_blind = all(unwatched)
         edges_m, around_m = sector_edges_m(self._outline, count), sector_edges_m(self._around, count)
-        for k in long_runs(unknown, UNKNOWN_SECTORS):
-            begins_m = around_m[k] if unwatched[k] else max(free[k], edges_m[k])
-            ends = self._unwatched if unwatched[k] else self._gaps if has_gap[k] else self._unknown
+        for k, free_m, is_gap in unknown_ends(ring.ranges_m, ring.free_m, self._settings.stop_m):
+            begins_m = around_m[k] if unwatched[k] else max(free_m, edges_m[k])
+            ends = self._unwatched if unwatched[k] else self._gaps if is_gap else self._unknown
             ends.append((begins_m * directions[k][1], begins_m * directions[k][2]))
 
     def step(self, now_ns: int, motion: Twist, *, to_heading: bool = False) -> Twist:

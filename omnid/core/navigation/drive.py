@@ -15,7 +15,7 @@ from omnid.core.navigation.follower import Follower
 from omnid.core.navigation.giving_way import GivingWay
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
-from omnid.core.navigation.situation import Situation
+from omnid.core.navigation.situation import NOWHERE, Situation
 from omnid.navigation_state import NavigationState
 
 Array = NDArray[np.float64]
@@ -45,6 +45,12 @@ class Drive:
     giving_way: GivingWay | None = None  # None unless the base gives way now
     gave_way: int = 0  # number of times that the base gave way at the last block
     gave_way_m: float = math.inf  # length of the path that was left at that block
+    around_unknown: bool = False  # floor that was not seen has stopped the base: it is an obstacle until it is passed
+
+    def obstacles(self, now: Situation) -> Array:
+        """Return what the base must not come near (N, 2), in odom."""
+        known = NOWHERE if now.obstacles is None else now.obstacles
+        return np.vstack([known, now.unknown]) if self.around_unknown else known
 
     def path_ahead(self, now: Situation, way_m: float) -> Array:
         """Return the path (N, 2) ahead, in odom."""

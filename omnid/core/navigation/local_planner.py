@@ -29,6 +29,7 @@ from omnid.core.navigation.grid_ways import (
     wave_front,
 )
 from omnid.core.navigation.settings import NavigationSettings
+from omnid.core.navigation.situation import NOWHERE
 
 Array = NDArray[np.float64]
 
@@ -108,13 +109,20 @@ class LocalPlanner:
         leg_left_m: float = math.inf,
         moving: Forecast | None = None,
         speed_mps: float = 0.0,
+        unknown: Array = NOWHERE,
     ) -> Detour:
         """Return the motion: the wanted one where the path is free, else one around the obstacles, or none.
 
         pose: x, y, yaw (3,). path: (N, 2) from the nearest point on, some 5 cm apart. obstacles: (M, 2), with those of
         `moving` among them. wanted: the motion on the path. leg_left_m: distance to the next corner; obstacles beyond
-        it do not matter yet. speed_mps: measured speed of the base.
+        it do not matter yet. speed_mps: measured speed of the base. unknown (M, 2): places that are obstacles, too,
+        where there is a way around them; else the collision monitor decides how near to them the base may come.
         """
+        if len(unknown):
+            around = np.vstack([obstacles, unknown])
+            detour = self.plan(pose, path, around, wanted, leg_left_m=leg_left_m, moving=moving, speed_mps=speed_mps)
+            if detour.setpoint is not None:
+                return detour
         # 1. Without moving obstacles, or without a motion forwards, only obstacles at rest count.
         if moving is None or not (self._avoiding or wanted.velocity_mps > 0):
             return self._around_standing(pose, path, obstacles, wanted, leg_left_m, None)

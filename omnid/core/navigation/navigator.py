@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from omnid.core.control.collision_monitor import UNKNOWN
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint
@@ -22,7 +23,7 @@ from omnid.core.navigation.local_planner import Detour, LocalPlanner
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import NOWHERE, Situation, refusal_of_map, refusal_to_drive
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -133,7 +134,10 @@ class Navigator:
             return self._taken_away(following)
         setpoint = drive.in_odom(following.setpoint, now)
         # 5. Obstacles, and a safety rule that holds the wheels because of one.
-        plan = self._around_obstacles(drive.follower, drive.path_ahead(now, PLANNED_M), now, setpoint)
+        drive.around_unknown |= now.wheels.held_by == UNKNOWN
+        path, leg_m = drive.path_ahead(now, PLANNED_M), drive.follower.leg_left_m
+        plan = self._around_obstacles(drive, path, leg_m, now, setpoint)
+        drive.around_unknown &= plan.avoiding or bool(now.wheels.held_by)
         if plan.avoiding:
             drive.follower.skip_corner(pose)
         if plan.setpoint is None:
@@ -226,16 +230,15 @@ class Navigator:
         drive.waits[NavigationState.BLOCKED] = drive.stuck_s = 0.0
         if now.obstacles is None or not self._settings.give_way_m:
             return False
-        drive.giving_way = give_way(
-            self._trail, self._settings, now.pose, now.stamp_ns, now.obstacles, self._half_width_m
-        )
+        obstacles = drive.obstacles(now)
+        drive.giving_way = give_way(self._trail, self._settings, now.pose, now.stamp_ns, obstacles, self._half_width_m)
         if drive.giving_way is not None:
             drive.gave_way, drive.gave_way_m, drive.nearest_m = drive.gave_way + 1, left_m, math.inf
         return drive.giving_way is not None
 
     def _give_way(self, drive: Drive, giving: GivingWay, now: Situation, dt_s: float) -> Navigation:
         """Drive back, rest, and come again to the place where the base was blocked. All in odom."""
-        obstacles = np.zeros((0, 2)) if now.obstacles is None else now.obstacles
+        obstacles = drive.obstacles(now)
         motion = now.stamp_ns, now.pose, now.speed_mps, now.yaw_rate_radps
         following = None if giving.phase is Phase.REST else giving.drive(*motion)
         if following is not None and self._is_beside(following):
@@ -258,9 +261,8 @@ class Navigator:
                 return self._wait(drive, NavigationState.BLOCKED, f"it gives way: {WAITS}", dt_s)
         # 3. To the place where it was blocked.
         elif following is not None:
-            plan = self._around_obstacles(
-                giving.follower, giving.follower.path_ahead(PLANNED_M), now, following.setpoint
-            )
+            path, leg_m = giving.follower.path_ahead(PLANNED_M), giving.follower.leg_left_m
+            plan = self._around_obstacles(drive, path, leg_m, now, following.setpoint)
             if plan.setpoint is None or now.wheels.held_by:
                 giving.rest()
                 drive.nearest_m = math.inf
@@ -274,17 +276,18 @@ class Navigator:
         drive.waits.clear()
         return Navigation(STAND, self.state, self.reason, drive.gave_way_m)
 
-    def _around_obstacles(self, follower: Follower, path: Array, now: Situation, setpoint: Setpoint) -> Detour:
-        """Return the motion, by way of a detour where the path (N, 2) in odom is blocked."""
+    def _around_obstacles(self, drive: Drive, path: Array, leg_m: float, now: Situation, wanted: Setpoint) -> Detour:
+        """Return the motion, by way of a detour where the path (N, 2) in odom is blocked; leg_m: to its next corner."""
         if now.obstacles is None:
-            return Detour(setpoint, False)
+            return Detour(wanted, False)
         return self._planner.plan(
             now.pose,
             path,
             now.obstacles,
-            setpoint,
+            wanted,
+            unknown=now.unknown if drive.around_unknown else NOWHERE,
             moving=now.moving,
-            leg_left_m=follower.leg_left_m,
+            leg_left_m=leg_m,
             speed_mps=now.speed_mps,
         )
 

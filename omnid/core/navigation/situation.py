@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from omnid.core.navigation.requests import NavigationFrame
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
+
+
+NOWHERE: Final = np.zeros((0, 2))
 
 
 class WheelState(NamedTuple):
@@ -51,6 +54,7 @@ class Situation(NamedTuple):
     in_map: MapPosition | None = None  # None: nothing is known yet
     obstacles: Array | None = None  # (N, 2) positions in odom, m; None: none are known
     moving: Forecast | None = None  # those of them that move
+    unknown: Array = NOWHERE  # (N, 2) near ends of the floor that was seen, in odom
     obstacle_m: float = math.inf  # distance of the outline from the nearest obstacle that is not behind the base
 
     def T_frame_odom(self, frame: NavigationFrame) -> Array:

@@ -21,7 +21,7 @@ from omnid.core.obstacles.cell_kernels import FLOOR, LIMIT, MOST_RATIO, SURFACE,
 from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
 from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of, level_odds
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
-from omnid.core.obstacles.near_field import NearField
+from omnid.core.obstacles.near_field import SEEN_SURFACE, NearField, lose_before
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN
 from omnid.core.obstacles.usual_floor import UsualFloor, arrivals_at
@@ -123,18 +123,21 @@ class ObstacleGrid:
         # 1. Evidence of each cell, and what has come onto floor that was free.
         cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         angles = self._azimuths + float(se3.yaw(T_odom_base))
-        origin = np.array([*eye, CELL_M, self._max_range_m, self._at_1m])
+        nearest_m = evidence.nearest_floor_m + 2 * CELL_M
+        origin = np.array([*eye, CELL_M, self._max_range_m, self._at_1m, nearest_m])
         ways = self._watch.was_free(stamp_ns), self._odds[SURFACE] > TAKEN_ODDS, origin, angles
         # Who comes is wide: the mean of a cell is less noisy than its weakest directions, which show something thin.
-        comes_m, _ = self._usual.hidden(self._usual.compare((rows, columns), cells[MEAN_FLOOR], weight), *ways)
-        arrivals = arrivals_at(comes_m, evidence.nearest_floor_m + 2 * CELL_M, self._at_1m)
+        comes = self._usual.hidden(self._usual.compare((rows, columns), cells[MEAN_FLOOR], weight), *ways)
+        arrivals = arrivals_at(comes.ranges_m, nearest_m, self._at_1m)
         hidden = self._usual_thin.compare((rows, columns), cells[FLOOR], weight)
-        _, behind = self._usual_thin.hidden(hidden, *ways)
+        thin = self._usual_thin.hidden(
+            hidden, ways[0], self._shown_near(rows, columns, cells, eye, nearest_m), *ways[2:]
+        )
         # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
         in_view = np.isfinite(cells[FLOOR])
-        lost = np.where(behind, hidden, np.minimum(hidden, 0))
+        lost = np.where(thin.behind, hidden, np.minimum(hidden, 0))
         nearest = int(evidence.nearest_floor_m / CELL_M)
-        self._near.lose_before(lost, eye, nearest)
+        lose_before(lost, thin.near, eye, angles, nearest)
         past = partial(self._near.seen_past, self._odds, self._watch, eye, max(nearest, 1))
         gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
         amount = self._add((rows, columns), cells, lost, gone, weight, at_rest)
@@ -153,9 +156,20 @@ class ObstacleGrid:
         self._odds[SURFACE, *own] = PRIOR[SURFACE]
         # 4. The ring.
         gaps = self._gap_share, CELL_M + self._gap_share * self._nearest_m
-        nearest_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
-        view = RingView(place - corner, angles, CELL_M, self._max_range_m, nearest_m, *gaps)
+        in_view_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
+        view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, *gaps)
         return ring_of(self.state(), view, arrivals)
+
+    def _shown_near(self, rows: slice, columns: slice, cells: Floats, eye: Array, nearest_m: float) -> Flags:
+        """Return the cells (CELLS, CELLS) of what stands, and of surfaces that a pair surely shows too near for floor.
+
+        Such a surface explains that it hides the floor: nothing else need stand before it.
+        """
+        shown: Flags = self._odds[SURFACE] > TAKEN_ODDS
+        shown[rows, columns] |= (cells[SURFACE] >= SEEN_SURFACE) & self._near.within(eye, nearest_m / CELL_M)[
+            rows, columns
+        ]
+        return shown
 
     def _add(
         self,

@@ -201,48 +201,66 @@ def march(state: Bytes, origin: Doubles, azimuths: Doubles, hit: Doubles, free: 
 
 
 @compiled(
-    "(f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], u1[:, ::1])", writes=("found", "behind")
+    "(f4[:, ::1], f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], f4[::1], u1[:, ::1])",
+    writes=("found", "near", "behind"),
 )
 def hidden_from(
     hidden: Floats,
+    usual: Floats,
     was_free: Bytes,
     taken: Bytes,
     origin: Doubles,
     azimuths: Doubles,
     bounds: Doubles,
     found: Doubles,
+    near: Floats,
     behind: Bytes,
 ) -> None:
-    """Write, along directions (N,), the range from which on all floor that was free is hidden, NaN where none is; and 1
-    for the cells (H, W) from there on.
+    """Write, along directions (N,), the range from which on all floor that was free is hidden, NaN where none is; 1 for
+    the cells (H, W) from there on; and the log-odds (N,) that what hides it stands nearer than all of it.
 
     The sum of log-odds from a range to the end of the way is that of all less that of what is nearer: it is largest
-    from where the latter is least. Each disparity counts once, however many cells it has.
-    hidden (H, W): log-odds of cells; was_free, taken (H, W): 1 where so. origin (5,): viewpoint in cells, size of a
-    cell [m], longest way [m], disparity at 1 m. bounds (2,): least sum, and gap [m] in what was free that ends a way:
-    the floor behind an object there may be hidden by it.
+    from where the latter is least. Each disparity counts once, however many cells it has. That it stands nearer than
+    all of the floor in view has the sum S of all, against the larger one of 0 (nothing is hidden) and of the largest
+    sum from farther away: `min(S, least sum up to there)`.
+    Floor is hidden where its sum is a share of what it would be without any evidence, m^2 / 4 in each cell: a little
+    less evidence than usual in all of a direction is none of that.
+    hidden, usual (H, W): log-odds of cells, and usual evidence m; was_free, taken (H, W): 1 where so. origin (5,):
+    viewpoint in cells, size of a cell [m], longest way [m], disparity at 1 m. bounds (4,): least sum, gap [m] in what
+    was free that ends a way, as the floor behind an object there may be hidden by it; range [m] to which floor is the
+    nearest in view; and the share.
     """
     height, width = hidden.shape
     cell, longest, at_1m = origin[2], origin[3], origin[4]
     step = 0.5 * cell
     for n in range(len(azimuths)):
         dx, dy = math.cos(azimuths[n]) / cell, math.sin(azimuths[n]) / cell
-        total, least, begin, last = 0.0, 0.0, math.nan, math.nan
+        total, least, begin, last, before = 0.0, 0.0, math.nan, math.nan, math.inf
+        full, full_before = 0.0, 0.0  # sum without any evidence, of all and up to the least sum
         r = cell
         while r < longest:
             i, j = math.floor(origin[1] + r * dy), math.floor(origin[0] + r * dx)
-            if i < 0 or j < 0 or i >= height or j >= width or taken[i, j] > 0 or r - last > bounds[1]:
+            if i < 0 or j < 0 or i >= height or j >= width or taken[i, j] > 0:
+                break
+            # Nearer than the floor in view nothing is known by floor: what is not free there ends no way.
+            if r > bounds[2] and r - last > bounds[1]:
                 break
             if was_free[i, j] > 0:
-                total += hidden[i, j] * at_1m * step / (r * r)
+                weight = at_1m * step / (r * r)
+                total += hidden[i, j] * weight
+                full += 0.25 * usual[i, j] * usual[i, j] * weight if hidden[i, j] != 0.0 else 0.0
                 last = r
                 if total <= least:
-                    least, begin = total, math.nan
+                    least, begin, full_before = total, math.nan, full
                 elif math.isnan(begin):
                     begin = r
+                if r >= bounds[2]:
+                    before = min(before, total)
             r += step
         found[n] = math.nan
-        if total - least < bounds[0]:
+        nearer = min(total, before)
+        near[n] = nearer if nearer <= -bounds[0] or total >= max(bounds[0], bounds[3] * full) else 0.0
+        if total - least < max(bounds[0], bounds[3] * (full - full_before)):
             continue
         found[n] = r = begin
         while r <= last:

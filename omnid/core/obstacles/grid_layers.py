@@ -8,7 +8,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.cell_kernels import ABOVE, BELOW, FLOOR, FLOOR_PRIOR, SURFACE, SURFACE_PRIOR, VISIBLE_PRIOR
+from omnid.core.obstacles.cell_kernels import (
+    ABOVE,
+    BELOW,
+    FLOOR,
+    FLOOR_LOW,
+    FLOOR_PRIOR,
+    SURFACE,
+    SURFACE_PRIOR,
+    VISIBLE_PRIOR,
+)
 from omnid.core.obstacles.state_kernels import free_cells
 
 Floats = NDArray[np.float32]
@@ -33,8 +42,11 @@ def cells_of(odds: Floats, shown: Floats) -> Bytes:
 
 
 def level_odds(odds: Floats) -> Floats:
-    """Return the least log-odds (H, W) against steps up and down, which are wider than a cell."""
-    return np.minimum(mean_over(odds[ABOVE], WIDE_CELLS), mean_over(odds[BELOW], EDGE_CELLS))
+    """Return the least log-odds (H, W) against steps up and down, which are wider than a cell.
+
+    An edge is remembered by lower log-odds than FLOOR_LOW, but a few such cells are not as wide as one.
+    """
+    return np.minimum(mean_over(odds[ABOVE], WIDE_CELLS), mean_over(np.maximum(odds[BELOW], FLOOR_LOW), EDGE_CELLS))
 
 
 def mean_over(odds: Floats, cells: int) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -12,7 +13,7 @@ from omnid.core.obstacles import near_field_kernels as kernels
 from omnid.core.obstacles.cell_kernels import FLOOR, SURFACE, TAKEN_ODDS
 from omnid.core.obstacles.grid_layers import FLOORS
 from omnid.core.obstacles.state_kernels import FREE_ODDS
-from omnid.core.obstacles.watch import LEAST_FRESH, Watch
+from omnid.core.obstacles.watch import LEAST_FRESH, NARROW_CELLS, Watch
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -53,16 +54,6 @@ class NearField:
     def forget(self, bare: Flags) -> None:
         """Forget from how near surfaces were seen, in cells (cells, cells) that show none: others may come there."""
         self._seen_m[bare] = np.inf
-
-    def lose_before(self, lost: Floats, eye: Array, nearest: int) -> None:
-        """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen: as behind them.
-
-        What hides the nearest floor in view may stand anywhere before it; as the base moves, directions cross there.
-        Of the directions through a cell the most hidden one counts. eye (2,): viewpoint in cells; nearest: range of the
-        nearest floor in view in cells.
-        """
-        if nearest >= 2:
-            kernels.lose_before(eye, self._directions, nearest, lost)
 
     def gone(
         self,
@@ -106,13 +97,16 @@ class NearField:
     def clear_seen_past(self, odds: Floats, watch: Watch, eye: Array, nearest: int) -> None:
         """End the flood too near to be seen where something behind it is watched: a person would hide that.
 
-        Behind it is the floor in view nearest to it, or a surface, such as the walls of a corridor.
+        Behind it is the floor in view nearest to it, or a surface, such as the walls of a corridor. Between two such
+        directions nothing else may stand that is wider than the way between them.
         """
         if not nearest or not watch.flooded.any():
             return
         floor_behind, clear = self._view_past(odds, watch, eye, nearest)
         past = _side_by_side(floor_behind | (clear < nearest + BEHIND_CELLS))
-        ended = self._marked(eye, np.where(past, np.minimum(clear, nearest + 2), 0)) & (watch.flooded > 0)
+        ways = np.where(past, np.minimum(clear, nearest + 2), 0)
+        ways = _over_narrow(ways, int(NARROW_CELLS / nearest * len(ways) / math.tau))
+        ended = self._marked(eye, ways) & (watch.flooded > 0)
         odds[FLOORS, ended] = FREE_ODDS + 1
         watch.flooded[ended] = 0
 
@@ -130,6 +124,27 @@ class NearField:
         cells = np.zeros(self._seen_m.shape, np.uint8)
         kernels.mark(eye, self._directions, ways.astype(np.int32), cells)
         return cells.view(np.bool_)
+
+
+def lose_before(lost: Floats, near: Floats, eye: Array, azimuths: Array, nearest: int) -> None:
+    """Change the log-odds `lost` (H, W) that visible floor loses, in cells too near to be seen.
+
+    What hides the nearest floor in view may stand anywhere before it; as the base moves, directions cross there. Of the
+    directions through a cell the most hidden one counts. near (N,): log-odds that something hides it, along azimuths
+    (N,); eye (2,): viewpoint in cells; nearest: range of the nearest floor in view in cells.
+    """
+    if nearest >= 2:
+        directions = np.column_stack([np.cos(azimuths), np.sin(azimuths)])
+        kernels.lose_before(eye, directions, nearest, near, lost)
+
+
+def _over_narrow(ways: NDArray[np.integer[Any]], count: int) -> NDArray[np.integer[Any]]:
+    """Return ways (SECTORS,) with runs of at most so many zeros replaced by the shorter way beside them."""
+    found, ended = ways.copy(), np.flatnonzero(ways)
+    for begin, end in zip(ended, [*ended[1:], *(ended[:1] + len(ways))], strict=True):
+        if 1 < end - begin <= count + 1:
+            found[np.arange(begin + 1, end) % len(ways)] = min(ways[begin], ways[end % len(ways)])
+    return found
 
 
 def _side_by_side(flags: Flags) -> Flags:

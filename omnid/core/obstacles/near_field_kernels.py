@@ -18,25 +18,16 @@ Bytes = NDArray[np.uint8]
 Numbers = NDArray[np.int32]
 
 
-@compiled("(f8[::1], f8[:, ::1], i8, f4[:, ::1])", writes=("lost",))
-def lose_before(eye: Doubles, directions: Doubles, nearest: int, lost: Floats) -> None:
-    """Write to the cells of `lost` (H, W) nearer than `nearest` the mean of the two cells behind it; the most of the
-    directions through a cell."""
+@compiled("(f8[::1], f8[:, ::1], i8, f4[::1], f4[:, ::1])", writes=("lost",))
+def lose_before(eye: Doubles, directions: Doubles, nearest: int, near: Floats, lost: Floats) -> None:
+    """Write to the cells of `lost` (H, W) nearer than `nearest` the most of the values (N,) of their directions."""
     height, width = lost.shape
-    behind = np.empty(len(directions), np.float32)
-    for n in range(len(directions)):
-        total = np.float32(0.0)
-        for step in (nearest + 1, nearest + 2):
-            i, j = math.floor(eye[1] + step * directions[n, 1]), math.floor(eye[0] + step * directions[n, 0])
-            if 0 <= i < height and 0 <= j < width:
-                total += lost[i, j]
-        behind[n] = total / np.float32(2.0)
     for turn in range(2):
         for n in range(len(directions)):
             for step in range(1, nearest):
                 i, j = math.floor(eye[1] + step * directions[n, 1]), math.floor(eye[0] + step * directions[n, 0])
                 if 0 <= i < height and 0 <= j < width:
-                    lost[i, j] = max(lost[i, j], behind[n]) if turn else np.float32(-np.inf)
+                    lost[i, j] = max(lost[i, j], near[n]) if turn else np.float32(-np.inf)
 
 
 @compiled(

@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 # the base came to it, as F is about 0 there; it need not follow faster than F falls from 3.3 at 4 m to 1.5 at 1 m.
 LEARNED: Final = np.float32(0.2)
 HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden: two disparities in full
+# Part of the log-odds without any evidence from which floor is hidden: F below a quarter of the usual in the mean.
+HIDDEN_SHARE: Final = 0.5
 BIN_SIGMA: Final = 0.3  # sigma of the range at which hidden floor begins, in disparities: within one
 NEAR_SIGMA: Final = 0.3  # the same where nearer floor is not in view, as a share of the range: anywhere before it
 GAP_M: Final = 0.1  # Length of floor that was not free lately and ends a free way: the base of an object.
@@ -34,6 +36,14 @@ class Arrivals(NamedTuple):
     ranges_m: Floats  # (SECTORS,) from which on that floor is hidden, NaN where it is not
     sigma_m: Floats  # (SECTORS,)
     is_nearer: Flags  # (SECTORS,) the nearest floor in view is hidden: the range is the most that it may be
+
+
+class Hidden(NamedTuple):
+    """Floor that was free and is hidden, by one pair."""
+
+    ranges_m: Array  # (N,) along directions, from which on it is, NaN where it is not
+    near: Floats  # (N,) log-odds that what hides it stands nearer than the nearest floor in view; 0: not known
+    behind: Flags  # (H, W) hidden cells
 
 
 class UsualFloor:
@@ -55,19 +65,18 @@ class UsualFloor:
         found[window] = hidden
         return found
 
-    def hidden(
-        self, odds: Floats, was_free: Flags, taken: Flags, origin: Array, azimuths: Array
-    ) -> tuple[Array, Flags]:
-        """Return the ranges (N,) [m] from which on floor is hidden, NaN where it is not, and the cells (H, W) behind.
+    def hidden(self, odds: Floats, was_free: Flags, taken: Flags, origin: Array, azimuths: Array) -> Hidden:
+        """Return where floor is hidden.
 
-        odds (H, W): log-odds of `compare`; was_free: lately; taken: occupied by an object. origin (5,): viewpoint
-        [cells], size of a cell [m], longest range [m], disparity at 1 m; azimuths (N,) of the directions in odom.
+        odds (H, W): log-odds of `compare`; was_free: lately; taken: occupied by an object. origin (6,): viewpoint
+        [cells], size of a cell [m], longest range [m], disparity at 1 m, end of the nearest floor in view [m];
+        azimuths (N,) of the directions in odom.
         """
-        ranges_m = np.empty(len(azimuths))
+        ranges_m, near, behind = np.empty(len(azimuths)), np.empty(len(azimuths), np.float32), np.zeros_like(was_free)
         flags = was_free.view(np.uint8), taken.view(np.uint8)
-        behind = np.zeros(odds.shape, np.uint8)
-        kernels.hidden_from(odds, *flags, origin, azimuths, np.array([HIDDEN_SUM, GAP_M]), ranges_m, behind)
-        return ranges_m, behind.view(np.bool_)
+        bounds = np.array([HIDDEN_SUM, GAP_M, origin[5], HIDDEN_SHARE])
+        kernels.hidden_from(odds, self.mean, *flags, origin, azimuths, bounds, ranges_m, near, behind.view(np.uint8))
+        return Hidden(ranges_m, near, behind)
 
 
 def arrivals_at(ranges_m: Array, nearest_m: float, at_1m: float) -> Arrivals:

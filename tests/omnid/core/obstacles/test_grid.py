@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.cell_kernels import ABOVE, BELOW, FLOOR, LEAST_VISIBLE, SURFACE
 from omnid.core.obstacles.cell_kernels import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
@@ -16,10 +17,11 @@ from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
 from omnid.core.obstacles.grid_layers import PRIOR
 from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.near_field import lose_before
 from omnid.core.obstacles.pair_views import DIRECTIONS
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.state_kernels import FREE_ODDS
-from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER
+from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER, ONCE_FREE_NS
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,
@@ -133,6 +135,16 @@ def test_nothing_is_free_before_hidden_floor_that_is_the_nearest_in_view(grid: O
     assert after(grid, bare, 8, first=38).free_m[AHEAD].min() > 2.0
 
 
+def test_a_place_that_was_hidden_for_long_is_free_again(grid: ObstacleGrid) -> None:
+    """What stood too near to be seen for longer than floor counts as free lately has left."""
+    near_m = 0.5 * COLUMNS.nearest_floor_m
+    bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.05)))
+    after(grid, bare, 30)
+    stood = round(1.2 * ONCE_FREE_NS / PERIOD_NS)
+    assert np.median(after(grid, hidden, stood, first=30).free_m[AHEAD]) < 0.2
+    assert after(grid, bare, 20, first=30 + stood).free_m[AHEAD].min() > 2.0
+
+
 def test_directions_cross_where_a_thin_thing_stands_that_is_too_near_to_be_seen(grid: ObstacleGrid) -> None:
     """A pole of 4 cm, 0.6 m ahead and 0.25 m to the left, hides other floor as the base drives."""
     middle, nearest, pole = np.full(2, CELLS / 2), round(1.0 / CELL_M), np.array([0.6, 0.25]) / CELL_M
@@ -142,9 +154,11 @@ def test_directions_cross_where_a_thin_thing_stands_that_is_too_near_to_be_seen(
         base = np.array([x_m / CELL_M, 0.0])
         away, to_pole = centres - base, pole - base
         across = np.abs(away[..., 0] * to_pole[1] - away[..., 1] * to_pole[0]) / np.linalg.norm(to_pole)
-        shadow = across / np.linalg.norm(away, axis=-1) < 0.02 / CELL_M / np.linalg.norm(to_pole)
-        lost = np.where(shadow & ((away @ to_pole) > 0), 1.0, -1.0).astype(np.float32)
-        grid._near.lose_before(lost, middle + base, nearest)
+        half_rad = 0.02 / CELL_M / np.linalg.norm(to_pole)
+        lost = np.where((across / np.linalg.norm(away, axis=-1) < half_rad) & ((away @ to_pole) > 0), 1.0, -1.0)
+        near = np.where(np.abs(azimuths() - math.atan2(to_pole[1], to_pole[0])) < half_rad, 1.0, -1.0)
+        lost, near = lost.astype(np.float32), near.astype(np.float32)
+        lose_before(lost, near, middle + base, azimuths(), nearest)
         visible = np.clip(visible - lost, LEAST_VISIBLE, PRIOR[VISIBLE_LAYER])
     hidden = visible <= 0.0
     column, row = np.floor(middle + pole).astype(int)

@@ -20,21 +20,18 @@ def ahead(step: int) -> tuple[int, int]:
     return math.floor(EYE[1]), math.floor(EYE[0] + step)
 
 
-def test_cells_before_hidden_floor_lose_what_the_floor_does() -> None:
+def test_cells_before_the_floor_in_view_lose_what_their_direction_does() -> None:
     lost = np.full((SIDE, SIDE), -0.5, np.float32)
-    lost[ahead(5)], lost[ahead(6)] = 2.0, 1.0
-    kernels.lose_before(EYE, DIRECTIONS, 4, lost)
-    assert [float(lost[ahead(step)]) for step in range(1, 8)] == [1.5, 1.5, 1.5, -0.5, 2.0, 1.0, -0.5]
+    kernels.lose_before(EYE, DIRECTIONS, 4, np.array([1.5, -2.0, 0.0], np.float32), lost)
+    assert [float(lost[ahead(step)]) for step in range(1, 6)] == [1.5, 1.5, 1.5, -0.5, -0.5]
 
 
 def test_of_two_directions_through_a_cell_the_more_hidden_one_counts() -> None:
-    lost = np.zeros((SIDE, SIDE), np.float32)
-    lost[ahead(4)] = lost[ahead(5)] = 2.0
     almost = np.array([[1.0, 0.0], [math.cos(0.3), math.sin(0.3)]])
-    for directions in (almost, almost[::-1].copy()):
-        found = lost.copy()
-        kernels.lose_before(EYE, directions, 3, found)
-        assert found[ahead(1)] == 2.0
+    for near in ([2.0, -1.0], [-1.0, 2.0]):
+        lost = np.zeros((SIDE, SIDE), np.float32)
+        kernels.lose_before(EYE, almost, 3, np.array(near, np.float32), lost)
+        assert lost[ahead(1)] == 2.0
 
 
 @pytest.mark.parametrize(("surface_at", "clear"), [(None, 9), (1, 0), (6, 5), (9, 8)])
@@ -67,7 +64,7 @@ def test_cells_are_marked_up_to_the_end_of_each_way() -> None:
 def test_cells_out_of_the_square_are_left_out() -> None:
     around = np.zeros((3 * SIDE, 3 * SIDE), np.float32)
     lost = around[SIDE : 2 * SIDE, SIDE : 2 * SIDE].copy()
-    kernels.lose_before(EYE, DIRECTIONS, SIDE, lost)
+    kernels.lose_before(EYE, DIRECTIONS, SIDE, np.zeros(3, np.float32), lost)
     cells = np.zeros((SIDE, SIDE), np.uint8)
     kernels.mark(EYE, DIRECTIONS, np.full(3, 2 * SIDE, np.int32), cells)
     assert (lost == 0.0).all() and cells[ahead(11)] == 1 and cells.sum() < 3 * SIDE
