@@ -52,9 +52,10 @@ class SerialMotor:
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
-    status with watchdog_expired; the command after it drives. A port that is gone is opened again by a later `send`,
-    with growing waits, during which `send` fails at once. A pseudo-terminal that another program has since is not
-    opened.
+    status with watchdog_expired; the command after it drives. After an error the controller is first set up again, as
+    after a new connection, because it may have been switched off and on. A port that is gone is opened again by a later
+    `send`, with growing waits, during which `send` fails at once. A pseudo-terminal that another program has since is
+    not opened.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class SerialMotor:
             raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
         self.errors = 0  # calls of `send` that failed
         self.replaced_by_stop = 0  # commands in place of which a stop was sent
-        self.connections = 0
+        self.connections = 0  # times that the controller was set up
         self._protocol = protocol or LineProtocol(DifferentialDrive())
         self._framer = self._protocol.framer()
         self._name, self._baud = port, baud or self._protocol.baud
@@ -106,6 +107,7 @@ class SerialMotor:
         Raises LateReplyError or NoReplyError at the timeout, DriverError where the port is gone or the command is
         rejected.
         """
+        was_armed = self._armed
         try:
             return self._send(command, time.monotonic() + self._timeout_s)
         except DriverError as error:
@@ -113,6 +115,9 @@ class SerialMotor:
             if isinstance(error, NoReplyError) and self._watchdog_alive():
                 raise LateReplyError(str(error)) from None
             self._stop_first = True
+            # The controller may have lost its power and its settings. After a call that has just set it up, and had too
+            # little time left for the command, it is not set up again: a slow link would never get beyond that.
+            self._armed = self._armed and not was_armed
             raise
 
     def _watchdog_alive(self) -> bool:

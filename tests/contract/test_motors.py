@@ -97,6 +97,21 @@ def test_a_late_reply_stops_nothing(name: str) -> None:
         assert motor.replaced_by_stop == replaced_by_stop
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_controller_that_was_switched_off_and_on_gets_its_watchdog_and_settings_again(name: str) -> None:
+    """As by an emergency stop that takes its power, while the serial adapter stays: the port is never gone."""
+    watchdog_ms = shortest_watchdog_ms(name)
+    with connected_motor(name, watchdog_ms=watchdog_ms, timeout_s=SHORT_S) as (motor, simulated):
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        simulated.drop_input = True
+        assert until(lambda: type(send_error(motor)) is NoReplyError)
+        simulated.controller = controller_of(name, watchdog_ms=watchdog_ms)  # with the defaults of its firmware
+        simulated.drop_input = False
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        assert simulated.base.watchdog_ms == watchdog_ms and motor.connections == 2
+        assert simulated.base.unsafe_resumes == 0
+
+
 def send_error(motor: SerialMotor) -> DriverError:
     """Return the exception raised for a command without a reply."""
     with pytest.raises(DriverError) as caught:
