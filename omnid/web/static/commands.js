@@ -47,6 +47,7 @@ export function wireCommands() {
   const armButton = byId("arm");
   let sureUntil = 0;
   let wasArmed = null;
+  let stamp = 0; // the server's time in the newest state: a request to arm that comes late arms nothing
   const showStop = wireStop(() => { sureUntil = 0; });
 
   async function arm() {
@@ -60,7 +61,7 @@ export function wireCommands() {
     unsure();
     byId("answer").textContent = "asking the robot ...";
     showStop("", "");
-    const answer = await post("arm", 0, () => {});
+    const answer = await post("arm", 0, () => {}, String(stamp));
     byId("answer").textContent = answer.text;
   }
 
@@ -73,8 +74,10 @@ export function wireCommands() {
   armButton.addEventListener("click", arm);
 
   return {
-    // reported: false where the robot reports no wheels. Answers that are no longer true are taken away.
-    setArmed(armed, reported) {
+    // reported: false where the robot reports no wheels. serverMs: the server's time in the state. Answers that are no
+    // longer true are taken away.
+    setArmed(armed, reported, serverMs) {
+      stamp = serverMs;
       armButton.hidden = armed;
       armButton.disabled = !reported;
       if (armed && sureUntil) unsure();
