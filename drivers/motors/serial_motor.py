@@ -86,7 +86,7 @@ class SerialMotor:
         self._port: serial.Serial | None = None
         self._closed = self._armed = False
         self._stop_first = True
-        self._last_sent_s = -math.inf  # start of the last command that got a reply
+        self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
         self._wait_s, self._next_open_s = FIRST_WAIT_S, -math.inf
         self._connect(connect_s)
@@ -122,7 +122,7 @@ class SerialMotor:
 
     def _watchdog_alive(self) -> bool:
         """True if the controller's watchdog cannot have expired by now."""
-        return self._armed and not self._stop_first and time.monotonic() - self._last_sent_s <= self._fresh_s
+        return self._armed and not self._stop_first and _clock_s() - self._last_sent_s <= self._fresh_s
 
     def close(self) -> None:
         """Stop the wheels if the controller replies, and release the port; a second call does nothing."""
@@ -138,7 +138,7 @@ class SerialMotor:
             self._open()
         if not self._armed:
             self._arm(deadline_s)
-        now_s = time.monotonic()
+        now_s = _clock_s()
         stopping = self._stop_first or now_s - self._last_sent_s > self._fresh_s
         sent = stop_command(command.stamp_ns) if stopping else command
         status = self._run(self._protocol.drive(sent, now_s), deadline_s)
@@ -294,6 +294,11 @@ def _opened(port: str, baud: int) -> serial.Serial:
             f"motor port {port!r} at {baud} baud cannot be opened: "
             f"{reason or _one_line(error) + '; is it a serial port?'}"
         ) from None
+
+
+def _clock_s() -> float:
+    """Return the time with that in which the host was suspended: a controller's watchdog expires meanwhile."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def _one_line(error: BaseException) -> str:

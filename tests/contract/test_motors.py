@@ -73,6 +73,20 @@ def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) ->
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_a_stop_comes_before_motion_after_the_host_was_suspended(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CLOCK_MONOTONIC stands meanwhile, CLOCK_BOOTTIME does not, nor does the controller's watchdog."""
+    with connected_motor(name) as (motor, simulated):
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        simulated.expire()
+        gettime = time.clock_gettime
+        monkeypatch.setattr(
+            time, "clock_gettime", lambda clock: gettime(clock) + 3600.0 * (clock == time.CLOCK_BOOTTIME)
+        )
+        assert motor.send(FORWARD).watchdog_expired and simulated.base.commanded_mps == [0.0, 0.0]
+        assert simulated.base.unsafe_resumes == 0
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_missing_reply_is_an_error_and_a_stop_comes_before_motion(name: str) -> None:
     with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, simulated):
         first_status(motor)
