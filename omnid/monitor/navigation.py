@@ -45,7 +45,10 @@ def follow(robot: Robot, command_ns: int, show: Callable[[NavigationReport], Non
                 show(report)
             elif begun:
                 raise OmnidError(f"{robot.name} follows another request now: {report.task}")
-    raise OmnidError(f"{robot.name} has been silent for {SILENCE_S:g} s: it stops by itself; see `omnid listen`")
+    raise OmnidError(
+        f"{robot.name} has been silent for {SILENCE_S:g} s: look at it; if only the network between is gone, it drives "
+        "on (`omnid stop`, `omnid listen`)"
+    )
 
 
 class ProgressLine:
