@@ -4,8 +4,10 @@ import { byId } from "./elements.js";
 
 const RETRY_MS = 300;
 const GIVE_UP_MS = 10000;
+const SILENT_MS = 2500; // without an answer, or news of the robot (connection.js)
 const SURE_MS = 4000;
 const EMERGENCY = "STOP IS NOT SENT: use the emergency stop on the robot";
+const NO_ANSWER = "NO ANSWER YET: use the emergency stop on the robot";
 
 // The STOP button and the space key. Returns show(text, className), which writes beside it; before() is called first.
 export function wireStop(before = () => {}) {
@@ -18,7 +20,10 @@ export function wireStop(before = () => {}) {
     before();
     show("sending STOP ...", "");
     button.classList.add("sent");
-    const answer = await post("stop", GIVE_UP_MS, () => show(EMERGENCY, "bad"));
+    const answer = await firstAnswer(
+      () => post("stop", GIVE_UP_MS, () => show(EMERGENCY, "bad")),
+      () => number === newest && show(NO_ANSWER, "bad"),
+    );
     if (number !== newest) return; // a newer press shows its own answer
     button.classList.remove("sent");
     show(answer.text, answer.done ? "good" : "bad");
@@ -41,6 +46,24 @@ export function wireStop(before = () => {}) {
     if (event.code === "Space" && !event.target.matches("input, textarea")) event.preventDefault();
   }, { capture: true });
   return show;
+}
+
+// The first answer to a request that is sent again while none comes, for GIVE_UP_MS: on a connection that the network
+// has lost a request waits for minutes, and a new one may get through.
+function firstAnswer(send, onSilence) {
+  return new Promise((resolve) => {
+    const end = performance.now() + GIVE_UP_MS;
+    const timer = setInterval(() => {
+      onSilence();
+      if (performance.now() > end) clearInterval(timer);
+      else send().then(settle);
+    }, SILENT_MS);
+    function settle(answer) {
+      clearInterval(timer);
+      resolve(answer);
+    }
+    send().then(settle);
+  });
 }
 
 export function wireCommands() {
