@@ -52,10 +52,10 @@ class SerialMotor:
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
-    status with watchdog_expired; the command after it drives. After an error the controller is first set up again, as
-    after a new connection, because it may have been switched off and on. A port that is gone is opened again by a later
-    `send`, with growing waits, during which `send` fails at once. A pseudo-terminal that another program has since is
-    not opened.
+    status with watchdog_expired; the command after it drives. After a missing reply and a pause the controller is
+    set up again once a stop has got a reply, because it may have been switched off and on, and another stop
+    follows. A port that is gone is opened again by a later `send`, with growing waits, during which `send` fails at
+    once. A pseudo-terminal that another program has since is not opened.
     """
 
     def __init__(
@@ -86,6 +86,8 @@ class SerialMotor:
         self._port: serial.Serial | None = None
         self._closed = self._armed = False
         self._stop_first = True
+        # True after silence, in which the controller may have lost power and settings, until it replies to a stop.
+        self._set_up_again = False
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
         self._wait_s, self._next_open_s = FIRST_WAIT_S, -math.inf
@@ -115,9 +117,9 @@ class SerialMotor:
             if isinstance(error, NoReplyError) and self._watchdog_alive():
                 raise LateReplyError(str(error)) from None
             self._stop_first = True
-            # The controller may have lost its power and its settings. After a call that has just set it up, and had too
-            # little time left for the command, it is not set up again: a slow link would never get beyond that.
-            self._armed = self._armed and not was_armed
+            # After a call that has just set up the controller, and had too little time left for the command, it is not
+            # set up again: a slow link would never get beyond that.
+            self._set_up_again |= was_armed and isinstance(error, NoReplyError)
             raise
 
     def _watchdog_alive(self) -> bool:
@@ -136,14 +138,19 @@ class SerialMotor:
     def _send(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
         if self._port is None:
             self._open()
-        if not self._armed:
+        was_armed = self._armed
+        if not was_armed:
             self._arm(deadline_s)
         now_s = _clock_s()
-        stopping = self._stop_first or now_s - self._last_sent_s > self._fresh_s
+        paused = now_s - self._last_sent_s > self._fresh_s
+        self._set_up_again |= was_armed and paused
+        stopping = self._stop_first or paused
         sent = stop_command(command.stamp_ns) if stopping else command
         status = self._run(self._protocol.drive(sent, now_s), deadline_s)
         self._last_sent_s = now_s
         self._stop_first = status.watchdog_expired
+        if self._set_up_again:  # The reply is that to a stop, which had to come first: the next call sets it up.
+            self._armed = False
         if is_stop(command) or not stopping:
             return status
         self.replaced_by_stop += 1
@@ -175,7 +182,7 @@ class SerialMotor:
         self._stop_first = True
         in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
         self._fresh_s = FRESH_SHARE * in_force_ms / 1000
-        self._armed, self._wait_s = True, FIRST_WAIT_S
+        self._armed, self._set_up_again, self._wait_s = True, False, FIRST_WAIT_S
         self.connections += 1
 
     def _stopped(self) -> bool:
