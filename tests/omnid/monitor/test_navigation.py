@@ -28,7 +28,7 @@ GOTO = ("goto", "1", "0")
 REPEAT = ("route", "repeat", "hall")
 
 
-def test_a_robot_that_is_not_heard_any_more_is_not_said_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing on a robot watches the program that has asked for a drive: it goes on without the network."""
     monkeypatch.setattr(navigation, "SILENCE_S", 0.5)
     endpoint = free_endpoint()
