@@ -47,8 +47,9 @@ class LateReplyError(NoReplyError):
 class SerialMotor:
     """The base on a serial port, locked for this program.
 
-    `send` blocks for at most timeout_s, plus the time to open the port where it was gone; `close` for STOPS_AT_CLOSE
-    times timeout_s. A command is sent once and never repeated: the caller sends the next one at its own rate.
+    `send` blocks for at most timeout_s, plus the time to open the port where it was gone, and CONNECT_TRY_S where the
+    controller is to be set up; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated:
+    the caller sends the next one at its own rate.
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
@@ -117,8 +118,6 @@ class SerialMotor:
             if isinstance(error, NoReplyError) and self._watchdog_alive():
                 raise LateReplyError(str(error)) from None
             self._stop_first = True
-            # After a call that has just set up the controller, and had too little time left for the command, it is not
-            # set up again: a slow link would never get beyond that.
             self._set_up_again |= was_armed and isinstance(error, NoReplyError)
             raise
 
@@ -140,7 +139,8 @@ class SerialMotor:
             self._open()
         was_armed = self._armed
         if not was_armed:
-            self._arm(deadline_s)
+            self._arm(time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+            deadline_s = max(deadline_s, time.monotonic() + self._timeout_s)
         now_s = _clock_s()
         paused = now_s - self._last_sent_s > self._fresh_s
         self._set_up_again |= was_armed and paused
