@@ -47,14 +47,16 @@ class LateReplyError(NoReplyError):
 class SerialMotor:
     """The base on a serial port, locked for this program.
 
-    `send` blocks for at most timeout_s, plus the time to open the port where it was gone; `close` for STOPS_AT_CLOSE
-    times timeout_s. A command is sent once and never repeated: the caller sends the next one at its own rate.
+    `send` blocks for at most timeout_s, plus the time to open the port where it was gone, and CONNECT_TRY_S where the
+    controller is to be set up; `close` for STOPS_AT_CLOSE times timeout_s. A command is sent once and never repeated:
+    the caller sends the next one at its own rate.
 
     After LateReplyError the next command drives as usual. After any other error, a pause in which the controller's
     watchdog may have expired, or a new connection, `send` sends a stop in place of the first command and returns a
-    status with watchdog_expired; the command after it drives. A port that is gone is opened again by a later `send`,
-    with growing waits, during which `send` fails at once. A pseudo-terminal that another program has since is not
-    opened.
+    status with watchdog_expired; the command after it drives. After a missing reply and a pause the controller is
+    set up again once a stop has got a reply, because it may have been switched off and on, and another stop
+    follows. A port that is gone is opened again by a later `send`, with growing waits, during which `send` fails at
+    once. A pseudo-terminal that another program has since is not opened.
     """
 
     def __init__(
@@ -76,7 +78,7 @@ class SerialMotor:
             raise DriverError(f"motor timeout is {timeout_s} s; give a time above 0, for example 0.05")
         self.errors = 0  # calls of `send` that failed
         self.replaced_by_stop = 0  # commands in place of which a stop was sent
-        self.connections = 0
+        self.connections = 0  # times that the controller was set up
         self._protocol = protocol or LineProtocol(DifferentialDrive())
         self._framer = self._protocol.framer()
         self._name, self._baud = port, baud or self._protocol.baud
@@ -85,7 +87,9 @@ class SerialMotor:
         self._port: serial.Serial | None = None
         self._closed = self._armed = False
         self._stop_first = True
-        self._last_sent_s = -math.inf  # start of the last command that got a reply
+        # True after silence, in which the controller may have lost power and settings, until it replies to a stop.
+        self._set_up_again = False
+        self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
         self._wait_s, self._next_open_s = FIRST_WAIT_S, -math.inf
         self._connect(connect_s)
@@ -106,6 +110,7 @@ class SerialMotor:
         Raises LateReplyError or NoReplyError at the timeout, DriverError where the port is gone or the command is
         rejected.
         """
+        was_armed = self._armed
         try:
             return self._send(command, time.monotonic() + self._timeout_s)
         except DriverError as error:
@@ -113,11 +118,12 @@ class SerialMotor:
             if isinstance(error, NoReplyError) and self._watchdog_alive():
                 raise LateReplyError(str(error)) from None
             self._stop_first = True
+            self._set_up_again |= was_armed and isinstance(error, NoReplyError)
             raise
 
     def _watchdog_alive(self) -> bool:
         """True if the controller's watchdog cannot have expired by now."""
-        return self._armed and not self._stop_first and time.monotonic() - self._last_sent_s <= self._fresh_s
+        return self._armed and not self._stop_first and _clock_s() - self._last_sent_s <= self._fresh_s
 
     def close(self) -> None:
         """Stop the wheels if the controller replies, and release the port; a second call does nothing."""
@@ -131,14 +137,20 @@ class SerialMotor:
     def _send(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
         if self._port is None:
             self._open()
-        if not self._armed:
-            self._arm(deadline_s)
-        now_s = time.monotonic()
-        stopping = self._stop_first or now_s - self._last_sent_s > self._fresh_s
+        was_armed = self._armed
+        if not was_armed:
+            self._arm(time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+            deadline_s = max(deadline_s, time.monotonic() + self._timeout_s)
+        now_s = _clock_s()
+        paused = now_s - self._last_sent_s > self._fresh_s
+        self._set_up_again |= was_armed and paused
+        stopping = self._stop_first or paused
         sent = stop_command(command.stamp_ns) if stopping else command
         status = self._run(self._protocol.drive(sent, now_s), deadline_s)
         self._last_sent_s = now_s
         self._stop_first = status.watchdog_expired
+        if self._set_up_again:  # The reply is that to a stop, which had to come first: the next call sets it up.
+            self._armed = False
         if is_stop(command) or not stopping:
             return status
         self.replaced_by_stop += 1
@@ -170,7 +182,7 @@ class SerialMotor:
         self._stop_first = True
         in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
         self._fresh_s = FRESH_SHARE * in_force_ms / 1000
-        self._armed, self._wait_s = True, FIRST_WAIT_S
+        self._armed, self._set_up_again, self._wait_s = True, False, FIRST_WAIT_S
         self.connections += 1
 
     def _stopped(self) -> bool:
@@ -289,6 +301,11 @@ def _opened(port: str, baud: int) -> serial.Serial:
             f"motor port {port!r} at {baud} baud cannot be opened: "
             f"{reason or _one_line(error) + '; is it a serial port?'}"
         ) from None
+
+
+def _clock_s() -> float:
+    """Return the time with that in which the host was suspended: a controller's watchdog expires meanwhile."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 def _one_line(error: BaseException) -> str:

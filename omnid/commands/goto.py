@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from functools import partial
 
 from omnid.commands.config import add_settings
 from omnid.commands.listen import add_robot, config_of
@@ -18,7 +19,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "goto",
         help="drive a robot to a pose, around obstacles",
         description="Drive an armed robot to a pose of its base and wait for the end; "
-        "Ctrl-C cancels, and it stops. Exit code 0: reached, 1: not reached.",
+        "Ctrl-C, or a terminal that closes, cancels, and it stops. Exit code 0: reached, 1: not reached.",
     )
     parser.add_argument(
         "pose",
@@ -67,5 +68,8 @@ def run(args: argparse.Namespace) -> int:
             print(granted(robot, driver.navigate(args.verb)))
             return 0
         heading_rad = math.radians(args.pose[2]) if len(args.pose) == 3 else None
-        granted(robot, driver.goal(args.pose[0], args.pose[1], heading_rad, args.frame))
-        return 0 if args.no_wait else drive_to_end(robot, driver)
+        ask = partial(driver.goal, args.pose[0], args.pose[1], heading_rad, args.frame)
+        if not args.no_wait:
+            return drive_to_end(robot, driver, ask)
+        granted(robot, ask())
+        return 0

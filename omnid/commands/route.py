@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -113,8 +114,11 @@ def run_repeat(args: argparse.Namespace) -> int:
     text = " ".join([*words, f"loops={args.loops}", f"from={args.begin}"])
     with connected(config_of(args).bus) as robot:
         driver = robot.driver()
-        granted(robot, driver.route(text))
-        return 0 if args.no_wait else drive_to_end(robot, driver)
+        ask = partial(driver.route, text)
+        if not args.no_wait:
+            return drive_to_end(robot, driver, ask)
+        granted(robot, ask())
+        return 0
 
 
 def run_text(args: argparse.Namespace) -> int:

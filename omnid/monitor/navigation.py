@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.client import CONNECT_S, Answer, Driver, NavigationReport, Robot
+from omnid.engine.signals import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.transport.bus_config import BusConfig
@@ -45,7 +46,10 @@ def follow(robot: Robot, command_ns: int, show: Callable[[NavigationReport], Non
                 show(report)
             elif begun:
                 raise OmnidError(f"{robot.name} follows another request now: {report.task}")
-    raise OmnidError(f"{robot.name} has been silent for {SILENCE_S:g} s: it stops by itself; see `omnid listen`")
+    raise OmnidError(
+        f"{robot.name} has been silent for {SILENCE_S:g} s: look at it; if only the network between is gone, it drives "
+        "on (`omnid stop`, `omnid listen`)"
+    )
 
 
 class ProgressLine:
@@ -75,18 +79,28 @@ class ProgressLine:
             print()
 
 
-def drive_to_end(robot: Robot, driver: Driver) -> int:
-    """Show the drive that the driver's newest request began; Ctrl-C cancels it. Return 0 if it has reached its goal."""
+def drive_to_end(robot: Robot, driver: Driver, ask: Callable[[], Answer]) -> int:
+    """Ask for a drive by the driver, and show it until its end. Return 0 if it has reached its goal.
+
+    Ctrl-C, a terminal that closes and other ends of this program cancel it, also while the robot has not answered yet.
+    """
     line = ProgressLine()
     try:
-        report = follow(robot, driver.asked_ns, line)
+        with handle_stop_signals(_interrupt):
+            granted(robot, ask())
+            report = follow(robot, driver.asked_ns, line)
     except KeyboardInterrupt:
+        words = granted(robot, driver.navigate("cancel"))  # before a word is printed: the terminal may be gone
         line.end()
-        print(granted(robot, driver.navigate("cancel")))
+        print(words)
         return 1
     line.end()
     print(f"{report.state}: {report.reason}" if report.reason else report.state)
     return int(report.state != NavigationState.REACHED)
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def record_until_enter(robot: Robot, name: str) -> int:

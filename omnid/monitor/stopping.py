@@ -32,6 +32,7 @@ def stop(bus: BusConfig, answer_s: float = ANSWER_S, connection: Robot | None = 
         ):
             driver = robot.driver()
             driver.require_connected()
+            statuses.newest()  # The one that the robot has kept is from before this stop.
             while time.monotonic() < deadline_s:
                 driver.stop()
                 if _is_stopped(statuses) or datagrams.ask(0.0) == STOPPED:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import select
 import sys
 import termios
@@ -32,7 +33,12 @@ FIRST_SHARE: Final = 0.4  # Share of the highest speeds at the start.
 SHARE_STEP: Final = 0.1
 READ_BYTES: Final = 256
 HELP: Final = "arrows: drive  space: stop  a: arm  +/-: speed  q: quit"
-ARROWS: Final = {b"\x1b[A": (1, 0), b"\x1b[B": (-1, 0), b"\x1b[D": (0, 1), b"\x1b[C": (0, -1)}
+_SIDES: Final = {b"A": (1, 0), b"B": (-1, 0), b"D": (0, 1), b"C": (0, -1)}
+# A terminal sends ESC [ A or, in its application mode, ESC O A.
+ARROWS: Final = {begin + letter: side for letter, side in _SIDES.items() for begin in (b"\x1b[", b"\x1bO")}
+# One key: a whole escape sequence (ECMA-48, 5.4, without intermediate bytes, of which the space is one), or a byte.
+_KEY: Final = re.compile(rb"\x1b(?:\[[0-?]{0,16}|O)[@-~]|.", re.DOTALL)
+_BEGUN: Final = re.compile(rb"\x1b(?:\[[0-?]{0,16}|O)?\Z")  # a sequence whose end has not come yet
 
 
 @dataclass
@@ -44,17 +50,21 @@ class Stick:
     stop_asked: bool = False
     arm_asked: bool = False
     quit: bool = False
+    _begun: bytes = b""  # first bytes of a key whose others have not come yet
     _axes: list[tuple[int, float]] = field(default_factory=lambda: [(0, -math.inf), (0, -math.inf)])
 
     def press(self, data: bytes, now_s: float) -> None:
-        """Take the bytes of the keys pressed until now_s."""
-        while data:
-            arrow = next((code for code in ARROWS if data.startswith(code)), b"")
-            if arrow:
-                self._push(*ARROWS[arrow], now_s)
+        """Take the bytes of the keys pressed until now_s; those of one key may come in parts."""
+        data = self._begun + data
+        begun = _BEGUN.search(data)
+        self._begun = begun[0] if begun else b""
+        for key in _KEY.findall(data, 0, len(data) - len(self._begun)):
+            if key in ARROWS:
+                self._push(*ARROWS[key], now_s)
             else:
-                self._letter(data[:1])
-            data = data[len(arrow) or 1 :]
+                self._letter(key)
+        if begun:
+            self._release()  # It may be the key Esc, which means nothing.
 
     def twist(self, now_s: float) -> tuple[float, float]:
         """Return forward speed [m/s] and yaw rate [rad/s]."""

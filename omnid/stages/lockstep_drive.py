@@ -73,8 +73,9 @@ def controller_pose(odometry: OdometryUpdate, T_base_rig: NDArray[np.float64]) -
     """Return the part of a pose that the controller needs; one that is not finite is LOST."""
     T_odom_base, _, velocity, covariance = of_base(odometry, T_base_rig)
     heading_rad, velocity_mps, rate_radps = float(se3.yaw(T_odom_base)), float(velocity[0]), float(velocity[5])
-    sigma_mps, sigma_radps = (math.sqrt(max(0.0, float(covariance[axis, axis]))) for axis in (0, 5))
-    finite = all(map(math.isfinite, (heading_rad, velocity_mps, rate_radps)))
+    # The order of max: it returns its first argument where that is NaN.
+    sigma_mps, sigma_radps = (math.sqrt(max(float(covariance[axis, axis]), 0.0)) for axis in (0, 5))
+    finite = all(map(math.isfinite, (heading_rad, velocity_mps, rate_radps, sigma_mps, sigma_radps)))
     return ControllerPose(
         odometry.stamp_ns,
         heading_rad,

@@ -167,7 +167,7 @@ class NavigationStage:
         T_map_base, covariance = base_pose(update.T_map_rig, update.covariance, self._T_base_rig)
         T_map_odom = self._T_base_rig @ update.T_map_odom @ self._T_rig_base
         in_plane = in_outer_axes(T_map_base, covariance)[:2, :2]
-        sigma_m = math.sqrt(max(0.0, float(np.linalg.eigvalsh(in_plane)[-1])))
+        sigma_m = math.sqrt(max(float(np.linalg.eigvalsh(in_plane)[-1]), 0.0))  # NaN stays NaN in this order
         self._in_map = MapPosition(planar(T_map_odom), update.state, sigma_m, update.stamp_ns)
         T_map_keyframe = T_map_base @ self._T_base_rig @ se3.inverse(update.T_keyframe_rig) @ self._T_rig_base
         self._tie = KeyframeTie(update.keyframe, planar(T_map_keyframe))

@@ -29,7 +29,7 @@ class RobotPage:
         return [
             WebSocketRoute("/live", self.feed.browsers.serve),
             command_route("/stop", lambda _: self.wheels.stop()),
-            command_route("/arm", lambda _: self._arm()),
+            command_route("/arm", self._arm),
             command_route("/route", self._requests.route),
             command_route("/navigation", self._requests.navigation),
             command_route("/map", lambda _: self._requests.save_map()),
@@ -42,10 +42,10 @@ class RobotPage:
         counts = {"dropped": self.feed.inbox.dropped, "stops": self.wheels.stops, "arms": self._requests.arms}
         return metrics(self.feed.state, self.feed.browsers, guard.refused, counts)
 
-    async def _arm(self) -> Answer:
+    async def _arm(self, request: Request) -> Answer:
         if self.wheels.is_stopping:
             return Answer(False, "a stop is not confirmed yet: arm after it")
-        return await self._requests.arm()
+        return await self._requests.arm(request, self.wheels.stop_ms)
 
 
 def command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Route:

@@ -11,7 +11,7 @@ from typing import Final
 from starlette.requests import Request
 
 from omnid.client import Answer, Driver
-from omnid.core.navigation.requests import navigation_verb, route_request
+from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
 from omnid.errors import OmnidError
 from omnid.web.feed import RobotFeed
 from omnid.web.snapshot import is_recent
@@ -22,10 +22,15 @@ LONGEST_BODY: Final = 256
 BODY_S: Final = 5.0
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
 _GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
+_STAMP: Final = re.compile(r"\d{1,15}")
+_STAMPED: Final = re.compile(r"(.*?)(?: stamp=(\d{1,15}))?", re.DOTALL)
 
 
 class RobotRequests:
     """Passes requests on to the robot.
+
+    What lets the robot move (arm, goal, repeat, resume) carries the server's time in the newest state that the page has
+    shown, so a request that waited in a network moves nothing. What ends a motion needs none.
 
     A request occupies a thread until it is answered, so only one of each kind is open. arms: number of requests to
     arm so far.
@@ -36,17 +41,23 @@ class RobotRequests:
         self._busy: set[str] = set()  # kinds of the requests that wait for an answer
         self.arms = 0
 
-    async def arm(self) -> Answer:
-        """Ask the robot to arm."""
+    async def arm(self, request: Request, since_ms: int = 0) -> Answer:
+        """Ask the robot to arm; the text is the stamp. since_ms: earlier requests are from before a stop."""
+        try:
+            stamp_ms = stamp_of(await text_of(request))
+        except OmnidError as error:
+            return Answer(False, str(error))
+        if stamp_ms < since_ms:
+            return Answer(False, "a stop was asked for since: arm again if it is to move")
         self.arms += 1
         return await self._asked("arm", Driver.arm)
 
     async def route(self, request: Request) -> Answer:
-        """Pass on a request in the words of cmd/route, such as "teach NAME", "finish", "repeat NAME" or "stop"."""
+        """Pass on a request in the words of cmd/route: "teach NAME", "finish", "repeat NAME stamp=STAMP" or "stop"."""
         return await self._asked_in_words("route", request, route_request, Driver.route)
 
     async def navigation(self, request: Request) -> Answer:
-        """Pass on cancel, pause or resume."""
+        """Pass on "cancel", "pause" or "resume stamp=STAMP"."""
         return await self._asked_in_words("navigation", request, navigation_verb, Driver.navigate)
 
     async def goal(self, request: Request) -> Answer:
@@ -62,11 +73,17 @@ class RobotRequests:
         return await self._asked("map", Driver.save_map)
 
     async def _asked_in_words(
-        self, kind: str, request: Request, check: Callable[[str], object], ask: Callable[[Driver, str], Answer]
+        self,
+        kind: str,
+        request: Request,
+        parse: Callable[[str], NavigationRequest],
+        ask: Callable[[Driver, str], Answer],
     ) -> Answer:
         try:
-            text = await text_of(request)
-            check(text)
+            found = _STAMPED.fullmatch(await text_of(request))
+            text, stamp = ("", None) if found is None else found.groups()
+            if may_begin_motion(parse(text)):
+                stamp_of(stamp or "")
         except OmnidError as error:
             return Answer(False, str(error))
         return await self._asked(kind, lambda driver: ask(driver, text))
@@ -97,9 +114,20 @@ def goal_of(text: str) -> tuple[float, float, float | None]:
     found = _GOAL.fullmatch(text)
     if found is None:
         raise OmnidError('a goal is "X Y STAMP" or "X Y YAW STAMP" in m, m, deg')
-    if not is_recent(int(found[4])):
-        raise OmnidError("the goal came too late: the page had no new state of the robot; choose it again")
+    stamp_of(found[4])
     return float(found[1]), float(found[2]), None if found[3] is None else math.radians(float(found[3]))
+
+
+def stamp_of(text: str) -> int:
+    """Return the stamp of a request: the server's time [ms] in the state that the page showed last.
+
+    Raise OmnidError for any other text, and for a stamp that is too old.
+    """
+    if not _STAMP.fullmatch(text):
+        raise OmnidError("a request that lets the robot move repeats server_ms, the server's time in the newest state")
+    if not is_recent(int(text)):
+        raise OmnidError("the request came too late: the page had no new state of the robot; ask again")
+    return int(text)
 
 
 async def text_of(request: Request) -> str:

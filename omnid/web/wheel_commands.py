@@ -12,6 +12,7 @@ from omnid.errors import OmnidError
 from omnid.monitor.stopping import stop
 from omnid.transport.driver import ANSWER_S
 from omnid.web.feed import RobotFeed
+from omnid.web.snapshot import server_ms
 
 T = TypeVar("T")
 
@@ -26,6 +27,7 @@ class WheelCommands:
         self._driver: Driver | None = None
         self._again = False  # a stop was asked for since the newest one was sent
         self.stops = 0  # stops that were requested
+        self.stop_ms = 0  # the server's time at the newest one
 
     @property
     def is_stopping(self) -> bool:
@@ -35,6 +37,7 @@ class WheelCommands:
     async def stop(self) -> Answer:
         """Stop the wheels, and wait until the robot confirms it, for at most 10 s after the newest request."""
         self.stops += 1
+        self.stop_ms = server_ms()
         self._again = True
         if self._stopping is None or self._stopping.done():
             self._stopping = asyncio.create_task(self._stop())

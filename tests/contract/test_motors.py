@@ -70,6 +70,21 @@ def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) ->
         assert simulated.base.commanded_mps == [0.0, 0.0] and motor.replaced_by_stop >= 1
         assert until(lambda: motor.send(FORWARD) is not None and simulated.base.commanded_mps != [0.0, 0.0])
         assert simulated.base.unsafe_resumes == 0 and simulated.errors == 0
+        assert motor.connections > 1, "it is set up again: it may have been switched off and on"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stop_comes_before_motion_after_the_host_was_suspended(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CLOCK_MONOTONIC stands meanwhile, CLOCK_BOOTTIME does not, nor does the controller's watchdog."""
+    with connected_motor(name) as (motor, simulated):
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        simulated.expire()
+        gettime = time.clock_gettime
+        monkeypatch.setattr(
+            time, "clock_gettime", lambda clock: gettime(clock) + 3600.0 * (clock == time.CLOCK_BOOTTIME)
+        )
+        assert motor.send(FORWARD).watchdog_expired and simulated.base.commanded_mps == [0.0, 0.0]
+        assert simulated.base.unsafe_resumes == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -95,6 +110,35 @@ def test_a_late_reply_stops_nothing(name: str) -> None:
         simulated.drop_replies = False
         assert not first_status(motor).watchdog_expired and simulated.base.commanded_mps != [0.0, 0.0]
         assert motor.replaced_by_stop == replaced_by_stop
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stops_are_sent_while_no_replies_come(name: str) -> None:
+    """As where only the wire of the replies is broken: commands still arrive, and no watchdog expires by them."""
+    with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, simulated):
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        simulated.drop_replies = True
+        assert until(lambda: type(send_error(motor)) is NoReplyError)
+        for _ in range(3):
+            before = simulated.commands
+            send_error(motor)
+            assert until(lambda before=before: simulated.commands > before)  # type: ignore[misc]
+            assert simulated.base.commanded_mps == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_controller_that_was_switched_off_and_on_gets_its_watchdog_and_settings_again(name: str) -> None:
+    """As by an emergency stop that takes its power, while the serial adapter stays: the port is never gone."""
+    watchdog_ms = shortest_watchdog_ms(name)
+    with connected_motor(name, watchdog_ms=watchdog_ms, timeout_s=SHORT_S) as (motor, simulated):
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        simulated.drop_input = True
+        assert until(lambda: type(send_error(motor)) is NoReplyError)
+        simulated.controller = controller_of(name, watchdog_ms=watchdog_ms)  # with the defaults of its firmware
+        simulated.drop_input = False
+        assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
+        assert simulated.base.watchdog_ms == watchdog_ms and motor.connections == 2
+        assert simulated.base.unsafe_resumes == 0
 
 
 def send_error(motor: SerialMotor) -> DriverError:

@@ -35,7 +35,7 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         operator.drive(0.3)
         assert not state(server, lambda found: found["wheels"] and found["pose"])["wheels"]["armed"]
         assert not base.line.moved_since(0.0)
-        assert server.post("/arm") == {"done": True, "text": "armed: it obeys commands from now on"}
+        assert server.arm() == {"done": True, "text": "armed: it obeys commands from now on"}
         wait_until(lambda: base.drives, "motion")
         answer = server.post("/stop")
         assert answer["done"] and "stand until" in answer["text"]
@@ -46,10 +46,10 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         assert not stopped["wheels"]["armed"]
         time.sleep(0.5)
         assert not base.line.moved_since(since_s), "the operator, who sends at 20 Hz, moves nothing"
-        assert server.post("/arm")["done"]
+        assert server.arm()["done"]
         base.unplug()
         wait_until(lambda: operator.message("wheels") == FAILED, "the fault")
-        assert server.post("/arm") == {"done": False, "text": f"omnid refuses: {FAILED}"}
+        assert server.arm() == {"done": False, "text": f"omnid refuses: {FAILED}"}
         base.plug_in()
         assert daemon.end()[0] == 0
         gone = state(server, lambda found: found["alive"] is False and len(found["warnings"]) == 1)

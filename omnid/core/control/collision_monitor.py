@@ -23,7 +23,7 @@ from omnid.core.control.collision_geometry import (
     within_reach,
 )
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
-from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
+from omnid.core.control.heading_controller import Twist
 from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.nanoseconds import S_PER_NS
 
@@ -311,7 +311,7 @@ class CollisionMonitor:
         for at_ns, motion in reversed(self._motions):
             begin_ns = max(at_ns, stamp_ns)
             if until_ns > begin_ns:
-                pieces.append((motion, min((until_ns - begin_ns) * S_PER_NS, LONGEST_TICK_S)))
+                pieces.append((motion, (until_ns - begin_ns) * S_PER_NS))
             until_ns = min(until_ns, begin_ns)
             if at_ns <= stamp_ns:
                 break

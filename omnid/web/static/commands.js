@@ -4,8 +4,10 @@ import { byId } from "./elements.js";
 
 const RETRY_MS = 300;
 const GIVE_UP_MS = 10000;
+const SILENT_MS = 2500; // without an answer, or news of the robot (connection.js)
 const SURE_MS = 4000;
 const EMERGENCY = "STOP IS NOT SENT: use the emergency stop on the robot";
+const NO_ANSWER = "NO ANSWER YET: use the emergency stop on the robot";
 
 // The STOP button and the space key. Returns show(text, className), which writes beside it; before() is called first.
 export function wireStop(before = () => {}) {
@@ -18,7 +20,10 @@ export function wireStop(before = () => {}) {
     before();
     show("sending STOP ...", "");
     button.classList.add("sent");
-    const answer = await post("stop", GIVE_UP_MS, () => show(EMERGENCY, "bad"));
+    const answer = await firstAnswer(
+      () => post("stop", GIVE_UP_MS, () => show(EMERGENCY, "bad")),
+      () => number === newest && show(NO_ANSWER, "bad"),
+    );
     if (number !== newest) return; // a newer press shows its own answer
     button.classList.remove("sent");
     show(answer.text, answer.done ? "good" : "bad");
@@ -43,10 +48,29 @@ export function wireStop(before = () => {}) {
   return show;
 }
 
+// The first answer to a request that is sent again while none comes, for GIVE_UP_MS: on a connection that the network
+// has lost a request waits for minutes, and a new one may get through.
+function firstAnswer(send, onSilence) {
+  return new Promise((resolve) => {
+    const end = performance.now() + GIVE_UP_MS;
+    const timer = setInterval(() => {
+      onSilence();
+      if (performance.now() > end) clearInterval(timer);
+      else send().then(settle);
+    }, SILENT_MS);
+    function settle(answer) {
+      clearInterval(timer);
+      resolve(answer);
+    }
+    send().then(settle);
+  });
+}
+
 export function wireCommands() {
   const armButton = byId("arm");
   let sureUntil = 0;
   let wasArmed = null;
+  let stamp = 0; // the server's time in the newest state: a request to arm that comes late arms nothing
   const showStop = wireStop(() => { sureUntil = 0; });
 
   async function arm() {
@@ -60,7 +84,7 @@ export function wireCommands() {
     unsure();
     byId("answer").textContent = "asking the robot ...";
     showStop("", "");
-    const answer = await post("arm", 0, () => {});
+    const answer = await post("arm", 0, () => {}, String(stamp));
     byId("answer").textContent = answer.text;
   }
 
@@ -73,8 +97,10 @@ export function wireCommands() {
   armButton.addEventListener("click", arm);
 
   return {
-    // reported: false where the robot reports no wheels. Answers that are no longer true are taken away.
-    setArmed(armed, reported) {
+    // reported: false where the robot reports no wheels. serverMs: the server's time in the state. Answers that are no
+    // longer true are taken away.
+    setArmed(armed, reported, serverMs) {
+      stamp = serverMs;
       armButton.hidden = armed;
       armButton.disabled = !reported;
       if (armed && sureUntil) unsure();

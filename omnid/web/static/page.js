@@ -62,7 +62,7 @@ function showState(state) {
   setBadge("state", state.state, state.fresh ? STATES[state.state] ?? "warn" : "bad");
   byId("rate").textContent = state.fresh ? `${fixed(state.rate_hz, 1)} poses/s` : "";
   showWell(state);
-  showWheels(state.wheels);
+  showWheels(state.wheels, state.server_ms);
   stick.show(state);
   goal.show(state);
   routes.show(state);
@@ -88,13 +88,13 @@ function showWell(state) {
     : `All is well. ${moves}`;
 }
 
-function showWheels(wheels) {
+function showWheels(wheels, serverMs) {
   const armed = wheels !== null && wheels.armed;
   setBadge("armed", wheels === null ? "" : armed ? "armed" : "not armed", armed ? "warn" : "rest");
   const source = wheels !== null && wheels.source ? `, commanded by ${wheels.source}` : "";
   byId("wheels").textContent = wheels === null ? "not reported: the robot has no motor, or is not there"
     : `${wheels.message}${source}`;
-  commands.setArmed(armed, wheels !== null);
+  commands.setArmed(armed, wheels !== null, serverMs);
 }
 
 function showWarnings(warnings) {

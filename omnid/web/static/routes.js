@@ -12,13 +12,14 @@ export function wireRoutes() {
   let armed = false;
   let report = null;
   let sureUntil = 0;
+  let stamp = 0; // the server's time in the newest state: what would move the robot and comes late moves nothing
   const ask = async (address, text) => {
     byId("route-answer").textContent = "asking the robot ...";
     const answer = await post(address, 0, () => {}, text);
     byId("route-answer").textContent = answer.text;
   };
-  const named = (verb) => {
-    if (name.reportValidity()) ask("route", `${verb} ${name.value}`);
+  const named = (verb, end = "") => {
+    if (name.reportValidity()) ask("route", `${verb} ${name.value}${end}`);
   };
   const repeat = byId("route-repeat");
   const unsure = () => {
@@ -36,13 +37,13 @@ export function wireRoutes() {
       return;
     }
     unsure();
-    named("repeat");
+    named("repeat", ` stamp=${stamp}`);
   });
   byId("route-teach").addEventListener("click", () => named("teach"));
   byId("route-finish").addEventListener("click", () => ask("route", "finish"));
   byId("route-stop").addEventListener("click", () => ask("route", "stop"));
   byId("route-pause").addEventListener("click", () => ask("navigation", "pause"));
-  byId("route-resume").addEventListener("click", () => ask("navigation", "resume"));
+  byId("route-resume").addEventListener("click", () => ask("navigation", `resume stamp=${stamp}`));
 
   // A button can be pressed where it does something.
   function enable() {
@@ -59,6 +60,7 @@ export function wireRoutes() {
   return {
     show(state) {
       armed = state.wheels !== null && state.wheels.armed;
+      stamp = state.server_ms;
       enable();
     },
     showNavigation(newest) {

@@ -28,7 +28,7 @@ from drivers.motors.protocols.line_protocol import (
     encode,
 )
 from drivers.motors.protocols.motor_protocol import T, Transaction
-from drivers.motors.serial_motor import SerialMotor
+from drivers.motors.serial_motor import NoReplyError, SerialMotor
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 
@@ -191,6 +191,35 @@ def opens_as_another_user(port: str) -> bool:
     """True if another program can open the port; without the privileges of root, which ignores the exclusive mode."""
     user: dict[str, Any] = {"user": OTHER_ID, "group": OTHER_ID, "extra_groups": []} if os.geteuid() == 0 else {}
     return subprocess.run(["sh", "-c", 'exec 3<> "$0"', port], capture_output=True, check=False, **user).returncode == 0
+
+
+class SlowToSetUp(SimulatedLine):
+    """A controller that takes longer to set its watchdog than a command may take, as an ODrive by 50 commands/s."""
+
+    def handle(self, line: bytes) -> bytes | None:
+        if line.startswith(b"$W"):
+            time.sleep(0.1)
+        return super().handle(line)
+
+
+def test_after_silence_a_controller_has_the_time_to_be_set_up_again() -> None:
+    with contextlib.closing(SimulatedMotor(SlowToSetUp(heading_input=False))) as simulated:
+        motor = SerialMotor(simulated.port, timeout_s=0.05, watchdog_ms=200, connect_s=PATIENCE_S)
+        with contextlib.closing(motor):
+            simulated.drop_replies = True
+            assert until(lambda: type(failure(motor)) is NoReplyError)
+            simulated.drop_replies = False
+            assert until(lambda: failure(motor) is None and simulated.base.commanded_mps != [0.0, 0.0])
+            assert motor.connections == 2
+
+
+def failure(motor: SerialMotor) -> DriverError | None:
+    """Return the error of a command, None where it got a reply."""
+    try:
+        motor.send(VelocityCommand(0, 0.3, 0.0, 0.0))
+    except DriverError as error:
+        return error
+    return None
 
 
 def test_after_a_command_that_was_refused_a_stop_comes_first(simulated: SimulatedMotor) -> None:

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import time
 from pathlib import Path
 
 import pytest
 
 from omnid.errors import OmnidError
 from omnid.monitor.stopping import stop
+from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
+from omnid.transport.status_names import DISARMED_BY_STOP, WHEELS, Key
 from tests.omnid.transport.bus_fixtures import free_endpoint, script
 
+STOPPED = DiagnosticStatus(WHEELS, 0, "", {Key.DISARMED_BY: DISARMED_BY_STOP})
 CROWD = """
 import json, sys, time, zenoh
 held = []
@@ -44,6 +49,25 @@ def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None
         with script(CROWD, endpoint):
             assert stop(BusConfig(connect=(endpoint,)))
     assert set(commands) == {"cmd/stop"}
+
+
+def test_a_status_from_before_the_stop_does_not_confirm_it() -> None:
+    """The robot has kept that of an earlier stop, and was armed since. As behind a router nothing answers datagrams."""
+    endpoint = free_endpoint()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [STOPPED]))
+        stops: list[str] = []
+
+        def execute(request: Request) -> None:
+            stops.append(request.topic)
+            if len(stops) == 3:
+                bus.publish("status", codec.diagnostics_cdr(time.time_ns(), [STOPPED]))
+
+        bus.subscribe_commands(execute, {})
+        assert bus._stop_listener is not None
+        bus._stop_listener.close()
+        assert stop(BusConfig(connect=(endpoint,)))
+    assert stops == ["cmd/stop"] * 3, "it is sent again until a new status confirms it"
 
 
 def test_without_a_robot_there_the_error_is_that_of_the_bus() -> None:

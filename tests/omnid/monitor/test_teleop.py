@@ -48,6 +48,33 @@ def test_any_other_key_ends_the_motion(stick: Stick, key: bytes) -> None:
     assert stick.stop_asked == (key == b" ")
 
 
+@pytest.mark.parametrize(
+    "parts", [(b"\x1b", b"[A"), (b"\x1b[", b"A"), (b"x\x1b", b"[A"), (b"\x1bOA",), (b"\x1bO", b"A")]
+)
+def test_an_arrow_that_comes_in_parts_or_in_the_other_mode_of_terminals_drives_and_does_not_arm(
+    stick: Stick, parts: tuple[bytes, ...]
+) -> None:
+    for part in parts:
+        stick.press(part, 0.0)
+    assert stick.twist(0.0) == (0.5, 0.0)
+    assert not (stick.arm_asked or stick.quit or stick.stop_asked)
+
+
+@pytest.mark.parametrize("key", [b"\x1b[1;2A", b"\x1bOQ", b"\x1b[5~", b"\x1b[15~", b"\x1b[?1;2c"])
+def test_other_keys_of_several_bytes_end_the_motion_and_mean_nothing_else(stick: Stick, key: bytes) -> None:
+    stick.press(UP + key, 0.0)
+    assert stick.twist(0.0) == (0.0, 0.0)
+    assert not (stick.arm_asked or stick.quit or stick.stop_asked) and stick.share == 0.5
+
+
+@pytest.mark.parametrize("begun", [b"\x1b", b"\x1b[", b"\x1bO", b"\x1b[1;", b"\x1b[" + b"1" * 100])
+def test_a_stop_after_a_part_of_a_key_is_a_stop(stick: Stick, begun: bytes) -> None:
+    stick.press(UP + begun, 0.0)
+    assert stick.twist(0.0) == (0.0, 0.0), "the key Esc ends the motion"
+    stick.press(b" ", 0.1)
+    assert stick.stop_asked
+
+
 def test_letters(stick: Stick) -> None:
     stick.press(b"aq", 0.0)
     assert stick.arm_asked and stick.quit and not stick.stop_asked

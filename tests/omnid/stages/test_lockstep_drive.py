@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -98,6 +99,15 @@ def test_steers_the_base_and_not_the_rig() -> None:
 def test_a_pose_that_is_not_finite_is_lost(odd: dict[str, float]) -> None:
     assert controller_pose(odometry(0.0), np.eye(4)).state == TrackingState.TRACKING
     assert controller_pose(odometry(0.0, **odd), np.eye(4)).state == TrackingState.LOST
+
+
+@pytest.mark.parametrize("axis", [0, 5])
+def test_a_pose_whose_velocity_has_no_known_covariance_is_lost(axis: int) -> None:
+    update = odometry(0.0)
+    covariance = update.velocity_covariance.copy()
+    covariance[axis, axis] = math.nan
+    pose = controller_pose(replace(update, velocity_covariance=covariance), np.eye(4))
+    assert pose.state == TrackingState.LOST
 
 
 def test_the_controllers_pose_is_that_of_the_base() -> None:

@@ -291,6 +291,15 @@ def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path
             assert "not localised" in robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer.refusal
 
 
+def test_a_pose_in_the_map_without_a_known_covariance_begins_no_drive_in_it(tmp_path: Path) -> None:
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.stage.process(
+        PlaceUpdate(9, 9 * PERIOD_NS, np.eye(4), np.eye(4), np.full((6, 6), np.nan), MapState.LOCALIZED, 3, np.eye(4))
+    )
+    assert "uncertain by nan m" in robot.send(GoalRequest(MAP, 1.0, 0.0), id=7).answers[-1].refusal
+
+
 def test_after_a_reset_a_place_from_before_it_is_none(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()

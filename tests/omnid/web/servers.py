@@ -59,10 +59,19 @@ class WebServer:
         finally:
             connection.close()
 
-    def post(self, path: str) -> dict[str, Any]:
+    def post(self, path: str, body: str | None = None) -> dict[str, Any]:
         """Send a command as a program; return the answer."""
-        found: dict[str, Any] = json.loads(self.request(path, "POST", self.bearer).text)
+        found: dict[str, Any] = json.loads(self.request(path, "POST", self.bearer, body).text)
         return found
+
+    def arm(self) -> dict[str, Any]:
+        """Ask for arming, as a page that shows the newest state; return the answer."""
+        return self.post("/arm", str(self.state_ms()))
+
+    def state_ms(self) -> int:
+        """Return the server's time in the newest state, as a page knows it."""
+        with self.live(self.bearer) as live:
+            return int(Shown(live).until("state")["server_ms"])
 
     def cookie(self) -> dict[str, str]:
         """Return the header of a browser that has opened the printed address."""

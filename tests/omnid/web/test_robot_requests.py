@@ -98,4 +98,28 @@ def test_what_is_no_request_and_what_finds_no_robot_is_not_done(at_50_s: None) -
         answer = asyncio.run(ask(asked(text)))
         assert not answer.done and words in answer.text
     assert requests.arms == 0
-    assert not asyncio.run(requests.arm()).done and requests.arms == 1
+    assert not asyncio.run(requests.arm(asked(str(NOW_MS)))).done and requests.arms == 1
+
+
+def test_what_lets_the_robot_move_and_comes_late_or_without_a_stamp_is_refused(at_50_s: None) -> None:
+    requests = RobotRequests(RobotFeed(BusConfig()))
+    late = NOW_MS - 1001
+    for ask, text, words in (
+        (requests.arm, "", "server_ms"),
+        (requests.arm, f"{late}", "too late"),
+        (requests.arm, f"{NOW_MS + 1}", "too late"),
+        (requests.arm, f"{NOW_MS} x", "server_ms"),
+        (requests.route, "repeat hall", "server_ms"),
+        (requests.route, f"repeat hall {NOW_MS}", "expected"),
+        (requests.route, f"repeat hall loops=2 stamp={late}", "too late"),
+        (requests.route, f"repeat hall stamp={NOW_MS} loops=2", "expected"),
+        (requests.navigation, "resume", "server_ms"),
+        (requests.navigation, f"resume stamp={late}", "too late"),
+        (requests.route, f"repeat hall loops=2 stamp={NOW_MS}", "There is no connection"),
+        (requests.navigation, f"resume stamp={NOW_MS}", "There is no connection"),
+        (requests.navigation, f"cancel stamp={late}", "There is no connection"),
+        (requests.route, "stop", "There is no connection"),
+    ):
+        answer = asyncio.run(ask(asked(text)))
+        assert not answer.done and words in answer.text, text
+    assert requests.arms == 0

@@ -77,17 +77,18 @@ def answer(robot: tuple[WebServer, Navigator], path: str, text: str) -> dict[str
 
 def test_requests_reach_the_robot_and_its_answer_the_page(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
-    for path, text in (
-        ("/route", "teach dock"),
-        ("/route", "finish"),
-        ("/route", "repeat dock"),
-        ("/route", "stop"),
-        ("/navigation", "pause"),
-        ("/navigation", "resume"),
+    for path, text, moves in (
+        ("/route", "teach dock", False),
+        ("/route", "finish", False),
+        ("/route", "repeat dock", True),
+        ("/route", "stop", False),
+        ("/navigation", "pause", False),
+        ("/navigation", "resume", True),
     ):
-        assert answer(robot, path, text) == {"done": True, "text": f"does {text}"}
+        stamp = f" stamp={server.state_ms()}" if moves else ""
+        assert answer(robot, path, f"{text}{stamp}") == {"done": True, "text": f"does {text}"}
         assert navigator.asked[-1] == text
-    refused = answer(robot, "/route", "repeat lost")
+    refused = answer(robot, "/route", f"repeat lost stamp={server.state_ms()}")
     assert not refused["done"] and refused["text"] == "omnid refuses: that cannot be"
     with server.live(server.bearer) as live:
         shown = Shown(live).until("navigation", navigator.publish)
@@ -122,22 +123,16 @@ def test_other_texts_never_leave_the_server(robot: tuple[WebServer, Navigator], 
     assert server.request(path, headers=server.bearer).status == 405
 
 
-def server_ms(server: WebServer) -> int:
-    """Return the server's time in the newest state, as a page knows it."""
-    with server.live(server.bearer) as live:
-        return int(Shown(live).until("state")["server_ms"])
-
-
 def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
-    given = answer(robot, "/goal", f"1.5 -0.25 90 {server_ms(server)}")
+    given = answer(robot, "/goal", f"1.5 -0.25 90 {server.state_ms()}")
     assert given == {"done": True, "text": "it drives there"}
     goal = navigator.goals[-1]
     assert (goal.frame, goal.x_m, goal.y_m) == ("odom", 1.5, -0.25)
     assert goal.heading_rad == pytest.approx(math.pi / 2)
-    assert answer(robot, "/goal", f"1 2 {server_ms(server)}")["done"] and navigator.goals[-1].heading_rad is None
+    assert answer(robot, "/goal", f"1 2 {server.state_ms()}")["done"] and navigator.goals[-1].heading_rad is None
     count = len(navigator.goals)
-    now_ms = server_ms(server)
+    now_ms = server.state_ms()
     for text in (
         "1 2",
         "1 2 3",
@@ -155,26 +150,26 @@ def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tup
     server, navigator = robot
     limits = VelocityLimits()
     assert (
-        answer(robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"]
-        or answer(robot, "/drive", f"1 -0.5 {server_ms(server)} a1")["done"]
+        answer(robot, "/drive", f"1 -0.5 {server.state_ms()} a1")["done"]
+        or answer(robot, "/drive", f"1 -0.5 {server.state_ms()} a1")["done"]
     )  # the first one may wait for the limits
     wait_until(lambda: navigator.twists)
     assert navigator.twists[-1] == pytest.approx(
         (FIRST_SHARE * limits.velocity_mps, -0.5 * FIRST_SHARE * limits.yaw_rate_radps)
     )
-    assert "another page drives" in answer(robot, "/drive", f"1 0 {server_ms(server)} b2")["text"]
+    assert "another page drives" in answer(robot, "/drive", f"1 0 {server.state_ms()} b2")["text"]
     # 1. A request that waited in a network moves nothing; a release always counts.
     count = len(navigator.twists)
-    assert "too slow" in answer(robot, "/drive", f"1 0 {server_ms(server) - 1500} a1")["text"]
-    assert "too slow" in answer(robot, "/drive", f"1 0 {server_ms(server) + 60_000} a1")["text"]
-    assert answer(robot, "/drive", f"0 0 {server_ms(server) - 1500} a1") == {
+    assert "too slow" in answer(robot, "/drive", f"1 0 {server.state_ms() - 1500} a1")["text"]
+    assert "too slow" in answer(robot, "/drive", f"1 0 {server.state_ms() + 60_000} a1")["text"]
+    assert answer(robot, "/drive", f"0 0 {server.state_ms() - 1500} a1") == {
         "done": True,
         "text": "the stick is released: it stands",
     }
     wait_until(lambda: len(navigator.twists) > count)
     assert navigator.twists[count:] == [(0.0, 0.0)]
     # 2. Anything else is refused, and so are requests of other sites.
-    now_ms = server_ms(server)
+    now_ms = server.state_ms()
     for text in (
         f"1.5 0 {now_ms} a1",
         f"0 -1.01 {now_ms} a1",
@@ -186,7 +181,7 @@ def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tup
         f"1 0 {now_ms} a1 b",
     ):
         assert not answer(robot, "/drive", text)["done"], text
-    body = f"1 0 {server_ms(server)} a1"
+    body = f"1 0 {server.state_ms()} a1"
     assert server.request("/drive", "POST", body=body).status == 403
     assert server.request("/drive", "POST", {**server.bearer, "Origin": "http://evil.example"}, body).status == 403
     assert len(navigator.twists) == count + 1

@@ -253,7 +253,7 @@ def test_a_stop_is_repeated_until_the_status_confirms_it(server: WebServer, bus:
     with ThreadPoolExecutor(2) as threads:
         answers = [threads.submit(server.post, "/stop") for _ in range(2)]
         wait_until(lambda: received.count("cmd/stop") >= 5)
-        assert not any(answer.done() for answer in answers) and not server.post("/arm")["done"]
+        assert not any(answer.done() for answer in answers) and not server.arm()["done"]
         is_stopped[0] = True
         assert all(answer.result()["done"] for answer in answers) and "cmd/arm" not in received
 
@@ -362,7 +362,7 @@ def test_without_a_robot_the_page_says_so_and_a_stop_is_not_confirmed(default_si
         with server.live(server.bearer) as live:
             state = Shown(live).until("state", holds=lambda found: "cannot reach" in found["link"])
         assert state["warnings"][0]["name"] == "connection"
-        assert server.post("/arm")["text"].startswith("There is no connection")
+        assert server.arm()["text"].startswith("There is no connection")
         assert server.post("/stop")["text"].startswith("the stop is NOT confirmed: use the emergency stop")
         assert server.end(signal.SIGINT) == (0, "")
 

@@ -82,7 +82,8 @@ def connected(rover: Rover) -> Iterator[RobotFeed]:
 def clock_ms(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The server's time, which stands until a test changes it."""
     now_ms = [NOW_MS]
-    monkeypatch.setattr(snapshot, "server_ms", lambda: now_ms[0])
+    for module in (snapshot, wheel_commands):
+        monkeypatch.setattr(module, "server_ms", lambda: now_ms[0])
     return now_ms
 
 
@@ -244,7 +245,7 @@ def test_nothing_drives_or_arms_while_a_stop_is_not_confirmed(
     async def refused() -> tuple[Answer, Answer]:
         stopping = asyncio.create_task(page.wheels.stop())
         await until(lambda: "cmd/stop" in rover.topics)
-        answers = await page._stick.drive(asked(f"1 0 {clock_ms[0]} a")), await page._arm()
+        answers = await page._stick.drive(asked(f"1 0 {clock_ms[0]} a")), await page._arm(asked(str(clock_ms[0])))
         rover.is_stopped = True
         assert (await stopping).done
         return answers
@@ -253,8 +254,21 @@ def test_nothing_drives_or_arms_while_a_stop_is_not_confirmed(
     assert drive == Answer(False, "a stop is not confirmed yet: drive after it")
     assert arm == Answer(False, "a stop is not confirmed yet: arm after it")
     assert set(rover.topics) == {"cmd/stop"}
-    assert asyncio.run(page._arm()).done
+    assert asyncio.run(page._arm(asked(str(clock_ms[0])))).done
     assert rover.topics[-1] == "cmd/arm"
+
+
+def test_arming_that_was_asked_for_before_a_stop_and_comes_after_it_is_refused(
+    rover: Rover, connected: RobotFeed, clock_ms: list[int]
+) -> None:
+    page, before_ms = RobotPage(connected), clock_ms[0]
+    rover.is_stopped = True
+    clock_ms[0] += 200
+    assert asyncio.run(page.wheels.stop()).done
+    clock_ms[0] += 200
+    assert asyncio.run(page._arm(asked(str(before_ms)))).text.startswith("a stop was asked for since")
+    assert "cmd/arm" not in rover.topics
+    assert asyncio.run(page._arm(asked(str(clock_ms[0])))).done
 
 
 def test_requests_are_answered_by_the_robot_one_of_each_kind_at_a_time(
@@ -267,7 +281,7 @@ def test_requests_are_answered_by_the_robot_one_of_each_kind_at_a_time(
         first = asyncio.create_task(requests.goal(asked(f"1 2 {clock_ms[0]}")))
         await until(lambda: "cmd/goal" in rover.topics)
         second = await requests.goal(asked(f"3 4 {clock_ms[0]}"))
-        arm = asyncio.create_task(requests.arm())  # of another kind
+        arm = asyncio.create_task(requests.arm(asked(str(clock_ms[0]))))  # of another kind
         await until(lambda: requests._busy == {"goal", "arm"})
         rover.answering.set()
         return [second, *await asyncio.gather(first, arm), await requests.goal(asked(f"5 6 {clock_ms[0]}"))]
@@ -282,5 +296,5 @@ def test_requests_are_answered_by_the_robot_one_of_each_kind_at_a_time(
     with Robot("other", settings=BusConfig(robot="other", connect=(rover.endpoint,)), timeout_s=30.0) as other:
         connected.robot = other
         for _ in range(2):  # the first does not keep the second out
-            answer = asyncio.run(requests.arm())
+            answer = asyncio.run(requests.arm(asked(str(clock_ms[0]))))
             assert not answer.done and "takes such requests" in answer.text

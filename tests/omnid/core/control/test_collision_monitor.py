@@ -286,6 +286,18 @@ def test_an_older_ring_makes_the_base_no_freer(age_s: float, speed_mps: float) -
             assert monitor.step(now_ns, Twist(-speed_mps)) == Twist(-speed_mps), "it may back out"
 
 
+@pytest.mark.parametrize("late_s", [0.05, 0.2, 0.45])
+def test_a_ring_is_moved_by_all_of_the_way_until_a_late_tick(late_s: float) -> None:
+    """With motor.rate_hz = 5 a tick that is not yet a fault, by controller.deadlines.tick_s, comes after 0.45 s."""
+    speed_mps = 0.3  # at 1.5 s to a collision: the distance left is what the time allows
+    wall_m = SETTINGS.front_m + SETTINGS.stop_m + speed_mps * late_s + 0.3
+    monitor = CollisionMonitor(SETTINGS, 1.5)
+    monitor.set_ring(ControllerRing(10 * S, with_points((wall_m, 0.0))))
+    monitor.follow(10 * S, Twist(speed_mps))
+    allowed = monitor.step(10 * S + round(late_s * S), Twist(speed_mps))
+    assert allowed.velocity_mps == pytest.approx(0.3 / SETTINGS.time_s, rel=0.02)
+
+
 def test_a_ring_from_before_all_motions_that_are_remembered_is_stale() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, stale_s=10.0), 1.5)
     monitor.set_ring(ControllerRing(10 * S, FREE_RING))

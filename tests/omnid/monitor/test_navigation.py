@@ -1,0 +1,77 @@
+"""The progress of a drive, as commands show it until its end."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from omnid.client import NavigationReport, Robot
+from omnid.errors import OmnidError
+from omnid.monitor import navigation
+from omnid.transport import codec
+from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.navigation_codec import string_from_cdr
+from omnid.transport.records import DiagnosticStatus
+from omnid.transport.requests import Answer, Request
+from omnid.transport.status_names import NAVIGATION, Key
+from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC
+from omnid.transport.topics import command_topics
+from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+
+COMMAND_NS = 7
+GOTO = ("goto", "1", "0")
+REPEAT = ("route", "repeat", "hall")
+
+
+def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing on a robot watches the program that has asked for a drive: it goes on without the network."""
+    monkeypatch.setattr(navigation, "SILENCE_S", 0.5)
+    endpoint = free_endpoint()
+    shown: list[NavigationReport] = []
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+        values = {Key.STATE: "driving", Key.COMMAND_NS: str(COMMAND_NS)}
+        entry = DiagnosticStatus(NAVIGATION, 0, "", {str(key): value for key, value in values.items()})
+        bus.publish("navigation", codec.diagnostics_cdr(time.time_ns(), [entry]))
+        with Robot("omnid", endpoint, timeout_s=30.0) as robot, pytest.raises(OmnidError, match="silent") as caught:
+            navigation.follow(robot, COMMAND_NS, shown.append)
+    assert [report.state for report in shown] == ["driving"]
+    assert "it drives on (`omnid stop`" in str(caught.value)
+
+
+@pytest.mark.parametrize("is_answered", [True, False])
+@pytest.mark.parametrize(
+    ("words", "number"),
+    [(GOTO, signal.SIGINT), (GOTO, signal.SIGTERM), (REPEAT, signal.SIGINT), (REPEAT, signal.SIGHUP)],
+)
+def test_a_drive_is_cancelled_when_its_command_is_ended(
+    words: tuple[str, ...], number: signal.Signals, is_answered: bool
+) -> None:
+    """By Ctrl-C, by its terminal that closes, or by a script; also while the robot has not yet answered."""
+    endpoint, asked, cancelled = free_endpoint(), list[str](), list[str]()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
+
+        def take(request: Request) -> None:
+            if request.topic == NAVIGATION_TOPIC:
+                cancelled.append(string_from_cdr(request.payload))
+                bus.answer(request.id, Answer(True, "cancelled"))
+                return
+            if is_answered:
+                bus.answer(request.id, Answer(True, "it drives"))
+            asked.append(request.topic)
+
+        bus.subscribe_commands(take, command_topics(("operator",)))
+        command = [sys.executable, "-m", "omnid", *words, "--connect", endpoint]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            wait_until(lambda: len(asked) == 1)
+            time.sleep(0.5)  # it waits for the answer, or for the end of the drive
+            process.send_signal(number)
+            try:
+                process.communicate(timeout=30.0)
+            finally:
+                process.kill()
+        assert cancelled == ["cancel"] and process.returncode == 1
