@@ -15,7 +15,7 @@ from omnid.core.control.collision_monitor import UNKNOWN
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import PLANNER
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, IDLE
+from omnid.core.control.safety_rules import ASKED
 from omnid.core.navigation.drive import Drive, Navigation
 from omnid.core.navigation.follower import STAND, Follower, Following
 from omnid.core.navigation.giving_way import GivingWay, Phase, Trail, closed, give_way, is_free
@@ -150,7 +150,7 @@ class Navigator:
                 return self._wait(drive, NavigationState.BLOCKED, AROUND, dt_s)
             return self._no_progress(now, AROUND if plan.avoiding else "")
         self.state = NavigationState.AVOIDING if plan.avoiding else NavigationState.DRIVING
-        self.reason = now.wheels.reason if _holds(now) else plan.reason
+        self.reason = now.wheels.reason if now.wheels.is_held else plan.reason
         drive.waits.clear()
         return Navigation(plan.setpoint, self.state, self.reason, following.left_m, following.offset_m)
 
@@ -315,7 +315,7 @@ class Navigator:
         return self._failed(f"{abs(following.offset_m):.1f} m beside the path: drive back to it and ask again")
 
     def _no_progress(self, now: Situation, does: str) -> Navigation:
-        why = now.wheels.reason if _holds(now) else does
+        why = now.wheels.reason if now.wheels.is_held else does
         words = f"no progress for {self._settings.stuck_s:g} s", why, "look at the robot"
         return self._failed(": ".join(word for word in words if word))
 
@@ -326,8 +326,3 @@ class Navigator:
     def _end(self, state: NavigationState, reason: str) -> None:
         self.drive, self._stops = None, STOPS
         self.state, self.reason = state, reason
-
-
-def _holds(now: Situation) -> bool:
-    """True if a rule of the controller holds the wheels now."""
-    return now.wheels.reason not in ("", IDLE, COMMAND_STALE)

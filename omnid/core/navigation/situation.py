@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed
+from omnid.core.control.safety_rules import COMMAND_STALE, IDLE
 from omnid.core.navigation.forecast import Forecast
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.tracking_state import MapState, TrackingState
@@ -30,6 +31,11 @@ class WheelState(NamedTuple):
     held_by: str = ""  # why the collision monitor stops the base; empty: it does not
     halts: int = 0  # how often a stop or a fault has made cmd/arm necessary, also if it has come since
     halted_by: str = ""  # the newest of their reasons
+
+    @property
+    def is_held(self) -> bool:
+        """True if a rule of the controller holds the wheels now."""
+        return self.reason not in ("", IDLE, COMMAND_STALE)
 
 
 class MapPosition(NamedTuple):
