@@ -21,7 +21,7 @@ from omnid.core.obstacles.cell_kernels import FLOOR, LIMIT, MOST_RATIO, SURFACE,
 from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
 from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of, level_odds
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
-from omnid.core.obstacles.near_field import SEEN_SURFACE, NearField, lose_before
+from omnid.core.obstacles.near_field import NearField, lose_before
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN
 from omnid.core.obstacles.usual_floor import UsualFloor, arrivals_at
@@ -130,13 +130,12 @@ class ObstacleGrid:
         comes = self._usual.hidden(self._usual.compare((rows, columns), cells[MEAN_FLOOR], weight), *ways)
         arrivals = arrivals_at(comes.ranges_m, nearest_m, self._at_1m)
         hidden = self._usual_thin.compare((rows, columns), cells[FLOOR], weight)
-        thin = self._usual_thin.hidden(
-            hidden, ways[0], self._shown_near(rows, columns, cells, eye, nearest_m), *ways[2:]
-        )
+        # A surface too near for floor explains that it hides the floor: nothing thin need stand before it.
+        in_view, nearest = np.isfinite(cells[FLOOR]), int(evidence.nearest_floor_m / CELL_M)
+        stands = ways[1] | self._near.surely_shown((rows, columns), cells[SURFACE], in_view, eye, nearest)
+        thin = self._usual_thin.hidden(hidden, ways[0], stands, *ways[2:])
         # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
-        in_view = np.isfinite(cells[FLOOR])
         lost = np.where(thin.behind, hidden, np.minimum(hidden, 0))
-        nearest = int(evidence.nearest_floor_m / CELL_M)
         lose_before(lost, thin.near, eye, angles, nearest)
         past = partial(self._near.seen_past, self._odds, self._watch, eye, max(nearest, 1))
         gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
@@ -159,17 +158,6 @@ class ObstacleGrid:
         in_view_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
         view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, *gaps)
         return ring_of(self.state(), view, arrivals)
-
-    def _shown_near(self, rows: slice, columns: slice, cells: Floats, eye: Array, nearest_m: float) -> Flags:
-        """Return the cells (CELLS, CELLS) of what stands, and of surfaces that a pair surely shows too near for floor.
-
-        Such a surface explains that it hides the floor: nothing else need stand before it.
-        """
-        shown: Flags = self._odds[SURFACE] > TAKEN_ODDS
-        shown[rows, columns] |= (cells[SURFACE] >= SEEN_SURFACE) & self._near.within(eye, nearest_m / CELL_M)[
-            rows, columns
-        ]
-        return shown
 
     def _add(
         self,

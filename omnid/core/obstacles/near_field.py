@@ -71,20 +71,28 @@ class NearField:
         pair, and where floor can be seen; past: returns the cells (H, W) behind which floor is seen.
         """
         found = np.zeros(surface.shape, bool)
-        begin = np.floor(eye).astype(int) - nearest
-        rows, columns = (
-            slice(max(at, side.start), min(at + 2 * nearest + 1, side.stop))
-            for at, side in zip(begin[::-1].tolist(), window, strict=True)
-        )
-        near = tuple(slice(a.start - b.start, a.stop - b.start) for a, b in zip((rows, columns), window, strict=True))
+        part, near = _about(eye, nearest, window)
         out_of_view, shown = ~in_view[near], surface[near]
-        range_m = self._cell_m * np.hypot(self._x[rows, columns] - eye[0], self._y[rows, columns] - eye[1])
-        seen_m = self._seen_m[rows, columns]
+        range_m = self._range_m(part, eye)
+        seen_m = self._seen_m[part]
         np.minimum(seen_m, range_m, out=seen_m, where=(shown >= SEEN_SURFACE) & out_of_view)
         would_show = (shown <= 0) & out_of_view & (range_m >= seen_m - self._cell_m)
         if would_show.any():
-            found[near] = would_show & past()[rows, columns]
+            found[near] = would_show & past()[part]
         return found
+
+    def surely_shown(
+        self, window: tuple[slice, slice], surface: Floats, in_view: Flags, eye: Array, nearest: int
+    ) -> Flags:
+        """Return the cells (H, W) too near to show floor in which a pair surely shows a surface."""
+        found = np.zeros(self._seen_m.shape, bool)
+        part, near = _about(eye, nearest, window)
+        found[part] = (surface[near] >= SEEN_SURFACE) & ~in_view[near]
+        return found
+
+    def _range_m(self, part: tuple[slice, slice], eye: Array) -> Floats:
+        """Return the ranges [m] of cells in a part of the square."""
+        return np.asarray(self._cell_m * np.hypot(self._x[part] - eye[0], self._y[part] - eye[1]), np.float32)
 
     def seen_past(self, odds: Floats, watch: Watch, eye: Array, nearest: int) -> Flags:
         """Return the cells (H, W) behind which the nearest floor in view is watched, in some sectors side by side.
@@ -124,6 +132,17 @@ class NearField:
         cells = np.zeros(self._seen_m.shape, np.uint8)
         kernels.mark(eye, self._directions, ways.astype(np.int32), cells)
         return cells.view(np.bool_)
+
+
+def _about(eye: Array, reach: int, window: tuple[slice, slice]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Return the part of a square, and of a window of it, within a reach of the viewpoint (2,), all in cells."""
+    begin = np.floor(eye).astype(int) - reach
+    rows, columns = (
+        slice(max(at, side.start), min(at + 2 * reach + 1, side.stop))
+        for at, side in zip(begin[::-1].tolist(), window, strict=True)
+    )
+    inside = [slice(a.start - b.start, a.stop - b.start) for a, b in zip((rows, columns), window, strict=True)]
+    return (rows, columns), (inside[0], inside[1])
 
 
 def lose_before(lost: Floats, near: Floats, eye: Array, azimuths: Array, nearest: int) -> None:

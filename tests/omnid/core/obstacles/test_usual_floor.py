@@ -16,8 +16,8 @@ USUAL: Final = 2.0  # evidence of the floor, without which the log-odds are 1
 IN_VIEW_M, NEAREST_M, FAR_M, END_M = 0.9, 1.0, 1.6, 3.0
 
 
-def found(odds_by_range: dict[tuple[float, float], float]) -> Hidden:
-    """Return what is hidden ahead, by the log-odds of cells from one range to another."""
+def found(odds_by_range: dict[tuple[float, float], float], stands_m: float | None = None) -> Hidden:
+    """Return what is hidden ahead, by the log-odds of cells from one range to another, and where something stands."""
     range_m = CELL_M * (np.arange(CELLS) + 0.5 - EYE[0])
     odds, was_free = np.zeros((CELLS, CELLS), np.float32), np.zeros((CELLS, CELLS), bool)
     was_free[:, (range_m > IN_VIEW_M) & (range_m < END_M)] = True
@@ -26,7 +26,10 @@ def found(odds_by_range: dict[tuple[float, float], float]) -> Hidden:
     origin = np.array([*EYE, CELL_M, 3.5, 28.0, NEAREST_M])
     usual = UsualFloor(CELLS)
     usual.mean[:] = USUAL
-    return usual.hidden(odds, was_free, np.zeros_like(was_free), origin, np.zeros(1))
+    stands = np.zeros_like(was_free)
+    if stands_m is not None:
+        stands[:, np.abs(range_m - stands_m) < CELL_M] = True
+    return usual.hidden(odds, was_free, stands, origin, np.zeros(1))
 
 
 def test_what_hides_all_floor_in_view_stands_nearer() -> None:
@@ -51,3 +54,8 @@ def test_little_evidence_shows_nothing() -> None:
     for odds in (0.1, 0.4):  # less than any noise, and less than half of what floor that is hidden has
         hidden = found({(IN_VIEW_M, END_M): odds})
         assert hidden.near[0] == 0.0 and np.isnan(hidden.ranges_m[0])
+
+
+def test_what_stands_explains_by_itself_that_it_hides_floor() -> None:
+    hidden = found({(IN_VIEW_M, END_M): 1.0}, stands_m=0.7)
+    assert hidden.near[0] == 0.0 and not hidden.behind.any()
