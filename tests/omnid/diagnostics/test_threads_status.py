@@ -6,7 +6,6 @@ import os
 import threading
 import time
 
-from omnid.engine.realtime import name_thread
 from omnid.diagnostics.threads_status import (
     LIBRARIES,
     MAIN,
@@ -19,6 +18,7 @@ from omnid.diagnostics.threads_status import (
     shares,
     thread_times,
 )
+from omnid.engine.realtime import name_thread
 from omnid.transport.status_names import Key
 from tests.replay.live import wait_until
 
