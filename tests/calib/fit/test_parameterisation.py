@@ -17,7 +17,7 @@ from calib.models.unified import UnifiedCamera
 SIZE = (780, 768)
 OMNI = UnifiedCamera(0.93, (-205.0, 206.2), (394.2, 380.9), SIZE, (-0.02, 0.004, 1e-3, -2e-3))
 OCAM = OcamCamera(
-    (-131.6, 0.0, 1.9e-3, 9e-8, -6e-10), (380.9, 394.2), (0.998, 2e-4, 3e-4), SIZE, tangential=(1e-7, 2e-7)
+    (-131.6, 0.0, 1.9e-3, 9e-8, -6e-10), (380.9, 394.2), (0.998, 2e-4, 2e-4), SIZE, tangential=(1e-7, 2e-7)
 )
 
 
