@@ -81,13 +81,10 @@ def _status_in_recording(recorder: Recorder, clock_ns: Callable[[], int]) -> Sta
     return record
 
 
-TERMINAL_PERIOD_S: Final = 0.5
-
-
 class TerminalStatus:
     """The action of a ticker: shows a line as long as the run lasts."""
 
-    period_s = TERMINAL_PERIOD_S
+    period_s: Final = 0.5
 
     def __init__(
         self,
