@@ -35,6 +35,6 @@ def test_models_have_names_and_mirrors_a_disc(camera: OmniCamera, name: str, is_
     assert visible_part(camera) == (whole_image(camera) if is_direct else inscribed_mask(camera))
 
 
-def test_the_view_of_a_polynomial_is_said() -> None:
+def test_the_view_of_a_polynomial_is_part_of_its_name() -> None:
     assert (model_in_words(MIRROR), model_in_words(DIRECT)) == ("ocam, mirror view", "ocam, direct view")
     assert model_in_words(UnifiedCamera(0.0, FOCAL, CENTER, SIZE)) == "omni"

@@ -1,4 +1,4 @@
-"""The folder of compiled functions: read only where it is whole, and written by nobody else."""
+"""The folder of compiled functions: read only where it is whole, and written by this program alone."""
 
 from __future__ import annotations
 

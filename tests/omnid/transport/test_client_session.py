@@ -33,7 +33,7 @@ def test_many_robots_are_counted() -> None:
         del held
 
 
-def test_nobody_there_and_wrong_settings() -> None:
+def test_no_router_and_wrong_settings_are_errors() -> None:
     with pytest.raises(Unreachable):
         open_client(BusConfig(connect=(free_endpoint(),)))
     with pytest.raises(OmnidError, match="write protocol/host:port") as caught:

@@ -1,4 +1,4 @@
-"""Commands and requests of programs: where nobody answers, the error says what to check."""
+"""Commands and requests of programs: where there is no answer, the error says what to check."""
 
 from __future__ import annotations
 

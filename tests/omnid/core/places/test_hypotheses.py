@@ -25,35 +25,35 @@ def hypothesis(x_m: float, error_m: float = 0.0, inliers: int = 12, *, by_tag: b
     return Hypothesis(found, NEWEST, np.eye(4), COVARIANCE, T_odom_rect)
 
 
-def agreeing(*given: Hypothesis, poses: dict[int, Array] = POSES) -> int:
+def consistent(*given: Hypothesis, poses: dict[int, Array] = POSES) -> int:
     """Return how many agree at the last one of recognitions that are added in turn."""
     kept = Hypotheses()
     return [len(kept.add(one, poses)) for one in given][-1]
 
 
 def test_recognitions_that_agree_count_once_they_are_enough() -> None:
-    assert [agreeing(*[hypothesis(0.1 * k) for k in range(n)]) for n in (1, 2, 3, 4)] == [0, 0, CONSISTENT, 4]
+    assert [consistent(*[hypothesis(0.1 * k) for k in range(n)]) for n in (1, 2, 3, 4)] == [0, 0, CONSISTENT, 4]
 
 
 def test_one_that_contradicts_does_not_count() -> None:
-    assert agreeing(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2)) == 0
-    assert agreeing(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2), hypothesis(0.3)) == CONSISTENT
+    assert consistent(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2)) == 0
+    assert consistent(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2), hypothesis(0.3)) == CONSISTENT
 
 
 def test_a_robot_at_rest_needs_recognitions_with_more_inliers() -> None:
-    assert agreeing(*[hypothesis(0.0)] * 5) == 0
-    assert agreeing(*[hypothesis(0.0, inliers=SURE_INLIERS) for _ in range(3)]) == CONSISTENT
+    assert consistent(*[hypothesis(0.0)] * 5) == 0
+    assert consistent(*[hypothesis(0.0, inliers=SURE_INLIERS) for _ in range(3)]) == CONSISTENT
 
 
 def test_a_tag_may_differ_by_its_uncertainty() -> None:
     """Its direction is less certain than that of a view."""
     others = [hypothesis(0.0), hypothesis(0.1)]
-    assert agreeing(*others, hypothesis(0.2, error_m=0.04, by_tag=True)) == CONSISTENT
-    assert agreeing(*others, hypothesis(0.2, error_m=0.3, by_tag=True)) == 0
+    assert consistent(*others, hypothesis(0.2, error_m=0.04, by_tag=True)) == CONSISTENT
+    assert consistent(*others, hypothesis(0.2, error_m=0.3, by_tag=True)) == 0
 
 
 def test_keyframes_that_left_the_map_do_not_count() -> None:
-    assert agreeing(*[hypothesis(0.1 * k) for k in range(2)], hypothesis(0.2), poses=POSES) == CONSISTENT
+    assert consistent(*[hypothesis(0.1 * k) for k in range(2)], hypothesis(0.2), poses=POSES) == CONSISTENT
     kept = Hypotheses()
     for k in range(2):
         kept.add(hypothesis(0.1 * k), POSES)
