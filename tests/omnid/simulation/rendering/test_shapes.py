@@ -20,9 +20,9 @@ def test_a_wall_stands_between_its_points_and_faces_inwards() -> None:
 def test_posters_hang_on_their_wall_and_do_not_overlap() -> None:
     rng = np.random.default_rng(2)
     on = wall(rng, next(iter(PAINTERS)), (0, 0), (4, 0))
-    hung = posters(rng, on, 5, first=3)
+    hung = posters(rng, on, 12, first=3)  # a third of a metre each: less than the largest poster
     spans = sorted((float(one.corners[:, 0].min()), float(one.corners[:, 0].max())) for one in hung)
-    assert [one.name for one in hung] == [f"poster{number}" for number in range(3, 8)]
+    assert [one.name for one in hung] == [f"poster{number}" for number in range(3, 15)]
     assert spans[0][0] >= 0 and spans[-1][1] <= 4 and all(a[1] <= b[0] for a, b in pairwise(spans))
 
 
