@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.cameras.log_camera import LogCamera, LogMotion
     from drivers.frame import Camera
     from omnid.config import Config
-    from omnid.runs.live_cameras import LiveCamera, OpenCamera
+    from omnid.runs.live_robot import LiveCamera, OpenCamera
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:

@@ -1,21 +1,46 @@
-"""The robot of a live run: its clock, its images, its samples and its wheels."""
+"""The robot of a live run: its clock, its cameras with their first images, its samples and its wheels."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing
-from typing import Final, Protocol
+from itertools import islice
+from typing import Final, Protocol, TypeAlias
 
 from drivers.cameras.camera_state import CameraState
-from drivers.frame import CAMERAS, Camera, Frame
+from drivers.frame import CAMERAS, Camera, Frame, FrameSource
 from drivers.motion import MotionSample
 from omnid.controller.link import DriveLink
+from omnid.engine.flow import nothing
 from omnid.engine.graph import Graph, Stream
-from omnid.runs.live_cameras import LiveCamera, OpenCamera, first_frames
 from omnid.runs.sensor_sources import MotionSource
 from omnid.runs.session import Session
 from omnid.transport.records import DiagnosticStatus
+
+MASK_FRAMES: Final = 60  # images of each camera in which the rim is searched, where the rig has no mask
+
+
+class LiveCamera(FrameSource, Protocol):
+    """A source of frames with a state for the status."""
+
+    state: CameraState
+
+
+OpenCamera: TypeAlias = Callable[[Camera], LiveCamera]  # called a second time after the first camera was closed
+
+
+def first_frames(open_camera: OpenCamera) -> Generator[Frame, None, None]:
+    """Yield the first frames of both cameras in turn; the cameras are open until this generator is closed."""
+    with ExitStack() as cameras:
+        streams = []
+        for name in CAMERAS:
+            camera = cameras.enter_context(closing(open_camera(name)))
+            frames = iter(camera.frames())
+            cameras.callback(getattr(frames, "close", nothing))  # a generator holds the device until it is closed
+            streams.append(islice(frames, MASK_FRAMES))
+        for pair in zip(*streams, strict=False):
+            yield from pair
 
 
 class LiveRobot(Protocol):

@@ -7,12 +7,12 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from omnid.config import Config
 from omnid.core.control.arming import MANUAL
+from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.diagnostics.status import StatusCollector, StatusTick
-from omnid.diagnostics.terminal_status import TerminalStatus
 from omnid.engine.logging_setup import Report
 from omnid.errors import OmnidError
 from omnid.runs.session import TICKERS, Session
@@ -79,3 +79,38 @@ def _status_in_recording(recorder: Recorder, clock_ns: Callable[[], int]) -> Sta
             recorder.add(status_report(now_ns, statuses), now_ns)
 
     return record
+
+
+class TerminalStatus:
+    """The action of a ticker: shows a line as long as the run lasts."""
+
+    period_s: Final = 0.5
+
+    def __init__(
+        self,
+        show: Callable[[str], None],
+        line: Callable[[], str],
+        report: Callable[[str], None],
+        statistics: RunStatistics,
+        ready: str,
+    ) -> None:
+        """show: rewrites the line. line: its text. report: takes lines that stay. ready: of the start."""
+        self._show, self._line, self._report = show, line, report
+        self._statistics, self._ready = statistics, ready
+
+    def __call__(self) -> None:
+        """Report that the run is ready, once, and show the line."""
+        if self._ready:
+            self._report(self._ready)
+            self._ready = ""
+        self._show(f"{self._statistics.length_m:8.2f} m  {self._line()}")
+
+    def close(self) -> None:
+        """Remove the line, and report the summary."""
+        self._show("")
+        statistics = self._statistics
+        states = ", ".join(f"{state} {count / statistics.poses:.1%}" for state, count in statistics.states.items())
+        self._report(
+            f"ended: {statistics.poses} poses, {statistics.length_m:.2f} m, {statistics.resets} resets"
+            f"{f'; {states}' if states else ''}"
+        )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,19 +16,27 @@ from omnid.config import Config
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.messages import GridUpdate, MapUpdate, NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
-from omnid.sinks.navigation_status import navigation_status
+from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 from omnid.transport import codec, map_codec, navigation_codec
+from omnid.transport.codec import ERROR, OK, WARN
 from omnid.transport.motion_codec import IMU_SCHEMA, WHEEL_SCHEMA, gyro_cdr, wheel_cdr
 from omnid.transport.moving_codec import moving_cdr
 from omnid.transport.records import DiagnosticStatus, FrameTransform
 from omnid.transport.scan_codec import SCAN_SCHEMA, scan_cdr
-from omnid.transport.status_names import ODOMETRY, PLACES, Key
+from omnid.transport.status_names import NAVIGATION, ODOMETRY, PLACES, Key
 from omnid.transport.topics import MAP_POSE, SCAN
 
 Outgoing: TypeAlias = (
     OdometryUpdate | VelocityCommand | MapUpdate | PlaceUpdate | GridUpdate | ObstacleRing | NavigationUpdate
 )
+
+NAVIGATION_LEVELS: Final = {
+    NavigationState.BLOCKED: WARN,
+    NavigationState.NOT_LOCALISED: WARN,
+    NavigationState.PAUSED: WARN,
+    NavigationState.FAILED: ERROR,
+}
 
 
 class OutgoingMessage(NamedTuple):
@@ -191,3 +200,27 @@ def _most_confident(points: MapPoints, count: int) -> tuple[NDArray[np.float32],
         return points.xyz, points.confidence
     kept = np.sort(np.argsort(-points.confidence, kind="stable")[:count])
     return points.xyz[kept], points.confidence[kept]
+
+
+def navigation_status(update: NavigationUpdate) -> DiagnosticStatus:
+    """Return the status entry of an update, for its own topic."""
+    values: dict[str, str] = {Key.STATE: update.state}
+    if update.task:
+        values[Key.TASK] = update.task
+    if update.command_ns:
+        values[Key.COMMAND_NS] = str(update.command_ns)
+    if update.reason:
+        values[Key.REASON] = update.reason
+    for key, number in ((Key.LEFT_M, update.left_m), (Key.OFFSET_M, update.offset_m)):
+        if math.isfinite(number):
+            values[key] = f"{number:.3f}"
+    if update.loops_left > 1:
+        values[Key.LOOPS_LEFT] = str(update.loops_left)
+    if update.teaching:
+        values |= {Key.TEACHING: update.teaching, Key.TAUGHT_M: f"{update.taught_m:.2f}"}
+    if update.answer is not None:
+        values[Key.REQUEST] = update.answer.request
+        if update.answer.refusal:
+            values[Key.REFUSAL] = update.answer.refusal
+    message = f"{update.state}: {update.reason}" if update.reason else str(update.state)
+    return DiagnosticStatus(NAVIGATION, NAVIGATION_LEVELS.get(update.state, OK), message, values)

@@ -14,14 +14,13 @@ import tempfile
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
 from omnid.batch.tables import CSV_FILE
 from tests.benchmark.results import Column, ResultTable
+from tests.omnid.batch.dask_cluster import dask_cluster
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 FIRST_BYTES, STEP_BYTES = 600_000, 20_000
@@ -41,54 +40,6 @@ def batch(logs: Path, out: Path, *words: str) -> tuple[float, Counter[str], int]
         Counter(result["status"] for result in results),
         sum(result["attempts"] - 1 for result in results),
     )
-
-
-@contextmanager
-def dask(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """Run a scheduler and two workers; yield its address and the workers."""
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with ExitStack() as ends:
-        known = folder / "scheduler.json"
-        scheduler = subprocess.Popen(
-            [
-                sys.executable,
-                "-m",
-                "distributed.cli.dask_scheduler",
-                "--host",
-                "127.0.0.1",
-                "--port",
-                "0",
-                "--no-dashboard",
-                "--scheduler-file",
-                str(known),
-            ],
-            **quiet,
-        )
-        ends.callback(scheduler.kill)
-        while not known.exists():
-            time.sleep(0.1)
-        address = json.loads(known.read_text())["address"]
-        workers = [
-            subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "distributed.cli.dask_worker",
-                    address,
-                    "--nthreads",
-                    "1",
-                    "--no-dashboard",
-                    "--no-nanny",
-                    "--local-directory",
-                    str(folder),
-                ],
-                **quiet,
-            )
-            for _ in range(2)
-        ]
-        for worker in workers:
-            ends.callback(worker.kill)
-        yield address, workers
 
 
 def same(first: Path, other: Path) -> bool:
@@ -131,7 +82,7 @@ def main() -> None:
             table.add(f"{jobs} at a time", taken_s, text(states), repeated, equal)
         if find_spec("distributed") is None:
             return
-        with dask(top) as (address, workers):
+        with dask_cluster(top) as (address, workers):
             threading.Timer(KILLED_AFTER_S, workers[0].kill).start()
             taken_s, states, repeated = batch(logs, top / "dask", "--dask", address)
         equal = same(top / "jobs1", top / "dask")

@@ -1,7 +1,7 @@
 """Processor time of the whole daemon by its threads, over a minute: `python -m tests.benchmark.daemon`.
 
 `omnid run` on a log that begins again at its end, with all stages, the bus, an operator who sends commands, and a
-simulated motor controller. The share of a core is that of all threads of a name (omnid/engine/thread_times.py).
+simulated motor controller. The share of a core is that of all threads of a name (omnid/diagnostics/threads_status.py).
 Memory: the resident size at the end and the largest one.
 The log is that of `tests/benchmark/live_daemon.py`; --rates are those at which its pairs are offered.
 """
@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from omnid.engine.thread_times import ThreadShare, process_time_s, shares, thread_times
+from omnid.diagnostics.threads_status import ThreadShare, process_time_s, shares, thread_times
 from tests.benchmark.live_daemon import HZ, daemon
 from tests.benchmark.results import Column, ResultTable
 from tests.replay.live import Operator

@@ -21,9 +21,8 @@ from rosbags.rosbag1 import Reader
 
 from drivers.logs.ros1_bag import Ros1Bag
 from tests.drivers.logs.bags import write_bag, write_db3
-from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, Entry
+from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, Entry, pairs
 from tests.drivers.logs.repeated_pages import repeat_pages
-from tests.drivers.logs.test_log_formats import pairs
 
 FILES: Final = 400
 LIMIT_S: Final = 60.0

@@ -2,51 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
 from omnid.errors import OmnidError
-from omnid.settings import knob, load, parse
-from omnid.settings_dump import dump
-
-
-@dataclass(frozen=True, slots=True)
-class Stereo:
-    window_px: int = knob(11, "side of the matching window, px", low=3, high=31)
-    ratio: float = knob(0.8, "second best over best, 1", low=0.0, high=1.0)
-    method: str = knob("sad", "cost of a match", choices=("sad", "census"))
-    subpixel: bool = knob(True, "whether to refine")
-    horizon_s: float = knob(math.inf, "how long a match is kept, s", low=0.0, finite=False)
-
-
-@dataclass(frozen=True, slots=True)
-class Serial:
-    port: str = knob('/dev/"omnid"\t\x7f\n\\ü', "device of the motor")
-    bauds: tuple[int, ...] = knob((115200, 9600), "rates to try, baud", low=1)
-
-
-@dataclass(frozen=True, slots=True)
-class Motor:
-    limit_mps: float = knob(1.0, "speed limit, m/s", high=0)
-    serial: Serial = field(default_factory=lambda: Serial(bauds=(57600,)))
-
-
-@dataclass(frozen=True, slots=True)
-class Config:
-    robot: str = knob("robot", "name on the bus")
-    offset_m: tuple[float, float, float] = knob((0.0, 1e-5, 1e16), "where the rig is, m")
-    topics: tuple[str, ...] = knob((), "topics to record")
-    stereo: Stereo = field(default_factory=Stereo)
-    motor: Motor = field(default_factory=lambda: Motor(limit_mps=-1.0))
-
-
-def written(tmp_path: Path, text: str | bytes) -> Path:
-    path = tmp_path / "omnid.toml"
-    path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    return path
+from omnid.settings import load, parse
+from tests.omnid.sample_settings import Config, Motor, Serial, Stereo, written
 
 
 def refusal(text: str | bytes, *overrides: str) -> str:
@@ -71,29 +34,6 @@ def test_a_file_changes_what_it_names_and_nothing_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "overrides",
-    [
-        [],
-        ["stereo.window_px=31", "stereo.subpixel=false", "motor.serial.port=a\\b", "topics=['a', \"it's\"]"],
-        ["motor.serial.bauds=[]", "stereo.horizon_s=2", "offset_m=[1, -2.5e-300, 3]"],
-    ],
-)
-def test_a_dump_reads_back_as_the_same_object(tmp_path: Path, overrides: list[str]) -> None:
-    settings = load(Config, None, overrides)
-    assert load(Config, written(tmp_path, dump(settings))) == settings
-
-
-def test_dumps_every_knob_with_its_range_and_its_default() -> None:
-    text = dump(load(Config, None, ["stereo.window_px=5"]))
-    lines = "# side of the matching window, px\n# an integer from 3 to 31; default 11\nwindow_px = 5\n"
-    assert f"[stereo]\n{lines}" in text
-    assert "# a list of 3 numbers; default [0.0, 1e-05, 1e+16]\n" in text
-    assert "# a string, one of 'sad', 'census'; default \"sad\"\n" in text
-    assert "# a number of at most 0; default -1.0\n" in text  # the default of this section here, not of its class
-    assert "# a list of integers of at least 1; default [57600]\n" in text
-
-
-@pytest.mark.parametrize(
     ("override", "value"),
     [("robot=seven", "seven"), ("robot=7", "7"), ("robot='7'", "7"), ("robot=true", "true"), ("robot=a=b", "a=b")],
 )
@@ -109,12 +49,6 @@ def test_overrides_win_over_the_file_and_later_ones_over_earlier(tmp_path: Path)
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("[stereo]\nwindow = 5", "unknown key stereo.window: did you mean stereo.window_px?"),
-        ("window_px = 5", "unknown key window_px: did you mean stereo.window_px?"),
-        ("[stero]\nwindow_px = 5", "unknown key stero: did you mean stereo?"),
-        ("[motor.serial]\nprot = 'x'", "unknown key motor.serial.prot: did you mean motor.serial.port?"),
-        ("[stereo]\nzzz = 5", "unknown key stereo.zzz: known are stereo.window_px, "),
-        ('"a\\nb" = 1', "unknown key 'a\\nb': known are robot, "),
         (f"{'q' * 300} = 1", "unknown key 'qqq"),
         (f"{'q' * 100_000} = 1", "keys and numbers of at most 400 characters"),
         ("a." * 20_000 + "a = 1", "a key of at most 9 parts"),
@@ -171,44 +105,6 @@ def test_refuses_a_wrong_override(override: str, expected: str) -> None:
     message = refusal("", override)
     assert message.startswith("override ")
     assert expected in message
-
-
-RENAMED = {
-    "depth.window": "stereo.window_px",
-    "wheels": "motor",
-    "wheels.port": "motor.serial.port",
-    "wheels.top_mps": "the base keeps its own limit, set it there",
-    "stereo.window": "stereo.window_px",
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("depth.window", "depth.window is now called stereo.window_px"),
-        ("stereo.window", "stereo.window is now called stereo.window_px"),
-        ("wheels.limit_mps", "wheels.limit_mps is now called motor.limit_mps"),
-        ("wheels.serial.bauds", "wheels.serial.bauds is now called motor.serial.bauds"),
-        ("wheels.port", "wheels.port is now called motor.serial.port"),
-        ("wheels.top_mps", "wheels.top_mps was removed: the base keeps its own limit, set it there"),
-        ("wheels.colour", "wheels is now called motor, which has no colour"),
-        ("depth.widow", "unknown key depth"),
-    ],
-)
-def test_refuses_a_key_of_an_earlier_version_with_its_new_name(tmp_path: Path, name: str, expected: str) -> None:
-    section, _, key = name.rpartition(".")
-    with pytest.raises(OmnidError) as in_file:
-        load(Config, written(tmp_path, f"robot = 'r2'\n[{section}]\n{key} = 5"), renamed=RENAMED)
-    assert str(in_file.value).startswith(f"{tmp_path / 'omnid.toml'}: {expected}")
-    with pytest.raises(OmnidError) as in_override:
-        load(Config, None, [f"{name}=5"], renamed=RENAMED)
-    assert str(in_override.value).startswith(f"override '{name}=5': {expected}")
-    assert "\n" not in str(in_file.value) + str(in_override.value)
-
-
-def test_refuses_an_empty_section_of_an_earlier_version() -> None:
-    with pytest.raises(OmnidError, match=r"^omnid\.toml: wheels is now called motor$"):
-        parse(Config, b"[wheels]", origin="omnid.toml", renamed=RENAMED)
 
 
 def test_refuses_an_override_below_a_value_of_the_file() -> None:

@@ -21,8 +21,7 @@ from drivers.logs.log_reader import LogReader
 from omnid.config import load_config
 from omnid.report.report_data import collect_report_data
 from omnid.runs.live import LiveRun
-from omnid.runs.live_cameras import LiveCamera
-from omnid.runs.live_robot import ConnectedRobot
+from omnid.runs.live_robot import ConnectedRobot, LiveCamera
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from tests.drivers.logs.mcap_logs import COMPRESSED, Entry, compressed, write_log

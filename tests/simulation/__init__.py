@@ -1,11 +1,12 @@
 """Rendered worlds with exact ground truth: scenes, rigs, paths, and logs of a robot in them."""
 
-from omnid.simulation.rendering.ray_caster import render, render_grey
+from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
 from omnid.simulation.rendering.shapes import box, posters, wall
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from tests.simulation.builders import corridor, room
+from tests.simulation.images import render
 from tests.simulation.logs import camchain, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build
 

@@ -7,8 +7,8 @@ import numpy as np
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera
-from omnid.simulation.rendering.ray_caster import render
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from tests.simulation.images import render
 from tests.simulation.mirrors import MirrorCamera
 
 CENTER, SIZE = (384.2, 381.1), (768, 768)

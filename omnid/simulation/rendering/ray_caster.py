@@ -31,11 +31,6 @@ SMALLEST_PX = 8
 _atlases: list[Atlas] = []  # the one used last at the end
 
 
-def render(scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2) -> NDArray[np.uint8]:
-    """Return the image (H, W) uint8 of the camera on a rig at T_world_rig; 0 outside the mask."""
-    return np.clip(np.rint(render_grey(scene, mounted, T_world_rig, supersample)), 0, 255).astype(np.uint8)
-
-
 def render_grey(
     scene: Scene, mounted: MountedCamera, T_world_rig: Array, supersample: int = 2, row_twist: Array | None = None
 ) -> Floats:

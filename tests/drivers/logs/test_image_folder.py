@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from drivers.errors import DriverError
 from drivers.frame import gray
 from drivers.logs.image_folder import ImageFolder, parse_stamp
 from drivers.logs.image_log import images_of
+from drivers.logs.log_reader import LogReader
+from tests.drivers.logs.foreign_logs import PAIRS, expected, read, write_folders
+from tests.drivers.logs.mcap_logs import pairs
 
 
 @pytest.mark.parametrize(
@@ -75,3 +82,114 @@ def test_a_colour_image_of_sixteen_bits_is_read_as_before(tmp_path: Path) -> Non
     cv2.imwrite(str(tmp_path / "lower/1.5.png"), image)
     expected = cv2.imread(str(tmp_path / "lower/1.5.png"), cv2.IMREAD_GRAYSCALE)
     assert (read_by_log(tmp_path)[0] == expected).all()
+
+
+@pytest.mark.parametrize("names", [str, lambda stamp: f"{stamp // 10**9}.{stamp % 10**9:09d}"])
+def test_folders_of_images_with_stamps(tmp_path: Path, names: Callable[[int], str]) -> None:
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), names)
+    (folder / "rig.toml").write_text("[rig]")
+    found, reader = read(folder)
+    assert found == expected(tmp_path) and not reader.warnings
+    with closing(LogReader(folder)) as again:
+        assert again.attachments() == {"rig.toml": b"[rig]"} and again.pair_estimate() == PAIRS
+
+
+def test_folders_with_a_list_of_stamps(tmp_path: Path) -> None:
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp: f"{numbers[stamp]:010d}")
+    for camera in ("lower", "upper"):
+        stamps = [frame[2] for frame in expected(tmp_path) if frame[0] == camera]
+        lines = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in stamps]
+        (folder / camera / "timestamps.txt").write_text("\n".join(lines) + "\n")
+    assert read(folder)[0] == expected(tmp_path)
+    for path in folder.glob("*/*.jpg"):  # 10 comes after 9, not after 1
+        path.rename(path.with_stem(str(int(path.stem))))
+    assert read(folder)[0] == expected(tmp_path)
+    kept = (folder / "upper" / "timestamps.txt").read_text()
+    for name in ("0000000007", "7"):  # without the list it would be taken for 7 s
+        (folder / "upper" / "timestamps.txt").unlink(missing_ok=True)
+        with pytest.raises(DriverError, match=r"upper' are numbered, .*timestamps.txt"):
+            LogReader(folder)
+        for path in (folder / "upper").glob("*.jpg"):
+            path.rename(path.with_stem(f"{int(path.stem):0{len(name)}d}"))
+    (folder / "upper" / "timestamps.txt").write_text(kept)
+    assert read(folder)[0] == expected(tmp_path)
+    (folder / "upper" / "timestamps.txt").write_text("1.0\n")
+    with pytest.raises(DriverError, match="12 images, and its list of stamps 1 lines"):
+        LogReader(folder)
+
+
+def test_cameras_of_folders_with_other_names_are_given(tmp_path: Path) -> None:
+    folder = write_folders(tmp_path / "images", pairs(PAIRS))
+    for camera, name in (("lower", "cam0"), ("upper", "cam1")):
+        (folder / "mav0" / name).mkdir(parents=True)
+        (folder / camera).rename(folder / "mav0" / name / "data")
+    with pytest.raises(DriverError, match="mav0/cam0/data, mav0/cam1/data; give --lower and --upper"):
+        LogReader(folder)
+    assert read(folder, lower="mav0/cam0/data", upper="mav0/cam1/data")[0] == expected(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("step", "apart"),
+    [(100_000_000, "3.2 years"), (10_000, "2.8 hours"), (100_000, "27.8 hours"), (1_000_000, "12 days")],
+)
+def test_images_hours_apart_are_a_question(tmp_path: Path, step: int, apart: str) -> None:
+    """Names of 10 digits that count nanoseconds or so would be seconds; one line says so, names the images and asks."""
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp: f"{step * numbers[stamp]:010d}")
+    with pytest.raises(DriverError, match=f"0000000000.* are {apart} apart .*fewer than 16 digits are seconds"):
+        LogReader(folder)
+
+
+def test_images_named_by_microseconds_are_not_taken_for_nanoseconds(tmp_path: Path) -> None:
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(
+        tmp_path / "images", pairs(PAIRS), lambda stamp: str(1_418_381_798_086_398 + 33_333 * numbers[stamp])
+    )
+    with pytest.raises(DriverError, match=r"1418381798086398.* are 33\.333 us apart .*microseconds"):
+        LogReader(folder)
+
+
+def test_images_less_than_an_hour_apart_are_a_log(tmp_path: Path) -> None:
+    numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
+    folder = write_folders(tmp_path / "images", pairs(PAIRS), lambda stamp: f"{3600 * numbers[stamp]:010d}")
+    assert len(read(folder)[0]) == 2 * PAIRS
+
+
+def test_an_image_without_stamp_is_refused(tmp_path: Path) -> None:
+    folder = write_folders(tmp_path / "images", pairs(1), lambda stamp: f"frame{stamp % 100}")
+    with pytest.raises(DriverError, match=r"is named 'frame0'; expected a stamp.* timestamps\.txt"):
+        LogReader(folder)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "link", "folder"])
+@pytest.mark.parametrize("name", ["lower/1700000000000000001.jpg", "rig.toml"])
+def test_folders_hold_regular_files_only(tmp_path: Path, kind: str, name: str) -> None:
+    """Anything else is one line, and nothing waits for a pipe; a rig that is none is left out."""
+    folder, odd = write_folders(tmp_path / "images", pairs(2)), tmp_path / "images" / name
+    (tmp_path / "secret").write_text("secret")
+    if kind == "pipe":
+        os.mkfifo(odd)
+    elif kind == "folder":
+        odd.mkdir()
+    else:
+        odd.symlink_to("/dev/zero" if kind == "device" else tmp_path / "secret")
+    if name == "rig.toml":
+        with closing(LogReader(folder)) as reader:
+            assert reader.attachments() == {}
+        return
+    with pytest.raises(DriverError, match=r"1700000000000000001.jpg': no regular file of the folder") as refused:
+        LogReader(folder)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_link_within_the_folder_is_an_image_and_a_pipe_that_comes_later_is_not_waited_for(tmp_path: Path) -> None:
+    folder = write_folders(tmp_path / "images", pairs(3))
+    first, last = (sorted((folder / "lower").iterdir())[number] for number in (0, -1))
+    (folder / "kept").mkdir()
+    first.rename(folder / "kept" / "image")
+    first.symlink_to(folder / "kept" / "image")
+    with closing(LogReader(folder)) as reader:
+        last.unlink()
+        os.mkfifo(last)
+        assert len(list(reader.frames())) == 5 and reader.counts["broken"] + reader.counts["broken_records"] == 1

@@ -20,9 +20,8 @@ import pytest
 
 from drivers.logs.mcap_index import read_attachments, read_summary
 from drivers.logs.mcap_records import LogFile
-from omnid.batch.job_runner import KILLED, OK, JobTask, run_job, stored_result
+from omnid.batch.job_runner import OK, run_job, stored_result
 from omnid.batch.jobs import BatchOptions, find_logs, jobs
-from omnid.batch.workers import dask_workers
 from omnid.cli import main
 from omnid.errors import OmnidError
 
@@ -183,11 +182,6 @@ def test_an_interrupted_batch_leaves_no_program_and_goes_on_later(
     )
 
 
-def test_a_log_that_takes_too_long_is_ended(tmp_path: Path) -> None:
-    (job,) = jobs(find_logs([str(SAMPLE)]), tmp_path, BatchOptions(timeout_s=0.3))
-    assert run_job(job).status == "timed out"
-
-
 def test_reads_logs_at_addresses(tmp_path: Path) -> None:
     pytest.importorskip("fsspec")
     log = short_log(tmp_path / "logs" / "log.mcap")
@@ -231,57 +225,3 @@ def test_wrong_options_are_one_line(tmp_path: Path) -> None:
     for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1"), *times):
         done = omnid("batch", SAMPLE, "--out", tmp_path / "out", *words)
         assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
-
-
-@pytest.mark.slow
-def test_a_dask_worker_that_is_killed_costs_nothing_but_repetition(tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
-    logs = [short_log(tmp_path / "logs" / f"{number}.mcap", BYTES + 1000 * number) for number in range(8)]
-    scheduler = subprocess.Popen(
-        [
-            sys.executable,
-            "-m",
-            "distributed.cli.dask_scheduler",
-            "--host",
-            "127.0.0.1",
-            "--port",
-            "0",
-            "--no-dashboard",
-            "--scheduler-file",
-            str(tmp_path / "scheduler"),
-        ]
-    )
-    workers = []
-    try:
-        wait_until((tmp_path / "scheduler").exists)
-        address = json.loads((tmp_path / "scheduler").read_text())["address"]
-        workers = [
-            subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "distributed.cli.dask_worker",
-                    address,
-                    "--nthreads",
-                    "1",
-                    "--no-dashboard",
-                    "--no-nanny",
-                    "--local-directory",
-                    str(tmp_path),
-                ]
-            )
-            for _ in range(2)
-        ]
-        results = []
-        tasks = [JobTask(job) for job in jobs([str(log) for log in logs], tmp_path / "out", BatchOptions())]
-        with dask_workers(address) as run:
-            for result in run(tasks):
-                results.append(result)
-                if len(results) == 1:
-                    workers[0].kill()
-        assert sorted(result.name for result in results) == sorted(log.stem for log in logs)
-        assert {result.status for result in results} == {OK} and KILLED not in results
-    finally:
-        for process in (*workers, scheduler):
-            process.kill()
-            process.wait()

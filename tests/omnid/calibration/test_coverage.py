@@ -9,7 +9,6 @@ import numpy as np
 from calib.boards.board import BoardView
 from calib.models.camera import Mask
 from omnid.calibration.coverage import HOURS, CameraCoverage
-from omnid.calibration.coverage_screen import COLUMNS, ROWS, disc
 
 RIM = Mask((100.0, 120.0), 10.0, 100.0)
 
@@ -41,13 +40,3 @@ def test_enough_is_all_hours_and_two_rings() -> None:
     for hour in range(1, 7):
         coverage.add(at(2 * hour, 20))
     assert coverage.missing() == []
-
-
-def test_the_disc_shows_where_boards_were() -> None:
-    coverage = CameraCoverage(RIM)
-    for _ in range(12):
-        coverage.add(at(3, 60))
-    rows = disc(coverage, at(9, 60))
-    assert len(rows) == ROWS and all(len(row) == COLUMNS for row in rows)
-    middle = rows[ROWS // 2]
-    assert middle.index("@") < COLUMNS // 2 < middle.index("9") and rows[0].strip(" .") == ""

@@ -15,7 +15,7 @@ from calib.rig_file import read_rig
 from omnid.calibration.height import HeightCalibration, on_floor
 from omnid.core.floor import Floor
 from omnid.simulation.rendering.rigs import make_rig
-from tests.omnid.commands.test_calibrate import omnid as command
+from tests.omnid.commands.test_calibrate_files import omnid as command
 
 HEIGHT_M = 1.2  # of rendered rigs: tests/simulation/paths.py
 

@@ -12,10 +12,8 @@ from omnid.calibration.coverage_screen import status, table
 from omnid.calibration.live_boards import LiveBoards, PairOutcome
 from omnid.monitor.screen import fitted
 from tests.omnid.commands.test_calibrate_rig import BOARD, render_pairs, rig_of
-from tests.replay.command import Command
 
 PAIRS = 2  # of different places
-OPTIONS = ("--corners", "7x6", "--square-mm", "30")
 
 
 @pytest.fixture(scope="module")
@@ -50,48 +48,3 @@ def test_a_pair_is_kept_where_the_board_stands_still_at_a_new_place(folder: Path
     values = status(boards, seen[-1]).values
     assert len(values["lower_coverage"]) == len(values["upper_coverage"]) == 36 and values["pairs"] != "0"
     boards.close()
-
-
-def test_live_writes_what_it_keeps_and_goes_on_where_it_ended(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    omnid, kept = Command(capsys), tmp_path / "kept"
-    first = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert first.code == 1 and f"{PAIRS} pairs, not enough yet: {15 - PAIRS} more positions" in first.err
-    assert first.out.splitlines()[0].startswith("1: 14 more positions; both cameras: ")
-    assert sorted(path.name for path in kept.iterdir())[::PAIRS] == ["lower_001.png", "upper_001.png"]
-    np.testing.assert_array_equal(image(kept, "upper_002"), image(folder, "upper_01"))
-    again = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert again.out == "" and f"{PAIRS} pairs, not enough yet" in again.err and len(list(kept.iterdir())) == 2 * PAIRS
-
-
-@pytest.mark.parametrize("side", ["lower", "upper"])
-def test_live_goes_on_after_half_a_pair(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], side: str
-) -> None:
-    omnid, kept, half = Command(capsys), tmp_path / "kept", f"{side}_001.png"
-    kept.mkdir()
-    before = (folder / f"{side}_00.png").read_bytes()
-    (kept / half).write_bytes(before)
-    again = omnid("calibrate", "live", kept, "--log", folder, *OPTIONS)
-    assert again.code == 1 and f"{PAIRS} pairs, not enough yet" in again.err
-    assert (kept / half).read_bytes() == before and len(list(kept.iterdir())) == 2 * PAIRS + 1
-
-
-def test_live_refuses_images_of_another_size(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for path in folder.iterdir():
-        if path.stem.startswith("upper_"):
-            cv2.imwrite(str(tmp_path / path.name), image(folder, path.stem)[:600, :500])
-        elif path.stem.startswith("lower_"):
-            (tmp_path / path.name).write_bytes(path.read_bytes())
-    error = Command(capsys).refused("calibrate", "live", tmp_path, "--log", folder, *OPTIONS)
-    assert "upper camera: expected images of 500x600 px as the first ones, found 640x640 px; " in error
-
-
-def test_wrong_use_of_live_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    omnid = Command(capsys)
-    assert "name a folder" in omnid.refused("calibrate", "live", *OPTIONS)
-    assert "--square-mm" in omnid.refused("calibrate", "live", tmp_path, "--corners", "7x6")
-    assert "/dev/no-camera" in omnid("calibrate", "live", tmp_path, *OPTIONS, "--lower", "/dev/no-camera").err
-    (tmp_path / "file").touch()
-    assert "name a folder" in omnid.refused("calibrate", "live", tmp_path / "file", *OPTIONS)

@@ -1,97 +1,22 @@
-"""The graph: drop policies, end of the run, errors, stops, tickers; threads and inline give the same results."""
+"""The graph: end of the run, errors, stops; threads and inline give the same results."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
 from functools import partial
 from itertools import count
 from typing import NoReturn
 
-import numpy as np
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot
-from omnid.engine.ticker import Ticker, skipped_deadlines
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.errors import OmnidError
+from tests.omnid.engine.graph_parts import LONG_S, Action, Apply, Collect, Sums, both, fail_at, stopped_at
 
-pytestmark = pytest.mark.usefixtures("default_signals")
-
-LONG_S = 20.0  # a timeout that only a defect reaches
-both = pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
-
-
-@pytest.fixture(autouse=True)
-def no_thread_is_left() -> Iterator[None]:
-    before = set(threading.enumerate())
-    yield
-    assert set(threading.enumerate()) <= before  # threads of other tests may have ended meanwhile
-
-
-@dataclass
-class Collect:
-    """A sink that keeps its messages and counts calls of finish."""
-
-    got: list[int] = field(default_factory=list)
-    finished: int = 0
-
-    def process(self, message: int) -> None:
-        self.got.append(message)
-
-    def finish(self) -> None:
-        self.finished += 1
-
-
-@dataclass
-class Apply:
-    """A stage without finish."""
-
-    function: Callable[[int], int | None]
-
-    def process(self, message: int) -> int | None:
-        return self.function(message)
-
-
-@dataclass
-class Sums:
-    """A stage with state: sums of two messages; at the end the message left over and a marker."""
-
-    held: list[int] = field(default_factory=list)
-
-    def process(self, message: int) -> int | None:
-        self.held.append(message)
-        if len(self.held) < 2:
-            return None
-        total, self.held = sum(self.held), []
-        return total
-
-    def finish(self) -> Iterable[int]:
-        yield from self.held
-        yield -1
-
-
-def fail_at(bad: int) -> Callable[[int], int]:
-    def check(message: int) -> int:
-        if message == bad:
-            raise ValueError(f"cannot take {message}")
-        return message
-
-    return check
-
-
-def stopped_at(graph: Graph, last: int, act: Callable[[], None]) -> Callable[[int], int]:
-    """Return a function that passes messages on and acts at one of them."""
-
-    def check(message: int) -> int:
-        if message == last:
-            act()
-        return message
-
-    return check
+pytestmark = pytest.mark.usefixtures("no_thread_is_left", "default_signals")
 
 
 def summed(threaded: bool) -> tuple[list[int], list[int], list[int]]:
@@ -112,28 +37,6 @@ def test_threads_give_the_results_of_inline() -> None:
     assert raw == list(range(101))
     assert sums == [4 * k + 1 for k in range(50)] + [100, -1]  # with the results of finish
     assert late == [sums[k] + sums[k + 1] for k in range(0, 52, 2)] + [-1]
-
-
-def test_lossless_waits_for_a_slow_reader_with_a_bounded_inbox() -> None:
-    graph, slow = Graph(policy=LOSSLESS, depth=3), Collect()
-    produced: list[int] = []
-    ahead: list[int] = []
-
-    def numbers() -> Iterator[int]:
-        for number in range(300):
-            produced.append(number)
-            yield number
-
-    def crawl(message: int) -> int:
-        threading.Event().wait(1e-4)
-        ahead.append(len(produced) - message)
-        return message
-
-    graph.sink("slow", slow, graph.stage("crawl", Apply(crawl), graph.source("numbers", numbers)))
-    graph.run()
-    assert slow.got == list(range(300))
-    assert max(ahead) <= 3 + 2  # the inbox, one message at the writer, one at the reader
-    assert [row.drops for row in graph.telemetry.summary()] == [0, 0, 0]
 
 
 @both
@@ -191,42 +94,6 @@ def test_sinks_that_wait_drop_nothing() -> None:
     assert (graph.telemetry.of("slow").processed, graph.telemetry.of("slow").dropped) == (200, 0)
 
 
-def test_newest_drops_the_oldest_and_counts_it() -> None:
-    graph, slow, fast, all_sent = Graph(policy=NEWEST, depth=2), Collect(), Collect(), threading.Event()
-
-    def numbers() -> Iterator[int]:
-        yield from range(50)
-        all_sent.set()
-
-    def hold(message: int) -> int:
-        assert all_sent.wait(LONG_S)
-        return message
-
-    stream = graph.source("numbers", numbers)
-    graph.sink("slow", slow, graph.stage("hold", Apply(hold), stream), policy=LOSSLESS)
-    graph.sink("fast", fast, stream, policy=LOSSLESS)
-    graph.run()
-    assert fast.got == list(range(50))  # the policy of the sink
-    assert slow.got[-2:] == [48, 49]
-    assert len(slow.got) in (2, 3)  # and perhaps the first one
-    counted = {stats.name: (stats.processed, stats.dropped) for stats in graph.telemetry.stages}
-    assert counted["hold"] == (len(slow.got), 50 - len(slow.got))
-    assert counted["numbers"] == counted["fast"] == (50, 0)
-
-
-@both
-def test_merges_several_sources_into_one_inbox(threaded: bool) -> None:
-    graph, sink = Graph(threaded=threaded), Collect()
-    streams = [graph.source("even", lambda: range(0, 100, 2)), graph.source("odd", lambda: range(1, 60, 2))]
-    graph.sink("sink", sink, *streams)
-    graph.run()
-    assert sorted(sink.got) == sorted([*range(0, 100, 2), *range(1, 60, 2)])
-    assert [number for number in sink.got if number % 2] == list(range(1, 60, 2))
-    assert sink.finished == 1
-    if not threaded:
-        assert sink.got[:60] == list(range(60))  # inline: round robin
-
-
 @both
 def test_a_failing_stage_ends_the_run_with_its_error(threaded: bool) -> None:
     graph, before, beside, after, closed = Graph(threaded=threaded), Collect(), Collect(), Collect(), threading.Event()
@@ -249,24 +116,6 @@ def test_a_failing_stage_ends_the_run_with_its_error(threaded: bool) -> None:
     assert [sink.finished for sink in (before, beside, after)] == [1, 1, 1]  # all are finished nevertheless
     assert before.got == list(range(len(before.got)))
     assert closed.is_set()
-
-
-def test_a_failed_reader_releases_its_waiting_writer() -> None:
-    graph, third = Graph(depth=1), threading.Event()
-
-    def numbers() -> Iterator[int]:
-        yield from (0, 1)
-        third.set()  # one message in process, one in the inbox: the next one has to wait
-        yield 2
-
-    def fail(message: int) -> int:
-        assert third.wait(LONG_S)
-        raise ValueError(f"cannot take {message}")
-
-    graph.stage("fragile", Apply(fail), graph.source("numbers", numbers))
-    with pytest.raises(ValueError, match="cannot take 0"):
-        graph.run()
-    assert [(row.n, row.drops) for row in graph.telemetry.summary()] == [(3, 0), (0, 2)]
 
 
 @both
@@ -444,96 +293,6 @@ def test_a_stop_before_the_run_ends_it_at_once(threaded: bool) -> None:
     assert (sink.got, sink.finished) == ([], 1)
 
 
-@dataclass
-class Action:
-    """An action that sets an event at the call `enough` and fails at the call `bad`."""
-
-    enough: int
-    bad: int = -1
-    calls: int = 0
-    closed: int = 0
-    reached: threading.Event = field(default_factory=threading.Event)
-
-    def __call__(self) -> None:
-        self.calls += 1
-        if self.calls == self.bad:
-            raise OSError("no answer from the motor")
-        if self.calls >= self.enough:
-            self.reached.set()
-
-    def close(self) -> None:
-        self.closed += 1
-
-
-@both
-def test_a_ticker_runs_beside_a_slow_stage(threaded: bool) -> None:
-    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=20)
-
-    def hold(message: int) -> int:
-        assert action.reached.wait(LONG_S)  # the stage ends after 20 more ticks only
-        return message
-
-    graph.sink("sink", sink, graph.stage("hold", Apply(hold), graph.source("one", lambda: [7])))
-    ticker = graph.ticker("motor", 1e-3, action)
-    graph.run()
-    assert sink.got == [7]
-    assert action.closed == 1
-    assert ticker.stats.processed == action.calls >= 20
-    assert ticker.stats in graph.telemetry.stages
-
-
-@both
-def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
-    graph, sink, action = Graph(threaded=threaded), Collect(), Action(enough=99, bad=3)
-    graph.sink("sink", sink, graph.source("numbers", lambda: (number % 7 for number in count())), policy=NEWEST)
-    graph.ticker("motor", 1e-3, action)
-    with pytest.raises(OSError, match="no answer") as caught:
-        graph.run()
-    assert caught.value.__notes__ == ["in 'motor'"]
-    assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
-
-
-def test_a_stop_ends_tickers_before_the_inboxes_are_empty() -> None:
-    graph, sink, action = Graph(), Collect(), Action(enough=1)
-    hourly, both_closed = Action(enough=1), threading.Barrier(3)
-    action.close = hourly.close = partial(both_closed.wait, LONG_S)  # type: ignore[method-assign, assignment]
-
-    def drain_slowly(message: int) -> int:
-        graph.stop()
-        both_closed.wait(LONG_S)  # tickers are closed while this message is in process
-        return message
-
-    graph.sink("sink", sink, graph.stage("slow", Apply(drain_slowly), graph.source("one", lambda: [1])))
-    graph.ticker("motor", 1e-3, action)
-    graph.ticker("hourly", 3600.0, hourly)
-    graph.run()
-    assert sink.got == [1]
-
-
-@pytest.mark.parametrize(
-    ("late_ns", "skipped"), [(-50, 0), (0, 0), (99, 0), (100, 1), (199, 1), (1000, 10), (1050, 10)]
-)
-def test_skips_missed_deadlines_and_keeps_the_phase(late_ns: int, skipped: int) -> None:
-    assert skipped_deadlines(5_000, 5_000 + late_ns, 100) == skipped
-
-
-def test_a_stalled_ticker_counts_missed_deadlines_without_a_burst() -> None:
-    stalled, period_s = threading.Event(), 2e-3
-
-    def action() -> None:
-        if not stalled.is_set():
-            threading.Event().wait(25 * period_s)
-            stalled.set()
-        elif ticker.stats.processed >= 5:
-            ticker.halt()
-
-    ticker, start_s = Ticker("motor", period_s, action), time.monotonic()
-    ticker.run(lambda: False)
-    assert ticker.stats.processed == 6
-    assert ticker.stats.dropped >= 23  # of the deadlines within the stall the newest is served
-    assert ticker.stats.processed + ticker.stats.dropped <= (time.monotonic() - start_s) / period_s + 1
-
-
 @both
 def test_runs_leave_no_thread(threaded: bool) -> None:
     before = set(threading.enumerate())
@@ -554,18 +313,6 @@ def test_threads_have_the_names_of_their_stages(threaded: bool) -> None:
     graph.stage("where", where, graph.source("one", lambda: [1]))
     graph.run()
     assert names == ["where" if threaded else threading.current_thread().name]
-
-
-@both
-def test_a_slot_as_a_sink_keeps_the_newest(threaded: bool) -> None:
-    slot: Slot[int] = Slot()
-    assert slot.get() is None
-    graph = Graph(threaded=threaded)
-    graph.sink("newest", slot, graph.source("numbers", lambda: range(10)))
-    graph.run()
-    assert slot.get() == 9
-    slot.put(3)
-    assert slot.get() == 3
 
 
 def test_runs_outside_the_main_thread() -> None:
@@ -594,161 +341,3 @@ def test_refuses_wrong_wiring() -> None:
         graph.run()
     with pytest.raises(OmnidError, match="runs once"):
         graph.source("late", lambda: range(3))
-
-
-def test_of_two_writers_each_drops_its_own_oldest_message() -> None:
-    """So a camera never takes the place of the other one's image."""
-    graph, gate, out = Graph(policy=NEWEST, depth=1), threading.Event(), Collect()
-    sent = [threading.Event(), threading.Event()]
-
-    def numbers(offset: int, done: threading.Event) -> Iterator[int]:
-        yield from range(offset, offset + 5)
-        done.set()
-
-    class Slow:
-        def process(self, number: int) -> int:
-            if not gate.is_set():
-                for event in sent:
-                    event.wait(5)
-                gate.set()
-            return number
-
-    lower = graph.source("lower", lambda: numbers(0, sent[0]))
-    upper = graph.source("upper", lambda: numbers(100, sent[1]))
-    graph.sink("out", out, graph.stage("slow", Slow(), lower, upper), policy=LOSSLESS)
-    graph.run()
-    assert {4, 104} <= set(out.got)
-
-
-class Held:
-    """Holds the first message until all were sent; of dropped messages it keeps the parts."""
-
-    def __init__(self, all_sent: threading.Event) -> None:
-        self._all_sent = all_sent
-
-    def process(self, parts: tuple[int, ...]) -> tuple[int, ...]:
-        assert self._all_sent.wait(LONG_S)
-        return parts
-
-    def merge(self, older: tuple[int, ...], newer: tuple[int, ...]) -> tuple[int, ...]:
-        return older + newer
-
-
-@pytest.mark.parametrize("depth", [1, 3])
-def test_parts_of_dropped_messages_go_along_with_the_next_one_of_their_writer(depth: int) -> None:
-    graph, out, all_sent = Graph(policy=NEWEST, depth=depth), Collect(), threading.Event()
-    sent = [threading.Event(), threading.Event()]
-
-    def parts(first: int, done: threading.Event) -> Iterator[tuple[int, ...]]:
-        yield from ((number,) for number in range(first, first + 20))
-        done.set()
-        if all(event.is_set() for event in sent):
-            all_sent.set()
-
-    streams = [
-        graph.source(name, partial(parts, first, done)) for name, first, done in zip("ab", (0, 100), sent, strict=True)
-    ]
-    graph.sink("out", out, graph.stage("held", Held(all_sent), *streams), policy=LOSSLESS)
-    graph.run()
-    found = [number for message in out.got for number in message]
-    assert len(out.got) <= 2 * depth + 1 and graph.telemetry.of("held").dropped == 40 - len(out.got)
-    for first in (0, 100):  # nothing is lost, twice or mixed, and the newest messages are whole by themselves
-        assert [number for number in found if number // 100 == first // 100] == list(range(first, first + 20))
-        assert depth == 1 or (first + 19,) in out.got
-    assert all(len({number // 100 for number in message}) == 1 for message in out.got)
-
-
-class Recorded:
-    """Passes numbers on after an optional wait, and keeps what it was given."""
-
-    def __init__(self, wait_s: float = 0.0) -> None:
-        self.seen: list[int] = []
-        self._wait_s = wait_s
-
-    def process(self, number: int) -> int:
-        self.seen.append(number)
-        time.sleep(self._wait_s)
-        return number
-
-
-@pytest.mark.parametrize("bound", [True, False])
-def test_a_bound_head_works_only_for_what_the_tail_will_take(bound: bool) -> None:
-    """Without the bound, the head's work on most messages is dropped in front of the slow tail."""
-    graph, head, tail = Graph(policy=NEWEST, depth=1), Recorded(), Recorded(0.03)
-
-    def numbers() -> Iterator[int]:
-        for number in range(200):
-            time.sleep(0.001)
-            yield number
-
-    graph.sink("tail", tail, graph.stage("head", head, graph.source("numbers", numbers)))
-    if bound:
-        graph.bound("head", "tail")
-    graph.run()
-    assert tail.seen[-1] == 199  # the last one is not lost
-    assert (len(head.seen) <= len(tail.seen) + 1) == bound
-
-
-def test_after_long_work_that_follows_a_result_the_tail_takes_the_newest() -> None:
-    """A message prepared for it during its own work has become old meanwhile."""
-    made: list[int] = []  # numbers so far, of which the last one is the newest
-    ages: list[int] = []  # how many newer ones there were when the tail took one after its long work
-    during: list[int] = []  # how many were made during that
-
-    class Tail:
-        after_work = False
-        taken = 0
-
-        def process(self, number: int) -> None:
-            if self.after_work:
-                ages.append(made[-1] - number)
-            self.taken += 1
-            self.after_work = self.taken % 5 == 0
-            time.sleep(0.005)
-
-        def after(self) -> None:
-            if self.after_work:
-                before = made[-1]
-                time.sleep(0.06)
-                during.append(made[-1] - before)
-
-    def numbers() -> Iterator[int]:
-        for number in range(600):
-            made.append(number)
-            time.sleep(0.001)
-            yield number
-
-    graph = Graph(policy=NEWEST, depth=1)
-    graph.sink("tail", Tail(), graph.stage("head", Recorded(0.003), graph.source("numbers", numbers)))
-    graph.bound("head", "tail")
-    graph.run()
-    assert np.median(ages) < np.median(during) / 2
-
-
-def test_a_bound_head_ends_with_a_tail_that_fails() -> None:
-    class Failing:
-        def process(self, number: int) -> None:
-            raise ValueError("broken")
-
-    graph = Graph(policy=NEWEST, depth=1)
-    graph.sink("tail", Failing(), graph.stage("head", Recorded(), graph.source("numbers", lambda: iter(range(50)))))
-    graph.bound("head", "tail")
-    with pytest.raises(ValueError, match="broken"):
-        graph.run()
-
-
-def test_direct_stages_and_sinks_run_in_the_thread_of_the_one_before() -> None:
-    names: list[str] = []
-
-    class Named:
-        def process(self, number: int) -> int:
-            names.append(threading.current_thread().name)
-            return number
-
-    graph, out = Graph(), Collect()
-    first = graph.stage("first", Named(), graph.source("numbers", lambda: iter(range(3))))
-    graph.sink("out", out, graph.stage("second", Named(), first, direct=True))
-    graph.sink("third", Named(), first, direct=True)
-    graph.run()
-    assert set(names) == {"first"} and out.got == [0, 1, 2]
-    assert [stats.processed for stats in graph.telemetry.stages if stats.name in ("second", "third")] == [3, 3]

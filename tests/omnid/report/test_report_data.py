@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.rig_file import rig_toml
 from omnid.report.chart import Clock
 from omnid.report.plan import plan_figure
 from omnid.report.report import _plan, report_html
 from omnid.report.report_data import ReportData, collect_report_data
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PAIRING, Key
+from omnid.transport.status_names import ODOMETRY, Key
 from tests.omnid.report.recorded_logs import (
     Entry,
     corrupt_chunks,
@@ -26,37 +25,10 @@ from tests.omnid.report.recorded_logs import (
     state,
     status,
 )
-from tests.omnid.report.test_report import attached_rig_of_sample
 
 
 def event_texts(data: ReportData) -> list[tuple[str, str]]:
     return [(event.source, event.text) for event in data.events.in_order()]
-
-
-def test_poses_have_the_state_reported_after_them(tmp_path: Path) -> None:
-    data = collect_report_data(save(tmp_path / "log.mcap", run(100, lost=range(40, 50))))
-    assert data.poses.states == {0: 90, 2: 10}
-    assert event_texts(data) == [("state", "lost"), ("state", "tracking")]
-    assert [round(event.start_s, 6) for event in data.events.in_order()] == [4.0, 5.0]
-
-
-def test_orders_status_from_before_the_first_pose_and_late_status(tmp_path: Path) -> None:
-    entries = [
-        status(
-            -20,
-            DiagnosticStatus(ODOMETRY, 3, "no pose yet", {}),
-            DiagnosticStatus(PAIRING, 1, "none", {}),
-        ),
-        odom(0),
-        state(0, "tracking"),
-        odom(5),
-        state(5, "lost"),
-        state(4, "tracking"),
-        odom(6),
-    ]  # status from before the loss, recorded after it
-    data = collect_report_data(save(tmp_path / "log.mcap", entries))
-    assert data.poses.states == {0: 1, 2: 2}
-    assert event_texts(data)[0] == ("pairing", "none") and data.events.in_order()[0].start_s == -2.0
 
 
 def test_corrupt_chunks_of_a_log_with_an_index_are_counted(tmp_path: Path) -> None:
@@ -110,25 +82,6 @@ def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_i
     shown = plan_figure(_plan(data, None), Clock(0.0, data.poses.end_s))
     assert [len(re.findall("[ML]", d)) for d in re.findall(r"class='p\d' d='([^']*)'", shown)][-2:] == [20, 20]
     assert re.findall("[ML]", re.findall("class='halo' d='([^']*)'", shown)[0]).count("M") == 2
-
-
-def test_the_plan_draws_what_is_above_the_floor_where_the_rig_states_its_height(tmp_path: Path) -> None:
-    """The floor filled the plans of robots whose cameras are lower than a metre."""
-    rig = attached_rig_of_sample()
-    for height_m, low_m in ((0.9, -0.8), (1.5, -1.0)):
-        files = {"rig.toml": rig_toml(rig.at_height(height_m)).encode()}
-        data = collect_report_data(save(tmp_path / "a.mcap", run(3), files))
-        assert _plan(data, None).heights_m == pytest.approx((low_m, 1.5))
-    without = collect_report_data(save(tmp_path / "a.mcap", run(3)))
-    assert _plan(without, None).heights_m == (-1.0, 1.5)
-
-
-def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
-    """The way during the gap counts; a report that was recorded late has fewer resets than the one before."""
-    entries = [*straight(0, 10), length(9, 0.9), state(9, "tracking", 1)]
-    entries += [odom(60, se3.transform(np.eye(3), [5.0, 0.0, 0.0])), length(60, 5.0, 1), state(8, "tracking", 0)]
-    data = collect_report_data(save(tmp_path / "a.mcap", entries))
-    assert data.poses.length_m == pytest.approx(5.0) and STARTED_AGAIN not in event_texts(data)
 
 
 def test_a_pose_in_the_map_without_its_pose_of_odometry_is_left_out(tmp_path: Path) -> None:

@@ -19,12 +19,6 @@ ROOT = Path(__file__).parents[3]
 FILES = ("etc/systemd/system/omnid.service", "etc/udev/rules.d/90-omnid.rules", "etc/omnid/omnid.toml")
 
 
-@pytest.fixture
-def omnid(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    monkeypatch.setattr(sys, "prefix", "/srv/robot")
-    return Command(capsys)
-
-
 def test_writes_the_unit_of_this_program_and_keeps_edited_files(omnid: Command, tmp_path: Path) -> None:
     listed = omnid("install-service", "--root", tmp_path, "--dry-run").out
     assert [str(tmp_path / name) for name in FILES] == [line.split()[1] for line in listed.splitlines()]
@@ -100,26 +94,6 @@ def test_refuses_a_program_that_no_unit_can_name(
     monkeypatch.setattr(sys, "prefix", f"/srv/{name}")
     assert "characters that a systemd unit cannot name" in omnid.refused("install-service", "--root", tmp_path, "--yes")
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("link", ["etc", "etc/systemd", FILES[0], FILES[2]])
-def test_writes_through_no_link_below_the_root(omnid: Command, tmp_path: Path, link: str) -> None:
-    elsewhere, root = tmp_path / "elsewhere", tmp_path / "root"
-    elsewhere.mkdir()
-    (root / link).parent.mkdir(parents=True)
-    (root / link).symlink_to(elsewhere / "file" if link in FILES else elsewhere)
-    assert "symbolic link" in omnid.refused("install-service", "--root", root, "--yes")
-    assert list(elsewhere.iterdir()) == []
-
-
-def test_a_link_that_appears_later_is_not_followed(tmp_path: Path) -> None:
-    steps = Installation(tmp_path / "root", Path("/srv/robot/bin/omnid")).steps()
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "root").mkdir()
-    (tmp_path / "root" / "etc").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OmnidError, match="symbolic link"):
-        steps[0].act()
-    assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
 def test_the_files_are_found_in_a_clone() -> None:

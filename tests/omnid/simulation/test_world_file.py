@@ -9,7 +9,6 @@ import pytest
 
 from omnid.errors import OmnidError
 from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.people import IMPATIENT, PATIENCE_S, Walkers
 from omnid.simulation.rendering import shapes
 from omnid.simulation.world_file import WorldOptions, load_world, shipped_worlds
 
@@ -53,45 +52,6 @@ def test_walls_have_doors_and_boxes_have_outlines(tmp_path: Path) -> None:
     assert clearance_m(segments, (2.0, 0.8), 0.2) == pytest.approx(-0.2)  # in the wall
     assert clearance_m(segments, (0.0, 0.0), 0.2) == pytest.approx(0.7)
     assert clearance_m(footprints(world.standing, 2.5), (2.0, 0.05), 0.2) == pytest.approx(-0.2)  # the lintel
-
-
-def test_polite_people_wait_until_the_robot_has_gone(tmp_path: Path) -> None:
-    polite = HALL.replace('repeat = "back and forth"', "waits_within_m = 0.8")
-    people = Walkers(load_world(write(tmp_path, polite), 1).people)
-    robot = (0.5, -1.0)  # in the way
-    for tenth in range(1, 31):
-        people.advance(0.1 * tenth, robot)
-    assert -0.35 <= people.places()[0][0] <= -0.3
-    for tenth in range(31, 41):
-        people.advance(0.1 * tenth, (-0.5, -0.5))  # behind the person, who goes away from it
-    assert people.places()[0][0] == pytest.approx(0.2, abs=0.06)
-
-
-def test_people_who_have_waited_for_long_come_nearer_and_then_turn_round(tmp_path: Path) -> None:
-    polite = HALL.replace('repeat = "back and forth"', 'repeat = "back and forth"\nwaits_within_m = 0.8')
-    people = Walkers(load_world(write(tmp_path, polite), 1).people)
-    x_m = []
-    for tenth in range(1, 120):
-        people.advance(0.1 * tenth, (0.5, -1.0))  # in the way for good
-        x_m.append(people.places()[0][0])
-    for at_m in (0.5 - 0.8, 0.5 - IMPATIENT * 0.8):
-        stood = np.flatnonzero(np.abs(np.array(x_m[:100]) - at_m) < 0.06)
-        assert len(stood) == pytest.approx(10 * PATIENCE_S, abs=6)
-    assert x_m[-1] < -0.5, "he has turned round"
-
-
-def test_people_walk_and_some_wait_for_the_robot(tmp_path: Path) -> None:
-    people = Walkers(load_world(write(tmp_path, HALL), 1).people)
-    people.advance(1.0, (-5.0, 0.0))
-    assert people.places()[0] == pytest.approx((-0.5, -1.0, 0.0))
-    people.advance(5.0, (-5.0, 0.0))
-    assert people.places()[0] == pytest.approx((0.5, -1.0, -np.pi))
-    assert people.places()[1][:2] == (3.0, 1.5)
-    people.advance(6.0, (1.5, 0.5))
-    people.advance(6.5, (1.5, 0.5))
-    assert people.places()[1][:2] == pytest.approx((3.0, 1.0))
-    people.advance(60.0, (-5.0, 0.0))
-    assert people.places()[1][:2] == pytest.approx((3.0, 0.5))
 
 
 @pytest.mark.parametrize("name", shipped_worlds())

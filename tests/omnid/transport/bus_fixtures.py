@@ -1,8 +1,9 @@
-"""Fixtures for tests of the bus: free endpoints, messages, a router and subscribers that do not import omnid."""
+"""Fixtures for tests of the bus: endpoints, messages, sessions, a router and subscribers that do not import omnid."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
 import subprocess
 import sys
@@ -11,9 +12,14 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import zenoh
 
 from calib import se3
+from omnid.client import Robot
 from omnid.transport import codec
+from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.requests import Request
+from omnid.transport.topics import command_topics
 
 DEADLINE_S = 30.0
 
@@ -78,3 +84,26 @@ def wait_until(condition: Callable[[], bool], pause_s: float = 0.02) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, f"not within {DEADLINE_S:g} s"
         time.sleep(pause_s)
+
+
+@contextlib.contextmanager
+def session(**settings: object) -> Iterator[zenoh.Session]:
+    """Open a zenoh session; double underscores in the names stand for slashes."""
+    config = zenoh.Config()
+    defaults = {"scouting__multicast__enabled": False, "transport__shared_memory__enabled": False}
+    for key, value in (defaults | settings).items():
+        config.insert_json5(key.replace("__", "/"), json.dumps(value))
+    opened = zenoh.open(config)
+    try:
+        yield opened
+    finally:
+        opened.close()  # type: ignore[no-untyped-call]
+
+
+@contextlib.contextmanager
+def robot() -> Iterator[tuple[Bus, Robot, list[Request]]]:
+    """Yield a bus that keeps what comes, and a program on it."""
+    endpoint, received = free_endpoint(), list[Request]()
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus, Robot(connect=(endpoint,)) as program:
+        bus.subscribe_commands(received.append, command_topics(("operator",)))
+        yield bus, program, received

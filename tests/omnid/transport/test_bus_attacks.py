@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import socket
 import threading
-import time
-from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -17,25 +13,7 @@ import zenoh
 from omnid.client import Robot
 from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.codec import ERROR, OK, WARN
-from omnid.transport.intake import UNKNOWN, budget_of
-from omnid.transport.requests import Request
-from omnid.transport.topics import command_topics
-from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
-
-
-@contextlib.contextmanager
-def session(**settings: object) -> Iterator[zenoh.Session]:
-    """Open a zenoh session; double underscores in the names stand for slashes."""
-    config = zenoh.Config()
-    defaults = {"scouting__multicast__enabled": False, "transport__shared_memory__enabled": False}
-    for key, value in (defaults | settings).items():
-        config.insert_json5(key.replace("__", "/"), json.dumps(value))
-    opened = zenoh.open(config)
-    try:
-        yield opened
-    finally:
-        opened.close()  # type: ignore[no-untyped-call]
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session, wait_until
 
 
 def test_does_not_connect_to_a_peer_that_another_one_introduces() -> None:
@@ -147,123 +125,3 @@ def test_idle_connections_do_not_lock_others_out() -> None:
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))
         with Robot(connect=(endpoint,), timeout_s=5.0) as operator:  # zenoh's own limits: 10 s
             assert operator.alive
-
-
-def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
-    router = free_endpoint()
-    with script(ROUTER, router), contextlib.ExitStack() as stack:
-        first = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)))))
-        warnings, commands = list[str](), list[str]()
-        second = stack.enter_context(contextlib.closing(Bus(BusConfig(listen=(), connect=(router,)), warnings.append)))
-        assert len(warnings) == 1 and "change bus.robot" in warnings[0] and "\n" not in warnings[0]
-        second.subscribe_commands(lambda request: commands.append(request.topic), {})
-        assert second.status().level == ERROR and not second.is_unique and commands == ["cmd/stop"]
-        with contextlib.closing(Bus(BusConfig(robot="other", listen=(), connect=(router,)))) as other:
-            assert other.status().level == first.status().level == OK
-        first.close()
-        wait_until(lambda: second.status().level == OK and second.is_unique)
-
-
-@pytest.mark.parametrize("token", ["omnid/alive", "omnid/alive/x"])
-def test_a_token_of_a_stranger_keeps_no_robot_from_starting(token: str) -> None:
-    """It may keep the robot disarmed, and the status says so, where no user needs a password."""
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
-        commands: list[str] = []
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
-        with session(mode="client", connect__endpoints=[endpoint]) as stranger:
-            held = stranger.liveliness().declare_token(token)
-            if token.endswith("x"):
-                wait_until(lambda: bus.status().level == ERROR)
-                wait_until(lambda: commands == ["cmd/stop"])
-            else:
-                stranger.put("omnid/cmd/mark", b"")
-                wait_until(lambda: commands == ["cmd/mark"])
-                assert bus.is_unique
-            del held
-        wait_until(lambda: bus.status().level == OK)
-
-
-def test_with_users_only_the_robot_declares_tokens_below_its_name(tmp_path: Path) -> None:
-    endpoint, users = free_endpoint(), tmp_path / "users"
-    users.write_text("eve:secret\n")
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), users_file=str(users)))) as bus:
-        commands: list[str] = []
-        bus.subscribe_commands(lambda request: commands.append(request.topic), {})
-        with session(
-            mode="client",
-            connect__endpoints=[endpoint],
-            transport__auth__usrpwd__user="eve",
-            transport__auth__usrpwd__password="secret",
-        ) as stranger:
-            held = stranger.liveliness().declare_token("omnid/alive/x")
-            stranger.put("omnid/cmd/mark", b"")
-            wait_until(lambda: commands == ["cmd/mark"])
-            assert bus.is_unique and bus.status().level == OK
-            replies = list(stranger.liveliness().get("omnid/alive"))
-            assert len(replies) == 1, "that of the robot is still seen"
-            del held
-
-
-FLOOD = """
-import json, sys, time, zenoh
-config = zenoh.Config()
-config.insert_json5("mode", '"client"')
-config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
-config.insert_json5("scouting/multicast/enabled", "false")
-with zenoh.open(config) as session:
-    key, block = sys.argv[2], zenoh.CongestionControl.BLOCK
-    publisher = session.declare_publisher(key, congestion_control=block)
-    print("ready", flush=True)
-    while "@" not in key:
-        publisher.put(b"")
-    while True:
-        session.get(key, lambda reply: None, payload=b"", congestion_control=block, timeout=1.0)
-"""
-
-
-@pytest.mark.parametrize("key", ["cmd/imu", "cmd/route", "cmd/arm", "cmd/nothing", "@request/arm", "@request/path"])
-def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> None:
-    """Of the flood no more than the budget is passed on; a stop and a command on another key get through."""
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,)))) as bus:
-        commands: Counter[str] = Counter()
-
-        def count(request: Request) -> None:
-            commands[request.topic] += 1
-
-        bus.subscribe_commands(count, command_topics(("operator",)))
-        with script(FLOOD, endpoint, f"omnid/{key}"), Robot(connect=(endpoint,)) as operator:
-            driver = operator.driver()
-            wait_until(lambda: bus.status().level == WARN)
-            assert any(name.startswith("flooded, ") for name in bus.status().values)
-            topic = key.replace("@request", "cmd")
-            begin_s, before = time.monotonic(), commands[topic]
-            wait_until(lambda: driver.stop() is None and commands["cmd/stop"] > 0)
-            wait_until(lambda: driver.twist(0.1, 0.0) is None and commands["cmd/twist"] > 0)
-            time.sleep(1.0)
-            budget = UNKNOWN if key == "cmd/nothing" else budget_of(topic)
-            most = 2 * budget.burst + budget.rate_hz * (time.monotonic() - begin_s)
-            assert commands[topic] - before <= most
-
-
-def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:
-    """Two robots start as clients without a router, which connects them later."""
-    router, warnings = free_endpoint(), list[str]()
-    with contextlib.ExitStack() as stack:
-        first, second = (
-            stack.enter_context(contextlib.closing(Bus(BusConfig(mode="client", connect=(router,)), warnings.append)))
-            for _ in range(2)
-        )
-        connection = stack.enter_context(script(ROUTER, router))
-        wait_until(
-            lambda: (
-                bool([bus.connect() for bus in (first, second)])
-                and first.status().level == second.status().level == ERROR
-            )
-        )
-        assert "bus.robot" in first.status().message and first.status().values["same_name"] == "1"
-        assert len(warnings) == 2
-        connection.kill()
-        wait_until(lambda: first.status().level == second.status().level == OK)
-        assert len(warnings) == 2, "each warns once"

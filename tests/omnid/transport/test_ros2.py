@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import re
 import shutil
 import struct
 import subprocess
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,8 +20,8 @@ from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.requests import Request
-from omnid.transport.topics import PUBLISHED, command_topics
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
+from tests.omnid.transport.ros2_fixtures import COMMANDS, TOPICS, client
 
 ODOMETRY_KEY = (
     "0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"
@@ -40,52 +37,7 @@ HASHES = {  # as published by ROS 2's own type description service, first digits
     "sensor_msgs/msg/CompressedImage": "15640771",
     "geometry_msgs/msg/TwistStamped": "5f0fcd4f",
 }
-TOPICS = {
-    "/omnid/cloud": "sensor_msgs/msg/PointCloud2",
-    "/omnid/drive": "geometry_msgs/msg/TwistStamped",
-    "/omnid/map": "nav_msgs/msg/OccupancyGrid",
-    "/omnid/moving": "sensor_msgs/msg/PointCloud2",
-    "/omnid/scan": "sensor_msgs/msg/LaserScan",
-    "/omnid/odom": "nav_msgs/msg/Odometry",
-    "/omnid/panorama": "sensor_msgs/msg/CompressedImage",
-    "/omnid/map_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "/omnid/pose": "geometry_msgs/msg/PoseStamped",
-    "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
-    "/tf": "tf2_msgs/msg/TFMessage",
-    "/tf_static": "tf2_msgs/msg/TFMessage",
-    "/omnid/path": "nav_msgs/msg/Path",
-    "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
-    "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped",
-    "/omnid/cmd/stop": "std_msgs/msg/Empty",
-    "/omnid/cmd/arm": "std_msgs/msg/Header",
-    "/omnid/cmd/planner/twist": "geometry_msgs/msg/TwistStamped",
-    "/omnid/cmd/planner/heading": "geometry_msgs/msg/Vector3Stamped",
-    "/omnid/navigation": "diagnostic_msgs/msg/DiagnosticArray",
-    "/omnid/plan": "nav_msgs/msg/Path",
-    "/omnid/cmd/goal": "geometry_msgs/msg/PoseStamped",
-    "/omnid/cmd/path": "nav_msgs/msg/Path",
-    "/omnid/cmd/navigation": "std_msgs/msg/String",
-    "/omnid/cmd/route": "std_msgs/msg/String",
-    "/omnid/cmd/map": "std_msgs/msg/String",
-    "/omnid/cmd/bumper": "std_msgs/msg/Bool",
-    "/omnid/cmd/cliff": "std_msgs/msg/Bool",
-    "/omnid/wheel_odom": "nav_msgs/msg/Odometry",
-    "/omnid/imu": "sensor_msgs/msg/Imu",
-    "/omnid/cmd/wheel_odom": "nav_msgs/msg/Odometry",
-    "/omnid/cmd/imu": "sensor_msgs/msg/Imu",
-    "/omnid/cmd/joint_states": "sensor_msgs/msg/JointState",
-}
-COMMANDS = command_topics(("planner",))
 PACE_S = 0.01  # between messages, so that a reader which is slow for a moment has them all
-
-
-@contextlib.contextmanager
-def client(endpoint: str, mode: str = "client") -> Iterator[zenoh.Session]:
-    config = zenoh.Config()
-    for key, value in (("mode", mode), ("connect/endpoints", [endpoint]), ("scouting/multicast/enabled", False)):
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
-        yield session
 
 
 @pytest.mark.parametrize("schema", HASHES)
@@ -137,31 +89,6 @@ def test_rmw_zenoh_receives_the_same_message_with_its_attachment() -> None:
     assert len(gids) == 1 and numbers == list(range(numbers[0], numbers[0] + 3))
 
 
-def tokens(endpoint: str, pattern: str, expected: int) -> set[str]:
-    found: set[str] = set()
-    with client(endpoint) as session:
-
-        def complete() -> bool:
-            found.update(str(reply.ok.key_expr) for reply in session.liveliness().get(pattern) if reply.ok)
-            return len(found) >= expected
-
-        wait_until(complete)
-    return found
-
-
-def test_all_topics_are_announced_to_rmw_zenoh() -> None:
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh", ros2_domain=3))) as bus:
-        bus.subscribe_commands(lambda *_: None, COMMANDS)
-        found = [token.split("/") for token in tokens(endpoint, "@ros2_lv/3/**", len(TOPICS) + 1)]
-    announced = {parts[9].replace("%", "/"): (parts[5], parts[10]) for parts in found if parts[5] != "NN"}
-    assert announced == {
-        topic: ("MS" if "/cmd/" in topic else "MP", ros2.dds_type(schema)) for topic, schema in TOPICS.items()
-    }
-    assert len({parts[4] for parts in found}) == len(TOPICS) + 1, "entity numbers are unique"
-    assert [parts[5:] for parts in found if parts[5] == "NN"] == [["NN", "%", "%", "omnid"]]
-
-
 def test_receives_a_twist_from_ros() -> None:
     endpoint, received = free_endpoint(), []
     key = ros2.data_key(3, "/omnid/cmd/twist", codec.TWIST_SCHEMA)
@@ -211,59 +138,6 @@ def test_joins_nothing_but_a_router() -> None:
         Bus(replace(config, robot="other"))
     with script(ROUTER, endpoint), pytest.raises(OmnidError, match="stop the other program"):
         Bus(replace(config, ros2="off"))
-
-
-def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="ros2dds"))) as bus, client(endpoint) as session:
-        bus.subscribe_commands(lambda *_: None, COMMANDS)
-        found = {token.split("/", 3)[3] for token in tokens(endpoint, "@/*/@ros2_lv/**", len(TOPICS))}
-        odom, tf = (session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in ("omnid/odom", "tf"))
-        wait_until(
-            lambda: (
-                bus.publish("odom", odometry(1)) is None
-                and bus.publish("/tf", b"tf") is None
-                and odom.try_recv() is not None
-                and tf.try_recv() is not None
-            )
-        )
-    assert "MP/omnid§odom/nav_msgs§msg§Odometry/:1:0:0,10" in found
-    assert "MP/tf/tf2_msgs§msg§TFMessage/:1:0:0,10" in found
-    assert "MS/omnid§cmd§twist/geometry_msgs§msg§TwistStamped/:1:0:0,10" in found
-
-
-@pytest.mark.parametrize(
-    ("mode", "key"), [("rmw_zenoh", ros2.data_key(0, "/tf_static", codec.TRANSFORM_SCHEMA)), ("ros2dds", "tf_static")]
-)
-def test_late_subscribers_of_ros_receive_the_static_frames(mode: str, key: str) -> None:
-    """A subscriber that is transient local in ROS 2 is an AdvancedSubscriber with history of zenoh."""
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2=mode))) as bus:
-        for payload in (b"before a refinement", b"frames"):
-            bus.publish("/tf_static", payload)
-        with client(endpoint) as session:
-            history, came = ext.HistoryConfig(detect_late_publishers=True, max_samples=1), list[bytes]()
-            subscriber = ext.declare_advanced_subscriber(
-                session, key, lambda sample: came.append(sample.payload.to_bytes()), history=history
-            )
-            wait_until(lambda: bool(came))
-            bus.publish("/tf_static", b"refined")
-            wait_until(lambda: len(came) == 2)
-            subscriber.undeclare()
-        quality, pattern = (
-            (ros2.TRANSIENT_LOCAL, "@ros2_lv/**")
-            if mode == "rmw_zenoh"
-            else (ros2.BRIDGE_TRANSIENT_LOCAL, "@/*/@ros2_lv/**")
-        )
-        publishers = tokens(endpoint, pattern, len(PUBLISHED) - 1)  # /clock is that of a simulation
-    kept = {
-        topic
-        for topic in ("tf_static", "map", "tf", "map_pose")
-        for token in publishers
-        if re.search(f"[%/§]{topic}/", token) and token.endswith("/" + quality)
-    }
-    assert not any("clock" in token for token in publishers)
-    assert came == [b"frames", b"refined"] and kept == {"tf_static", "map"}
 
 
 def test_a_name_that_ros_does_not_allow_is_refused() -> None:

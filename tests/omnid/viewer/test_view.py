@@ -25,11 +25,6 @@ from tests.simulation import build, write_log
 START_NS = 10**18
 
 
-@pytest.fixture
-def omnid(capsys: pytest.CaptureFixture[str]) -> Command:
-    return Command(capsys)
-
-
 @pytest.fixture(scope="module")
 def drawn(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the same log replayed, recorded and drawn."""
@@ -155,40 +150,6 @@ def test_shows_one_of_several_robots(tmp_path: Path, omnid: Command) -> None:
     assert "/rover/odom" in error and "/digger/odom" in error and "--topic" in error
     assert "'/crane/odom'" in omnid.refused("view", log, "-o", out, "--robot", "crane") and not out.exists()
     assert omnid("view", log, "-o", out, "--robot", "digger").out.startswith("3 poses")
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (("--web", "-o", "x.rrd"), "-o and --web"),
-        (("--replay",), "--replay"),
-        (("--port", "9090"), "--web"),
-        (("--web", "--port", "65535"), "65534"),
-        (("--seconds", "-1"), "--seconds"),
-        (("log.mcap", "--connect", "tcp/127.0.0.1:1"), "--connect"),
-        (("log.mcap", "--seconds", "3"), "--seconds"),
-    ],
-)
-def test_refuses_contradictory_options(words: tuple[str, ...], expected: str, omnid: Command) -> None:
-    assert expected in omnid.refused("view", *words)
-
-
-def test_refuses_files_that_cannot_be_written(scene: Path, tmp_path: Path, omnid: Command) -> None:
-    need_rerun()
-    log = scene / "log.mcap"
-    assert "no folder" in omnid.refused("view", log, "-o", tmp_path / "nowhere" / "x.rrd")
-    assert "the log that is read" in omnid.refused("view", log, "-o", log)
-    assert "device or a pipe" in omnid.refused("view", log, "-o", "/dev/full")
-
-
-def test_without_a_display_the_alternatives_are_named(
-    scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    need_rerun()
-    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(name, raising=False)
-    error = omnid.refused("view", scene / "log.mcap")
-    assert "display" in error and "-o FILE.rrd" in error and "--web" in error
 
 
 def test_without_rerun_the_installation_is_named(scene: Path, omnid: Command, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from tests.replay.command import Command
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 RECORDS = """
 import os
 import sys

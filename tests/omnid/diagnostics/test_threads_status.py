@@ -6,17 +6,20 @@ import os
 import threading
 import time
 
-from omnid.engine.realtime import name_thread
-from omnid.engine.thread_times import (
+from omnid.diagnostics.threads_status import (
     LIBRARIES,
     MAIN,
+    MOST_THREADS,
     ThreadShare,
     ThreadShares,
+    ThreadsStatus,
     ThreadTime,
     process_time_s,
     shares,
     thread_times,
 )
+from omnid.engine.realtime import name_thread
+from omnid.transport.status_names import Key
 from tests.replay.live import wait_until
 
 BURNT_S = 0.15
@@ -68,3 +71,16 @@ def test_an_id_that_is_used_again_begins_at_zero() -> None:
 
 def test_there_are_none_of_a_process_that_has_ended() -> None:
     assert thread_times(2**22 + 1) == {}, "above the largest id of a process"
+
+
+def test_the_status_has_the_share_of_all_threads_and_the_largest_by_name() -> None:
+    status, end = ThreadsStatus(), threading.Event()
+    started = [burning(f"burner {number}", end) for number in range(2)]
+    values = status().values
+    end.set()
+    for thread in started:
+        thread.join()
+    by_name = {name: float(share) for name, share in values.items() if name != Key.ALL}
+    assert {"burner 0", "burner 1", MAIN} <= by_name.keys() and len(by_name) <= MOST_THREADS
+    assert abs(float(values[Key.ALL]) - sum(by_name.values())) < 0.001 * (len(by_name) + 1)
+    assert min(by_name["burner 0"], by_name["burner 1"]) > 0

@@ -1,0 +1,80 @@
+"""Recognitions count once enough of them, in frames apart, give the same pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib import se3
+from omnid.core.places.hypotheses import CONSISTENT, SURE_INLIERS, Hypotheses, Hypothesis
+from omnid.core.places.recognition import Recognition
+from tests.omnid.core.mapping.rooms import pose
+from tests.omnid.core.scenery import Array
+
+PLACE, NEWEST = 3, 9  # ids of keyframes: one of the map, one of the run
+POSES = {PLACE: pose(5.0, 1.0, 0.5), NEWEST: pose(5.2, 1.1, 0.6)}
+T_MAP_ODOM = pose(4.0, -1.0, 0.3)
+COVARIANCE = np.diag([0.01] * 3 + [0.01] * 3) ** 2
+
+
+def hypothesis(x_m: float, error_m: float = 0.0, inliers: int = 12, *, by_tag: bool = False) -> Hypothesis:
+    """Return a recognition from a frame at x in odom, wrong by an error."""
+    T_odom_rect = pose(x_m, 0.0, 0.0)
+    T_map_rect = T_MAP_ODOM @ T_odom_rect @ pose(0.0, error_m, 0.0)
+    found = Recognition(PLACE, se3.inverse(POSES[PLACE]) @ T_map_rect, COVARIANCE, inliers, 30, 4, by_tag)
+    return Hypothesis(found, NEWEST, np.eye(4), COVARIANCE, T_odom_rect)
+
+
+def consistent(*given: Hypothesis, poses: dict[int, Array] = POSES) -> int:
+    """Return how many agree at the last one of recognitions that are added in turn."""
+    kept = Hypotheses()
+    return [len(kept.add(one, poses)) for one in given][-1]
+
+
+def test_recognitions_that_agree_count_once_they_are_enough() -> None:
+    assert [consistent(*[hypothesis(0.1 * k) for k in range(n)]) for n in (1, 2, 3, 4)] == [0, 0, CONSISTENT, 4]
+
+
+def test_one_that_contradicts_does_not_count() -> None:
+    assert consistent(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2)) == 0
+    assert consistent(hypothesis(0.0), hypothesis(0.1, error_m=0.2), hypothesis(0.2), hypothesis(0.3)) == CONSISTENT
+
+
+def test_a_robot_at_rest_needs_recognitions_with_more_inliers() -> None:
+    assert consistent(*[hypothesis(0.0)] * 5) == 0
+    assert consistent(*[hypothesis(0.0, inliers=SURE_INLIERS) for _ in range(3)]) == CONSISTENT
+
+
+def test_a_tag_may_differ_by_its_uncertainty() -> None:
+    """Its direction is less certain than that of a view."""
+    others = [hypothesis(0.0), hypothesis(0.1)]
+    assert consistent(*others, hypothesis(0.2, error_m=0.04, by_tag=True)) == CONSISTENT
+    assert consistent(*others, hypothesis(0.2, error_m=0.3, by_tag=True)) == 0
+
+
+def test_keyframes_that_left_the_map_do_not_count() -> None:
+    assert consistent(*[hypothesis(0.1 * k) for k in range(2)], hypothesis(0.2), poses=POSES) == CONSISTENT
+    kept = Hypotheses()
+    for k in range(2):
+        kept.add(hypothesis(0.1 * k), POSES)
+    old, moved = hypothesis(0.2), {PLACE + 1: POSES[PLACE], NEWEST: POSES[NEWEST]}
+    recognised = Recognition(PLACE + 1, old.recognition.T_place_rect, COVARIANCE, old.recognition.inliers, 30, 4)
+    assert kept.add(Hypothesis(recognised, NEWEST, np.eye(4), COVARIANCE, old.T_odom_rect), moved) == []
+
+
+def test_a_recognition_is_taken_once() -> None:
+    kept, one = Hypotheses(), hypothesis(0.0)
+    assert kept.take(one) and not kept.take(one) and kept.take(hypothesis(0.0))
+    kept.add(one, POSES)
+    assert len(kept) == 1
+    kept.clear()
+    assert len(kept) == 0
+
+
+def test_the_edge_leads_from_the_place_to_the_newest_keyframe() -> None:
+    T_keyframe_rect = pose(0.3, 0.1, 0.2)
+    one = hypothesis(0.0)
+    link = Hypothesis(one.recognition, NEWEST, T_keyframe_rect, COVARIANCE, one.T_odom_rect).link()
+    assert (link.a, link.b, link.inliers) == (PLACE, NEWEST, 12)
+    assert np.allclose(link.T_a_b @ T_keyframe_rect, one.recognition.T_place_rect)
+    assert np.trace(link.covariance) == pytest.approx(2 * np.trace(COVARIANCE), rel=0.3)
