@@ -58,7 +58,7 @@ def test_where_no_floor_is_seen_across_the_way_the_base_waits_and_says_so() -> N
 
 
 def test_the_base_drives_towards_floor_that_is_not_seen_yet() -> None:
-    """Where the floor ends far ahead, nothing is an obstacle: it comes into view as the base drives."""
+    """The end of the floor far ahead is no obstacle: more floor comes into view as the base drives."""
     base = BaseAmongPatches(Boxes())
     assert base.run(60).state is NavigationState.REACHED
     assert not any(sample.navigation.state is NavigationState.AVOIDING for sample in base.samples)

@@ -136,7 +136,7 @@ def test_nothing_is_free_before_hidden_floor_that_is_the_nearest_in_view(grid: O
 
 
 def test_a_place_that_was_hidden_for_long_is_free_again(grid: ObstacleGrid) -> None:
-    """What stood too near to be seen for longer than floor counts as free lately has left."""
+    """A pole stood too near to be seen for longer than floor counts as free lately, and has left."""
     near_m = 0.5 * COLUMNS.nearest_floor_m
     bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.05)))
     after(grid, bare, 30)

@@ -1,4 +1,4 @@
-"""What the layers of log-odds say of cells."""
+"""Layers of log-odds, and what they say of cells."""
 
 from __future__ import annotations
 
