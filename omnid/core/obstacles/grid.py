@@ -121,25 +121,25 @@ class ObstacleGrid:
         self._last_ns = stamp_ns
         weight, at_rest = self._weights(passed_ns, T_odom_base[:2, 3])
         # 1. Evidence of each cell, and what has come onto floor that was free.
-        cells = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
+        found = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         angles = self._azimuths + float(se3.yaw(T_odom_base))
         nearest_m = evidence.nearest_floor_m + 2 * CELL_M
         origin = np.array([*eye, CELL_M, self._max_range_m, self._at_1m, nearest_m])
-        ways = self._watch.was_free(stamp_ns), self._odds[SURFACE] > TAKEN_ODDS, origin, angles
+        ways = self._watch.was_floor(stamp_ns), self._odds[SURFACE] > TAKEN_ODDS, origin, angles
         # Who comes is wide: the mean of a cell is less noisy than its weakest directions, which show something thin.
-        comes = self._usual.hidden(self._usual.compare((rows, columns), cells[MEAN_FLOOR], weight), *ways)
+        comes = self._usual.hidden(self._usual.compare((rows, columns), found[MEAN_FLOOR], weight), *ways)
         arrivals = arrivals_at(comes.ranges_m, nearest_m, self._at_1m)
-        hidden = self._usual_thin.compare((rows, columns), cells[FLOOR], weight)
+        hidden = self._usual_thin.compare((rows, columns), found[FLOOR], weight)
         # A surface too near for floor explains that it hides the floor: nothing thin need stand before it.
-        in_view, nearest = np.isfinite(cells[FLOOR]), int(evidence.nearest_floor_m / CELL_M)
-        stands = ways[1] | self._near.surely_shown((rows, columns), cells[SURFACE], in_view, eye, nearest)
+        in_view, nearest = np.isfinite(found[FLOOR]), int(evidence.nearest_floor_m / CELL_M)
+        stands = ways[1] | self._near.surely_shown((rows, columns), found[SURFACE], in_view, eye, nearest)
         thin = self._usual_thin.hidden(hidden, ways[0], stands, *ways[2:])
         # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
         lost = np.where(thin.behind, hidden, np.minimum(hidden, 0))
         lose_before(lost, thin.near, eye, angles, nearest)
         past = partial(self._near.seen_past, self._odds, self._watch, eye, max(nearest, 1))
-        gone = self._near.gone((rows, columns), cells[SURFACE], in_view, past, eye, nearest)
-        amount = self._add((rows, columns), cells, lost, gone, weight, at_rest)
+        gone = self._near.gone((rows, columns), found[SURFACE], in_view, past, eye, nearest)
+        amount = self._add((rows, columns), found, lost, gone, weight, at_rest)
         self._near.forget((self._odds[SURFACE] <= PRIOR[SURFACE]) & (self._shown <= FREE_SHOWN))
         # 3. What is not watched, and may have changed.
         self._watch.take(passed_ns, (rows, columns), amount)
@@ -157,7 +157,9 @@ class ObstacleGrid:
         gaps = self._gap_share, CELL_M + self._gap_share * self._nearest_m
         in_view_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
         view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, *gaps)
-        return ring_of(self.state(), view, arrivals)
+        cells = self.state()
+        self._watch.free_ns[cells == 1] = stamp_ns
+        return ring_of(cells, view, arrivals)
 
     def _add(
         self,

@@ -37,22 +37,23 @@ class Watch:
         self._steps_per_s = FLOOD_MPS / cell_m
         self._carry = 0.0  # part of a step that is left from the pair before
         self.evidence = np.zeros((cells, cells), np.float32)  # mean of the last FRESH_NS
-        self.free_ns = np.full((cells, cells), NEVER, np.int64)  # stamp of the pair at which a cell was free last
+        self.floor_ns = np.full((cells, cells), NEVER, np.int64)  # stamp of the last pair at which a cell was floor
+        self.free_ns = self.floor_ns.copy()  # the same of cells that were free by all layers
         self.flooded = np.zeros((cells, cells), np.uint8)  # 1 where something may have come unseen
 
     @property
     def layers(self) -> tuple[tuple[NDArray[Any], float], ...]:
         """The layers (cells, cells), and what each holds where nothing is known."""
-        return (self.evidence, 0), (self.free_ns, NEVER), (self.flooded, 0)
+        return (self.evidence, 0), (self.floor_ns, NEVER), (self.free_ns, NEVER), (self.flooded, 0)
 
     @property
     def watched(self) -> Flags:
         """Cells of which there is enough evidence lately."""
         return np.asarray(self.evidence > LEAST_FRESH)
 
-    def was_free(self, stamp_ns: int) -> Flags:
-        """Return the cells through which an object may have come at a stamp."""
-        return np.asarray(self.free_ns > stamp_ns - ONCE_FREE_NS)
+    def was_floor(self, stamp_ns: int) -> Flags:
+        """Return the cells that were floor lately, at a stamp."""
+        return np.asarray(self.floor_ns > stamp_ns - ONCE_FREE_NS)
 
     def take(self, passed_ns: int, window: tuple[slice, slice], amount: Floats) -> None:
         """Take the amount of evidence of a pair in a window into the mean, passed_ns after the pair before."""
@@ -60,24 +61,26 @@ class Watch:
         self.evidence *= np.float32(kept)
         self.evidence[window] += np.float32(1 - kept) * np.clip(amount, 0, MOST_FRESH)
 
-    def spread(self, stamp_ns: int, passed_ns: int, free: Flags, visible: Flags) -> Flags:
-        """Return the free cells that may be so no more, as something may have come to them that was not seen.
+    def spread(self, stamp_ns: int, passed_ns: int, floor: Flags, visible: Flags) -> Flags:
+        """Return the cells of floor to which something may have come that was not seen.
 
-        free: cells of seen floor; visible: those that a pair can show.
+        floor: cells of seen floor; visible: those that a pair can show.
         """
         self._carry += min(passed_ns * 1e-9, 1.0) * self._steps_per_s
         steps, self._carry = int(self._carry), self._carry % 1.0
         unwatched = ~self.watched
-        self.free_ns[free] = stamp_ns
-        # 1. Where it may come from: what was free, wider than an object, and is hidden or lost.
-        lost = (unwatched & (visible | ~free) & self.was_free(stamp_ns)).view(np.uint8)
+        self.floor_ns[floor] = stamp_ns
+        # 1. Where it may come from: what was free by all layers, wider than an object, and is hidden or lost. Noise
+        # shows floor beyond walls, too, and nobody comes from there.
+        was_free = self.free_ns > stamp_ns - ONCE_FREE_NS
+        lost = (unwatched & (visible | ~floor) & was_free).view(np.uint8)
         box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
         reached = np.asarray(cv2.morphologyEx(lost, cv2.MORPH_OPEN, box), np.uint8) | (self.flooded & lost)
         # 2. How far it may have come since the pair before, through what is not watched.
-        ways = (free & unwatched).view(np.uint8) | lost
+        ways = (floor & unwatched).view(np.uint8) | lost
         passable = np.asarray(cv2.morphologyEx(ways, cv2.MORPH_OPEN, GAP), np.uint8)
         for step in range(steps):
             kernel = np.ones((3, 3), np.uint8) if step % 2 else CROSS
             reached = np.asarray(cv2.dilate(reached, kernel), np.uint8) & passable
         self.flooded[:] = reached
-        return np.asarray((reached > 0) & free)
+        return np.asarray((reached > 0) & floor)
