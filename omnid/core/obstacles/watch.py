@@ -71,7 +71,7 @@ class Watch:
         unwatched = ~self.watched
         self.floor_ns[floor] = stamp_ns
         # 1. Where it may come from: what was free by all layers, wider than an object, and is hidden or lost. Noise
-        # shows floor beyond walls, too, and nobody comes from there.
+        # shows floor beyond walls, too, through which nothing comes.
         was_free = self.free_ns > stamp_ns - ONCE_FREE_NS
         lost = (unwatched & (visible | ~floor) & was_free).view(np.uint8)
         box = np.ones((NARROW_CELLS, NARROW_CELLS), np.uint8)
