@@ -27,7 +27,8 @@ def commands(text: str) -> list[str]:
 def test_the_checks_run_the_readmes_test_command() -> None:
     job, tests = commands((ROOT / "README.md").read_text())
     assert "omnid" in job and "pytest" in tests
-    assert commands((ROOT / ".ci" / "run").read_text()) == [tests]
+    lines = (ROOT / ".ci" / "run").read_text().splitlines()
+    assert all(part in lines for part in tests.rsplit(" && ", 1)), "first what it needs, then the tests"
 
 
 def test_the_sample_is_small_and_whole() -> None:

@@ -176,6 +176,7 @@ def test_the_first_start_of_a_drive_says_what_it_waits_for(tmp_path: Path) -> No
     assert "compiling" in first and out == ""
 
 
+@pytest.mark.slow
 def test_demo_waits_for_a_busy_computer_and_loses_nothing(tmp_path: Path) -> None:
     """It has half of one core: it is stopped for the other half of the time."""
     one_core = ["taskset", "--cpu-list", str(min(os.sched_getaffinity(0)))]

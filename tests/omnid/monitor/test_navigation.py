@@ -26,6 +26,12 @@ from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 COMMAND_NS = 7
 GOTO = ("goto", "1", "0")
 REPEAT = ("route", "repeat", "hall")
+# The command omnid. Below nohup a command ignores a terminal that closes, and so do those of tests that are run that way.
+HEARS_ALL = """import runpy, signal
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module("omnid", run_name="__main__")
+"""
 
 
 def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,7 +71,7 @@ def test_a_drive_is_cancelled_when_its_command_is_ended(
             asked.append(request.topic)
 
         bus.subscribe_commands(take, command_topics(("operator",)))
-        command = [sys.executable, "-m", "omnid", *words, "--connect", endpoint]
+        command = [sys.executable, "-c", HEARS_ALL, *words, "--connect", endpoint]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             wait_until(lambda: len(asked) == 1)
             time.sleep(0.5)  # it waits for the answer, or for the end of the drive
