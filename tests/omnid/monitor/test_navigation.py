@@ -26,7 +26,7 @@ from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
 COMMAND_NS = 7
 GOTO = ("goto", "1", "0")
 REPEAT = ("route", "repeat", "hall")
-# The command omnid. Below nohup a command ignores a terminal that closes, and so do those of tests that are run that way.
+# The command omnid. Below nohup commands ignore a terminal that closes, those of tests that are run that way, too.
 HEARS_ALL = """import runpy, signal
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 signal.signal(signal.SIGINT, signal.default_int_handler)
