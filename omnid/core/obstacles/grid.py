@@ -24,7 +24,7 @@ from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring
 from omnid.core.obstacles.near_field import NearField, lose_before
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN
-from omnid.core.obstacles.usual_floor import UsualFloor, arrivals_at
+from omnid.core.obstacles.usual_floor import Arrivals, Hidden, UsualFloor, arrivals_at
 from omnid.core.obstacles.watch import FRESH_NS, Watch
 
 Array = NDArray[np.float64]
@@ -123,17 +123,9 @@ class ObstacleGrid:
         # 1. Evidence of each cell, and what has come onto floor that was free.
         found = self._gathered(T_odom_base, CELL_M * (corner + (columns.start, rows.start) + 0.5), evidence)
         angles = self._azimuths + float(se3.yaw(T_odom_base))
-        nearest_m = evidence.nearest_floor_m + 2 * CELL_M
-        origin = np.array([*eye, CELL_M, self._max_range_m, self._at_1m, nearest_m])
-        ways = self._watch.was_floor(stamp_ns), self._odds[SURFACE] > TAKEN_ODDS, origin, angles
-        # Who comes is wide: the mean of a cell is less noisy than its weakest directions, which show something thin.
-        comes = self._usual.hidden(self._usual.compare((rows, columns), found[MEAN_FLOOR], weight), *ways)
-        arrivals = arrivals_at(comes.ranges_m, nearest_m, self._at_1m)
-        hidden = self._usual_thin.compare((rows, columns), found[FLOOR], weight)
-        # A surface too near for floor explains that it hides the floor: nothing thin need stand before it.
         in_view, nearest = np.isfinite(found[FLOOR]), int(evidence.nearest_floor_m / CELL_M)
-        stands = ways[1] | self._near.surely_shown((rows, columns), found[SURFACE], in_view, eye, nearest)
-        thin = self._usual_thin.hidden(hidden, ways[0], stands, *ways[2:])
+        in_view_m = evidence.nearest_floor_m
+        arrivals, thin, hidden = self._hidden(stamp_ns, (rows, columns), found, eye, angles, in_view_m, weight)
         # 2. Log-odds; all floor behind something is hidden, and a cell that is so by itself is noise.
         lost = np.where(thin.behind, hidden, np.minimum(hidden, 0))
         lose_before(lost, thin.near, eye, angles, nearest)
@@ -155,11 +147,38 @@ class ObstacleGrid:
         self._odds[SURFACE, *own] = PRIOR[SURFACE]
         # 4. The ring.
         gaps = self._gap_share, CELL_M + self._gap_share * self._nearest_m
-        in_view_m = circle_from(self._directions, self._T_base_eye[:2, 3], evidence.nearest_floor_m)
-        view = RingView(place - corner, angles, CELL_M, self._max_range_m, in_view_m, *gaps)
+        nearest_m = circle_from(self._directions, self._T_base_eye[:2, 3], in_view_m)
+        view = RingView(place - corner, angles, CELL_M, self._max_range_m, nearest_m, *gaps)
         cells = self.state()
         self._watch.free_ns[cells == 1] = stamp_ns
         return ring_of(cells, view, arrivals)
+
+    def _hidden(
+        self,
+        stamp_ns: int,
+        window: tuple[slice, slice],
+        found: Floats,
+        eye: Array,
+        angles: Array,
+        in_view_m: float,
+        weight: np.float32,
+    ) -> tuple[Arrivals, Hidden, Floats]:
+        """Return who comes, what floor something thin hides, and the log-odds (CELLS, CELLS) that it does.
+
+        found (5, N, N): evidence of the cells of a window; eye (2,): viewpoint in cells; angles (SECTORS,) of the
+        directions in odom; in_view_m: range of the nearest floor in view; weight: of the pair.
+        """
+        nearest, nearest_m = int(in_view_m / CELL_M), in_view_m + 2 * CELL_M
+        origin = np.array([*eye, CELL_M, self._max_range_m, self._at_1m])
+        was_floor, stands = self._watch.was_floor(stamp_ns), self._odds[SURFACE] > TAKEN_ODDS
+        # Who comes is wide: the mean of a cell is less noisy than its weakest directions, which show something thin.
+        wide_odds = self._usual.compare(window, found[MEAN_FLOOR], weight)
+        comes = self._usual.hidden(wide_odds, was_floor, stands, origin, angles, nearest_m)
+        # A surface too near for floor explains that it hides the floor: nothing thin need stand before it.
+        stands |= self._near.surely_shown(window, found[SURFACE], np.isfinite(found[FLOOR]), eye, nearest)
+        odds = self._usual_thin.compare(window, found[FLOOR], weight)
+        thin = self._usual_thin.hidden(odds, was_floor, stands, origin, angles, nearest_m)
+        return arrivals_at(comes.ranges_m, nearest_m, self._at_1m), thin, odds
 
     def _add(
         self,

@@ -207,7 +207,7 @@ def march(state: Bytes, origin: Doubles, azimuths: Doubles, hit: Doubles, free: 
 def hidden_from(
     hidden: Floats,
     usual: Floats,
-    was_free: Bytes,
+    was_floor: Bytes,
     taken: Bytes,
     origin: Doubles,
     azimuths: Doubles,
@@ -225,7 +225,7 @@ def hidden_from(
     sum from farther away: `min(S, least sum up to there)`.
     Floor is hidden where its sum is a share of what it would be without any evidence, m^2 / 4 in each cell: a little
     less evidence than usual in all of a direction is none of that.
-    hidden, usual (H, W): log-odds of cells, and usual evidence m; was_free, taken (H, W): 1 where so. origin (5,):
+    hidden, usual (H, W): log-odds of cells, and usual evidence m; was_floor, taken (H, W): 1 where so. origin (5,):
     viewpoint in cells, size of a cell [m], longest way [m], disparity at 1 m. bounds (4,): least sum, gap [m] in what
     was free that ends a way, as the floor behind an object there may be hidden by it; range [m] to which floor is the
     nearest in view; and the share.
@@ -245,7 +245,7 @@ def hidden_from(
             # Nearer than the floor in view nothing is known by floor: what is not free there ends no way.
             if r > bounds[2] and r - last > bounds[1]:
                 break
-            if was_free[i, j] > 0:
+            if was_floor[i, j] > 0:
                 weight = at_1m * step / (r * r)
                 total += hidden[i, j] * weight
                 full += 0.25 * usual[i, j] * usual[i, j] * weight if hidden[i, j] != 0.0 else 0.0

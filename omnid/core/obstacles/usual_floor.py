@@ -39,7 +39,7 @@ class Arrivals(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """Floor that was free and is hidden, by one pair."""
+    """Floor that was seen lately and is hidden, by one pair."""
 
     ranges_m: Array  # (N,) along directions, from which on it is, NaN where it is not
     near: Floats  # (N,) log-odds that what hides it stands nearer than the nearest floor in view; 0: not known
@@ -65,16 +65,18 @@ class UsualFloor:
         found[window] = hidden
         return found
 
-    def hidden(self, odds: Floats, was_free: Flags, taken: Flags, origin: Array, azimuths: Array) -> Hidden:
+    def hidden(
+        self, odds: Floats, was_floor: Flags, taken: Flags, origin: Array, azimuths: Array, nearest_m: float
+    ) -> Hidden:
         """Return where floor is hidden.
 
-        odds (H, W): log-odds of `compare`; was_free: lately; taken: occupied by an object. origin (6,): viewpoint
-        [cells], size of a cell [m], longest range [m], disparity at 1 m, end of the nearest floor in view [m];
-        azimuths (N,) of the directions in odom.
+        odds (H, W): log-odds of `compare`; was_floor: lately; taken: occupied by an object. origin (5,): viewpoint
+        [cells], size of a cell [m], longest range [m], disparity at 1 m; azimuths (N,) of the directions in odom;
+        nearest_m: up to where floor is the nearest in view.
         """
-        ranges_m, near, behind = np.empty(len(azimuths)), np.empty(len(azimuths), np.float32), np.zeros_like(was_free)
-        flags = was_free.view(np.uint8), taken.view(np.uint8)
-        bounds = np.array([HIDDEN_SUM, GAP_M, origin[5], HIDDEN_SHARE])
+        ranges_m, near, behind = np.empty(len(azimuths)), np.empty(len(azimuths), np.float32), np.zeros_like(was_floor)
+        flags = was_floor.view(np.uint8), taken.view(np.uint8)
+        bounds = np.array([HIDDEN_SUM, GAP_M, nearest_m, HIDDEN_SHARE])
         kernels.hidden_from(odds, self.mean, *flags, origin, azimuths, bounds, ranges_m, near, behind.view(np.uint8))
         return Hidden(ranges_m, near, behind)
 

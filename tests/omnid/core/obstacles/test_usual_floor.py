@@ -19,17 +19,17 @@ IN_VIEW_M, NEAREST_M, FAR_M, END_M = 0.9, 1.0, 1.6, 3.0
 def found(odds_by_range: dict[tuple[float, float], float], stands_m: float | None = None) -> Hidden:
     """Return what is hidden ahead, by the log-odds of cells from one range to another, and where something stands."""
     range_m = CELL_M * (np.arange(CELLS) + 0.5 - EYE[0])
-    odds, was_free = np.zeros((CELLS, CELLS), np.float32), np.zeros((CELLS, CELLS), bool)
-    was_free[:, (range_m > IN_VIEW_M) & (range_m < END_M)] = True
+    odds, was_floor = np.zeros((CELLS, CELLS), np.float32), np.zeros((CELLS, CELLS), bool)
+    was_floor[:, (range_m > IN_VIEW_M) & (range_m < END_M)] = True
     for (first, end), value in odds_by_range.items():
         odds[:, (range_m > first) & (range_m < end)] = value
-    origin = np.array([*EYE, CELL_M, 3.5, 28.0, NEAREST_M])
+    origin = np.array([*EYE, CELL_M, 3.5, 28.0])
     usual = UsualFloor(CELLS)
     usual.mean[:] = USUAL
-    stands = np.zeros_like(was_free)
+    stands = np.zeros_like(was_floor)
     if stands_m is not None:
         stands[:, np.abs(range_m - stands_m) < CELL_M] = True
-    return usual.hidden(odds, was_free, stands, origin, np.zeros(1))
+    return usual.hidden(odds, was_floor, stands, origin, np.zeros(1), NEAREST_M)
 
 
 def test_what_hides_all_floor_in_view_stands_nearer() -> None:
