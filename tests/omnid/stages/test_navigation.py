@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import planar, transform
+from omnid.core.control.collision_monitor import UNKNOWN
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.navigation.local_planner import CROSSES
 from omnid.core.navigation.requests import (
@@ -230,6 +232,25 @@ def test_somebody_who_crosses_is_let_pass(tmp_path: Path) -> None:
         for _ in range(8):
             robot.pass_on()
         assert robot.updates[-1].reason == reason
+
+
+@pytest.mark.parametrize(("free_m", "avoids"), [(0.6, True), (1.5, False)])
+def test_unknown_floor_that_stops_the_wheels_is_passed_where_it_is_near(
+    tmp_path: Path, free_m: float, avoids: bool
+) -> None:
+    """More of what is farther away will come into view."""
+    robot = Robot(tmp_path)
+    robot.pass_on()
+    robot.send(GoalRequest(ODOM, 4.0, 0.0))
+    ranges, free = np.full(360, np.inf, np.float32), np.full(360, 6.0, np.float32)
+    free[165:195] = free_m
+    robot.stage.process(ObstacleRing(1, robot.seq * PERIOD_NS, ranges, ranges, free, np.eye(4)))
+    robot.wheels = WheelState(True, False, held_by=UNKNOWN)
+    robot.pass_on()
+    assert robot.updates[-1].state is NavigationState.BLOCKED
+    robot.wheels = WheelState(True, False)
+    robot.pass_on()
+    assert (robot.updates[-1].state is NavigationState.AVOIDING) == avoids
 
 
 def test_a_pose_in_the_map_without_a_known_covariance_begins_no_drive_in_it(tmp_path: Path) -> None:

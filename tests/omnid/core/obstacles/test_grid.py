@@ -145,6 +145,15 @@ def test_a_place_that_was_hidden_for_long_is_free_again(grid: ObstacleGrid) -> N
     assert after(grid, bare, 20, first=30 + stood).free_m[AHEAD].min() > 2.0
 
 
+def test_floor_before_a_surface_that_hides_the_nearest_in_view_stays_free(grid: ObstacleGrid) -> None:
+    """People come to 0.7 m from all sides: they are seen, and explain why no floor is."""
+    bare, people = evidence(stains, striped, wall_m=3.0), evidence(stains, striped, wall_m=0.7)
+    after(grid, bare, 30)
+    after(grid, people, 6, first=30)
+    column, row = np.floor((np.array([0.35, 0.0]) - grid.corner_m) / CELL_M).astype(int)
+    assert grid._odds[VISIBLE_LAYER][row, column] == PRIOR[VISIBLE_LAYER] and grid.state()[row, column] == 1
+
+
 def test_directions_cross_where_a_thin_thing_stands_that_is_too_near_to_be_seen(grid: ObstacleGrid) -> None:
     """A pole of 4 cm, 0.6 m ahead and 0.25 m to the left, hides other floor as the base drives."""
     middle, nearest, pole = np.full(2, CELLS / 2), round(1.0 / CELL_M), np.array([0.6, 0.25]) / CELL_M
