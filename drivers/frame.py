@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
-from drivers.jpeg import JpegHeader, read_header, restart_fault
+from drivers.jpeg import JpegHeader, Steps, read_header, restart_fault
 
 Camera = Literal["lower", "upper"]
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
@@ -82,6 +82,11 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
         raise _decode_error(frame, " ".join(str(error).split())[:_MAX_REASON]) from error
     image.setflags(write=False)
     return image
+
+
+def coding_steps(frame: Frame) -> Steps:
+    """Return the steps of a JPEG's quantisation (JpegHeader.steps), () of another image."""
+    return read_header(np.frombuffer(frame.data, np.uint8)).steps if frame.encoding == "jpeg" else ()
 
 
 def deep_samples(frame: Frame) -> NDArray[np.uint16] | None:

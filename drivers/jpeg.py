@@ -1,4 +1,4 @@
-"""Size of a JPEG and order of its restart markers, from its bytes, before it is decoded.
+"""Size of a JPEG, steps of its quantisation and order of its restart markers, from its bytes, before it is decoded.
 
 References are to ITU T.81. Cameras that send motion JPEG write a restart marker after each row of blocks or so. Where
 some were lost on the way, with the blocks between them, libjpeg goes on at the next one that it finds, and takes it for
@@ -8,8 +8,11 @@ higher up. It reports success in both cases.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from functools import lru_cache
+from typing import Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +25,19 @@ _FILL: Final = 0xFF
 _NO_LENGTH: Final = (0x00, 0x01, *range(0xD0, 0xDA))  # stuffed byte, TEM, RST0 to RST7, SOI, EOI: not in a header
 _LENGTH_BYTES: Final = 2  # the length counts itself
 _SCAN, _INTERVAL, _END = 0xDA, 0xDD, 0xD9  # SOS: the header ends here; DRI; EOI
+_TABLES: Final = 0xDB  # DQT: quantisation tables (B.2.4.1)
 _FIRST_RESTART, _RESTARTS = 0xD0, 8  # RST0 to RST7 follow each other in turn
 _FRAME_BYTES: Final = 10  # marker, length, precision, height, width, number of components
 _COMPONENT_BYTES: Final = 3  # identifier, sampling factors, quantisation table
 _BLOCK_PX: Final = 8
+_COEFFICIENTS: Final = _BLOCK_PX * _BLOCK_PX
+# Diagonal by diagonal, in turn up and down (figure A.6): row and column of each coefficient of a table.
+_ZIGZAG: Final = sorted(
+    ((i, j) for i in range(_BLOCK_PX) for j in range(_BLOCK_PX)),
+    key=lambda at: (at[0] + at[1], at[1] if (at[0] + at[1]) % 2 == 0 else at[0]),
+)
+
+Steps: TypeAlias = tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +50,7 @@ class JpegHeader:
     units: int = 0  # minimum coded units (A.2) of its one scan; 0: it may have several scans
     interval: int = 0  # units from restart marker to restart marker; 0: it has none
     scan: int = 0  # offset of the scan header
+    steps: Steps = ()  # of the 64 coefficients of the first component, in zigzag order; (): not known
 
 
 def read_header(data: NDArray[np.uint8]) -> JpegHeader:
@@ -48,19 +61,22 @@ def read_header(data: NDArray[np.uint8]) -> JpegHeader:
     """
     offset, interval = 2, 0  # after the start of image
     frames: list[int] = []
+    tables: dict[int, Steps] = {}
     for _ in range(_MAX_SEGMENTS):
         segment = data[offset : offset + _FRAME_BYTES].tobytes()
         if len(segment) < _FRAME_BYTES or segment[0] != _FILL:
             break
         marker, length = segment[1], int.from_bytes(segment[2:4], "big")
         if marker == _SCAN:
-            return _header(data, frames[0], interval, offset) if len(frames) == 1 else JpegHeader()
+            return _header(data, frames[0], interval, offset, tables) if len(frames) == 1 else JpegHeader()
         if marker in _NO_LENGTH or (marker != _FILL and length < _LENGTH_BYTES):
             break
         if _FIRST_FRAME <= marker <= _LAST_FRAME and marker not in _NO_FRAME:
             frames.append(offset)
         if marker == _INTERVAL:
             interval = int.from_bytes(segment[4:6], "big")
+        if marker == _TABLES:
+            tables |= _quantisation(data[offset + 4 : offset + 2 + length].tobytes())
         offset += 1 if marker == _FILL else 2 + length
     return JpegHeader()
 
@@ -85,7 +101,33 @@ def restart_fault(data: NDArray[np.uint8], header: JpegHeader) -> str:
     return ""
 
 
-def _header(data: NDArray[np.uint8], frame: int, interval: int, scan: int) -> JpegHeader:
+@lru_cache(maxsize=16)
+def coding_sigma(steps: Steps, highest: int) -> float:
+    """Return the standard deviation [grey levels] of what quantisation changes, of the lowest frequencies of blocks.
+
+    steps: JpegHeader.steps, (): 0. highest: of a block's 8 frequencies along rows and columns, the first that does not
+    count. An error is even within a step, so its variance is a twelfth of the step's square; the transform is
+    orthonormal (A.3.3), so a pixel has a 64th of their sum. The mean grey of blocks, which varies little within a
+    window of some blocks, does not count. Weaker contrast than a step is lost, with an error as large as itself.
+    """
+    if not steps:
+        return 0.0
+    counted = [step for step, (i, j) in zip(steps, _ZIGZAG, strict=True) if i + j > 0 and max(i, j) < highest]
+    return math.sqrt(sum(step * step for step in counted) / (12 * _COEFFICIENTS))
+
+
+def _quantisation(segment: bytes) -> dict[int, Steps]:
+    """Return the whole tables of a segment by their numbers; each has steps of 8 or of 16 bits."""
+    found: dict[int, Steps] = {}
+    while segment:
+        size = 2 if segment[0] >> 4 else 1
+        steps, segment, number = segment[1 : 1 + size * _COEFFICIENTS], segment[1 + size * _COEFFICIENTS :], segment[0]
+        if len(steps) == size * _COEFFICIENTS:
+            found[number & 15] = tuple(int.from_bytes(steps[k : k + size], "big") for k in range(0, len(steps), size))
+    return found
+
+
+def _header(data: NDArray[np.uint8], frame: int, interval: int, scan: int, tables: Mapping[int, Steps]) -> JpegHeader:
     """Return the header whose frame header and scan header are at these offsets."""
     segment = data[frame : frame + _FRAME_BYTES].tobytes()
     height, width, channels = int.from_bytes(segment[5:7], "big"), int.from_bytes(segment[7:9], "big"), segment[9]
@@ -96,4 +138,5 @@ def _header(data: NDArray[np.uint8], frame: int, interval: int, scan: int) -> Jp
     if segment[1] in _SEQUENTIAL and channels == in_scan == len(sampling) and sampling.all():
         across, down = (1, 1) if channels == 1 else (int((sampling >> 4).max()), int((sampling & 15).max()))
         units = -(-width // (_BLOCK_PX * max(1, across))) * -(-height // (_BLOCK_PX * max(1, down)))
-    return JpegHeader(width, height, channels, units, interval, scan)
+    (table,) = data[start + 2 : start + 3].tolist() or [-1]
+    return JpegHeader(width, height, channels, units, interval, scan, tables.get(table, ()))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import AGREE, Witness
@@ -42,6 +43,7 @@ class FramePair:
     upper: NDArray[np.uint8]  # (H, W)
     skew_s: float = 0.0  # upper minus lower exposure
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
+    steps: tuple[Steps, Steps] = ((), ())  # of the quantisation of both JPEGs (drivers.jpeg), (): none
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

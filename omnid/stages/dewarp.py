@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Maps, remap_tables, visible
+from drivers.jpeg import Steps
 from omnid.camera_config import TimingConfig
 from omnid.config import PanoramaConfig
 from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
@@ -52,19 +53,19 @@ class Dewarp:
         """Return the panoramas of a pair."""
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
-        lower, lower_light, lower_grey = self._panorama(pair.lower, self._lower, "lower", measured)
-        upper, upper_light, upper_grey = self._panorama(pair.upper, self._upper, "upper", measured)
+        lower, lower_light, lower_grey = self._panorama(pair.lower, pair.steps[0], self._lower, "lower", measured)
+        upper, upper_light, upper_grey = self._panorama(pair.upper, pair.steps[1], self._upper, "upper", measured)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
         times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
         tiles = self._tiles.update(pair.stamp_ns, {"lower": lower_grey, "upper": upper_grey}, self._noise_grey)
         return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
 
     def _panorama(
-        self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
+        self, image: NDArray[np.uint8], steps: Steps, maps: Maps, camera: Side, measured: bool
     ) -> tuple[PaddedPanorama, Light, NDArray[np.uint8]]:
         """Return a panorama, brightened if it is dim, its light, and (H, W) as the camera gave it.
 
-        measured: measure the noise of this camera again.
+        steps: of the quantisation of its JPEG; measured: measure the noise of this camera again.
         """
         smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
         remapped = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
@@ -74,7 +75,8 @@ class Dewarp:
         noise_grey = self._noise_grey[camera]
         found = light(inner, self._visible, noise_grey)
         gain = gain_of(found.level_grey)
-        padded = PaddedPanorama(brightened(remapped, gain), self._pad_px, gain * noise_grey, gain, *self._sector)
+        bright = brightened(remapped, gain)
+        padded = PaddedPanorama(bright, self._pad_px, gain * noise_grey, gain, *self._sector, steps)
         return padded, found, inner
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig import Rig
-from drivers.frame import Camera, Frame
+from drivers.frame import Camera, Frame, coding_steps
 from drivers.motion import MotionSample
 from omnid.camera_config import PairConfig
 from omnid.messages import FramePair
@@ -263,6 +263,7 @@ class Synchronise:
             upper_image,
             self.skew.exposure_ns * 1e-9,
             self.motion.take(lower.stamp_ns),
+            (coding_steps(lower), coding_steps(upper)),
         )
 
 

@@ -38,6 +38,8 @@ from tests.benchmark.cluttered_room import AT_EDGE, ROOMS, Wanderer, furnished, 
 from tests.benchmark.corridor_worlds import CROSSING, LIKE_FLOOR, POLISHED, SPEED_MPS, like_the_floor, world_text
 from tests.benchmark.fine_robot import BUILDS, USUAL, fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
+from tests.benchmark.furniture import FURNITURE, with_furniture
+from tests.benchmark.real_lenses import with_real_lenses
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
 
@@ -71,7 +73,7 @@ CASES: Final = {
     "edge 30 cm": 10.0,
     "edge 50 cm": 10.0,
     "ramp": 10.0,
-} | dict.fromkeys(KINDS, 12.0)
+} | dict.fromkeys((*KINDS, *FURNITURE), 12.0)
 CASES |= dict.fromkeys(CROSSING, 9.0)
 CASES |= dict.fromkeys(ROOMS, 40.0)  # The operator drives at random.
 UNEVEN: Final = ("edge", "ramp", AT_EDGE)  # Cases whose floor has two heights.
@@ -107,9 +109,15 @@ def run(
     speed_mps: float = SPEED_MPS,
     rate_hz: float = RATE_HZ,
     build: str = USUAL,
+    *,
+    real: bool = False,
 ) -> Drive:
-    """Drive one seed of a case along x, backwards at a negative speed, with a robot of BUILDS."""
-    robot = replace(fine_robot(size_px, BUILDS[build]), rate_hz=rate_hz)
+    """Drive one seed of a case along x, backwards at a negative speed, with a robot of BUILDS; real: its images are
+    those of real cameras (real_lenses.py).
+    """
+    robot, tamper = replace(fine_robot(size_px, BUILDS[build]), rate_hz=rate_hz), None
+    if real:
+        robot, tamper = with_real_lenses(robot, seed)
     limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
@@ -123,6 +131,8 @@ def run(
             world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
         if case.removeprefix(POLISHED) in KINDS:
             world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
+        if case.removeprefix(POLISHED) in FURNITURE:
+            world = with_furniture(world, case.removeprefix(POLISHED), random.Random(seed))
         if case == LIKE_FLOOR:
             world = like_the_floor(world)
         towards_rad = None
@@ -140,6 +150,7 @@ def run(
             seconds=CASES[case],
             seed=seed,
             config=load_config(None, ["places.enabled=false", *limits, *BUILDS[build].settings, *overrides]),
+            tamper=tamper,
         )
     return judged(done, world, robot, edges, backwards=speed_mps < 0, everywhere=is_cluttered)
 
@@ -232,6 +243,7 @@ def main() -> None:
     parser.add_argument("--speeds", type=float, nargs="+", default=(SPEED_MPS,), help="m/s; below 0: backwards")
     parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="of the cameras")
     parser.add_argument("--robot", choices=BUILDS, default=USUAL, help="its dimensions (fine_robot.py)")
+    parser.add_argument("--real", action="store_true", help="images of real cameras (real_lenses.py)")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
@@ -258,12 +270,10 @@ def main() -> None:
     seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
     table.seeds = [("obstacle stops", seed) for seed in seeds]
     parts = list(itertools.product(arguments.cases, arguments.speeds, arguments.sizes))
+    built = partial(run, rate_hz=arguments.rate, build=arguments.robot, real=arguments.real)
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
         runs = [
-            [
-                pool.submit(run, case, seed, size_px, arguments.overrides, speed_mps, arguments.rate, arguments.robot)
-                for seed in seeds
-            ]
+            [pool.submit(built, case, seed, size_px, arguments.overrides, speed_mps) for seed in seeds]
             for case, speed_mps, size_px in parts
         ]
         for part, futures in zip(parts, runs, strict=True):
@@ -271,16 +281,19 @@ def main() -> None:
             for seed, future in zip(seeds, futures, strict=True):
                 drives.append(future.result())
                 print(f"{part[0]} {seed}: {drives[-1]}", flush=True)
-            _add(table, *part, arguments.rate, arguments.robot, drives)
+            _add(table, _named(*part, arguments), drives)
 
 
-def _add(
-    table: ResultTable, case: str, speed_mps: float, size_px: int, rate_hz: float, build: str, drives: Sequence[Drive]
-) -> None:
+def _named(case: str, speed_mps: float, size_px: int, arguments: argparse.Namespace) -> str:
+    """Return a case with all in which its drives differ from the usual ones."""
     at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
-    at += f", {rate_hz:g} Hz" * (rate_hz != RATE_HZ) + f", {build} robot" * (build != USUAL)
+    at += f", {arguments.rate:g} Hz" * (arguments.rate != RATE_HZ) + ", real cameras" * arguments.real
+    return case + at + f", {arguments.robot} robot" * (arguments.robot != USUAL)
+
+
+def _add(table: ResultTable, label: str, drives: Sequence[Drive]) -> None:
     table.add(
-        case + at,
+        label,
         len(drives),
         sum(drive.contacts for drive in drives),
         sum(drive.own for drive in drives),

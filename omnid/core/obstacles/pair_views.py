@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
+from drivers.jpeg import coding_sigma
 from omnid.core.obstacles import panorama_kernels as kernels
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -27,6 +28,9 @@ COARSE_ROWS: Final = 17  # Rows of the coarse mean, which is taken twice: like a
 TEXTURE_SHARE: Final = 0.3  # Difference between two views of a surface, by the local contrast; noise is added to it.
 CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
 BAND_NOISE: Final = 0.5  # Noise of a smooth image by that of a panorama, because the mean of some rows has less.
+# Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows: of those
+# above a quarter of a cycle a pixel its smoothing leaves little. A coarser panorama shows fewer.
+CODING_FREQUENCIES: Final = 4.0
 UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
 ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
 BOUNDED_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
@@ -56,6 +60,7 @@ class WorkingPanoramas:
         ) % DIRECTIONS
         self.height = round(cylinder.height * FOCAL_PX / cylinder.focal_px)
         self.row0 = (cylinder.row0 + 0.5) * self.height / cylinder.height - 0.5
+        self._coding_frequencies = max(2, round(CODING_FREQUENCIES * FOCAL_PX / cylinder.focal_px))
         rows = np.arange(self.height)
         self.plane_rows = (rows + floor_slope * np.maximum(rows - self.row0, 0.0)).astype(np.float32)
         self._plane_steps = np.rint(self.plane_rows * kernels.STEPS_PER_ROW).astype(np.int32)
@@ -72,11 +77,16 @@ class WorkingPanoramas:
 
     def views(self, lower: PaddedPanorama, upper: PaddedPanorama, live: Bytes) -> tuple[Views, Views]:
         """Return the views of a pair for surfaces, and for the floor; live (H, DIRECTIONS): 255 where it is seen."""
-        noise_grey = BAND_NOISE * max(lower.noise_grey, upper.noise_grey)
+        noise_grey = max(self._noise_grey(lower), self._noise_grey(upper))
         one, two = self._smooth(lower), self._smooth(upper)
         surfaces = self._views(_band_pass(one), _band_pass(two), noise_grey, live)
         floor = self._views(_bounded_band_pass(one, noise_grey), _bounded_band_pass(two, noise_grey), noise_grey, live)
         return surfaces, floor
+
+    def _noise_grey(self, panorama: PaddedPanorama) -> float:
+        """Return the noise of a smooth image: of its sensor, and of its JPEG, whose errors extend over blocks."""
+        coding_grey = panorama.gain * coding_sigma(panorama.steps, self._coding_frequencies)
+        return math.hypot(BAND_NOISE * panorama.noise_grey, coding_grey)
 
     def _smooth(self, panorama: PaddedPanorama) -> Floats:
         """Return a panorama (H, DIRECTIONS) in the working size, smoothed along columns."""
