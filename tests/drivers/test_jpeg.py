@@ -1,4 +1,4 @@
-"""Restart markers of JPEG images: all samplings are read, and an image of which a part was lost is refused."""
+"""JPEG images: restart markers of all samplings, images of which a part was lost, and steps of the quantisation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from drivers.errors import FrameDecodeError
-from drivers.frame import Frame, gray
+from drivers.frame import Frame, coding_steps, gray
+from drivers.jpeg import coding_sigma
 
 
 def jpeg(data: bytes) -> Frame:
@@ -70,3 +71,39 @@ def test_the_units_of_a_grey_jpeg_are_blocks_whatever_its_sampling_factors() -> 
     data = bytearray(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_RST_INTERVAL, 2])[1].tobytes())
     data[data.index(b"\xff\xc0") + 11] = 0x22
     assert gray(jpeg(bytes(data))).shape == pixels.shape
+
+
+def test_the_steps_of_the_luminance_are_read_in_zigzag_order() -> None:
+    """Quality 50 has the tables of annex K.1, of which the steps of a higher quality are a part."""
+    assert coding_steps(jpeg(_coded(50)))[:10] == (16, 11, 12, 14, 12, 10, 16, 14, 13, 14)
+    assert coding_steps(jpeg(_coded(75)))[:6] == (8, 6, 6, 7, 6, 5)
+    assert coding_steps(Frame(0, 0, "lower", "mono8", np.zeros(64, np.uint8), 8, 8)) == ()
+
+
+def test_a_cut_table_has_no_steps() -> None:
+    whole = _coded(75)
+    at = whole.index(b"\xff\xdb")
+    assert coding_steps(jpeg(whole[: at + 30])) == ()
+    # The length says that the segment ends within the table, and the rest of it is no marker.
+    assert coding_steps(jpeg(whole[: at + 2] + b"\x00\x20" + whole[at + 4 :])) == ()
+    # Steps of 16 bits would need twice the bytes.
+    assert coding_steps(jpeg(whole[: at + 4] + b"\x10" + whole[at + 5 :])) == ()
+
+
+@pytest.mark.parametrize("quality", [50, 75, 90])
+@pytest.mark.parametrize("highest", [2, 3, 8])
+def test_images_differ_from_their_jpegs_by_the_stated_error(quality: int, highest: int) -> None:
+    """Of noise, whose coefficients exceed the steps, each frequency is off by a twelfth of the step's square."""
+    grey = np.clip(np.rint(np.random.default_rng(8).normal(128.0, 40.0, (256, 256))), 0, 255).astype(np.uint8)
+    data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    error = gray(jpeg(data)).astype(np.float32) - grey
+    blocks = [cv2.dct(error[v : v + 8, u : u + 8].copy()) for v in range(0, 256, 8) for u in range(0, 256, 8)]
+    squares = np.mean(np.square(blocks), axis=0)[:highest, :highest]
+    found = np.sqrt((squares.sum() - squares[0, 0]) / 64)
+    # Pixels are rounded as well, and coefficients below half a step are lost with an error as large as themselves.
+    assert found == pytest.approx(coding_sigma(coding_steps(jpeg(data)), highest), rel=0.15 if highest < 8 else 0.25)
+
+
+def _coded(quality: int) -> bytes:
+    noise = np.random.default_rng(2).integers(0, 256, (64, 96, 3), np.uint8)
+    return cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

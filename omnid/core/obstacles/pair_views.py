@@ -27,16 +27,18 @@ FINE_PX: Final = 0.8  # Sigma of the smoothing along columns, because views diff
 COARSE_ROWS: Final = 17  # Rows of the coarse mean, which is taken twice: like a sigma of 7 rows.
 TEXTURE_SHARE: Final = 0.3  # Difference between two views of a surface, by the local contrast; noise is added to it.
 CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
-BAND_NOISE: Final = 0.5  # Noise of a smooth image by that of a panorama, because the mean of some rows has less.
-# Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows: of those
-# above a quarter of a cycle a pixel its smoothing leaves little. A coarser panorama shows fewer.
-CODING_FREQUENCIES: Final = 4.0
+# Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
+# of 960 px 0.36 to 0.53 (test_pair_views.py). With 0.35, by trial, bases stood before free floor in dim or noisy images.
+BAND_NOISE: Final = 0.65
+# Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows: the
+# smoothing halves those above. A coarser panorama shows fewer.
+CODING_FREQUENCIES: Final = 3.0
 UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
 ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
 BOUNDED_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
 # Most that one of them counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
-# texture of the floor around it. With 5 to 20 bases passed such a line; with no limit they stood before it.
-BOUNDED_SIGMAS: Final = 10.0
+# texture of the floor around it. With 3 to 11 bases passed such a line; with no limit they stood before it.
+BOUNDED_SIGMAS: Final = 5.5
 
 
 class Views(NamedTuple):
@@ -77,7 +79,7 @@ class WorkingPanoramas:
 
     def views(self, lower: PaddedPanorama, upper: PaddedPanorama, live: Bytes) -> tuple[Views, Views]:
         """Return the views of a pair for surfaces, and for the floor; live (H, DIRECTIONS): 255 where it is seen."""
-        noise_grey = max(self._noise_grey(lower), self._noise_grey(upper))
+        noise_grey = math.hypot(self._noise_grey(lower), self._noise_grey(upper))  # of their difference
         one, two = self._smooth(lower), self._smooth(upper)
         surfaces = self._views(_band_pass(one), _band_pass(two), noise_grey, live)
         floor = self._views(_bounded_band_pass(one, noise_grey), _bounded_band_pass(two, noise_grey), noise_grey, live)

@@ -374,7 +374,7 @@ def test_single_directions_that_a_floor_mirrors_are_not_somebody(grid: ObstacleG
     """On a polished floor a tenth of the directions match what it mirrors; who comes hides all of them."""
     after(grid, seen, 20)
     mirrored = seen[0].floor.copy()
-    mirrored[:, DIRECTIONS // 2 - 15 : DIRECTIONS // 2 + 15 : 5] = -6.0
+    mirrored[:, DIRECTIONS // 2 - 15 : DIRECTIONS // 2 + 15 : 5] = -5.0
     ring = grid.update(20 * PERIOD_NS, np.eye(4), seen[0]._replace(floor=mirrored))
     assert np.isnan(ring.arrivals.ranges_m).all()
 
@@ -389,8 +389,9 @@ def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid
     found = np.isfinite(came.arrivals.ranges_m)
     assert 0.3 * np.degrees(0.3 / 1.3) < found.sum() < 2 * np.degrees(0.3 / 1.3)
     assert (came.arrivals.sigma_m[found] < 0.1).all()
-    stays = after(grid, person, 10, first=21)
-    assert np.nanmedian(stays.arrivals.ranges_m[AHEAD]) == pytest.approx(1.3, abs=0.15)
+    stays = [after(grid, person, 1, first=n).arrivals.ranges_m[AHEAD] for n in range(21, 31)]
+    seen_m = [np.nanmedian(ranges_m) for ranges_m in stays if np.isfinite(ranges_m).any()]
+    assert len(seen_m) >= 8 and np.allclose(seen_m, 1.3, atol=0.15)
     assert np.isnan(after(grid, seen, 5, first=31).arrivals.ranges_m).all(), "the floor is as it was"
     grid.clear()
     assert np.isnan(after(grid, person, 20).arrivals.ranges_m).all()
