@@ -33,8 +33,8 @@ LIMITS: Final = (-20, 35)
 OCCUPIED_FROM: Final = 14
 # ... and free from two misses on, because a false match may let a single view pass through a wall.
 FREE_UNTIL: Final = -8
-# A cell is free only by views from this near, because farther ones pass over what is low: a box 12 cm high is seen up to
-# 3 m, by the usual tilt. Farther ones clear what has gone, so that it is unknown.
+# A cell is free only by views from this near, because farther ones pass over what is low: a box 12 cm high is seen up
+# to 3 m, by the usual tilt. Farther ones clear what has gone, so that it is unknown.
 FREE_M: Final = 3.0
 # From this far on a cell is free only where a view has seen through the whole of it, so that what is narrower than a
 # cell and shows no range, as a plain pole, is unknown; nearer is the base itself. By trial on a development seed.
