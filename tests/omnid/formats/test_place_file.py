@@ -174,7 +174,7 @@ def test_a_cut_map_is_refused(tmp_path: Path, size: int) -> None:
         read_places(path)
 
 
-def test_a_pipe_that_nobody_writes_to_is_refused_at_once(tmp_path: Path) -> None:
+def test_a_pipe_without_a_writer_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "place.omap")
     with pytest.raises(OmnidError, match=r"expected a map of places \(\.omap\), found a pipe: name a file"):
         read_places(tmp_path / "place.omap")
