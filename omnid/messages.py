@@ -156,6 +156,8 @@ class PlaceUpdate:
     # scans of the part of the map in which the pose is; the same object until they change
     scans: KeyframeScans | None = None
     keyframes: MapKeyframes | None = None  # the same object while the map stays
+    # False: in a saved map or after a gap no place has been recognised yet, so it is unknown where odom lies in the map
+    is_known: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)

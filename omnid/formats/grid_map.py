@@ -9,7 +9,7 @@ import numpy as np
 
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid
 from omnid.errors import OmnidError
-from omnid.formats.whole_file import write_whole
+from omnid.formats.whole_file import replacement
 
 _WHITE, _BLACK, _GREY = 254, 0, 205  # free, occupied and unknown, as map_saver writes them
 # With nav2's default of 0.25, grey (255 - 205) / 255 = 0.196 would count as free.
@@ -44,8 +44,14 @@ def write_grid(path: Path, grid: Grid) -> None:
     image[grid.cells == FREE] = _WHITE
     image[grid.cells == OCCUPIED] = _BLACK
     height, width = grid.cells.shape
-    write_whole(pixels, b"P5\n%d %d\n255\n" % (width, height) + image[::-1].tobytes())  # the first row is the highest y
-    write_whole(path, described)
+    rows = image[::-1].tobytes()  # the first row is the highest y
+    try:
+        # Both are on the disk before one takes its name, because an image beside the text of another map is shifted.
+        with replacement(pixels) as new_image, replacement(path) as new_text:
+            new_image.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + rows)
+            new_text.write_bytes(described)
+    except (OSError, ValueError) as error:
+        raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
 
 
 def _quoted(name: str) -> str:

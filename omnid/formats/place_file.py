@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence, Set
 from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
+from stat import S_ISFIFO
 from typing import Final
 
 import numpy as np
@@ -119,7 +120,10 @@ def read_places(
 def _version_of(path: Path) -> int:
     """Return the version in the header, once it is that of an SQLite database, ours, of a version that is read."""
     try:
-        size = path.stat().st_size
+        status = path.stat()
+        size = status.st_size
+        if S_ISFIFO(status.st_mode):
+            raise OmnidError(f"{path}: expected a map of places (.omap), found a pipe: name a file")
         with path.open("rb") as file:
             header = file.read(100)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name

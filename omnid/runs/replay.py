@@ -43,7 +43,7 @@ from omnid.settings_dump import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing
-from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_trajectory
+from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_known
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
 from omnid.sinks.simulated_wheels import SimulatedWheels
@@ -294,10 +294,11 @@ class _Replay:
         if self._drive is not None:
             counters = replace(counters, motor=self._drive.counts())
         newest, in_map = self._map.get(), results.map_poses(self._map_poses)
-        if self._options.map_tum:
-            write_trajectory(self._options.map_tum, self._map_poses.stamps_ns, in_map)
-        if self._options.map_live_tum:
-            write_trajectory(self._options.map_live_tum, self._map_poses.stamps_ns, self._map_poses.T_map_rig)
+        live, stamps_ns = self._map_poses.T_map_rig, self._map_poses.stamps_ns
+        if path := self._options.map_tum:
+            self._warnings += write_known(path, stamps_ns, in_map, results.known_in_map(self._map_poses))
+        if path := self._options.map_live_tum:
+            self._warnings += write_known(path, stamps_ns, live, self._map_poses.known)
         return RunResult(
             self._poses.stamps_ns,
             self._poses.T_odom_rig,
@@ -309,7 +310,7 @@ class _Replay:
             None if newest is None else newest.points,
             session.signal,
             in_map,
-            self._map_poses.T_map_rig,
+            live,
             self._map_poses.states,
             results.places() if self._options.collect else None,
             elapsed_s=time.monotonic() - self._begun_s,

@@ -54,6 +54,11 @@ class RunReport:
         found = [] if places is None else [places.corrected(update) for update in poses.updates]
         return np.array(found).reshape(-1, 4, 4)
 
+    def known_in_map(self, poses: MapPoseCollector) -> NDArray[np.bool_]:
+        """Return at which of the collected poses (N,) it is known at the end where odom lay in the map."""
+        places = self._stages.places
+        return np.zeros(0, np.bool_) if places is None else places.known(poses.updates)
+
     def timings(self) -> dict[str, SummaryRow]:
         """Return the times of the stages."""
         rows = self._session.graph.telemetry.summary()

@@ -132,6 +132,8 @@ class Encoder:
         T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, self.T_base_rig)
         pose = codec.pose_with_covariance_cdr(stamp_ns, T_map_base, in_outer_axes(T_map_base, covariance))
         yield OutgoingMessage(MAP_POSE, codec.MAP_POSE_SCHEMA, pose)
+        if not update.is_known:  # a transform has no covariance that could say so
+            return
         edge = FrameTransform("map", "odom", T_map_odom)
         yield OutgoingMessage("/tf", codec.TRANSFORM_SCHEMA, codec.transform_cdr(stamp_ns, [edge]))
 

@@ -131,6 +131,25 @@ def write_trajectory(path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np
         file.close()
 
 
+def write_known(
+    path: Path, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64], known: NDArray[np.bool_]
+) -> list[str]:
+    """Write those of poses in the map (N, 4, 4) that are known (N,), as TUM; return warnings about the others.
+
+    Raises OmnidError.
+    """
+    if len(poses) and not known.any():
+        try:
+            path.write_bytes(b"")  # no poses of an earlier run
+        except OSError as error:
+            raise OmnidError(f"{path}: can no longer be written: {error.strerror or error}") from error
+    write_trajectory(path, stamps_ns[known], poses[known])
+    if known.all():
+        return []
+    left_out = f"{len(known) - known.sum()} of {len(known)} poses are left out"
+    return [f"{path}: {left_out}: no place of the map was recognised there, so it is not known where in it they are"]
+
+
 class _TumFile:
     """A file that is opened for the first pose: a run without poses leaves an existing file as it was."""
 

@@ -80,6 +80,11 @@ class MapPoseCollector:
         return np.array([update.T_map_rig for update in self.updates]).reshape(-1, 4, 4)
 
     @property
+    def known(self) -> NDArray[np.bool_]:
+        """At which poses (N,) it was known at that time where odom lay in the map."""
+        return np.array([update.is_known for update in self.updates], np.bool_)
+
+    @property
     def states(self) -> tuple[MapState, ...]:
         """States (N,)."""
         return tuple(update.state for update in self.updates)

@@ -25,6 +25,8 @@ class MapGrid:
 
     def process(self, update: PlaceUpdate) -> GridUpdate | None:
         """Return the grid when it is due and has changed."""
+        if not update.is_known:  # where these scans lie in the map is unknown
+            return None
         self._newest = update
         if not self._every_ns or update.stamp_ns - self._given_ns < self._every_ns or update.scans is self._given:
             return None

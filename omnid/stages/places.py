@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -107,6 +108,7 @@ class Places:
             T_keyframe_rig,
             scans,
             self._copied_keyframes(scans),
+            pose.is_known,
         )
 
     def finish(self) -> list[PlaceUpdate]:
@@ -120,6 +122,14 @@ class Places:
         if T_map_rect is None:
             return update.T_map_rig
         return np.asarray(self._T_rig_rect @ T_map_rect @ self._T_rect_rig @ update.T_keyframe_rig)
+
+    def known(self, updates: Sequence[PlaceUpdate]) -> NDArray[np.bool_]:
+        """Return at which of earlier poses (N,) it is known now where odom lay in the map that can be saved."""
+        all_ids, joined = self._localiser.places.keyframes, self.map().keyframes
+        return np.array(
+            [update.keyframe in joined or (update.keyframe not in all_ids and update.is_known) for update in updates],
+            np.bool_,
+        )
 
     def _copied_keyframes(self, scans: object) -> MapKeyframes:
         """Return the keyframes of the map; scans: the same object while the map stays."""

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from calib import se3
 from calib.rig_file import read_rig, write_rig
@@ -113,12 +114,21 @@ def test_a_map_that_stays_in_its_file_gives_the_same_poses_and_is_not_extended_b
 
 
 def test_what_is_not_recognised_is_left_out_with_a_warning(
-    omnid: Command, scene: Path, elsewhere: Path, omap: Path
+    omnid: Command, scene: Path, elsewhere: Path, omap: Path, tmp_path: Path
 ) -> None:
-    before = omap.read_bytes()
-    result = omnid.replay(elsewhere / "log.mcap", "--map", omap, rig=scene / "rig.toml")
+    """No pose in the map is written, and no transform from it, as neither could say that the robot may be anywhere."""
+    before, log = omap.read_bytes(), tmp_path / "out.mcap"
+    files = ("--map-tum", tmp_path / "m", "--map-live-tum", tmp_path / "l", "--record", log)
+    for path in (tmp_path / "m", tmp_path / "l"):
+        path.write_text("1 0 0 0 0 0 0 1")  # of an earlier run
+    result = omnid.replay(elsewhere / "log.mcap", "--map", omap, *files, rig=scene / "rig.toml")
     assert result.code == 0 and result.count("loops") == 0
     assert f"{omap}: no place of it was recognised" in result.err and omap.read_bytes() == before
+    assert not (tmp_path / "m").read_bytes() and not (tmp_path / "l").read_bytes()
+    assert result.err.count("poses are left out") == 2
+    with log.open("rb") as file:
+        topics = [channel.topic for _, channel, message in make_reader(file).iter_messages() if b"map" in message.data]
+    assert "/omnid/map_pose" in topics and "/tf" not in topics and "/omnid/map" not in topics
 
 
 def test_build_extends_a_map(omnid: Command, scene: Path, omap: Path) -> None:

@@ -33,6 +33,12 @@ LIMITS: Final = (-20, 35)
 OCCUPIED_FROM: Final = 14
 # ... and free from two misses on, because a false match may let a single view pass through a wall.
 FREE_UNTIL: Final = -8
+# A cell is free only by views from this near, because farther ones pass over what is low: a box 12 cm high is seen up
+# to 3 m, by the usual tilt. Farther ones clear what has gone, so that it is unknown.
+FREE_M: Final = 3.0
+# From this far on a cell is free only where a view has seen through the whole of it, so that what is narrower than a
+# cell and shows no range, as a plain pole, is unknown; nearer is the base itself. By trial on a development seed.
+WHOLE_M: Final = 0.5
 # Factor [1/m] of the squared range: the free space ends by this much before the obstacle, as the noise of stereo grows.
 SHORTER: Final = 0.02
 # Sectors to each side whose nearest range ends the free space, because an edge may be measured that far off.
@@ -52,7 +58,7 @@ class ScanGrid:
         self._first = np.floor(low / cell_m)
         width, height = (np.floor(high / cell_m) - self._first + 1).astype(int)
         self._odds = np.zeros((height, width), np.int8)
-        self._seen = np.zeros((height, width), bool)
+        self._near_odds = np.zeros((height, width), np.int8)  # the same, without what only far views have seen through
 
     def add(self, scan: RangeScan, x_m: float, y_m: float, yaw_rad: float) -> None:
         """Add a scan (SECTORS,) whose frame has this pose in the map."""
@@ -66,21 +72,21 @@ class ScanGrid:
         if window is None:
             return
         left, top, right, bottom = window
-        odds, seen = self._odds[top:bottom, left:right], self._seen[top:bottom, left:right]
-        free, hit = np.zeros(odds.shape, np.uint8), np.zeros(odds.shape, np.uint8)
-        # 2. The free space: a polygon through the shortened ranges. A sector without a range has its corner at the
-        # robot, so that nothing becomes free there. OpenCV has integers at the middles of cells, hence the 0.5.
+        part = slice(top, bottom), slice(left, right)
+        # 2. The free space ends before the nearest range of some neighbours; a sector without a range has none.
         ranges = np.where(known, scan, np.inf)
         neighbours = [np.roll(ranges, shift) for shift in range(-EDGE_SECTORS, EDGE_SECTORS + 1)]
         nearest = np.where(known, np.min(neighbours, axis=0), 0.0)
         seen_through = np.maximum(nearest - self._cell_m - SHORTER * nearest**2, 0.0)
-        corners = np.rint((centre + seen_through[:, None] * direction - [left, top] - 0.5) * 2**SHIFT).astype(np.int32)
-        cv2.fillPoly(free, [corners], 1, shift=SHIFT)
         # 3. The obstacles, and the sum of both; a cell with an obstacle is not free.
+        hit = np.zeros(self._odds[part].shape, np.uint8)
         _draw_hits(hit, scan, ends - [left, top])
-        change = np.where(hit > 0, HIT, -MISS * free.astype(np.int8)).astype(np.int8)
-        np.clip(odds + change, *LIMITS, out=odds)
-        seen |= (hit | free) > 0
+        middle, near = centre - [left, top], WHOLE_M / self._cell_m
+        for odds, far_m in ((self._odds[part], np.inf), (self._near_odds[part], FREE_M)):
+            seen = middle + np.minimum(seen_through, far_m)[:, None] * direction
+            free = _free(odds.shape, middle, seen, near)
+            change = np.where(hit > 0, HIT, -MISS * free.astype(np.int8)).astype(np.int8)
+            np.clip(odds + change, *LIMITS, out=odds)
 
     def grid(self) -> Grid:
         """Return the occupied, free and unknown cells.
@@ -88,9 +94,9 @@ class ScanGrid:
         A cell next to an occupied one is never free, because an obstacle is known to a cell only.
         """
         cells = np.full(self._odds.shape, UNKNOWN, np.int8)
-        is_occupied = self._seen & (self._odds >= OCCUPIED_FROM)
+        is_occupied = self._odds >= OCCUPIED_FROM
         near = cv2.dilate(is_occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        cells[self._seen & (self._odds <= FREE_UNTIL) & ~near] = FREE
+        cells[(np.maximum(self._odds, self._near_odds) <= FREE_UNTIL) & ~near] = FREE
         cells[is_occupied] = OCCUPIED
         x, y = (self._first * self._cell_m).tolist()
         return Grid(cells, self._cell_m, (x, y))
@@ -116,6 +122,20 @@ def scan_grid(scans: Sequence[RangeScan], poses: Array, cell_m: float) -> Grid:
 def reach_m(scan: NDArray[np.floating]) -> float:
     """Return the largest known range of a scan [m], 0 without one."""
     return float(np.max(scan, where=np.isfinite(scan), initial=0.0))
+
+
+def _free(shape: tuple[int, ...], centre: Array, ends: Array, near: float) -> NDArray[np.uint8]:
+    """Return the cells that a view from `centre` (2,) has seen through, up to `ends` (SECTORS, 2): 1, else 0.
+
+    The cells are whole ones from `near` on; all lengths in cells. OpenCV has integers at the middles of cells.
+    """
+    corners, middle = (np.rint((at - 0.5) * 2**SHIFT).astype(np.int32) for at in (ends, centre))
+    free, outline = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    cv2.fillPoly(free, [corners], 1, shift=SHIFT)
+    # Of the cells below the polygon's outline, a part was not seen through.
+    cv2.polylines(outline, [corners], True, 1, shift=SHIFT)
+    cv2.circle(outline, middle.tolist(), round(near * 2**SHIFT), 0, cv2.FILLED, shift=SHIFT)
+    return np.where(outline, np.uint8(0), free)
 
 
 def _draw_hits(hit: NDArray[np.uint8], scan: RangeScan, ends: Array) -> None:

@@ -23,7 +23,7 @@ from omnid.core.navigation.local_planner import Detour, LocalPlanner
 from omnid.core.navigation.path import DrivePath
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import NOWHERE, Situation, refusal_of_map, refusal_to_drive
+from omnid.core.navigation.situation import NOWHERE, UNKNOWN_M, Situation, refusal_of_map, refusal_to_drive
 from omnid.navigation_state import NavigationState
 from omnid.tracking_state import MapState, TrackingState
 
@@ -187,6 +187,8 @@ class Navigator:
             return
         if in_map.state is MapState.LOCALIZED and in_map.sigma_m <= self._settings.map_sigma_m:
             drive.unlocalised_m, drive.localised_ns = 0.0, in_map.stamp_ns
+        elif in_map.sigma_m > UNKNOWN_M:
+            drive.unlocalised_m = math.inf
 
     def _halt(self, drive: Drive, now: Situation) -> tuple[NavigationState, str] | None:
         """Return why the base must wait at this pose."""

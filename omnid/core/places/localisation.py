@@ -44,6 +44,8 @@ TIES: Final = 50  # newest keyframes that are kept where the map stays as it is,
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
 TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
+# After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
+CONTRADICTIONS: Final = 10
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
 
 
@@ -74,7 +76,7 @@ class MapLocaliser:
         self._newest: PlaceKeyframe | None = None  # newest keyframe of this part, placed by odometry
         self._T_map_odom = np.eye(4)
         self._resets = 0
-        self._path_m = 0.0
+        self._path_m = self._confirmed_m = 0.0  # m: the path, and that at the last search before contradictions
         self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
         self._by_tag = False  # it was a tag, which gives the pose less exactly than a view
@@ -93,8 +95,7 @@ class MapLocaliser:
             self._newest, frame.stamp_ns, frame.T_odom_rect, has_depth=frame.is_keyframe
         )
         if is_keyframe or self._search_is_due(frame):
-            small = thumbnail(frame.stereo.lower)
-            features = describe(frame.stereo)
+            small, features = thumbnail(frame.stereo.lower), describe(frame.stereo)
             # 1. Recognise: a shortlist by signatures, matches, RANSAC, Gauss-Newton; not what is ambiguous.
             tags = self._tags.find(frame.stereo) if self._tags else []
             found = self._recognise(frame, small, features, tags)
@@ -139,14 +140,8 @@ class MapLocaliser:
 
         Of a map that stays as it is, its own ones only.
         """
-        now = (
-            self.places.next_id,
-            len(self.places),
-            self._parts.current,
-            len(self._parts),
-            self.correction.optimisations,
-            len(self.places.links),
-        )
+        sizes = len(self.places), len(self.places.links), len(self._parts)
+        now = (self.places.next_id, self._parts.current, self.correction.optimisations, *sizes)
         if self._scans is None or self._scans[0] != now:
             shown = self._fixed if self._is_in_fixed else FixedPlaces(self.places, sorted(self._parts.ids()))
             loops = tuple((link.a, link.b) for link in self.places.links if link.is_loop)
@@ -154,12 +149,17 @@ class MapLocaliser:
         return self._scans[1]
 
     def _advance(self, frame: OdometryFrame) -> None:
-        """Sum up the path; after a gap of unknown motion begin a new part of the map."""
+        """Sum up the path; after a gap of unknown motion, noticed or not, begin a new part of the map."""
         if self._last_T is not None:
             self._path_m += length_m(se3.inverse(self._last_T) @ frame.T_odom_rect)
         self._last_T = frame.T_odom_rect
-        if frame.resets != self._resets:
-            self._resets = frame.resets
+        is_wrong = self.search.contradicted >= CONTRADICTIONS
+        if is_wrong:  # and so are the keyframes since the first contradiction
+            for id in [id for id, at_m in self._path_at.items() if at_m > self._confirmed_m]:
+                self.places.drop(id)
+            self._forget_dropped()
+        if frame.resets != self._resets or is_wrong:
+            self._resets, self.search.contradicted = frame.resets, 0
             self._hypotheses.clear()
             self._newest, self._recognised_at = None, None
             self._schedule.restart()
@@ -191,6 +191,7 @@ class MapLocaliser:
         self._schedule.begin(frame.stamp_ns, frame.T_odom_rect)
         expected = self._expected(frame)
         found = self.search.near(small, features, self.places, expected)
+        self._confirmed_m = self._confirmed_m if self.search.contradicted else self._path_m
         if found is None and (far := self._elsewhere()):
             by_scan = None if self._by_scan is None else self._by_scan.T_map_rect(frame.T_odom_rect)
             found = self.search.far(small, features, self.places, far, by_scan)
@@ -217,8 +218,7 @@ class MapLocaliser:
         """Return the poses (4, 4) in the map that the last search suggests for a frame, ambiguous ones too."""
         if not self._schedule.has_searched:
             return []
-        since = self._schedule.motion_since(frame.T_odom_rect)
-        return [T @ since for T in self.search.proposed(self.places.poses)]
+        return [T @ self._schedule.motion_since(frame.T_odom_rect) for T in self.search.proposed(self.places.poses)]
 
     def _expected(self, frame: OdometryFrame) -> Expected:
         """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""

@@ -41,3 +41,8 @@ class MapPose:
     state: MapState
     keyframe: int  # id of the newest keyframe of the run; NO_KEYFRAME: none since the last gap
     T_keyframe_rect: Array  # (4, 4) pose of the frame in that keyframe by odometry; the identity where there is none
+
+    @property
+    def is_known(self) -> bool:
+        """True if it is known where odom lies in the map."""
+        return self.covariance is not UNKNOWN_PLACE

@@ -59,6 +59,7 @@ class PlaceSearch:
         self._signatures: dict[int, Signature] = {}
         self.ambiguous = 0  # frames that fit two places equally well
         self.refused = 0  # recognitions that odometry contradicts
+        self.contradicted = 0  # the newest of them, without one that odometry confirms in between
         self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
         self._seen: list[Recognition] = []  # recognitions of the last search, whether they count or not
 
@@ -75,7 +76,10 @@ class PlaceSearch:
         best = self._unambiguous(found, places.poses)
         if best is not None and not _is_expected(best, places.poses, expected):
             self.refused += 1
+            self.contradicted += 1
             return None
+        if best is not None:
+            self.contradicted = 0
         return best
 
     def far(

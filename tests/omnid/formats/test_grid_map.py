@@ -44,3 +44,12 @@ def test_a_name_that_is_no_text_is_refused_before_anything_is_written(tmp_path: 
     ) as refused:
         write_grid(tmp_path / name, Grid(CELLS, 0.05, (0.0, 0.0)))
     assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
+
+
+def test_a_map_that_cannot_be_written_whole_leaves_the_old_image(tmp_path: Path) -> None:
+    """Its text tells where it lies."""
+    (tmp_path / "place.pgm").write_bytes(b"old")
+    (tmp_path / "place.yaml").mkdir()
+    with pytest.raises(OmnidError, match="cannot write the map"):
+        write_grid(tmp_path / "place.yaml", Grid(CELLS, 0.05, (0.0, 0.0)))
+    assert (tmp_path / "place.pgm").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 2

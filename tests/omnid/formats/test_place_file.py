@@ -174,6 +174,12 @@ def test_a_cut_map_is_refused(tmp_path: Path, size: int) -> None:
         read_places(path)
 
 
+def test_a_pipe_without_a_writer_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "place.omap")
+    with pytest.raises(OmnidError, match=r"expected a map of places \(\.omap\), found a pipe: name a file"):
+        read_places(tmp_path / "place.omap")
+
+
 def test_foreign_files_are_refused(tmp_path: Path) -> None:
     write_ply(tmp_path / "map.ply", some_points(1000))
     other = sqlite3.connect(tmp_path / "other.db")

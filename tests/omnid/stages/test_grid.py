@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from omnid.core.mapping.keyframe_grid import KeyframeScans
@@ -50,3 +52,11 @@ def test_nothing_is_drawn_while_the_computer_is_too_slow() -> None:
     assert given(stage, [update(k, scans(k)) for k in range(1, 5)]) == []
     slow[0] = False
     assert given(stage, [update(6, scans(6))]) == [6]
+
+
+def test_scans_of_unknown_place_are_not_drawn_into_the_map() -> None:
+    """Of a saved map, or after a gap, until a place is recognised; the last grid stays."""
+    stage = MapGrid(0.05, np.eye(4), every_s=1.0)
+    known, elsewhere = update(2, scans(1)), replace(update(4, scans(2)), is_known=False)
+    assert given(stage, [known, elsewhere]) == [2] and stage.finish() == []
+    assert given(stage, [update(6, scans(3))]) == [6]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
-from omnid.core.mapping.range_scan import SECTORS
+from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.mapping.scan_grid import MAX_CELLS, scan_grid
 from tests.omnid.core.mapping.rooms import box, pose, scan_of
 
@@ -30,7 +30,8 @@ def test_walls_are_occupied_the_room_is_free_the_rest_unknown() -> None:
     grid = scan_grid([scan_of(ROOM, T, 0.01, n) for n, T in enumerate(PATH)], PATH, 0.05)
     for y in np.arange(-1.9, 2.4, 0.1):
         assert OCCUPIED in near(grid, -3.0, y) and OCCUPIED in near(grid, 4.0, y)
-        assert {at(grid, x, y) for x in np.arange(-2.7, 3.7, 0.1)} == {FREE} or abs(y - 0.25) > 1.9
+        # Both last views are within FREE_M of x = 3.1.
+        assert {at(grid, x, y) for x in np.arange(-2.7, 3.15, 0.1)} == {FREE} or abs(y - 0.25) > 1.9
         assert at(grid, -3.3, y) == at(grid, 4.3, y) == UNKNOWN
 
 
@@ -57,6 +58,32 @@ def test_space_is_free_when_two_views_have_seen_through_it() -> None:
     scan = scan_of(ROOM, T[0])
     assert at(scan_grid([scan], T[:1], 0.05), 1.0, 0.0) == UNKNOWN
     assert at(scan_grid([scan] * 2, T, 0.05), 1.0, 0.0) == FREE
+
+
+def test_a_low_box_that_only_near_views_show_is_free_nowhere() -> None:
+    """From 3 m on the scan passes over it, and over the space behind its front."""
+    path = np.array([pose(x, 0, 0) for x in np.arange(-2.5, 7.0, 0.3)])
+    walls = box((-3.5, -2.0), (8.0, 2.0))
+    seen = np.concatenate([walls, box((0.0, 1.0), (0.4, 1.4))])
+    scans = [scan_of(seen if np.hypot(T[0, 3] - 0.2, 1.2) < 3.3 else walls, T) for T in path]
+    grid = scan_grid(scans, path, 0.05)
+    inside = {at(grid, x, y) for x in np.arange(0.02, 0.4, 0.05) for y in np.arange(1.02, 1.4, 0.05)}
+    assert FREE not in inside and {at(grid, x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
+
+
+def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
+    """A plain pole shows no range: those beside it pass it by half a cell."""
+    path = np.array([pose(x, 0, 0) for x in np.arange(-1.5, 1.5, 0.3)])
+    scans = []
+    for T in path:
+        scan = scan_of(ROOM, T)
+        off = np.arctan2(1.0, 0.2 - T[0, 3]) - azimuths()
+        scan[np.abs(off) < np.arctan2(0.02, np.hypot(1.0, 0.2 - T[0, 3])) + np.deg2rad(0.5)] = np.nan
+        scans.append(scan)
+    for cell_m in (0.02, 0.05):
+        grid = scan_grid(scans, path, cell_m)
+        assert FREE not in {at(grid, 0.2 + dx, 1.0 + dy) for dx in (-0.01, 0.01) for dy in (-0.01, 0.01)}
+        assert at(grid, 0.2, 0.5) == at(grid, 0.2, 0.0) == FREE
 
 
 def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:

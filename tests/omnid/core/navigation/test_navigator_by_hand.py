@@ -60,6 +60,15 @@ class Steps:
         return self.navigator.step(self.at(x_m, y_m, step_s, **change))
 
 
+def test_a_drive_in_the_map_stands_at_once_where_its_place_there_turns_out_to_be_unknown() -> None:
+    """As where places contradict odometry; the way by odometry alone is for a robot that was right so far."""
+    steps = Steps(NavigationFrame.MAP)
+    assert steps.step(0.1, in_map=UNLOCALISED).state is NavigationState.DRIVING
+    answer = steps.step(0.2, in_map=UNLOCALISED._replace(sigma_m=1000.0))
+    assert answer.state is NavigationState.NOT_LOCALISED and answer.setpoint == STAND
+    assert steps.step(0.3).state is NavigationState.DRIVING
+
+
 def test_a_gap_between_two_poses_counts_as_one_second_and_a_step_back_in_time_as_none() -> None:
     steps = Steps()
     for _ in range(4):
