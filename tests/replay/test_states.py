@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,18 @@ def test_another_scene_after_the_darkness(omnid: Command, tmp_path: Path, scene:
     assert found[-1] == ("tracking", 1)
     last = recorded(tmp_path / "out.mcap")[-1]
     assert np.sqrt(np.trace(last.covariance[:3, :3])) > 0.5  # the gap stays in the covariance
+
+
+def test_cameras_that_are_exchanged_on_the_way(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """The lower camera alone tracks on, 0.2 m too high, and stereo of exchanged images finds points by chance."""
+    other = {"lower": "upper", "upper": "lower"}
+    taken = [p if p.pair < 6 else replace(p, camera=other[p.camera]) for p in images(scene / "log.mcap")]
+    log = save(tmp_path / "log.mcap", taken)
+    result = omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")
+    assert "after the pose was lost, the images match better the other way round" in result.err
+    found = states(tmp_path / "out.mcap")
+    assert found[0] == ("tracking", 0) and "lost" in dict(found)
+    assert "tracking" not in dict(found[1:])
 
 
 def test_bricks_of_several_sizes_do_not_mislead(tmp_path: Path) -> None:
