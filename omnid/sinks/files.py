@@ -84,9 +84,7 @@ def _require_writable(option: str, path: Path) -> None:
     except OSError as error:
         raise OmnidError(f"{option} {path}: cannot be written: {error.strerror or error}; name another file") from error
     if is_locked(path):
-        raise OmnidError(
-            f"{option} {path}: another program is writing this file; name another one, or wait for its end"
-        )
+        raise OmnidError(f"{option} {path}: another program is writing it; name another file, or wait")
 
 
 def _require_file(option: str, path: Path) -> None:

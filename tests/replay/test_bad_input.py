@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.logs.mcap_writer import McapWriter
+from drivers.logs.mcap_writer import LogWriter
 from omnid.sinks.files import check_outputs, write_trajectory
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import Entry, text, write_log
@@ -209,10 +209,10 @@ def test_a_file_that_another_run_writes_is_no_output(omnid: Command, tmp_path: P
 
     def poses() -> Iterator[NDArray[np.float64]]:
         yield np.eye(4)
-        assert all("another program is writing this file" in error for error in errors())
+        assert all("another program is writing it" in error for error in errors())
         yield np.eye(4)
 
-    with McapWriter(mcap):
+    with LogWriter(mcap):
         write_trajectory(tum, np.arange(2), poses())  # type: ignore[arg-type]
     assert len(rows(tum)) == 2 and omnid("log", "info", mcap).code == 0
     assert omnid.replay(scene / "log.mcap", "--tum", tum, "--seconds", 0.1, rig=scene / "rig.toml").code == 0
