@@ -25,7 +25,7 @@ LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
 # Brightness of one panorama by the other's, above which nothing is changed: at 0.88 poses are as exact as at 1, at 0.85
 # they were degraded, at 0.8 lost.
 SAME_BRIGHTNESS = 0.87
-SECTORS = 24  # of azimuth, whose median brightness counts: a hand before one camera covers fewer than half of them
+SECTORS = 24  # of azimuth; three quarters of them must differ, as a hand before one camera does not cover so many
 MAX_GAIN = 8.0  # Largest gain of 8 bit images: more only magnifies their steps.
 # Noise is the difference of two Gaussian blurs in the smoothest blocks: texture is stronger than noise elsewhere.
 FINE_PX, COARSE_PX = 0.8, 1.6
@@ -79,10 +79,10 @@ def pair_gains(lower: Image, upper: Image, visible: Flags, gains: tuple[float, f
     """
     of_lower, of_upper = (gain * _sector_levels(one, visible) for one, gain in zip((lower, upper), gains, strict=True))
     known = (of_lower > 0) & (of_upper > 0)
-    ratio = float(np.median(of_lower[known] / of_upper[known])) if known.any() else 1.0
-    if SAME_BRIGHTNESS <= ratio <= 1 / SAME_BRIGHTNESS:
+    least, ratio, most = np.percentile(of_lower[known] / of_upper[known], (25, 50, 75)) if known.any() else (1.0,) * 3
+    if most >= SAME_BRIGHTNESS and least <= 1 / SAME_BRIGHTNESS:
         return gains
-    return min(MAX_GAIN, gains[0] / min(1.0, ratio)), min(MAX_GAIN, gains[1] * max(1.0, ratio))
+    return float(min(MAX_GAIN, gains[0] / min(1.0, ratio))), float(min(MAX_GAIN, gains[1] * max(1.0, ratio)))
 
 
 def _sector_levels(panorama: Image, visible: Flags) -> NDArray[np.float32]:

@@ -66,6 +66,9 @@ def test_the_dimmer_panorama_of_a_pair_becomes_as_bright_as_the_other(share: flo
     assert pair_gains(*pair, EVERYWHERE, (1.5, 1.5 / share)) == (1.5, 1.5 / share)
     pair[1][:, : SHAPE[1] // 3] = 5
     assert pair_gains(*pair, EVERYWHERE, (1.0, 1.0)) == pytest.approx(gains, rel=0.03)
+    # Two thirds behind it leave no more than a third that shows the brightness.
+    pair[1][:, : 2 * SHAPE[1] // 3] = 5
+    assert share < 0.9 or pair_gains(*pair, EVERYWHERE, (1.0, 1.0)) == (1.0, 1.0)
 
 
 def test_the_gain_of_a_covered_camera_is_bounded() -> None:
