@@ -154,7 +154,7 @@ class LogReader:
         self._fault = ""  # of the first message without a valid image
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
         self._other_joints = 0  # messages of joints without the wheels
-        self._has_wheels = False
+        self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, wheels and gyro
 
     def _image(self, logged: LoggedImage) -> RosImage | None:
         """Return an image, None of a broken one.
@@ -168,7 +168,9 @@ class LogReader:
             self._fault = self._fault or str(error)
             return None
         self.counts["unstamped"] += not image.stamp_ns and logged.log_time_ns != 0
-        return replace(image, stamp_ns=image.stamp_ns or logged.log_time_ns, data=memoryview(bytes(image.data)))
+        stamp_ns = image.stamp_ns or logged.log_time_ns
+        self._widen("images", stamp_ns)
+        return replace(image, stamp_ns=stamp_ns, data=memoryview(bytes(image.data)))
 
     def _sample(self, logged: LoggedMotion) -> MotionSample | None:
         """Return a sample, None of a broken one."""
@@ -178,12 +180,28 @@ class LogReader:
                 self._other_joints += 1
                 return None
             sample = reading.sample(logged.log_time_ns)
-            self._has_wheels = self._has_wheels or isinstance(sample, WheelSample)
+            self._widen("wheels" if isinstance(sample, WheelSample) else "gyro", sample.stamp_ns)
             return sample
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken_motion"] += 1
             self._motion_fault = self._motion_fault or str(error)
             return None
+
+    def _widen(self, what: str, stamp_ns: int) -> None:
+        first_ns, last_ns = self._spans.get(what, (stamp_ns, stamp_ns))
+        self._spans[what] = min(first_ns, stamp_ns), max(last_ns, stamp_ns)
+
+    def _of_another_clock(self) -> Iterator[str]:
+        """Yield a warning for wheels or gyro none of whose samples lies between the images."""
+        images = self._spans.get("images")
+        for what in ("wheels", "gyro"):
+            span = self._spans.get(what)
+            if images and span and (span[0] > images[1] or span[1] < images[0]):
+                apart_s = 1e-9 * (span[0] - images[0])
+                yield (
+                    f"no sample of the {what} is used: they begin {abs(apart_s):.1f} s "
+                    f"{'after' if apart_s > 0 else 'before'} the images by their stamps: are these of another clock?"
+                )
 
     def _report(self) -> None:
         damage = self._log.damage()
@@ -191,10 +209,11 @@ class LogReader:
         self.truncated = bool(damage.cut)
         if damage.cut:
             self.warnings.append(damage.cut)
-        self.counts["no_joints"] = 0 if self._has_wheels else self._other_joints
+        self.counts["no_joints"] = 0 if "wheels" in self._spans else self._other_joints
         found = {name: text for name, text in _WARNINGS.items() if self.counts[name]}
         faults = {"fault": self._fault, "motion_fault": self._motion_fault}
         self.warnings += [text.format(self.counts[name], **faults) for name, text in found.items()]
+        self.warnings += self._of_another_clock()
 
 
 class _Samples:

@@ -38,6 +38,8 @@ _OTHER_FORMATS = {  # first bytes -> advice
     b"SQLite f": f"part of an SQLite bag: {_CONVERT.format('ITS_FOLDER')}",
     b"#ROSBAG ": f"a ROS 1 bag: {_CONVERT.format('FILE')}",
     b"\x28\xb5\x2f\xfd": "a zstd-compressed file: unpack it with `zstd -d`",
+    b"\x1f\x8b": "a gzip-compressed file: unpack it with `gzip -d`, or `tar -xf` where it is an archive",
+    b"PK\x03\x04": "a zip archive: unpack it with `unzip`",
 }
 
 

@@ -59,9 +59,13 @@ def recover(path: str | os.PathLike[str], out: str | os.PathLike[str]) -> Recove
         raise DriverError(f"cannot recover {str(path)!r}: it is being written; stop the recording first")
     file = LogFile(path)
     try:
-        with _created(Path(out)) as target:
+        target = _created(Path(out))
+        try:
             lock(target)
             return _written(file, target, Path(out))
+        finally:
+            with suppress(OSError):  # of a file that a full disk has ended; a complete one has reached the disk
+                target.close()
     finally:
         file.close()
 

@@ -116,6 +116,8 @@ def _options(args: argparse.Namespace) -> BatchOptions:
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
     """Keep other batches out of a folder, which is created."""
+    if out.exists() and not out.is_dir():
+        raise OmnidError(f"batch: --out {str(out)!r}: expected a folder for the results, found a file")
     out.mkdir(parents=True, exist_ok=True)
     with (out / LOCK_FILE).open("wb") as file:
         try:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.logs.file_lock import is_locked, lock
 from drivers.logs.image_folder import IMAGE_SUFFIXES, STAMP_FILES
 from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
@@ -33,7 +34,7 @@ FORMATS: Final = {*SUFFIXES.values(), ".txt", ".tum", ".csv", ".json", ".jpg", "
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
-    """Check that all outputs (option, path) can be written and none is another one or an input (name, path).
+    """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
 
     Of an input that is a folder, what is read in it and in its folders counts as well. Raises OmnidError.
     """
@@ -82,6 +83,8 @@ def _require_writable(option: str, path: Path) -> None:
         _try_to_open(path)
     except OSError as error:
         raise OmnidError(f"{option} {path}: cannot be written: {error.strerror or error}; name another file") from error
+    if is_locked(path):
+        raise OmnidError(f"{option} {path}: another program is writing it; name another file, or wait")
 
 
 def _require_file(option: str, path: Path) -> None:
@@ -173,6 +176,7 @@ class _TumFile:
     def _append(self, row: bytes) -> None:
         if self._file is None:
             self._file = self._path.open("wb", buffering=0)
+            lock(self._file)
         try:
             written = self._file.write(row)
             while written < len(row):  # a full disk takes a part of the row, then nothing

@@ -14,7 +14,7 @@ from calib.panorama import Maps, remap_tables, visible
 from drivers.jpeg import Steps
 from omnid.camera_config import TimingConfig
 from omnid.config import PanoramaConfig
-from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma
+from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma, pair_gains
 from omnid.core.stereo.tiles import Side, TileMonitor, tile_columns
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import PixelTimes
@@ -53,31 +53,48 @@ class Dewarp:
         """Return the panoramas of a pair."""
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
-        lower, lower_light, lower_grey = self._panorama(pair.lower, pair.steps[0], self._lower, "lower", measured)
-        upper, upper_light, upper_grey = self._panorama(pair.upper, pair.steps[1], self._upper, "upper", measured)
+        lower, lower_light = self._remapped(pair.lower, self._lower, "lower", measured)
+        upper, upper_light = self._remapped(pair.upper, self._upper, "upper", measured)
+        lower_grey, upper_grey = self._inner(lower), self._inner(upper)
+        by_level = gain_of(lower_light.level_grey), gain_of(upper_light.level_grey)
+        lower_gain, upper_gain = pair_gains(lower_grey, upper_grey, self._visible, by_level)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
         times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
         tiles = self._tiles.update(pair.stamp_ns, {"lower": lower_grey, "upper": upper_grey}, self._noise_grey)
-        return Panoramas(pair.seq, pair.stamp_ns, lower, upper, self._visible, times, dimmer, pair.motion, tiles)
+        return Panoramas(
+            pair.seq,
+            pair.stamp_ns,
+            self._padded(lower, lower_gain, "lower", pair.steps[0]),
+            self._padded(upper, upper_gain, "upper", pair.steps[1]),
+            self._visible,
+            times,
+            dimmer,
+            pair.motion,
+            tiles,
+        )
 
-    def _panorama(
-        self, image: NDArray[np.uint8], steps: Steps, maps: Maps, camera: Side, measured: bool
-    ) -> tuple[PaddedPanorama, Light, NDArray[np.uint8]]:
-        """Return a panorama, brightened if it is dim, its light, and (H, W) as the camera gave it.
+    def _remapped(
+        self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
+    ) -> tuple[NDArray[np.uint8], Light]:
+        """Return a panorama with its padding, as the camera gave it, and its light.
 
-        steps: of the quantisation of its JPEG; measured: measure the noise of this camera again.
+        measured: measure the noise of this camera again.
         """
         smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
         remapped = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
-        inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
+        inner = self._inner(remapped)
         if measured:
             self._noise_grey[camera] = noise_sigma(inner, self._visible)
-        noise_grey = self._noise_grey[camera]
-        found = light(inner, self._visible, noise_grey)
-        gain = gain_of(found.level_grey)
-        bright = brightened(remapped, gain)
-        padded = PaddedPanorama(bright, self._pad_px, gain * noise_grey, gain, *self._sector, steps)
-        return padded, found, inner
+        return remapped, light(inner, self._visible, self._noise_grey[camera])
+
+    def _inner(self, remapped: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return a panorama (H, W) without its padding."""
+        return np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
+
+    def _padded(self, remapped: NDArray[np.uint8], gain: float, camera: Side, steps: Steps) -> PaddedPanorama:
+        """Return a panorama multiplied by a gain; steps: of the quantisation of its JPEG."""
+        noise_grey = gain * self._noise_grey[camera]
+        return PaddedPanorama(brightened(remapped, gain), self._pad_px, noise_grey, gain, *self._sector, steps)
 
 
 class _Tables(NamedTuple):

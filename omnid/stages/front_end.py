@@ -42,11 +42,12 @@ class FrontEnd:
 
 
 class CheckedOdometry:
-    """Odometry of a rig that its images do not contradict: the first pairs are checked before their poses."""
+    """Odometry of a rig that its images do not contradict: the first pairs, and those after a loss, are checked."""
 
     def __init__(self, odometry: OdometryStage, health: RigHealth) -> None:
         self._odometry, self._health = odometry, health
         self._unchecked: StereoDepth | None = None  # the last pair, if it is to be checked with its motion
+        self._was_found = False  # whether a pose was tracked yet
 
     def process(self, panoramas: Panoramas) -> OdometryUpdate:
         """Return the pose at a pair; RigContradictedError where the images contradict the rig."""
@@ -61,6 +62,9 @@ class CheckedOdometry:
         # 2. Estimate the pose. With a rig that the images contradict it is degraded at best.
         update = self._odometry.process(panoramas)
         self._unchecked = update.depth if is_checking and not panoramas.times.is_at_once else None
+        self._was_found |= update.state is TrackingState.TRACKING
+        if self._was_found and update.state is TrackingState.LOST:
+            self._health.check_again()
         if is_contradicted and update.state is TrackingState.TRACKING:
             return replace(update, state=TrackingState.DEGRADED)
         return update

@@ -8,13 +8,16 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from omnid.sinks.files import check_outputs
+from drivers.logs.mcap_writer import LogWriter
+from omnid.sinks.files import check_outputs, write_trajectory
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import Entry, text, write_log
 from tests.replay.command import Command, rows
@@ -194,6 +197,25 @@ def test_outputs_must_differ_from_each_other_and_from_the_log(omnid: Command, tm
     assert "the log that is read" in omnid.refused("replay", log, "--record", scene / ".." / scene.name / "log.mcap")
     assert "--tum" in omnid.refused("replay", log, "--tum", tmp_path / "x", "--cloud", tmp_path / "x")
     assert log.read_bytes() == before
+
+
+def test_a_file_that_another_run_writes_is_no_output(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """Two runs with one file would leave a recording that neither can be read from."""
+    mcap, tum = tmp_path / "run.mcap", tmp_path / "run.txt"
+
+    def errors() -> Iterator[str]:
+        for option, path in (("--record", mcap), ("--tum", tum)):
+            yield omnid.refused("replay", scene / "log.mcap", "--rig", scene / "rig.toml", option, path)
+
+    def poses() -> Iterator[NDArray[np.float64]]:
+        yield np.eye(4)
+        assert all("another program is writing it" in error for error in errors())
+        yield np.eye(4)
+
+    with LogWriter(mcap):
+        write_trajectory(tum, np.arange(2), poses())  # type: ignore[arg-type]
+    assert len(rows(tum)) == 2 and omnid("log", "info", mcap).code == 0
+    assert omnid.replay(scene / "log.mcap", "--tum", tum, "--seconds", 0.1, rig=scene / "rig.toml").code == 0
 
 
 def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Path) -> None:

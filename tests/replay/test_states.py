@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -18,7 +20,7 @@ from omnid.transport.status_names import ODOMETRY
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import STORE
 from tests.replay.command import Command, rows
-from tests.replay.edited import dark, images, save
+from tests.replay.edited import Image, dark, images, save
 from tests.simulation import build, write_log
 
 DARK_PAIRS = 20  # pairs, 2 s
@@ -44,6 +46,12 @@ def states(path: Path) -> list[tuple[str, int]]:
 def errors_m(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     a, b = (se3.inverse(t.T[0]) @ t.T for t in (estimate, truth))
     return np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1)
+
+
+def halved(image: Image) -> Image:
+    """Return the image of a camera with half of the exposure."""
+    pixels = cv2.imdecode(np.frombuffer(image.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return replace(image, jpeg=cv2.imencode(".jpg", pixels // 2, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
 
 
 def test_a_camera_without_images_for_a_second(omnid: Command, tmp_path: Path, scene: Path) -> None:
@@ -84,6 +92,27 @@ def test_another_scene_after_the_darkness(omnid: Command, tmp_path: Path, scene:
     assert found[-1] == ("tracking", 1)
     last = recorded(tmp_path / "out.mcap")[-1]
     assert np.sqrt(np.trace(last.covariance[:3, :3])) > 0.5  # the gap stays in the covariance
+
+
+def test_cameras_that_are_exchanged_on_the_way(omnid: Command, tmp_path: Path, scene: Path) -> None:
+    """The lower camera alone tracks on, 0.2 m too high, and stereo of exchanged images finds points by chance."""
+    other = {"lower": "upper", "upper": "lower"}
+    taken = [p if p.pair < 6 else replace(p, camera=other[p.camera]) for p in images(scene / "log.mcap")]
+    log = save(tmp_path / "log.mcap", taken)
+    result = omnid.replay(log, "--record", tmp_path / "out.mcap", rig=scene / "rig.toml")
+    assert "after the pose was lost, the images match better the other way round" in result.err
+    found = states(tmp_path / "out.mcap")
+    assert found[0] == ("tracking", 0) and "lost" in dict(found)
+    assert "tracking" not in dict(found[1:])
+
+
+@pytest.mark.parametrize("camera", ["lower", "upper"])
+def test_a_camera_whose_images_are_half_as_bright(omnid: Command, tmp_path: Path, scene: Path, camera: str) -> None:
+    taken = [halved(p) if p.camera == camera else p for p in images(scene / "log.mcap")]
+    log = save(tmp_path / "log.mcap", taken)
+    omnid.replay(log, "--record", tmp_path / "out.mcap", "--tum", tmp_path / "est", rig=scene / "rig.toml")
+    assert states(tmp_path / "out.mcap") == [("tracking", 0)]
+    assert errors_m(read_tum(tmp_path / "est"), read_tum(scene / "truth.txt")).max() < 0.02
 
 
 def test_bricks_of_several_sizes_do_not_mislead(tmp_path: Path) -> None:

@@ -134,6 +134,23 @@ def test_broken_messages_and_topics_that_are_not_clear_are_reported(
         LogReader(log, motion=MotionTopics(wheels="/nothing"))
 
 
+@pytest.mark.parametrize(("shift_s", "words"), [(3600, "3600.0 s after"), (-3600, "3600.0 s before")])
+def test_sensors_with_another_clock_than_the_images_are_named(
+    scene: Path, samples: list[MotionSample], tmp_path: Path, shift_s: int, words: str
+) -> None:
+    def shifted(sample: MotionSample) -> Entry:
+        if isinstance(sample, WheelSample):
+            return entry(sample)
+        late = replace(sample, stamp_ns=sample.stamp_ns + shift_s * 10**9)
+        return entry(sample)._replace(data=entry(late).data)
+
+    reader = LogReader(saved(tmp_path / "log.mcap", scene, [*map(shifted, samples)]), motion=MotionTopics())
+    assert len(list(reader.frames())) == 2 * PAIRS
+    assert [line for line in reader.warnings if "is used" in line] == [
+        f"no sample of the gyro is used: they begin {words} the images by their stamps: are these of another clock?"
+    ]
+
+
 def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[MotionSample], tmp_path: Path) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     t = store.types

@@ -28,7 +28,7 @@ COARSE_ROWS: Final = 17  # Rows of the coarse mean, which is taken twice: like a
 TEXTURE_SHARE: Final = 0.3  # Difference between two views of a surface, by the local contrast; noise is added to it.
 CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
-# of 960 px 0.36 to 0.53 (test_pair_views.py). With 0.35, by trial, bases stood before free floor in dim or noisy images.
+# of 960 px 0.36 to 0.53 (test_pair_views.py). With 0.35, by trial, bases stood before free floor in noisy images.
 BAND_NOISE: Final = 0.65
 # Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows: the
 # smoothing halves those above. A coarser panorama shows fewer.

@@ -49,6 +49,7 @@ class PoseEstimate:
     runner_up: Array | None = None  # (6,) [t; r] of the step to a pose that explains the images nearly as well
     # (K,) rows of the local map whose landmarks support that pose instead
     contradicting: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    upper_ratio: float = 1.0  # share of the inliers among the tracks that the upper panorama shows where they must be
 
     @property
     def spread(self) -> Array:
@@ -71,6 +72,14 @@ class PoseEstimate:
     def inlier_ratio(self) -> float:
         """Share of the tracked landmarks that are inliers."""
         return self.inliers / max(1, self.tracked)
+
+    @property
+    def least_ratio(self) -> float:
+        """The inlier ratio, or the share in the upper panorama if that is smaller.
+
+        The lower camera alone would confirm the pose of images that were not taken at one time, or are exchanged.
+        """
+        return min(self.inlier_ratio, self.upper_ratio)
 
 
 @dataclass(frozen=True, slots=True)

@@ -171,6 +171,7 @@ class FrameToMap:
             assumed,
             _cost(solution.squared[solution.squared < OUTLIER_SQUARED], in_view),
             in_view,
+            upper_ratio=_upper_ratio(frame, coarse),
         )
 
     def refine_recognised(
@@ -263,6 +264,16 @@ class FrameToMap:
             squared[kept] = solution.squared
             kept = squared < OUTLIER_SQUARED
         return (solution if kept.sum() >= MIN_LANDMARKS else None), kept
+
+
+def _upper_ratio(frame: StereoFrame, coarse: CoarsePose) -> float:
+    """Return the share of the inliers among the tracks that were found in the upper panorama.
+
+    Where the cameras expose at several times it is 1: an acceleration that is not known hides rows as well.
+    """
+    if not frame.times.is_at_once or not len(coarse.disparity):
+        return 1.0
+    return float(np.isfinite(coarse.disparity).mean())
 
 
 def _cost(squared: Array, in_view: int) -> float:

@@ -22,10 +22,20 @@ class OdometryLimits:
     keyframes: int = knob(8, "keyframes in the local map; 1: frame to frame", low=1, high=50)
     min_inliers: int = knob(20, "inliers below which a pose is refused", low=4, high=10_000)
     min_inlier_ratio: float = knob(
-        0.4, "inliers, as a share of the tracked landmarks, below which a pose is refused", low=0, high=1
+        0.4,
+        "inliers, as a share of the tracked landmarks, below which a pose is refused; likewise those that the upper "
+        "camera shows, as a share of the inliers",
+        low=0,
+        high=1,
     )
     good_inliers: int = knob(50, "inliers below which a pose is degraded", low=4, high=10_000)
-    good_inlier_ratio: float = knob(0.6, "inlier ratio below which other yaw angles are tried", low=0, high=1)
+    good_inlier_ratio: float = knob(
+        0.6,
+        "inlier ratio below which other yaw angles are tried, and share of the inliers in the upper camera below which "
+        "a pose is degraded",
+        low=0,
+        high=1,
+    )
     max_speed_mps: float = knob(5.0, "poses that imply a higher speed are refused, m/s", low=0.1, high=100)
     lost_after: int = knob(3, "consecutive refused frames after which the state is lost", low=1, high=1000)
     restart_after: int = knob(

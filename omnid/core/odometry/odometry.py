@@ -181,9 +181,9 @@ class VisualOdometry:
         return moved_m / since_s if moved_m > self._limits.max_speed_mps * since_s else 0.0
 
     def _has_support(self, estimate: PoseEstimate) -> bool:
-        """True if the pose has enough inliers."""
+        """True if the pose has enough inliers in both cameras."""
         limits = self._limits
-        return estimate.inliers >= limits.min_inliers and estimate.inlier_ratio >= limits.min_inlier_ratio
+        return estimate.inliers >= limits.min_inliers and estimate.least_ratio >= limits.min_inlier_ratio
 
     def _since_fix_s(self, dt_s: float) -> float:
         """Return the time since the last accepted pose, at a frame dt_s after the one before."""
@@ -212,7 +212,7 @@ class VisualOdometry:
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
         facts = FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=self._in_doubt, turned=turned)
-        self._advance(facts)
+        self._advance(replace(facts, lower_only=estimate.upper_ratio < self._limits.good_inlier_ratio))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 
     @property

@@ -5,6 +5,7 @@ STARTED, ACCEPTED ----------------------------------------> TRACKING
 STARTED again after an unknown motion --------------------> DEGRADED, and the reset counter rises
 ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
 ACCEPTED with a runner-up that is nearly as likely -----------> DEGRADED
+ACCEPTED with few inliers that the upper camera shows ------> DEGRADED
 REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
 REFUSED from then on -------------------------------------> LOST, and the map is started again when
                                                             restart_after textured frames matched nothing,
@@ -41,6 +42,7 @@ class FrameFacts:
     outcome: FrameOutcome
     dt_s: float  # since the previous frame
     inliers: int = 0
+    lower_only: bool = False  # the upper camera does not show many of the inliers
     runner_up: bool = False  # another motion explains the images nearly as well
     textured: bool = True  # the frame has enough corners for a map
     elsewhere: bool = False  # it was recognised at a place to which the predicted motion does not lead
@@ -76,7 +78,7 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
     if facts.outcome is FrameOutcome.ACCEPTED:
         few_inliers = facts.inliers < limits.good_inliers
         after_gap = status.refused_frames > 0 or facts.dt_s > limits.max_gap_s
-        is_doubtful = few_inliers or after_gap or facts.runner_up
+        is_doubtful = few_inliers or after_gap or facts.lower_only or facts.runner_up
         state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
         return TrackingStatus(state, has_begun=True, resets=status.resets + facts.turned)
 

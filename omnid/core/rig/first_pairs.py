@@ -56,12 +56,13 @@ class FirstPairs:
     matches, as in darkness, decides nothing.
     """
 
-    def __init__(self, cylinder: Cylinder) -> None:
+    def __init__(self, cylinder: Cylinder, last_ns: float = -float("inf")) -> None:
+        """last_ns: stamp of the last pair of an earlier check, RETRY_S after which this one begins."""
         self._cylinder = cylinder
         self._straight: list[Matches] = []
         self._exchanged: list[Matches] = []
         self._contradictions = self._rounds = 0
-        self._next_ns: float = -float("inf")
+        self._next_ns = last_ns + RETRY_S / S_PER_NS
         self._unknown_pairs = 0
         self.finding: StartFinding | None = None  # finding of the last round
         self.state = RigState.UNCHECKED  # state that was decided

@@ -40,7 +40,10 @@ class RigHealth:
     def __init__(self, cylinder: Cylinder, mode: str, every_s: float = 0.0, hint: str = "") -> None:
         """every_s: time between two views of the drive; 0: none is used. hint: ends the reason of a refusal."""
         self._mode, self._hint = mode, hint
+        self._cylinder = cylinder
         self._first = FirstPairs(cylinder)
+        self._again: FirstPairs | None = None  # the pairs of a later check, until it has decided or ended
+        self._since = ""  # when the state was found, as a line begins
         self._views = DrivingViews(cylinder, every_s) if every_s else None
         self._later = RigState.UNCHECKED  # state by the views of the drive
         self._newest_ns = 0
@@ -56,8 +59,8 @@ class RigHealth:
 
     @property
     def is_checking(self) -> bool:
-        """True while first pairs are needed."""
-        return self._mode != "off" and not self._first.ended
+        """True while first pairs, or those of a later check, are needed."""
+        return self._mode != "off" and (self._again is not None or not self._first.ended)
 
     @property
     def uses_views(self) -> bool:
@@ -91,7 +94,7 @@ class RigHealth:
         if self._mode == "off" or finding is None:
             return ""
         if self._first.state.is_contradicted:
-            return contradiction(finding)
+            return self._since + contradiction(finding)
         if self._first.state is RigState.UNCHECKED:
             return (
                 "the rig could not be checked by the images: too few points are seen by both cameras; are they "
@@ -104,8 +107,8 @@ class RigHealth:
             )
         if finding.state is RigState.DRIFTED:
             return (
-                f"the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate check` on "
-                "a recording"
+                f"{self._since}the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate "
+                "check` on a recording"
             )
         return ""
 
@@ -116,9 +119,30 @@ class RigHealth:
         """
         if not self.is_checking:
             return
+        if self._again is not None:
+            self._add_again(self._again, pair, exposure)
+            return
         self._first.add(pair, exposure)
         if self._first.state.is_contradicted and self._mode == "refuse":
             raise RigContradictedError(self.warning + self._hint)
+
+    def check_again(self) -> None:
+        """Check the next pairs as the first ones, as the pose was lost: cables may have been exchanged meanwhile.
+
+        A contradiction ends no run that has had poses, and is checked again until the rig fits, as a hand before a
+        mirror passes. The state stays as it is while the pairs show too little.
+        """
+        if not self.is_checking:
+            self._again = FirstPairs(self._cylinder)
+
+    def _add_again(self, again: FirstPairs, pair: PanoramaPair, exposure: Exposure | None) -> None:
+        again.add(pair, exposure)
+        if not again.ended:
+            return
+        if again.state is not RigState.UNCHECKED:
+            self._first, self._since = again, "after the pose was lost, "
+        is_wrong = again.state.is_contradicted
+        self._again = FirstPairs(self._cylinder, pair.stamp_ns) if is_wrong else None
 
     def drive(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
         """Use a pair of the drive if it is due; a finding changes the state unless it saw too little."""

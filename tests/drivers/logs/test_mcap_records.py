@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import os
 import random
 import struct
@@ -151,6 +152,8 @@ def test_reports_a_corrupt_length(tmp_path: Path) -> None:
         (b"SQLite format 3\0" + bytes(50), "file is not a database"),
         (b"#ROSBAG V2.0\n" + bytes(50), "`omnid log recover`"),
         (zstandard.compress(bytes(50)), "zstd -d"),
+        (gzip.compress(bytes(50)), "gzip -d"),
+        (b"PK\x03\x04" + bytes(50), "unzip"),
         (MAGIC, "`omnid log recover`"),
     ],
 )

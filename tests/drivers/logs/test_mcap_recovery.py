@@ -7,7 +7,7 @@ import random
 import resource
 import shutil
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -189,19 +189,22 @@ def test_skips_a_corrupt_attachment(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def small_files() -> Iterator[None]:
-    """The kernel refuses files over 100 kB."""
+def file_limit() -> Iterator[Callable[[int], None]]:
+    """Return a function after which the kernel refuses files over so many bytes."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    yield
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_full_disk_leaves_no_file(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize("part", [0.5, 0.9999])
+def test_a_full_disk_leaves_no_file(tmp_path: Path, file_limit: Callable[[int], None], part: float) -> None:
     path, out = write_log(tmp_path / "log.mcap", pairs(300)), tmp_path / "out.mcap"
     os.truncate(path, path.stat().st_size - 1)
-    request.getfixturevalue("small_files")
-    with pytest.raises(DriverError, match="File too large"):
+    recover(path, out)
+    size = out.stat().st_size
+    out.unlink()
+    file_limit(int(part * size))
+    with pytest.raises(DriverError, match=r"cannot write '.*out\.mcap': File too large"):
         recover(path, out)
     assert not out.exists()
 

@@ -225,3 +225,5 @@ def test_wrong_options_are_one_line(tmp_path: Path) -> None:
     for words in (("--jobs", 0), ("--set", "no.such=1"), ("--dask", "tcp://127.0.0.1:1"), *times):
         done = omnid("batch", SAMPLE, "--out", tmp_path / "out", *words)
         assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    done = omnid("batch", SAMPLE, "--out", Path(__file__))
+    assert done.returncode == 2 and "expected a folder for the results, found a file" in done.stderr

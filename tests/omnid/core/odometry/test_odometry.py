@@ -57,6 +57,19 @@ def odometry(cameras: RenderedCameras) -> VisualOdometry:
     return visual_odometry(cameras.model, OdometryLimits())
 
 
+@pytest.mark.parametrize("late", ["lower", "upper"])
+def test_a_pose_that_one_camera_contradicts_is_refused(
+    odometry: VisualOdometry, frames: list[StereoFrame], late: str
+) -> None:
+    """The landmarks agree in the lower panorama, and the upper one shows another instant."""
+    before, frame = frames[2:4]
+    other = replace(frame, lower=before.lower) if late == "lower" else replace(frame, upper=before.upper)
+    estimates = run(odometry, [*frames[:3], other, frames[4]])
+    assert [e.state for e in estimates[:3]] == [TrackingState.TRACKING] * 3
+    assert estimates[3].state is TrackingState.DEGRADED and estimates[3].covariance[0, 0] > 0.04**2
+    assert motion_errors(estimates[4].T_odom_rect, truth(4))[0] < 0.01
+
+
 def test_estimates_the_path_through_a_right_angle(odometry: VisualOdometry, frames: list[StereoFrame]) -> None:
     for k, estimate in enumerate(run(odometry, frames)):
         distance, angle = motion_errors(estimate.T_odom_rect, truth(k))

@@ -45,6 +45,7 @@ TRANSITIONS = [
     (FIX, FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
     (FIX, FrameFacts(ACCEPTED, DT_S, inliers=49), ROUGH),
     (ROUGH, FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
+    (FIX, FrameFacts(ACCEPTED, DT_S, inliers=50, lower_only=True), ROUGH),
     (FIX, FrameFacts(ACCEPTED, 0.5, inliers=50), FIX),
     (FIX, FrameFacts(ACCEPTED, 0.75, inliers=50), ROUGH),
     (FIX, FrameFacts(REFUSED, DT_S), REFUSED_ONCE),

@@ -221,6 +221,33 @@ def test_a_check_in_the_dark_changes_no_state(turned: Turned, true: tuple[RigHea
     assert health.state is RigState.BROKEN
 
 
+def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(true: tuple[RigHealth, Collector]) -> None:
+    assert true[0]._views is not None
+    health = RigHealth(true[0]._views._cylinder, "refuse")
+    pairs = [replace(one, stamp_ns=number * PERIOD_NS) for number, one in enumerate(true[1])]
+    exchanged = [replace(one, lower=one.upper, upper=one.lower) for one in pairs]
+    for one in pairs[:4]:
+        health.begin(one)
+    assert health.state is RigState.FITS
+    # 1. Without a loss the pairs are not used.
+    for one in exchanged[:4]:
+        health.begin(one)
+    assert health.state is RigState.FITS and not health.is_checking
+    # 2. Four pairs show that the cameras are exchanged.
+    health.check_again()
+    for one in exchanged[:4]:
+        health.begin(one)
+    assert health.state is RigState.EXCHANGED
+    assert health.warning.startswith("after the pose was lost, the images match better the other way round")
+    # 3. It is checked again, a second later, and so found that they are right again.
+    for one in pairs[4:12]:
+        health.begin(one)
+    assert health.state is RigState.EXCHANGED
+    for one in pairs[12:]:
+        health.begin(one)
+    assert health.state is RigState.FITS and not health.warning
+
+
 def test_the_refinement_is_part_of_the_entry(true: tuple[RigHealth, Collector]) -> None:
     health = started(true, true[1][:2])
     fits = rig_status(health, RefinementReport(0, "", {"windows": "1"}), "a.toml")
