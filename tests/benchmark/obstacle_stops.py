@@ -39,9 +39,10 @@ from tests.benchmark.corridor_worlds import CROSSING, LIKE_FLOOR, POLISHED, SPEE
 from tests.benchmark.fine_robot import BUILDS, USUAL, fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.furniture import FURNITURE, with_furniture
-from tests.benchmark.real_lenses import with_real_lenses
+from tests.benchmark.real_lenses import OF_CAMERAS, with_real_lenses
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
+from tests.simulation.disturbances import Disturbance
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]  # x, y [m], heading [rad]
@@ -109,15 +110,15 @@ def run(
     speed_mps: float = SPEED_MPS,
     rate_hz: float = RATE_HZ,
     build: str = USUAL,
-    *,
-    real: bool = False,
+    disturbed: Sequence[Disturbance] = (),
 ) -> Drive:
-    """Drive one seed of a case along x, backwards at a negative speed, with a robot of BUILDS; real: its images are
-    those of real cameras (real_lenses.py).
+    """Drive one seed of a case along x, backwards at a negative speed, with a robot of BUILDS.
+
+    disturbed: by what lenses and cameras do to its images (real_lenses.py).
     """
     robot, tamper = replace(fine_robot(size_px, BUILDS[build]), rate_hz=rate_hz), None
-    if real:
-        robot, tamper = with_real_lenses(robot, seed)
+    if disturbed:
+        robot, tamper = with_real_lenses(robot, seed, disturbed)
     limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
@@ -243,7 +244,8 @@ def main() -> None:
     parser.add_argument("--speeds", type=float, nargs="+", default=(SPEED_MPS,), help="m/s; below 0: backwards")
     parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="of the cameras")
     parser.add_argument("--robot", choices=BUILDS, default=USUAL, help="its dimensions (fine_robot.py)")
-    parser.add_argument("--real", action="store_true", help="images of real cameras (real_lenses.py)")
+    parser.add_argument("--disturb", nargs="+", default=(), choices=OF_CAMERAS, help="its images (real_lenses.py)")
+    parser.add_argument("--real", action="store_const", dest="disturb", const=OF_CAMERAS, help="by all of these")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
@@ -270,7 +272,7 @@ def main() -> None:
     seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
     table.seeds = [("obstacle stops", seed) for seed in seeds]
     parts = list(itertools.product(arguments.cases, arguments.speeds, arguments.sizes))
-    built = partial(run, rate_hz=arguments.rate, build=arguments.robot, real=arguments.real)
+    built = partial(run, rate_hz=arguments.rate, build=arguments.robot, disturbed=arguments.disturb)
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
         runs = [
             [pool.submit(built, case, seed, size_px, arguments.overrides, speed_mps) for seed in seeds]
@@ -287,7 +289,9 @@ def main() -> None:
 def _named(case: str, speed_mps: float, size_px: int, arguments: argparse.Namespace) -> str:
     """Return a case with all in which its drives differ from the usual ones."""
     at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
-    at += f", {arguments.rate:g} Hz" * (arguments.rate != RATE_HZ) + ", real cameras" * arguments.real
+    at += f", {arguments.rate:g} Hz" * (arguments.rate != RATE_HZ)
+    if arguments.disturb:
+        at += ", all disturbances" if arguments.disturb == OF_CAMERAS else f", {' and '.join(arguments.disturb)}"
     return case + at + f", {arguments.robot} robot" * (arguments.robot != USUAL)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Final
 
@@ -18,11 +19,13 @@ OF_SCENES: Final[frozenset[Disturbance]] = frozenset({"gloss", "glass", "windows
 OF_CAMERAS: Final = tuple(name for name in DISTURBANCES if name not in OF_SCENES)
 
 
-def with_real_lenses(robot: SimulatedRobot, seed: int) -> tuple[SimulatedRobot, Tamper]:
+def with_real_lenses(
+    robot: SimulatedRobot, seed: int, names: Collection[Disturbance] = OF_CAMERAS
+) -> tuple[SimulatedRobot, Tamper]:
     """Return the robot without noise, and what makes its images those of real cameras; the noise is added there."""
     rig = robot.rig
     cameras = {
-        name: DisturbedCamera.of(OF_CAMERAS, number, mounted.visible, mounted.camera.size, seed)
+        name: DisturbedCamera.of(names, number, mounted.visible, mounted.camera.size, seed)
         for number, (name, mounted) in enumerate(zip(CAMERAS, (rig.lower, rig.upper), strict=True))
     }
 
@@ -33,8 +36,7 @@ def with_real_lenses(robot: SimulatedRobot, seed: int) -> tuple[SimulatedRobot, 
         grey = camera.shown(light, frame.seq, time_s) + np.float32(robot.sensor.noise_sigma) * noise
         image = camera.digitised(np.clip(np.rint(grey), 0, 255).astype(np.uint8), frame.seq)
         data = camera.encoded(image, frame.seq)
-        assert data is not None  # OF_CAMERAS has "jpeg" and "restarts".
-        return replace(frame, encoding="jpeg", data=data)
+        return replace(frame, data=image.ravel()) if data is None else replace(frame, encoding="jpeg", data=data)
 
     noiseless: Sensor = replace(robot.sensor, noise_sigma=0.0)
     return replace(robot, sensor=noiseless), disturbed
