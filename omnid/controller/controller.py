@@ -12,10 +12,11 @@ from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport
 from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing, remedy
+from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Motion
 from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
-from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.floor import Floor
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS

@@ -25,7 +25,7 @@ STEPS: Final = (
     Step("odometry", "omnid.stages.odometry", "OdometryStage.process"),
     Step("mapping", "omnid.stages.mapping", "Mapping.process"),
     Step("decode", "omnid.stages.decoder", "gray"),
-    Step("remap", "omnid.stages.dewarp", "Dewarp._panorama"),
+    Step("remap", "omnid.stages.dewarp", "Dewarp._remapped"),
     Step("dense stereo", "omnid.stages.dense_stereo", "DenseStereo.compute"),
     Step("smooth", "omnid.core.stereo.matcher", "smooth"),
     Step("edges", "omnid.core.stereo.matcher", "edge_pixels"),

@@ -7,8 +7,9 @@ import pickle
 import time
 from typing import Final
 
-from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import CollisionMonitor
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.control.heading_controller import Twist
 from tests.benchmark.results import Column, ResultTable
 

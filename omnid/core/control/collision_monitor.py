@@ -23,6 +23,7 @@ from omnid.core.control.collision_geometry import (
     within_reach,
 )
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
+from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.nanoseconds import S_PER_NS
@@ -41,6 +42,8 @@ MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a pers
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
 NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs; a third one makes it smaller.
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
+# Speed of a person who turns towards the base, and time until it brakes then: two pairs at 10 Hz, and the way of both.
+WALK_MPS, TURN_S = 1.6, 0.4
 MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
 
 BLOCKED: Final = "an obstacle is in the way"
@@ -53,28 +56,6 @@ RING_STALE: Final = "no new obstacle ring"
 REMEDY: Final = "drive back or turn away, or clear the way"
 RING_REMEDY: Final = "check the cameras and the load; see controller.collision.stale"
 IMAGES_REMEDY: Final = "check light, mirrors and cameras, which the status names"
-
-
-class MovingPoint(NamedTuple):
-    """A moving obstacle in the base frame of its ring, whose axes do not move; m, m/s."""
-
-    x_m: float
-    y_m: float
-    vx_mps: float
-    vy_mps: float
-    radius_m: float
-    sigma_m: float = 0.0  # standard deviation of the place
-    sigma_mps: float = 0.0  # standard deviation of the velocity
-
-
-class ControllerRing(NamedTuple):
-    """The part of an obstacle ring that the monitor needs; sector k is about azimuth -pi + (k + 0.5) 2 pi / N."""
-
-    stamp_ns: int  # time of the capture
-    ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
-    free_m: tuple[float, ...] = ()  # (N,) up to which a direction was seen to be free; empty: the range, 0 if unknown
-    moving: tuple[MovingPoint, ...] = ()
-    unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
 
 
 class Allowance(NamedTuple):
@@ -199,7 +180,7 @@ class CollisionMonitor:
             ends = within_reach(self._unwatched, moved, reach_m)
             allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
         if self._moving:
-            allowances.append(self._before_moving(moved, age_s, motion))
+            allowances += [self._before_moving(moved, age_s, motion), self._beside_moving(moved, age_s, motion)]
         return min(allowances)
 
     def _before(self, points: list[Point], motion: Twist) -> Allowance:
@@ -292,6 +273,22 @@ class CollisionMonitor:
                         motion, max(settings.slow_mps, abs(motion.velocity_mps) * ahead_s / MOVING_S), MOVING
                     )
         return slow
+
+    def _beside_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
+        """Drive so slowly beside who moves that the base is at rest before they would be there if they turned round:
+        with a gap g `g = WALK_MPS (TURN_S + v / a)`. What the base leaves behind does not count.
+        """
+        side, braking_mps2 = math.copysign(1.0, motion.velocity_mps), BRAKING_SHARE * self._deceleration
+        now = [(one.x_m + one.vx_mps * age_s, one.y_m + one.vy_mps * age_s) for one in self._moving]
+        gaps_m = [
+            self._outline.gap_m(x, y) - obstacle.radius_m
+            for obstacle, (x, y) in zip(self._moving, seen_from(moved, now), strict=True)
+            if side * x > 0.0
+        ]
+        limit_mps = braking_mps2 * (min(gaps_m, default=math.inf) / WALK_MPS - TURN_S)
+        if motion.velocity_mps == 0.0 or abs(motion.velocity_mps) <= limit_mps:
+            return FREE
+        return self._capped(motion, max(self._settings.slow_mps, limit_mps), MOVING)
 
     def _capped(self, motion: Twist, speed_mps: float, reason: str) -> Allowance:
         """Return the share at which the speed is at most so high; turns on the spot slow down alike."""

@@ -11,10 +11,11 @@ from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 from omnid.core.control.arming import AUTOMATIC, Arming, ArmRequest, arming_knob
-from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing
+from omnid.core.control.collision_monitor import CollisionMonitor
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
 from omnid.core.control.contacts import Contacts
+from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
     HeadingController,

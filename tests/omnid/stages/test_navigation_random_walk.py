@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, transform
 from omnid.core.control.arming import MANUAL, ArmRequest
-from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
+from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import MotionSettings
 from omnid.core.navigation.requests import (

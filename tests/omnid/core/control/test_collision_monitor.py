@@ -10,8 +10,9 @@ import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
 from omnid.core.control.collision_geometry import Outline
-from omnid.core.control.collision_monitor import CollisionMonitor, ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import CollisionMonitor
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.control.heading_controller import Twist
 
 S = 1_000_000_000
@@ -357,16 +358,30 @@ def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does
     crossing = MovingPoint(0.9, 0.9, 0.0, -1.0, 0.25)
     allowed, reason = after(FREE_RING, moving=(crossing,))
     assert allowed.velocity_mps < 0.35 and reason == monitor_module.MOVING
-    assert after(FREE_RING, moving=(crossing._replace(vy_mps=1.0),)) == (AHEAD, "")
+    assert after(FREE_RING, moving=(crossing._replace(y_m=1.8, vy_mps=1.0),)) == (AHEAD, "")
     near = MovingPoint(0.9, 0.0, -1.0, 0.0, 0.25)
     assert after(FREE_RING, moving=(near,)) == (Twist(), monitor_module.MOVING)
 
 
+def test_is_slow_beside_who_may_turn_round() -> None:
+    """With a gap g there are g / 1.6 m/s less 0.4 s to brake, with 0.8 of 1.5 m/s^2."""
+    for side in (1, -1):
+        leaves = MovingPoint(0.9, side * 0.9, 0.0, side * 1.0, 0.25)
+        assert after(FREE_RING, moving=(leaves,)) == (Twist(pytest.approx(SETTINGS.slow_mps)), monitor_module.MOVING)
+        assert after(FREE_RING, moving=(leaves._replace(x_m=-0.9),)) == (AHEAD, ""), "it is left behind"
+        farther = leaves._replace(y_m=side * 1.3)
+        gap_m = math.hypot(0.9 - SETTINGS.front_m, 1.3 - SETTINGS.half_width_m) - 0.25
+        expected = Twist(pytest.approx(1.2 * (gap_m / 1.6 - 0.4)))
+        assert after(FREE_RING, moving=(farther,), age_s=0.0) == (expected, monitor_module.MOVING)
+        back = after(FREE_RING, Twist(-0.5), moving=(leaves._replace(x_m=-0.9),))
+        assert back == (Twist(pytest.approx(-SETTINGS.slow_mps)), monitor_module.MOVING)
+
+
 def test_a_new_one_slows_the_base_down_where_it_may_go() -> None:
     """Seen twice, it seems to walk beside the way; three looks make the sigma smaller than 0.4 m/s."""
-    new = MovingPoint(1.0, 1.0, 0.0, -0.1, 0.2, 0.1, 0.6)
+    new = MovingPoint(1.0, 1.6, 0.0, -0.1, 0.2, 0.1, 0.6)
     allowed, reason = after(FREE_RING, moving=(new,))
-    assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.MOVING
+    assert allowed.velocity_mps == pytest.approx(0.4) and reason == monitor_module.MOVING
     assert after(FREE_RING, moving=(new._replace(sigma_mps=0.3),)) == (AHEAD, "")
     assert after(FREE_RING, moving=(new._replace(y_m=3.0),)) == (AHEAD, "")
 

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, predicted, relative
-from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.local_planner import ARC_S, ARC_STEPS, MARGIN_M, NEARER_M, LocalPlanner, room_ahead

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import relative
-from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.navigation.forecast import Forecast, forecast
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
@@ -106,8 +106,8 @@ def test_nothing_changes_where_the_person_has_passed_before_or_comes_after(at_m:
     base = BaseAmongPeople(4, (at_m, 1.9), (0.0, -0.9), begins_s)
     assert base.run(60).state is NavigationState.REACHED
     assert base.gap_m > 0.3
-    # Two looks at somebody who steps out slow it down, until the third tells where they go.
-    assert base.slowest_mps(1.0, 4.0) > 0.3
+    # It drives slowly, and does not stop, beside somebody who is so near that they might turn round.
+    assert base.slowest_mps(1.0, 4.0) > (0.19 if base.gap_m < 1.2 else 0.3)
     assert sum(sample.navigation.reason != "" for sample in base.samples) <= 2
 
 
