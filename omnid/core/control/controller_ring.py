@@ -1,4 +1,4 @@
-"""What the collision monitor needs of an obstacle ring: ranges, free ways, and what moves."""
+"""Ring of obstacles as the collision monitor needs it: ranges, free ways, and what moves."""
 
 from __future__ import annotations
 

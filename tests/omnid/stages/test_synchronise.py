@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calib.rig import Rig
-from drivers.frame import Camera, Frame
+from drivers.frame import Camera, Frame, coding_steps
 from drivers.motion import GyroSample, WheelSample
 from omnid.camera_config import PairConfig
 from omnid.messages import FramePair
@@ -52,6 +52,11 @@ def test_a_pair_has_the_lower_stamp_and_both_images(pair: Synchronise) -> None:
         (found,) = made(pair, *(shot(c, index, 3 * MS * (c == "upper"), dark if c == "upper" else JPEG) for c in order))  # type: ignore[arg-type]
         assert (found.seq, found.stamp_ns) == (index, shot("lower", index).stamp_ns)
         assert found.lower.mean() > 80 and found.upper.mean() < 5
+
+
+def test_a_pair_has_the_steps_of_both_jpegs(pair: Synchronise) -> None:
+    (found,) = made(pair, shot("lower", 0), shot("upper", 0))
+    assert found.steps == (coding_steps(shot("lower", 0)),) * 2 and len(found.steps[0]) == 64
 
 
 def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from drivers.frame import Frame, coding_steps
 from omnid.config import PanoramaConfig
-from omnid.core.obstacles import pair_views
 from omnid.core.obstacles.column import Columns, FloorPlane
-from omnid.core.obstacles.pair_views import BAND_NOISE, WorkingPanoramas
+from omnid.core.obstacles.pair_views import DIRECTIONS, UNITS, WorkingPanoramas
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.messages import FramePair
 from omnid.simulation.robot import make_robot
@@ -27,17 +26,18 @@ COLUMNS = Columns(CYLINDER, BASELINE_M, FloorPlane(HEIGHT_M, 0.0, 0.0), (0.06, 1
 
 
 @pytest.mark.parametrize(("size_px", "least"), [(512, 0.8), (960, 0.5)])
-def test_white_noise_has_the_stated_share_in_the_rows_of_the_floor(size_px: int, least: float) -> None:
-    """Finer images have less of it, so that the stated share is the largest."""
+def test_two_views_of_nothing_but_noise_differ_by_one_sigma_in_the_rows_of_the_floor(
+    size_px: int, least: float
+) -> None:
+    """Finer images have less noise left, so that the stated share is the largest."""
     place = geometry(make_robot(size_px).rig, PanoramaConfig())
     rng = np.random.default_rng(5)
     images = (np.clip(np.rint(120 + rng.normal(0, NOISE_GREY, (size_px, size_px))), 0, 255) for _ in range(2))
-    lower = Dewarp(place, PanoramaConfig()).process(FramePair(0, 0, *(i.astype(np.uint8) for i in images))).lower
+    pair = Dewarp(place, PanoramaConfig()).process(FramePair(0, 0, *(image.astype(np.uint8) for image in images)))
     working = WorkingPanoramas(place.cylinder, (0.0, 0.0), 0.2)
-    # The band-passes of two views differ by the noise of both.
-    band = pair_views._band_pass(working._smooth(lower))[round(working.row0) :][FLOOR_ROWS]
-    share = float(band.std()) / lower.noise_grey
-    assert least * BAND_NOISE < share < 1.05 * BAND_NOISE
+    for views in working.views(pair.lower, pair.upper, np.full((working.height, DIRECTIONS), 255, np.uint8)):
+        difference = (views.lower.astype(float) - views.upper)[round(working.row0) :][FLOOR_ROWS]
+        assert least < difference.std() / UNITS < 1.05
 
 
 def test_a_floor_in_jpegs_is_no_evidence_against_itself() -> None:
