@@ -25,7 +25,7 @@ _FILL: Final = 0xFF
 _NO_LENGTH: Final = (0x00, 0x01, *range(0xD0, 0xDA))  # stuffed byte, TEM, RST0 to RST7, SOI, EOI: not in a header
 _LENGTH_BYTES: Final = 2  # the length counts itself
 _SCAN, _INTERVAL, _END = 0xDA, 0xDD, 0xD9  # SOS: the header ends here; DRI; EOI
-_TABLES: Final = 0xDB  # DQT: quantisation tables (B.2.4.1)
+_TABLES, _MOST_TABLES = 0xDB, 4  # DQT: quantisation tables, and how many there are at most (B.2.4.1)
 _FIRST_RESTART, _RESTARTS = 0xD0, 8  # RST0 to RST7 follow each other in turn
 _FRAME_BYTES: Final = 10  # marker, length, precision, height, width, number of components
 _COMPONENT_BYTES: Final = 3  # identifier, sampling factors, quantisation table
@@ -119,11 +119,14 @@ def coding_sigma(steps: Steps, highest: int) -> float:
 def _quantisation(segment: bytes) -> dict[int, Steps]:
     """Return the whole tables of a segment by their numbers; each has steps of 8 or of 16 bits."""
     found: dict[int, Steps] = {}
-    while segment:
-        size = 2 if segment[0] >> 4 else 1
-        steps, segment, number = segment[1 : 1 + size * _COEFFICIENTS], segment[1 + size * _COEFFICIENTS :], segment[0]
-        if len(steps) == size * _COEFFICIENTS:
-            found[number & 15] = tuple(int.from_bytes(steps[k : k + size], "big") for k in range(0, len(steps), size))
+    offset = 0
+    while offset < len(segment) and len(found) < _MOST_TABLES:
+        number, size = segment[offset] & 15, 2 if segment[offset] >> 4 else 1
+        steps = segment[offset + 1 : offset + 1 + size * _COEFFICIENTS]
+        if len(steps) < size * _COEFFICIENTS or number in found:
+            break
+        found[number] = tuple(int.from_bytes(steps[k : k + size], "big") for k in range(0, len(steps), size))
+        offset += 1 + len(steps)
     return found
 
 
