@@ -10,14 +10,14 @@ import pytest
 from omnid.simulation.clearance import footprints
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import World
-from tests.benchmark.furniture import AHEAD_M, FURNITURE, PLAIN, THINGS, with_furniture
+from tests.benchmark.furniture import AHEAD_M, PLAIN, THINGS, with_furniture
 from tests.benchmark.obstacle_stops import room_ahead_m
 
 NOWHERE = World("nowhere", ())
 HEIGHT_M, RADIUS_M = 1.2, 0.2
 
 
-@pytest.mark.parametrize("kind", FURNITURE)
+@pytest.mark.parametrize("kind", THINGS)
 def test_a_thing_is_in_the_way(kind: str) -> None:
     for seed in range(2):
         world = with_furniture(NOWHERE, kind, random.Random(seed))
