@@ -43,7 +43,7 @@ class FramePair:
     upper: NDArray[np.uint8]  # (H, W)
     skew_s: float = 0.0  # upper minus lower exposure
     motion: tuple[MotionSample, ...] = ()  # samples of wheels and gyro since the last pair
-    steps: tuple[Steps, Steps] = ((), ())  # of the quantisation of both JPEGs (drivers.jpeg), (): none
+    jpeg_steps: tuple[Steps, Steps] = ((), ())  # of the quantisation of both JPEGs (drivers.jpeg), (): none
 
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)

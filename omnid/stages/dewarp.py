@@ -64,8 +64,8 @@ class Dewarp:
         return Panoramas(
             pair.seq,
             pair.stamp_ns,
-            self._padded(lower, lower_gain, "lower", pair.steps[0]),
-            self._padded(upper, upper_gain, "upper", pair.steps[1]),
+            self._padded(lower, lower_gain, "lower", pair.jpeg_steps[0]),
+            self._padded(upper, upper_gain, "upper", pair.jpeg_steps[1]),
             self._visible,
             times,
             dimmer,

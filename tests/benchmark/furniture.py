@@ -1,4 +1,4 @@
-"""Things of several boxes that stand in the way of a robot, and what is known of none of them when numbers are set."""
+"""Furniture made of boxes that stands in the way of a robot; no number of the method was set on it."""
 
 from __future__ import annotations
 

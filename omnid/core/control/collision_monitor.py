@@ -42,7 +42,8 @@ MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a pers
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
 NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs; a third one makes it smaller.
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
-# Speed of a person who turns towards the base, and time until it brakes then: two pairs at 10 Hz, and the way of both.
+# Speed of a person who walks towards the base, and the time until it brakes: two pairs at 10 Hz show the person, and
+# images and commands are 0.2 s on their way.
 WALK_MPS, TURN_S = 1.6, 0.4
 MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
 
@@ -275,8 +276,8 @@ class CollisionMonitor:
         return slow
 
     def _beside_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
-        """Drive so slowly beside who moves that the base is at rest before they would be there if they turned round:
-        with a gap g `g = WALK_MPS (TURN_S + v / a)`. What the base leaves behind does not count.
+        """Drive so slowly beside a person that the base is at rest before the person would be there who turns round, or
+        another one who was hidden: with a gap g `g = WALK_MPS (TURN_S + v / a)`. Who is behind does not count.
         """
         side, braking_mps2 = math.copysign(1.0, motion.velocity_mps), BRAKING_SHARE * self._deceleration
         now = [(one.x_m + one.vx_mps * age_s, one.y_m + one.vy_mps * age_s) for one in self._moving]

@@ -87,7 +87,7 @@ class WorkingPanoramas:
 
     def _noise_grey(self, panorama: PaddedPanorama) -> float:
         """Return the noise of a smooth image: of its sensor, and of its JPEG, whose errors extend over blocks."""
-        coding_grey = panorama.gain * coding_sigma(panorama.steps, self._coding_frequencies)
+        coding_grey = panorama.gain * coding_sigma(panorama.jpeg_steps, self._coding_frequencies)
         return math.hypot(BAND_NOISE * panorama.noise_grey, coding_grey)
 
     def _smooth(self, panorama: PaddedPanorama) -> Floats:

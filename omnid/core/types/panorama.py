@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.jpeg import Steps
+
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -25,7 +27,7 @@ class PaddedPanorama:
     gain: float = 1.0  # factor that was applied because the image was dim
     turn_px: int = 0  # columns of a full turn, of which this shows a sector; 0: all of them
     first: int = 0  # column of the full turn that is column 0
-    steps: tuple[int, ...] = ()  # of the quantisation of the image's JPEG (drivers.jpeg), (): none
+    jpeg_steps: Steps = ()  # of the quantisation of the image's JPEG, (): none
 
     @property
     def width(self) -> int:

@@ -64,8 +64,8 @@ def test_points_project_to_the_pixels_they_were_matched_at() -> None:
 
 def test_panoramas_keep_the_steps_of_their_jpegs(rig_geometry: Geometry, frames: list[Frame]) -> None:
     (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    found = Dewarp(rig_geometry, CONFIG.panorama).process(replace(pair, steps=((1, 2), (3, 4))))
-    assert (found.lower.steps, found.upper.steps) == ((1, 2), (3, 4))
+    found = Dewarp(rig_geometry, CONFIG.panorama).process(replace(pair, jpeg_steps=((1, 2), (3, 4))))
+    assert (found.lower.jpeg_steps, found.upper.jpeg_steps) == ((1, 2), (3, 4))
 
 
 def test_the_visible_region_has_a_margin(rig_geometry: Geometry, frames: list[Frame]) -> None:

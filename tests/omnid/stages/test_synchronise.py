@@ -56,7 +56,7 @@ def test_a_pair_has_the_lower_stamp_and_both_images(pair: Synchronise) -> None:
 
 def test_a_pair_has_the_steps_of_both_jpegs(pair: Synchronise) -> None:
     (found,) = made(pair, shot("lower", 0), shot("upper", 0))
-    assert found.steps == (coding_steps(shot("lower", 0)),) * 2 and len(found.steps[0]) == 64
+    assert found.jpeg_steps == (coding_steps(shot("lower", 0)),) * 2 and len(found.jpeg_steps[0]) == 64
 
 
 def test_pairs_all_frames_in_any_order_of_arrival(pair: Synchronise) -> None:

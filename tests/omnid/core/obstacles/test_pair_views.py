@@ -62,4 +62,4 @@ def _coded(panorama: PaddedPanorama, known: bool = True) -> PaddedPanorama:
     data = cv2.imencode(".jpg", panorama.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1]
     steps = coding_steps(Frame(0, 0, "lower", "jpeg", data.tobytes())) if known else ()
     image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), np.uint8)
-    return PaddedPanorama(image, PAD_PX, panorama.noise_grey, steps=steps)
+    return PaddedPanorama(image, PAD_PX, panorama.noise_grey, jpeg_steps=steps)
