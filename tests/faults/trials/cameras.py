@@ -6,7 +6,7 @@ from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN
 from omnid.core.control.safety_rules import POSE_LOST, POSE_STALE
 from omnid.transport.status_names import STOPPED_PREFIX
 from tests.faults.trials.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
-from tests.replay.live import wait_until
+from tests.replay.live import patient, wait_until
 
 
 def camera_fault(setting: Setting, line: str, part: str, word: str) -> Outcome:
@@ -85,9 +85,12 @@ def repeated_now_and_then(setting: Setting) -> Outcome:
 @trial("images of another drive")
 def another_drive(setting: Setting) -> Outcome:
     """The images go to and fro at 0.5 m/s, as if the lens saw a screen, while 0.3 m/s forwards are commanded."""
-    with driving(setting, "--set", "controller.motion.check=true", module=FAULTY_DAEMON) as (_, operator, base):
+    words = patient("controller.motion.check=true")
+    with driving(setting, *words, module=FAULTY_DAEMON) as (_, operator, base):
         counts = [f"{STOPPED_PREFIX}{reason}" for reason in (NOT_SEEN, NOT_COMMANDED)]
         wait_until(lambda: any(key in operator.values("wheels") for key in counts), "a stop for this reason")
+        wait_until(lambda: not base.drives, "wheels that stop although commands arrive")
+        operator.stop_sending()  # after two seconds at rest the base would try again
         expect_stop(base)
         status = f"wheels: {operator.message('wheels')}"
     return Outcome("alive", "slowed down, then stopped", status)
