@@ -248,6 +248,22 @@ def test_after_a_loss_exchanged_cameras_are_noticed_and_end_no_run(true: tuple[R
     assert health.state is RigState.FITS and not health.warning
 
 
+def test_after_a_loss_a_late_camera_may_be_why_the_rig_does_not_fit(
+    turned: Turned, true: tuple[RigHealth, Collector]
+) -> None:
+    _, wrong = turned((0.0, 3.0, 0.0))
+    assert true[0]._views is not None
+    health = RigHealth(true[0]._views._cylinder, "warn")
+    for one in wrong:
+        health.begin(one)
+    assert health.state is RigState.BROKEN and "late" not in health.warning
+    health.check_again()
+    for one in wrong:
+        health.begin(replace(one, stamp_ns=one.stamp_ns + 10 * SECONDS))
+    assert health.warning.startswith("after the pose was lost, the images contradict the rig")
+    assert health.warning.endswith("one of the cameras is late now, or was moved")
+
+
 def test_the_refinement_is_part_of_the_entry(true: tuple[RigHealth, Collector]) -> None:
     health = started(true, true[1][:2])
     fits = rig_status(health, RefinementReport(0, "", {"windows": "1"}), "a.toml")
