@@ -59,6 +59,7 @@ def test_given_cameras_find_the_shape_too() -> None:
     np.testing.assert_allclose(found.bends_m, BENT.bends_m, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_one_camera_finds_the_shape_and_selects_its_model_with_it() -> None:
     seen = [lower for view in views_of(BENT, count=9) if (lower := view.seen[0])]
     flat = select_calibration(seen, ODD, LOWER.size, "omni")

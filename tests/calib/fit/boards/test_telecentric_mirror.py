@@ -110,6 +110,7 @@ def paraboloids() -> tuple[RigCalibration, RigCalibration]:
     return free, telecentric_if_as_good(free)
 
 
+@pytest.mark.slow
 def test_boards_of_paraboloids_give_the_profile_of_the_mirrors_twice_as_well() -> None:
     free, found = paraboloids()
     assert not free.telecentric and found.telecentric
@@ -120,6 +121,7 @@ def test_boards_of_paraboloids_give_the_profile_of_the_mirrors_twice_as_well() -
     assert len(found.covariance) == len(free.covariance)
 
 
+@pytest.mark.slow
 def test_mirrors_of_another_kind_are_not_taken_for_paraboloids() -> None:
     """Hyperboloids below their second focus: the image of another curve, and no wavefront."""
     _, perfect = board_rig(21, 1.0)
