@@ -22,7 +22,7 @@ EXCHANGE: Final = (
     "is that of other cameras"
 )
 CALIBRATE: Final = "give the rig of these cameras, or calibrate it: `omnid calibrate check` shows by how much it is off"
-LATER: Final = "; if the rig was right before, one of the cameras is late now, or was moved"
+LATE_OR_MOVED: Final = "; if the rig was right before, one of the cameras is late now, or was moved"
 GO_ON: Final = "give the rig of these cameras with --rig, or go on all the same with --set rig.check=warn"
 
 
@@ -96,7 +96,7 @@ class RigHealth:
             return ""
         if self._first.state.is_contradicted:
             is_exchanged = finding.state is RigState.EXCHANGED
-            return self._since + contradiction(finding) + (LATER if self._since and not is_exchanged else "")
+            return self._since + contradiction(finding) + (LATE_OR_MOVED if self._since and not is_exchanged else "")
         if self._first.state is RigState.UNCHECKED:
             return (
                 "the rig could not be checked by the images: too few points are seen by both cameras; are they "
@@ -110,7 +110,7 @@ class RigHealth:
         if finding.state is RigState.DRIFTED:
             return (
                 f"{self._since}the images do not quite fit the rig, {finding.straight.summary}: run `omnid calibrate "
-                "check` on a recording" + (LATER if self._since else "")
+                "check` on a recording" + (LATE_OR_MOVED if self._since else "")
             )
         return ""
 
