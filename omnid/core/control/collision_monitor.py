@@ -276,8 +276,8 @@ class CollisionMonitor:
         return slow
 
     def _beside_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
-        """Drive so slowly beside a person that the base stands by the time the person, turned round, or somebody who was
-        hidden could reach it: with a gap g `g = WALK_MPS (TURN_S + v / a)`. Who is behind does not count.
+        """Drive so slowly beside a person that the base stands by the time the person, turned round, or somebody who
+        was hidden could reach it: with a gap g `g = WALK_MPS (TURN_S + v / a)`. Who is behind does not count.
         """
         side, braking_mps2 = math.copysign(1.0, motion.velocity_mps), BRAKING_SHARE * self._deceleration
         now = [(one.x_m + one.vx_mps * age_s, one.y_m + one.vy_mps * age_s) for one in self._moving]
