@@ -4,19 +4,20 @@ An operator holds the stick ahead in a corridor at 0.5 m/s; the collision monito
 what it meets. A contact is one of the robot's true outline, over an edge, too; it is the robot's own where the robot
 drove. A stop of the monitor is false where nothing true stands or walks within 1 m of the outline, in the robot's way
 or 0.2 m beside it, and no person walks within 2 m. The speed told is the highest within 1 m of what stands ahead; the
-obstacle rings there are counted, and those that told the way as unknown.
+obstacle rings there are counted, and those that told the way as unknown. A line for each drive is printed; the
+published tables are those of `obstacle_drives`.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
 import math
 import random
+import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -30,6 +31,8 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
 from omnid.simulation.people import Walkers
+from omnid.simulation.rendering.surfaces import Scene
+from omnid.simulation.rendering.textures import PAINTERS
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
@@ -40,21 +43,18 @@ from tests.benchmark.fine_robot import BUILDS, USUAL, fine_robot
 from tests.benchmark.floating_boxes import KINDS, with_floating
 from tests.benchmark.furniture import FURNITURE, with_furniture
 from tests.benchmark.real_lenses import OF_CAMERAS, with_real_lenses
-from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.uneven_floors import with_edge, with_ramp
 from tests.simulation.disturbances import Disturbance
+from tests.simulation.photographs import with_photographs
 
 Array = NDArray[np.float64]
 Pose = tuple[float, float, float]  # x, y [m], heading [rad]
 
 SIZE_PX: Final = 512
 RATE_HZ: Final = 10.0
-REMARKS: Final = (
-    "A simulated robot at 0.5 m/s by the stick, straight on, 512 px at 10 Hz where a row says nothing else; only the "
-    "collision monitor keeps it from what it meets. A stop is false where the truth has nothing within 1 m ahead, or "
-    "up to 0.2 m to the side of the way. A contact counts for an edge when the outline is over it; of a person who "
-    "crosses, either of the two may have moved.",
-)
+TILES: Final = "tiles"
+PHOTOGRAPHS: Final = "photographs"  # On walls and boxes, too.
+FLOORS: Final = (TILES, "granite", "brick", "plaster", PHOTOGRAPHS)
 FALSE_M: Final = 1.0
 BESIDE_M: Final = 0.2  # of the robot's outline: what stands there may be its reason to stop
 WALKS_M: Final = 2.0  # nearer than this, a person who walks may be the reason to stop
@@ -81,6 +81,29 @@ UNEVEN: Final = ("edge", "ramp", AT_EDGE)  # Cases whose floor has two heights.
 CASES |= {POLISHED + case: seconds for case, seconds in CASES.items() if not case.startswith(UNEVEN)}
 
 
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """The ways in which drives of one case may differ."""
+
+    speed_mps: float = SPEED_MPS  # backwards below 0
+    size_px: int = SIZE_PX
+    rate_hz: float = RATE_HZ
+    build: str = USUAL  # of BUILDS
+    floor: str = TILES  # of FLOORS; rooms of CLUTTER have their own where it is TILES
+    disturbed: tuple[Disturbance, ...] = ()  # by what lenses and cameras do to its images (real_lenses.py)
+
+    def __str__(self) -> str:
+        """Return all in which these conditions differ from the usual ones."""
+        parts = [f"{self.speed_mps:g} m/s"] * (self.speed_mps != SPEED_MPS)
+        parts += [f"{self.size_px} px"] * (self.size_px != SIZE_PX) + [f"{self.rate_hz:g} Hz"] * (
+            self.rate_hz != RATE_HZ
+        )
+        parts += [f"floor of {self.floor}"] * (self.floor != TILES) + [f"{self.build} robot"] * (self.build != USUAL)
+        if self.disturbed:
+            parts += ["all disturbances" if self.disturbed == OF_CAMERAS else " and ".join(self.disturbed)]
+        return ", ".join(parts)
+
+
 class Drive(NamedTuple):
     """Result of a run."""
 
@@ -102,58 +125,56 @@ def ahead(moment: Moment, speed_mps: float = SPEED_MPS) -> Iterator[Request]:
     yield Setpoint(speed_mps, heading_rad=0.0)
 
 
-def run(
-    case: str,
-    seed: int,
-    size_px: int,
-    overrides: list[str],
-    speed_mps: float = SPEED_MPS,
-    rate_hz: float = RATE_HZ,
-    build: str = USUAL,
-    disturbed: Sequence[Disturbance] = (),
-) -> Drive:
-    """Drive one seed of a case along x, backwards at a negative speed, with a robot of BUILDS.
+def run(case: str, seed: int, conditions: Conditions = Conditions(), overrides: Sequence[str] = ()) -> Drive:
+    """Drive one seed of a case along x."""
+    build, is_backwards = BUILDS[conditions.build], conditions.speed_mps < 0
+    robot, tamper = replace(fine_robot(conditions.size_px, build), rate_hz=conditions.rate_hz), None
+    if conditions.disturbed:
+        robot, tamper = with_real_lenses(robot, seed, conditions.disturbed)
+    limits = [f"controller.{part}.velocity_mps={abs(conditions.speed_mps)}" for part in ("limits", "heading")]
+    is_cluttered = case.removeprefix(POLISHED) in ROOMS
+    world, edges = world_of(case, seed, conditions.floor)
+    if not is_cluttered:
+        world = replace(world, start=(0.0, 0.0, math.pi if is_backwards else 0.0))
+    # The edge of a room is along x; odom begins with the heading of the start.
+    towards_rad = -world.start[2] if case == AT_EDGE else None
+    done = simulate(
+        world,
+        robot,
+        Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=conditions.speed_mps),
+        seconds=CASES[case],
+        seed=seed,
+        config=load_config(None, ["places.enabled=false", *limits, *build.settings, *overrides]),
+        tamper=tamper,
+    )
+    return judged(done, world, robot, edges, backwards=is_backwards, everywhere=is_cluttered)
 
-    disturbed: by what lenses and cameras do to its images (real_lenses.py).
-    """
-    robot, tamper = replace(fine_robot(size_px, BUILDS[build]), rate_hz=rate_hz), None
-    if disturbed:
-        robot, tamper = with_real_lenses(robot, seed, disturbed)
-    limits = [f"controller.{part}.velocity_mps={abs(speed_mps)}" for part in ("limits", "heading")]
+
+def world_of(case: str, seed: int, floor: str) -> tuple[World, Array]:
+    """Return the world of a case and the edges (N, 2, 2) of its floor."""
+    bare, edges = case.removeprefix(POLISHED), np.zeros((0, 2, 2))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "world.toml"
-        is_cluttered = case.removeprefix(POLISHED) in ROOMS
-        path.write_text((room_text if is_cluttered else world_text)(case, random.Random(seed)))
+        text = (room_text if bare in ROOMS else world_text)(case, random.Random(seed))
+        if floor in PAINTERS and floor != TILES:
+            text = re.sub(r"(?m)^floor = .*\n", "", text).replace("[space]", f'[space]\nfloor = "{floor}"')
+        path.write_text(text)
         world = load_world(str(path), seed)
-        edges = np.zeros((0, 2, 2))
-        if case.startswith("edge"):
-            world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
-        if case == "ramp":
-            world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
-        if case.removeprefix(POLISHED) in KINDS:
-            world = with_floating(world, case.removeprefix(POLISHED), random.Random(seed))
-        if case.removeprefix(POLISHED) in FURNITURE:
-            world = with_furniture(world, case.removeprefix(POLISHED), random.Random(seed))
-        if case == LIKE_FLOOR:
-            world = like_the_floor(world)
-        towards_rad = None
-        if case == AT_EDGE:
-            world, edges = lowered(world, random.Random(seed))
-            towards_rad = -world.start[2]  # The edge is along x; odom begins with the heading of the start.
-        if is_cluttered:
-            world = furnished(world, random.Random(seed))
-        else:
-            world = replace(world, start=(0.0, 0.0, math.pi if speed_mps < 0 else 0.0))
-        done = simulate(
-            world,
-            robot,
-            Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=speed_mps),
-            seconds=CASES[case],
-            seed=seed,
-            config=load_config(None, ["places.enabled=false", *limits, *BUILDS[build].settings, *overrides]),
-            tamper=tamper,
-        )
-    return judged(done, world, robot, edges, backwards=speed_mps < 0, everywhere=is_cluttered)
+    if floor == PHOTOGRAPHS:
+        world = replace(world, standing=with_photographs(Scene(world.standing), seed).rectangles)
+    if case.startswith("edge"):
+        world, edges = with_edge(world, random.Random(seed).uniform(2.0, 3.0), float(case.split()[1]) / 100)
+    if case == "ramp":
+        world = with_ramp(world, random.Random(seed).uniform(2.0, 3.0))
+    if bare in KINDS:
+        world = with_floating(world, bare, random.Random(seed))
+    if bare in FURNITURE:
+        world = with_furniture(world, bare, random.Random(seed))
+    if case == LIKE_FLOOR:
+        world = like_the_floor(world)
+    if case == AT_EDGE:
+        world, edges = lowered(world, random.Random(seed))
+    return (furnished(world, random.Random(seed)) if bare in ROOMS else world), edges
 
 
 def judged(
@@ -236,69 +257,42 @@ def room_ahead_m(segments: Array, pose: Pose, radius_m: float) -> float:
 
 
 def main() -> None:
-    """Print a line for each run, and a row for each case at a speed and a size."""
+    """Print a line for each run, and the sums of each case."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="+", choices=sorted(CASES), metavar="CASE")
     parser.add_argument("--seeds", type=int, nargs=2, default=(1, 3), metavar=("FIRST", "LAST"))
-    parser.add_argument("--sizes", type=int, nargs="+", default=(512,), help="of the images, px")
+    parser.add_argument("--size", type=int, default=SIZE_PX, metavar="PX", help="of the images")
     parser.add_argument("--speeds", type=float, nargs="+", default=(SPEED_MPS,), help="m/s; below 0: backwards")
     parser.add_argument("--rate", type=float, default=RATE_HZ, metavar="HZ", help="of the cameras")
     parser.add_argument("--robot", choices=BUILDS, default=USUAL, help="its dimensions (fine_robot.py)")
+    parser.add_argument("--floor", choices=FLOORS, default=TILES)
     parser.add_argument("--disturb", nargs="+", default=(), choices=OF_CAMERAS, help="its images (real_lenses.py)")
     parser.add_argument("--real", action="store_const", dest="disturb", const=OF_CAMERAS, help="by all of these")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
-    table = ResultTable(
-        "obstacle_stops",
-        "obstacles",
-        "Stops of the collision monitor",
-        (
-            Column("case"),
-            Column("drives"),
-            Column("contacts"),
-            Column("of the robot's own"),
-            Column("least clearance", "m", 2),
-            Column("stops"),
-            Column("false stops"),
-            Column("driven", "m", 1),
-            Column("highest speed within 1 m", "m/s", 2),
-            Column("unknown rings within 1 m"),
-            Column("rings within 1 m"),
-        ),
-        REMARKS,
-        continued=True,
+    usual = Conditions(
+        size_px=arguments.size,
+        rate_hz=arguments.rate,
+        build=arguments.robot,
+        floor=arguments.floor,
+        disturbed=tuple(arguments.disturb),
     )
     seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
-    table.seeds = [("obstacle stops", seed) for seed in seeds]
-    parts = list(itertools.product(arguments.cases, arguments.speeds, arguments.sizes))
-    built = partial(run, rate_hz=arguments.rate, build=arguments.robot, disturbed=arguments.disturb)
+    parts = [(case, replace(usual, speed_mps=speed_mps)) for case in arguments.cases for speed_mps in arguments.speeds]
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool:
-        runs = [
-            [pool.submit(built, case, seed, size_px, arguments.overrides, speed_mps) for seed in seeds]
-            for case, speed_mps, size_px in parts
-        ]
-        for part, futures in zip(parts, runs, strict=True):
+        runs = [[pool.submit(run, case, seed, how, arguments.overrides) for seed in seeds] for case, how in parts]
+        for (case, how), futures in zip(parts, runs, strict=True):
             drives = []
             for seed, future in zip(seeds, futures, strict=True):
                 drives.append(future.result())
-                print(f"{part[0]} {seed}: {drives[-1]}", flush=True)
-            _add(table, _named(*part, arguments), drives)
+                print(f"{case} {seed} {how}: {drives[-1]}", flush=True)
+            print(f"{case} {how}: {summed(drives)}", flush=True)
 
 
-def _named(case: str, speed_mps: float, size_px: int, arguments: argparse.Namespace) -> str:
-    """Return a case with all in which its drives differ from the usual ones."""
-    at = f", {speed_mps:g} m/s" * (speed_mps != SPEED_MPS) + f", {size_px} px" * (size_px != SIZE_PX)
-    at += f", {arguments.rate:g} Hz" * (arguments.rate != RATE_HZ)
-    if arguments.disturb:
-        at += ", all disturbances" if arguments.disturb == OF_CAMERAS else f", {' and '.join(arguments.disturb)}"
-    return case + at + f", {arguments.robot} robot" * (arguments.robot != USUAL)
-
-
-def _add(table: ResultTable, label: str, drives: Sequence[Drive]) -> None:
-    table.add(
-        label,
-        len(drives),
+def summed(drives: Sequence[Drive]) -> Drive:
+    """Return the sums of drives, their least clearance and highest speed; without reasons."""
+    return Drive(
         sum(drive.contacts for drive in drives),
         sum(drive.own for drive in drives),
         min(drive.clearance_m for drive in drives),
@@ -306,7 +300,8 @@ def _add(table: ResultTable, label: str, drives: Sequence[Drive]) -> None:
         sum(drive.false_stops for drive in drives),
         sum(drive.driven_m for drive in drives),
         max(drive.near_mps for drive in drives),
-        *(sum(drive.unknown[k] for drive in drives) for k in (0, 1)),
+        (sum(drive.unknown[0] for drive in drives), sum(drive.unknown[1] for drive in drives)),
+        "",
     )
 
 
