@@ -154,7 +154,6 @@ def run_merge(args: argparse.Namespace) -> int:
 
 def run_export(args: argparse.Namespace) -> int:
     """Write the files that are asked for."""
-    import numpy as np
 
     from omnid.core.places import place_views
     from omnid.formats.grid_map import write_grid
@@ -176,9 +175,9 @@ def run_export(args: argparse.Namespace) -> int:
     check_outputs([*outputs, *images], inputs)
     places, rig = read_places(args.map)
     if args.grid:
-        if not any(np.isfinite(keyframe.scan).any() for keyframe in places.keyframes.values()):
+        if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
             print(
-                f"omnid: warning: {args.grid}: all cells are unknown: the map is of an earlier version, or was built "
+                f"omnid: warning: {args.grid}: no cell is free: the map is of an earlier version, or was built "
                 f"without the height of the cameras above the floor: {ADVICE}, and build the map again",
                 file=sys.stderr,
             )

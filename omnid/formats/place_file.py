@@ -30,13 +30,14 @@ from omnid.formats.place_rows import BadRowError, KeyframeRow
 from omnid.formats.stored_features import FeatureFile
 from omnid.formats.whole_file import replacement
 
-VERSION: Final = 5  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+VERSION: Final = 6  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
 APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
 # Earlier versions that are read as well. Scans before version 4 had heights above the base, not above the floor, and
-# passed over low obstacles before a wall: they are read as unknown.
+# passed over low obstacles before a wall: they are read as unknown. Before version 6 floor was not seen: none is free.
 WITHOUT_TAGS: Final = 2
 WITHOUT_FLOOR: Final = 3
 WITHOUT_CODES: Final = 4  # Features are in the rows of the keyframes, which are read whole.
+WITHOUT_FREE: Final = 5
 MAGIC: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
 MAX_VALUE_BYTES: Final = 1 << 20  # Limit of one value in the database.
@@ -47,8 +48,8 @@ MAX_INSTRUCTIONS: Final = 50_000_000  # Instructions that SQLite may take to rea
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
     "missed INTEGER, T_map_rect BLOB, "
-    "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, features INTEGER, codes BLOB, azimuths BLOB, "
-    "crc32 INTEGER)",
+    "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, free_m BLOB, features INTEGER, codes BLOB, "
+    "azimuths BLOB, crc32 INTEGER)",
     "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
     "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, tags INTEGER, tag_views INTEGER, "
     "width INTEGER, height INTEGER, "
@@ -59,8 +60,9 @@ SCHEMA: Final = {
     # The last table, so that what is read at the start lies together in the file.
     "features": "CREATE TABLE features (id INTEGER PRIMARY KEY, descriptors BLOB, views BLOB, crc32 INTEGER)",
 }
+SCHEMA_5: Final = {**SCHEMA, "keyframe": SCHEMA["keyframe"].replace("free_m BLOB, ", "")}
 SCHEMA_4: Final = {
-    "keyframe": SCHEMA["keyframe"].replace(
+    "keyframe": SCHEMA_5["keyframe"].replace(
         "features INTEGER, codes BLOB, azimuths BLOB", "descriptors BLOB, views BLOB"
     ),
     **{table: text for table, text in SCHEMA.items() if table not in ("keyframe", "features")},
@@ -69,6 +71,13 @@ SCHEMA_2: Final = {
     "keyframe": SCHEMA_4["keyframe"],
     "link": SCHEMA["link"],
     "map": SCHEMA["map"].replace("tags INTEGER, tag_views INTEGER, ", ""),
+}
+SCHEMAS: Final = {
+    WITHOUT_TAGS: SCHEMA_2,
+    WITHOUT_FLOOR: SCHEMA_4,
+    WITHOUT_CODES: SCHEMA_4,
+    WITHOUT_FREE: SCHEMA_5,
+    VERSION: SCHEMA,
 }
 IN_MEMORY: Final = 1 << 62  # More bytes than the features of any map have.
 BLOCK: Final = 1000  # Rows of which arrays are made at once: 5 MB of keyframes; by judgement, not measured.
@@ -131,7 +140,7 @@ def _version_of(path: Path) -> int:
     if len(header) < 100 or not header.startswith(MAGIC) or int.from_bytes(header[68:72]) != APPLICATION_ID:
         raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
     version = int.from_bytes(header[60:64])
-    if version not in (WITHOUT_TAGS, WITHOUT_FLOOR, WITHOUT_CODES, VERSION):
+    if version not in SCHEMAS:
         raise OmnidError(
             f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
             "`omnid map build`, or update omnid"
@@ -182,7 +191,7 @@ class _Reader:
 
     def __init__(self, database: sqlite3.Connection, version: int) -> None:
         self.database, self.version = database, version
-        schema = {WITHOUT_TAGS: SCHEMA_2, VERSION: SCHEMA}.get(version, SCHEMA_4)
+        schema = SCHEMAS[version]
         bound_work(database, MAX_INSTRUCTIONS)
         found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(schema) + 1))
         if found != schema:
@@ -244,13 +253,16 @@ def _read_keyframes(
     keyframes: list[KeyframeRow] = []
     features: list[PlaceFeatures] = []
     codes: list[place_rows.KeyframeCodes] = []
+    has_codes = reader.version > WITHOUT_CODES
     for block in reader.blocks("keyframe", MAX_KEYFRAMES):
+        if reader.version <= WITHOUT_FREE:
+            block = [place_rows.keyframe_without_free(row) for row in block]
         keyframes += place_rows.read_keyframes(block)
-        if reader.version == VERSION:
+        if has_codes:
             codes.append(place_rows.read_codes(block))
         else:
             features += [place_rows.read_features(row[-2], row[-1], rig) for row in block]
-    if reader.version != VERSION:
+    if not has_codes:
         return keyframes, features
     counts = [count for block in codes for count in block.counts]
     if sum(counts) * place_rows.FEATURE_BYTES > most_feature_bytes:

@@ -31,7 +31,7 @@ MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
 LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
 RIGID: Final = 1e-6  # Largest difference of an element of R R^T from the identity.
 THUMBNAIL: Final = (16, 128)  # rows and columns
-INDEX_COLUMNS: Final = 10  # Columns of a keyframe up to its scan, the same in all versions.
+INDEX_COLUMNS: Final = 11  # Columns of a keyframe up to its free ranges.
 MAX_HASH: Final = 128  # characters
 BASELINES_M: Final = (1e-3, 1e2)  # least and largest
 
@@ -52,6 +52,7 @@ class KeyframeRow(NamedTuple):
     covariance: Array  # (6, 6)
     thumbnail: NDArray[np.int8]  # (16, 128)
     scan: NDArray[np.float16]  # (SECTORS,) m
+    free_m: NDArray[np.float16]  # (SECTORS,) m
 
     def keyframe(self, features: PlaceFeatures | StoredFeatures) -> PlaceKeyframe:
         """Return the keyframe with its features."""
@@ -63,6 +64,7 @@ class KeyframeRow(NamedTuple):
             self.covariance,
             self.thumbnail,
             self.scan,
+            self.free_m,
             features,
         )
 
@@ -108,6 +110,7 @@ def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse, w
         _bytes(keyframe.covariance, "<f8"),
         _bytes(keyframe.thumbnail, "i1"),
         _bytes(keyframe.scan, "<f2"),
+        _bytes(keyframe.free_m, "<f2"),
         keyframe.features.count,
         _bytes(codes_of(features), "<u8"),
         _bytes(azimuths_of(features, width), "u1"),
@@ -173,17 +176,23 @@ def head_of_version_2(row: Row) -> Row:
     return (*row[:3], 0, 0, *row[3:])
 
 
+def keyframe_without_free(row: Row) -> Row:
+    """Return the row of a keyframe of versions up to 5, which knew no floor, as one of today: it is free nowhere."""
+    return (*row[: INDEX_COLUMNS - 1], bytes(2 * SECTORS), *row[INDEX_COLUMNS - 1 :])
+
+
 def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
     """Return keyframes without their features. Raises BadRowError. Poses and covariances are not checked.
 
     The arrays of all of them are made at once: one by one takes most of the time in which a large map opens.
     """
-    ids, sessions, stamps, found, missed, T_map_rect, T_odom_rect, covariance, thumbnail, scan = (
+    ids, sessions, stamps, found, missed, T_map_rect, T_odom_rect, covariance, thumbnail, scan, free = (
         [row[column] for row in rows] for column in range(INDEX_COLUMNS)
     )
-    ranges = _arrays(scan, "<f2", (SECTORS,))
-    if not (np.isnan(ranges) | ((ranges >= 0) & (ranges <= MAX_RANGE_M))).all():
-        raise BadRowError(f"a range of a keyframe is outside 0 to {MAX_RANGE_M:g} m")
+    ranges, free_m = (_arrays(of, "<f2", (SECTORS,)) for of in (scan, free))
+    for known, may_be in ((ranges, np.isnan(ranges)), (free_m, False)):
+        if not (may_be | ((known >= 0) & (known <= MAX_RANGE_M))).all():
+            raise BadRowError(f"a range of a keyframe is outside 0 to {MAX_RANGE_M:g} m")
     return [
         KeyframeRow(_integer(id), _integer(session), _integer(stamp_ns, -MAX_INTEGER), use, *arrays)
         for id, session, stamp_ns, use, *arrays in zip(
@@ -196,6 +205,7 @@ def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
             _arrays(covariance, "<f8", (6, 6)),
             _arrays(thumbnail, "i1", THUMBNAIL),
             ranges,
+            free_m,
             strict=True,
         )
     ]

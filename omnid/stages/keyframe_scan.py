@@ -1,4 +1,4 @@
-"""Range scan of a keyframe: the nearest obstacles above the floor, by the height of its points."""
+"""Range scan of a keyframe: the nearest obstacles above the floor by the height of its points, and the free floor."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.point_scan import ScanLimits, point_scan
-from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, RangeScan
+from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, FreeRanges, RangeScan, seen_from
 from omnid.core.obstacles.settings import RingSettings
-from omnid.messages import DensePoints
+from omnid.messages import DensePoints, ObstacleRing
 from omnid.stages.floor import CameraFloor
 
 Array = NDArray[np.float64]
@@ -26,11 +26,23 @@ def keyframe_scan(
         return np.full(SECTORS, np.nan, np.float32)
     T_floor_rig = camera_floor.T_floor_rig(floor)
     T_floor_rect = T_floor_rig @ T_rig_rect
-    # The level frame below the lower viewpoint, with the heading of the rectified frame.
-    heading = se3.rotation_exp(np.array([0.0, 0.0, float(se3.yaw(T_floor_rect))]))
-    T_floor_level = se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0]))
-    points = se3.apply(se3.inverse(T_floor_level) @ T_floor_rig, depth.points)
+    points = se3.apply(_T_level_floor(T_floor_rect) @ T_floor_rig, depth.points)
     view = np.array([0.0, 0.0, T_floor_rect[2, 3]])
     limits = ScanLimits(settings.heights_m, math.radians(settings.tilt_deg), MAX_RANGE_M, settings.min_points)
     ranges = point_scan(points, np.sqrt(depth.variance_m2), view, limits, floor.sigma_m)
     return np.where(np.isfinite(ranges), ranges, np.float32(np.nan))
+
+
+def keyframe_free(ring: ObstacleRing, camera_floor: CameraFloor, T_rig_rect: Array) -> FreeRanges:
+    """Return up to where the floor is free by the ring at a keyframe, (SECTORS,) as of its scan."""
+    floor = camera_floor.floor
+    if floor is None:
+        return np.zeros(SECTORS, np.float32)
+    free_m = seen_from(ring.free_m, _T_level_floor(camera_floor.T_floor_rig(floor) @ T_rig_rect))
+    return np.minimum(free_m, np.float32(MAX_RANGE_M))
+
+
+def _T_level_floor(T_floor_rect: Array) -> Array:
+    """Return the transform to the level frame below the lower viewpoint, with the heading of the rectified frame."""
+    heading = se3.rotation_exp(np.array([0.0, 0.0, float(se3.yaw(T_floor_rect))]))
+    return se3.inverse(se3.transform(heading, np.array([*T_floor_rect[:2, 3], 0.0])))

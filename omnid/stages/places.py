@@ -20,7 +20,8 @@ from omnid.messages import MapKeyframes, OdometryUpdate, PlaceUpdate, StereoDept
 from omnid.stages.dense_depths import DenseDepths
 from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
-from omnid.stages.keyframe_scan import keyframe_scan
+from omnid.stages.keyframe_scan import keyframe_free, keyframe_scan
+from omnid.stages.pair_rings import PairRings
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]
@@ -58,6 +59,7 @@ class Places:
         )
         self._T_rig_rect = geometry.T_rig_rect
         self._ring = config.obstacles.ring
+        self._rings = PairRings(geometry, config.obstacles.ring)  # at keyframes
         self.floor = CameraFloor(geometry.rig, config.obstacles.ring.floor_m)
         self._T_rect_rig = se3.inverse(self._T_rig_rect)
         self._to_rig = se3.adjoint(self._T_rig_rect)
@@ -158,6 +160,7 @@ class Places:
             odometry.reset_counter,
             odometry.is_keyframe,
             lambda: self._scan(depth),
+            lambda: keyframe_free(self._rings.add(odometry, self.floor), self.floor, self._T_rig_rect),
         )
 
     def _scan(self, depth: StereoDepth) -> RangeScan:

@@ -50,7 +50,7 @@ REMARKS: Final = (
     "A simulated robot by the stick, straight on, at 0.3, 0.5, 0.8 and -0.5 m/s (backwards) by turns, 512 px at 10 Hz; "
     "only the collision monitor keeps it from what it meets. A contact counts for an edge when the outline is over it; "
     "of a person, either of the two may have moved; it is the robot's own where it drove faster than 0.05 m/s. A stop "
-    "is false where the truth has nothing within 1 m ahead, or up to 0.2 m to the side of the way, and nobody walks "
+    "is false where the truth has nothing within 1 m ahead, or up to 0.2 m to the side of the way, and no person walks "
     "within 2 m. What a row does not name is as usual: tiles, matt; a robot 1.2 m high; cameras without compression.",
 )
 

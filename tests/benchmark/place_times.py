@@ -69,7 +69,7 @@ def main() -> None:
                 seconds(lambda: search.far(query.thumbnail, query.features, places, ids), 5),
                 f"{places.nbytes / 1e6:.0f} MB in memory",
             ),
-            ("grid of 1,000 range scans, 0.05 m", seconds(lambda: scan_grid(scans, poses, 0.05)), ""),
+            ("grid of 1,000 range scans, 0.05 m", seconds(lambda: scan_grid(scans, scans, poses, 0.05)), ""),
             ("particle filter: one update, 1,000 particles", seconds(lambda: particles.update(scans[0]), 25), ""),
         )
     table = ResultTable(

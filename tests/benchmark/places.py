@@ -256,6 +256,7 @@ def _asked(cameras: RenderedCameras, places: PlaceMap, poses: tuple[Array, Array
             0,
             True,
             lambda: np.full(360, np.nan, np.float32),
+            lambda: np.zeros(360, np.float32),
         )
         started = time.process_time()
         pose = localiser.process(frame)

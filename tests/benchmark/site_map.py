@@ -160,10 +160,10 @@ def site(views: Sequence[View], count: int, width: int, seed: int) -> Iterator[V
 def map_of(views: Iterator[View]) -> PlaceMap:
     """Return a map of keyframes, each linked to the next, and every fifth one to that before the one before."""
     places, before = PlaceMap(1 << 30, 1 << 40), list[Array]()
-    nothing = np.full(360, np.nan, np.float16)
+    nothing = np.full(360, np.nan, np.float16), np.zeros(360, np.float16)
     for id, view in enumerate(views):
         T = view.T_map_rect
-        keyframe = PlaceKeyframe(id, 0, 10**9 * id, T, COVARIANCE, view.thumbnail, nothing, view.features)
+        keyframe = PlaceKeyframe(id, 0, 10**9 * id, T, COVARIANCE, view.thumbnail, *nothing, view.features)
         places.keyframes[id], places.poses[id] = keyframe, T
         if id:
             places.links.append(Link(id - 1, id, se3.inverse(before[-1]) @ T, COVARIANCE))
@@ -211,7 +211,15 @@ def measured(path: Path, feature_bytes: int, queries: Sequence[View], rig: Rig, 
     for n, frame in enumerate(frames):
         T_odom = se3.inverse(T_first) @ path_of(seed)[0][5 + 4 * n] @ T_rig_rect
         given = OdometryFrame(
-            frame, n * 400_000_000, T_odom, 1e-8 * np.eye(6), False, 0, True, lambda: np.full(360, np.nan, np.float32)
+            frame,
+            n * 400_000_000,
+            T_odom,
+            1e-8 * np.eye(6),
+            False,
+            0,
+            True,
+            lambda: np.full(360, np.nan, np.float32),
+            lambda: np.zeros(360, np.float32),
         )
         begin_s = time.process_time()
         localised += localiser.process(given).state is MapState.LOCALIZED

@@ -26,6 +26,7 @@ class KeyframeScans:
     """Range scans of keyframes by their ids in the order of addition, and the poses (K, 4, 4) of their frames."""
 
     scans: Mapping[int, NDArray[np.float16]]  # (360,) each, see range_scan.py
+    free_m: Mapping[int, NDArray[np.float16]]  # (360,) each, up to which floor was seen
     T_map_rect: Array
     loops: tuple[tuple[int, int], ...] = ()  # ids of the keyframes between which places were recognised
 
@@ -55,7 +56,8 @@ class KeyframeGrid:
             self.redrawn += 1
         for id, (x, y, yaw) in planar.items():
             if id not in self._drawn:
-                self._grid.add(keyframes.scans[id].astype(np.float32), x, y, yaw)
+                scan, free_m = (of[id].astype(np.float32) for of in (keyframes.scans, keyframes.free_m))
+                self._grid.add(scan, free_m, x, y, yaw)
                 self._drawn[id] = x, y, yaw
         return known_part(self._grid.grid())
 

@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
+
 Array = NDArray[np.float64]
 
 # Sectors of one degree are as wide as a cell of the map, 5 cm, at 3 m; finer ones would not show more.
@@ -21,11 +23,28 @@ SURFACE_RATIO: Final = 1.15
 
 # Ranges (SECTORS,) [m] of the sectors in the order of azimuth, from -pi on. NaN: no obstacle was seen.
 RangeScan = NDArray[np.float32]
+# Ranges (SECTORS,) [m] in the same order, up to which the floor was seen without anything on it; 0: nowhere.
+FreeRanges = NDArray[np.float32]
 
 
 def azimuths() -> Array:
     """Return the azimuths (SECTORS,) [rad] of the sectors' middles."""
     return np.asarray((np.arange(SECTORS) + 0.5) * (2 * math.pi / SECTORS) - math.pi)
+
+
+def seen_from(free_m: FreeRanges, T_view_base: Array) -> FreeRanges:
+    """Return free ranges around a base as seen from a viewpoint on it: the floor that is free from both.
+
+    T_view_base (4, 4): from the base to the viewpoint, both level and on the floor [m].
+    """
+    directions = np.column_stack([np.cos(azimuths()), np.sin(azimuths()), np.zeros(SECTORS)])
+    x, y, _ = se3.apply(T_view_base, free_m[:, None] * directions).T
+    sector = np.floor((np.arctan2(y, x) + math.pi) * (SECTORS / math.tau)).astype(np.intp) % SECTORS
+    nearest = np.full(SECTORS, np.inf)
+    np.minimum.at(nearest, sector, np.where(free_m > 0, np.hypot(x, y), 0.0))
+    # An end between two sectors belongs to either side.
+    nearest = np.minimum(nearest, np.minimum(np.roll(nearest, 1), np.roll(nearest, -1)))
+    return np.where(np.isfinite(nearest), nearest, 0.0).astype(np.float32)
 
 
 def fill_gaps(scan: RangeScan) -> RangeScan:

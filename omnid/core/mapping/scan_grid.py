@@ -1,6 +1,8 @@
-"""Occupancy grid of range scans at poses: obstacles, and the space between the robot and them (ray casting).
+"""Occupancy grid of range scans at poses: obstacles, and the floor between the robot and them (ray casting).
 
 The scans are those of keyframes. A loop that closes moves the keyframes, and the grid is then drawn again.
+That nothing was measured up to a range does not make a cell free, as nothing low or thin is measured: free are the
+cells whose floor was seen (core/obstacles).
 Log odds with limits: Elfes 1989, "Using occupancy grids for mobile robot perception and navigation"; the limits, by
 which later views clear what has gone: Hornung et al. 2013, "OctoMap", section 3.4.
 """
@@ -16,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
-from omnid.core.mapping.range_scan import SURFACE_RATIO, RangeScan, azimuths
+from omnid.core.mapping.range_scan import SURFACE_RATIO, FreeRanges, RangeScan, azimuths
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int8]
@@ -33,9 +35,6 @@ LIMITS: Final = (-20, 35)
 OCCUPIED_FROM: Final = 14
 # ... and free from two misses on, because a false match may let a single view pass through a wall.
 FREE_UNTIL: Final = -8
-# A cell is free only by views from this near, because farther ones pass over what is low: a box 12 cm high is seen up
-# to 3 m, by the usual tilt. Farther ones clear what has gone, so that it is unknown.
-FREE_M: Final = 3.0
 # From this far on a cell is free only where a view has seen through the whole of it, so that what is narrower than a
 # cell and shows no range, as a plain pole, is unknown; nearer is the base itself. By trial on a development seed.
 WHOLE_M: Final = 0.5
@@ -58,10 +57,10 @@ class ScanGrid:
         self._first = np.floor(low / cell_m)
         width, height = (np.floor(high / cell_m) - self._first + 1).astype(int)
         self._odds = np.zeros((height, width), np.int8)
-        self._near_odds = np.zeros((height, width), np.int8)  # the same, without what only far views have seen through
+        self._floor_odds = np.zeros((height, width), np.int8)  # the same, by the views that have seen the floor
 
-    def add(self, scan: RangeScan, x_m: float, y_m: float, yaw_rad: float) -> None:
-        """Add a scan (SECTORS,) whose frame has this pose in the map."""
+    def add(self, scan: RangeScan, free_m: FreeRanges, x_m: float, y_m: float, yaw_rad: float) -> None:
+        """Add a scan (SECTORS,) whose frame has this pose in the map, and up to where floor was seen there."""
         # 1. The ends of the ranges, and the part of the grid in which they lie.
         known = np.isfinite(scan)
         angle = azimuths() + yaw_rad
@@ -82,21 +81,26 @@ class ScanGrid:
         hit = np.zeros(self._odds[part].shape, np.uint8)
         _draw_hits(hit, scan, ends - [left, top])
         middle, near = centre - [left, top], WHOLE_M / self._cell_m
-        for odds, far_m in ((self._odds[part], np.inf), (self._near_odds[part], FREE_M)):
-            seen = middle + np.minimum(seen_through, far_m)[:, None] * direction
-            free = _free(odds.shape, middle, seen, near)
+        floor_m = np.minimum(seen_through, free_m)
+        for odds, range_m in ((self._odds[part], seen_through), (self._floor_odds[part], floor_m)):
+            free = _free(odds.shape, middle, middle + range_m[:, None] * direction, near)
             change = np.where(hit > 0, HIT, -MISS * free.astype(np.int8)).astype(np.int8)
             np.clip(odds + change, *LIMITS, out=odds)
 
     def grid(self) -> Grid:
-        """Return the occupied, free and unknown cells.
+        """Return the occupied, free and unknown cells; a cell is free where its floor was seen."""
+        return self._grid(np.maximum(self._odds, self._floor_odds))
 
-        A cell next to an occupied one is never free, because an obstacle is known to a cell only.
-        """
+    def open_grid(self) -> Grid:
+        """Return the same, but a cell is free where views passed through it: something low or thin may stand there."""
+        return self._grid(self._odds)
+
+    def _grid(self, odds: Cells) -> Grid:
+        """Return the cells; one next to an occupied one is never free, as an obstacle is known to a cell only."""
         cells = np.full(self._odds.shape, UNKNOWN, np.int8)
         is_occupied = self._odds >= OCCUPIED_FROM
         near = cv2.dilate(is_occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        cells[(np.maximum(self._odds, self._near_odds) <= FREE_UNTIL) & ~near] = FREE
+        cells[(odds <= FREE_UNTIL) & ~near] = FREE
         cells[is_occupied] = OCCUPIED
         x, y = (self._first * self._cell_m).tolist()
         return Grid(cells, self._cell_m, (x, y))
@@ -109,14 +113,14 @@ class ScanGrid:
         return (int(low[0]), int(low[1]), int(high[0]), int(high[1])) if (low < high).all() else None
 
 
-def scan_grid(scans: Sequence[RangeScan], poses: Array, cell_m: float) -> Grid:
+def scan_grid(scans: Sequence[RangeScan], free_m: Sequence[FreeRanges], poses: Array, cell_m: float) -> ScanGrid:
     """Return the grid of K scans, the oldest first; poses (K, 4, 4): those of their frames in the map."""
     reach, xy = np.array([reach_m(scan) + cell_m for scan in scans])[:, None], poses[:, :2, 3]
     low, high = (xy - reach, xy + reach) if len(scans) else (np.zeros((1, 2)), np.zeros((1, 2)))
     drawn = ScanGrid(low.min(axis=0), high.max(axis=0), cell_m)
-    for scan, pose in zip(scans, poses, strict=True):
-        drawn.add(scan, float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0]))
-    return drawn.grid()
+    for scan, free, pose in zip(scans, free_m, poses, strict=True):
+        drawn.add(scan, free, float(pose[0, 3]), float(pose[1, 3]), math.atan2(pose[1, 0], pose[0, 0]))
+    return drawn
 
 
 def reach_m(scan: NDArray[np.floating]) -> float:

@@ -21,6 +21,7 @@ class FixedPlaces:
         self.known = frozenset(ids)
         self.poses: Array = np.array([places.poses[id] for id in ids]).reshape(-1, 4, 4)
         self.scans = {id: places.keyframes[id].scan for id in ids}
+        self.free_m = {id: places.keyframes[id].free_m for id in ids}
 
     @cached_property
     def _rows(self) -> dict[int, int]:

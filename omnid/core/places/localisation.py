@@ -145,7 +145,7 @@ class MapLocaliser:
         if self._scans is None or self._scans[0] != now:
             shown = self._fixed if self._is_in_fixed else FixedPlaces(self.places, sorted(self._parts.ids()))
             loops = tuple((link.a, link.b) for link in self.places.links if link.is_loop)
-            self._scans = now, KeyframeScans(shown.scans, shown.poses, loops)
+            self._scans = now, KeyframeScans(shown.scans, shown.free_m, shown.poses, loops)
         return self._scans[1]
 
     def _advance(self, frame: OdometryFrame) -> None:
@@ -270,6 +270,7 @@ class MapLocaliser:
             frame.covariance,
             small,
             frame.scan().astype(np.float16),
+            frame.free_m().astype(np.float16),
             features,
         )
         link = None if self._newest is None else by_odometry(self._newest, keyframe)

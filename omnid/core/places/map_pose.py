@@ -30,6 +30,7 @@ class OdometryFrame:
     resets: int  # gaps of unknown motion so far
     is_keyframe: bool  # True if its dense depth is known
     scan: Callable[[], NDArray[np.float32]]  # returns distances (SECTORS,) [m], see mapping/range_scan.py
+    free_m: Callable[[], NDArray[np.float32]]  # returns up to where floor was seen, asked once at a keyframe
 
 
 @dataclass(frozen=True, slots=True, eq=False)

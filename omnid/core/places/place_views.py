@@ -137,7 +137,9 @@ def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
     """Return the occupancy grid of the keyframes' range scans, the newest evidence last."""
     ids = sorted(places.keyframes, key=lambda id: (places.keyframes[id].session, places.keyframes[id].stamp_ns, id))
     poses = np.array([rig.T_base_rect @ places.poses[id] for id in ids]).reshape(-1, 4, 4)
-    return scan_grid([places.keyframes[id].scan.astype(np.float32) for id in ids], poses, cell_m)
+    scans = [places.keyframes[id].scan.astype(np.float32) for id in ids]
+    free_m = [places.keyframes[id].free_m.astype(np.float32) for id in ids]
+    return scan_grid(scans, free_m, poses, cell_m).grid()
 
 
 def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:

@@ -18,7 +18,15 @@ import pytest
 
 from omnid.core.places.place_map import UNUSED, PlaceMap
 from omnid.errors import OmnidError
-from omnid.formats.place_file import APPLICATION_ID, MAX_VALUE_BYTES, SCHEMA_2, SCHEMA_4, read_places, write_places
+from omnid.formats.place_file import (
+    APPLICATION_ID,
+    MAX_VALUE_BYTES,
+    SCHEMA_2,
+    SCHEMA_4,
+    SCHEMA_5,
+    read_places,
+    write_places,
+)
 from omnid.formats.place_rows import checksum, features_row, keyframe_row
 from omnid.formats.ply import write_ply
 from tests.faults.mutation import mutated
@@ -88,9 +96,30 @@ def test_version_4_had_the_features_in_the_rows_of_the_keyframes(tmp_path: Path)
     write_places(path, places, RIG)
     now = path.read_bytes()
     read, rig = read_places(as_of_version_4(path, places), most_feature_bytes=0)
-    assert read.stored is None and all(same(read.keyframes[id], places.keyframes[id]) for id in places.keyframes)
+    assert read.stored is None
+    for id, keyframe in read.keyframes.items():
+        assert not keyframe.free_m.any()
+        read.keyframes[id] = dataclasses.replace(keyframe, free_m=places.keyframes[id].free_m)
+        assert same(read.keyframes[id], places.keyframes[id])
     write_places(path, read, rig)
     assert path.read_bytes() == now
+
+
+def test_nothing_is_free_in_a_map_of_version_5(tmp_path: Path) -> None:
+    """It says where ranges were seen, but not where floor was."""
+    path, places = tmp_path / "a.omap", some_places(4)
+    write_places(path, places, RIG)
+    with closing(sqlite3.connect(path)) as database:
+        rows = [(*row[:10], *row[11:-1]) for row in database.execute("SELECT * FROM keyframe ORDER BY id")]
+    changed(path, "DROP TABLE keyframe", SCHEMA_5["keyframe"], "PRAGMA user_version = 5")
+    with closing(sqlite3.connect(path)) as database:
+        for row in rows:
+            database.execute(f"INSERT INTO keyframe VALUES ({', '.join('?' * 14)})", (*row, checksum(row)))
+        database.commit()
+    read, _ = read_places(path)
+    for id, keyframe in read.keyframes.items():
+        assert not keyframe.free_m.any() and same(keyframe.scan, places.keyframes[id].scan)
+        assert same(keyframe.features.copied(), places.keyframes[id].features)
 
 
 def as_of_version_4(path: Path, places: PlaceMap) -> Path:
@@ -206,7 +235,7 @@ def changed(path: Path, *statements: str) -> Path:
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
-        ("PRAGMA user_version = 1", "version 1, expected 5"),
+        ("PRAGMA user_version = 1", "version 1, expected 6"),
         ("UPDATE keyframe SET stamp_ns = 5 WHERE id = 2", "the checksum of row 3 of keyframe"),
         ("UPDATE link SET inliers = 5", "the checksum of row 1 of link"),
         ("DELETE FROM keyframe WHERE id = 3", "the features are not those of 3 keyframes"),
@@ -251,6 +280,7 @@ def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
         ({"covariance": np.triu(np.ones((6, 6)))}, "a covariance is not symmetric"),
         ({"covariance": np.full((6, 6), np.inf)}, "a covariance is not finite"),
         ({"scan": np.full(360, 1000, np.float16)}, "a range of a keyframe"),
+        ({"free_m": np.full(360, np.nan, np.float16)}, "a range of a keyframe"),
         ({"thumbnail": np.zeros((16, 64), np.int8)}, "an array has another size"),
         ({"session": -1}, "outside its range"),
     ],

@@ -17,7 +17,9 @@ SCAN = np.full(360, 2.0, np.float16)
 
 
 def scans(count: int) -> KeyframeScans:
-    return KeyframeScans(dict.fromkeys(range(count), SCAN), np.tile(np.eye(4), (count, 1, 1)))
+    return KeyframeScans(
+        dict.fromkeys(range(count), SCAN), dict.fromkeys(range(count), SCAN), np.tile(np.eye(4), (count, 1, 1))
+    )
 
 
 def update(seq: int, seen: KeyframeScans | None) -> PlaceUpdate:

@@ -115,8 +115,9 @@ def test_what_is_known_is_known_again_when_odometry_has_found_its_place_again() 
     pairs = [Panoramas(0, 0, *panoramas(stains, 3.0, striped, seed=seed), SHOWN) for seed in range(3)]
     for seq in range(20):
         stage.process(at_rest(seq, pairs[seq % 3], TrackingState.TRACKING))
-    corner = np.round(stage._grid.corner_m / CELL_M).astype(int)
-    stage._grid._odds[SURFACE, -corner[1] - 6 : -corner[1] + 6, -corner[0] + 8 : -corner[0] + 11] = 6.0
+    grid = stage._rings._grid
+    corner = np.round(grid.corner_m / CELL_M).astype(int)
+    grid._odds[SURFACE, -corner[1] - 6 : -corner[1] + 6, -corner[0] + 8 : -corner[0] + 11] = 6.0
     ranges_m = []
     for seq, state in ((20, TrackingState.TRACKING), (21, TrackingState.LOST), (22, TrackingState.DEGRADED)):
         ring = stage.process(at_rest(seq, pairs[seq % 3], state))

@@ -6,9 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.mapping.range_scan import MAX_RANGE_M, RangeScan, azimuths
+from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, RangeScan, azimuths
 
 Array = NDArray[np.float64]
+
+OPEN = np.full(SECTORS, MAX_RANGE_M, np.float32)  # free ranges, where floor was seen up to what stands on it
 
 
 def pose(x: float, y: float, yaw: float) -> Array:

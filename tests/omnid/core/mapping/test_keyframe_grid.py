@@ -6,20 +6,24 @@ import numpy as np
 
 from omnid.core.mapping.keyframe_grid import MAX_CELLS, KeyframeGrid, KeyframeScans
 from omnid.core.mapping.occupancy_grid import OCCUPIED, UNKNOWN, Grid, known_part
-from omnid.core.mapping.scan_grid import scan_grid
-from tests.omnid.core.mapping.rooms import box, pose, scan_of
-from tests.omnid.core.mapping.test_scan_grid import PATH, ROOM, near
+from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
+from tests.omnid.core.mapping.test_scan_grid import PATH, ROOM, grid_of, near
 
 SCANS = [scan_of(ROOM, T).astype(np.float16) for T in PATH]
 T_BASE_RECT = pose(0.1, 0.0, np.pi / 2)
 
 
 def drawn_at_once(scans: list, poses: np.ndarray) -> Grid:
-    return known_part(scan_grid([scan.astype(np.float32) for scan in scans], T_BASE_RECT @ poses, 0.05))
+    return known_part(grid_of([scan.astype(np.float32) for scan in scans], T_BASE_RECT @ poses))
 
 
 def seen(count: int, poses: np.ndarray = PATH, first: int = 0) -> KeyframeScans:
-    return KeyframeScans({7 + n: SCANS[n] for n in range(first, count)}, poses[first:count])
+    return of({7 + n: SCANS[n] for n in range(first, count)}, poses[first:count])
+
+
+def of(scans: dict[int, np.ndarray], poses: np.ndarray) -> KeyframeScans:
+    """Return scans with floor up to what they show."""
+    return KeyframeScans(scans, dict.fromkeys(scans, OPEN.astype(np.float16)), poses)
 
 
 def same(a: Grid, b: Grid) -> bool:
@@ -54,13 +58,13 @@ def test_a_keyframe_that_leaves_takes_its_evidence_along() -> None:
 
 def test_it_grows_and_is_bounded() -> None:
     grid = KeyframeGrid(0.05)
-    nothing = grid.draw(KeyframeScans({}, np.zeros((0, 4, 4))), T_BASE_RECT)
+    nothing = grid.draw(of({}, np.zeros((0, 4, 4))), T_BASE_RECT)
     assert (nothing.cells == UNKNOWN).all()
     far = np.array([PATH[0], pose(3000.0, 4000.0, 0.0) @ PATH[0]])
-    found = grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0]}, far), T_BASE_RECT)
+    found = grid.draw(of({0: SCANS[0], 1: SCANS[0]}, far), T_BASE_RECT)
     assert found.cell_m > 0.05 and found.cells.size <= MAX_CELLS and grid.redrawn == 2
     small = scan_of(box((-1, -1), (1, 1)), PATH[0]).astype(np.float16)
     assert same(
-        grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
-        grid.draw(KeyframeScans({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
+        grid.draw(of({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
+        grid.draw(of({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),
     )

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
-from omnid.core.mapping.range_scan import SECTORS, azimuths
+from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths, seen_from
 from omnid.core.mapping.scan_grid import MAX_CELLS, scan_grid
-from tests.omnid.core.mapping.rooms import box, pose, scan_of
+from tests.omnid.core.mapping.rooms import OPEN, Array, box, pose, scan_of
 
 ROOM = box((-3.0, -2.0), (4.0, 2.5))
 PATH = np.array([pose(x, 0.2 * x, 0.3 * x) for x in np.arange(-1.5, 1.5, 0.3)])
+
+
+def grid_of(scans: Sequence[RangeScan], poses: Array, cell_m: float = 0.05) -> Grid:
+    """Return the grid of scans with floor up to what they show."""
+    return scan_grid(scans, [OPEN] * len(scans), poses, cell_m).grid()
 
 
 def at(grid: Grid, x: float, y: float) -> int:
@@ -27,11 +34,10 @@ def near(grid: Grid, x: float, y: float) -> set[int]:
 
 
 def test_walls_are_occupied_the_room_is_free_the_rest_unknown() -> None:
-    grid = scan_grid([scan_of(ROOM, T, 0.01, n) for n, T in enumerate(PATH)], PATH, 0.05)
+    grid = grid_of([scan_of(ROOM, T, 0.01, n) for n, T in enumerate(PATH)], PATH)
     for y in np.arange(-1.9, 2.4, 0.1):
         assert OCCUPIED in near(grid, -3.0, y) and OCCUPIED in near(grid, 4.0, y)
-        # Both last views are within FREE_M of x = 3.1.
-        assert {at(grid, x, y) for x in np.arange(-2.7, 3.15, 0.1)} == {FREE} or abs(y - 0.25) > 1.9
+        assert {at(grid, x, y) for x in np.arange(-2.7, 3.55, 0.1)} == {FREE} or abs(y - 0.25) > 1.9
         assert at(grid, -3.3, y) == at(grid, 4.3, y) == UNKNOWN
 
 
@@ -39,15 +45,15 @@ def test_an_obstacle_that_has_gone_is_cleared_and_a_new_one_appears() -> None:
     T = np.tile(pose(0, 0, 0), (30, 1, 1))
     before, after = np.concatenate([ROOM, box((1, 1), (1.3, 1.3))]), np.concatenate([ROOM, box((1, -1), (1.3, -0.7))])
     scans = [scan_of(before, T[0])] * 18 + [scan_of(after, T[0])] * 12
-    grid = scan_grid(scans[:18], T[:18], 0.05)
+    grid = grid_of(scans[:18], T[:18])
     assert OCCUPIED in near(grid, 1.0, 1.0) and at(grid, 1.0, -0.7) == FREE
-    grid = scan_grid(scans, T, 0.05)
+    grid = grid_of(scans, T)
     assert near(grid, 1.0, 1.0) == {FREE} and OCCUPIED in near(grid, 1.0, -0.7)
 
 
 def test_no_free_cell_touches_an_occupied_one() -> None:
     scans = [scan_of(np.concatenate([ROOM, box((1, 1), (1.3, 1.3))]), T, 0.02, n) for n, T in enumerate(PATH)]
-    grid = scan_grid(scans, PATH, 0.05)
+    grid = grid_of(scans, PATH)
     occupied = np.pad(grid.cells == OCCUPIED, 1)
     near_occupied = np.any([np.roll(occupied, (dy, dx), (0, 1)) for dx in (-1, 0, 1) for dy in (-1, 0, 1)], axis=0)
     assert occupied.sum() > 100 and not (grid.cells[near_occupied[1:-1, 1:-1]] == FREE).any()
@@ -56,19 +62,20 @@ def test_no_free_cell_touches_an_occupied_one() -> None:
 def test_space_is_free_when_two_views_have_seen_through_it() -> None:
     T = np.tile(pose(0, 0, 0), (2, 1, 1))
     scan = scan_of(ROOM, T[0])
-    assert at(scan_grid([scan], T[:1], 0.05), 1.0, 0.0) == UNKNOWN
-    assert at(scan_grid([scan] * 2, T, 0.05), 1.0, 0.0) == FREE
+    assert at(grid_of([scan], T[:1]), 1.0, 0.0) == UNKNOWN
+    assert at(grid_of([scan] * 2, T), 1.0, 0.0) == FREE
 
 
-def test_a_low_box_that_only_near_views_show_is_free_nowhere() -> None:
-    """From 3 m on the scan passes over it, and over the space behind its front."""
+def test_what_no_scan_shows_is_free_nowhere_as_its_floor_is_not_seen() -> None:
+    """All scans pass over a low box; views pass through the space above it."""
     path = np.array([pose(x, 0, 0) for x in np.arange(-2.5, 7.0, 0.3)])
-    walls = box((-3.5, -2.0), (8.0, 2.0))
-    seen = np.concatenate([walls, box((0.0, 1.0), (0.4, 1.4))])
-    scans = [scan_of(seen if np.hypot(T[0, 3] - 0.2, 1.2) < 3.3 else walls, T) for T in path]
-    grid = scan_grid(scans, path, 0.05)
-    inside = {at(grid, x, y) for x in np.arange(0.02, 0.4, 0.05) for y in np.arange(1.02, 1.4, 0.05)}
-    assert FREE not in inside and {at(grid, x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
+    walls, low = box((-3.5, -2.0), (8.0, 2.0)), box((0.0, 1.0), (0.4, 1.4))
+    free_m = [np.minimum(seen_from(scan_of(np.concatenate([walls, low]), T), np.eye(4)), 3.0) for T in path]
+    grid = scan_grid([scan_of(walls, T) for T in path], free_m, path, 0.05)
+    inside = [(x, y) for x in np.arange(0.02, 0.4, 0.05) for y in np.arange(1.02, 1.4, 0.05)]
+    assert {at(grid.grid(), x, y) for x, y in inside} == {UNKNOWN}
+    assert {at(grid.open_grid(), x, y) for x, y in inside} == {FREE}
+    assert {at(grid.grid(), x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
 
 
 def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
@@ -81,7 +88,7 @@ def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
         scan[np.abs(off) < np.arctan2(0.02, np.hypot(1.0, 0.2 - T[0, 3])) + np.deg2rad(0.5)] = np.nan
         scans.append(scan)
     for cell_m in (0.02, 0.05):
-        grid = scan_grid(scans, path, cell_m)
+        grid = grid_of(scans, path, cell_m)
         assert FREE not in {at(grid, 0.2 + dx, 1.0 + dy) for dx in (-0.01, 0.01) for dy in (-0.01, 0.01)}
         assert at(grid, 0.2, 0.5) == at(grid, 0.2, 0.0) == FREE
 
@@ -89,7 +96,7 @@ def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
 def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:
     scan, T = scan_of(ROOM, pose(0, 0, 0)), np.tile(np.eye(4), (4, 1, 1))
     scan[180 + 45] = 10.0  # a false match far behind the wall, at 45.5 degrees
-    grid = scan_grid([scan] * 4, T, 0.05)
+    grid = grid_of([scan] * 4, T)
     behind = [at(grid, r * np.cos(np.deg2rad(45.5)), r * np.sin(np.deg2rad(45.5))) for r in np.arange(3.7, 9.5, 0.1)]
     assert FREE not in behind
 
@@ -97,7 +104,7 @@ def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it
 def test_the_map_moves_with_its_keyframes() -> None:
     scans = [scan_of(ROOM, T) for T in PATH]
     moved = pose(1.0, 2.0, np.pi / 2)
-    grid = scan_grid(scans, moved @ PATH, 0.05)
+    grid = grid_of(scans, moved @ PATH)
     for y in np.arange(-1.9, 2.4, 0.1):
         x_m, y_m = (moved @ [4.0, y, 0, 1])[:2]
         assert OCCUPIED in near(grid, x_m, y_m)
@@ -107,12 +114,12 @@ def test_the_map_moves_with_its_keyframes() -> None:
 def test_directions_without_a_range_stay_unknown() -> None:
     scan = scan_of(ROOM, pose(0, 0, 0))
     scan[: SECTORS // 2] = np.nan  # azimuths below 0
-    grid = scan_grid([scan] * 3, np.tile(np.eye(4), (3, 1, 1)), 0.05)
+    grid = grid_of([scan] * 3, np.tile(np.eye(4), (3, 1, 1)))
     assert at(grid, 0.5, -0.5) == UNKNOWN and at(grid, 0.5, 0.5) == FREE
 
 
 def test_no_scan_is_no_map_and_a_large_area_gets_larger_cells() -> None:
-    assert set(scan_grid([], np.zeros((0, 4, 4)), 0.05).cells.ravel()) == {UNKNOWN}
+    assert set(grid_of([], np.zeros((0, 4, 4))).cells.ravel()) == {UNKNOWN}
     far = np.array([pose(0, 0, 0), pose(900, 300, 0)])
-    grid = scan_grid([scan_of(ROOM, far[0])] * 2, far, 0.05)
+    grid = grid_of([scan_of(ROOM, far[0])] * 2, far)
     assert grid.cells.size <= MAX_CELLS and grid.cell_m == 0.2

@@ -55,6 +55,7 @@ def odometry(
                 resets,
                 True,
                 lambda: np.full(SECTORS, np.nan, np.float32),
+                lambda: np.zeros(SECTORS, np.float32),
             )
         )
     return found

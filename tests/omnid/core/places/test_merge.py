@@ -26,7 +26,8 @@ def drive(T_map_start: np.ndarray) -> PlaceMap:
     features = PlaceFeatures(np.zeros((1, 128), np.uint8), np.zeros((1, 3), np.float32))
     for n in range(COUNT):
         T = T_map_start @ se3.exp([0.3 * n, 0, 0, 0, 0, 0])
-        evidence = np.full((16, 128), n, np.int8), np.full(360, np.nan, np.float16), features
+        scan, free_m = np.full(360, np.nan, np.float16), np.zeros(360, np.float16)
+        evidence = np.full((16, 128), n, np.int8), scan, free_m, features
         keyframe = PlaceKeyframe(n, 0, n, T, (n + 1) * COVARIANCE, *evidence)
         places.add(keyframe, T, Link(n - 1, n, step, COVARIANCE) if n else None)
     return places

@@ -11,7 +11,7 @@ from calib import se3
 from omnid.core.mapping.occupancy_grid import Grid
 from omnid.core.mapping.scan_grid import scan_grid
 from omnid.core.places.particle_filter import SCANS, ParticleEstimate, ParticleFilter, systematic_resample
-from tests.omnid.core.mapping.rooms import box, pose, scan_of
+from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,8 @@ NOISE_M = 0.03
 
 def grid_of(walls: Array, path: Array) -> Grid:
     """Return the map of a drive."""
-    return scan_grid([scan_of(walls, T, NOISE_M, 500 + n) for n, T in enumerate(path)], path, 0.05)
+    scans = [scan_of(walls, T, NOISE_M, 500 + n) for n, T in enumerate(path)]
+    return scan_grid(scans, [OPEN] * len(path), path, 0.05).open_grid()
 
 
 def drive(start: Array, steps: int, turn: float) -> Array:
@@ -110,7 +111,7 @@ def test_without_ranges_or_without_a_map_there_is_no_pose() -> None:
     unknown = np.full(360, np.nan, np.float32)
     filter = ParticleFilter(grid_of(CORNERED, MAPPED), 7)
     assert not any(filter.update(unknown).converged for _ in range(2 * SCANS))
-    assert not ParticleFilter(scan_grid([], np.zeros((0, 4, 4)), 0.05)).update(unknown).converged
+    assert not ParticleFilter(scan_grid([], [], np.zeros((0, 4, 4)), 0.05).open_grid()).update(unknown).converged
 
 
 def test_resampling_takes_each_particle_about_as_often_as_its_weight_says() -> None:

@@ -20,6 +20,7 @@ def keyframe(number: int, features: int = 10) -> PlaceKeyframe:
         np.eye(6),
         np.zeros((16, 128), np.int8),
         np.full(360, np.nan, np.float16),
+        np.zeros(360, np.float16),
         PlaceFeatures(np.zeros((features, 128), np.uint8), np.zeros((features, 3), np.float32)),
     )
 

@@ -50,6 +50,7 @@ def places(twins: RenderedCameras) -> PlaceMap:
                 np.eye(6),
                 thumbnail(frame.lower),
                 np.full(360, np.nan, np.float16),
+                np.zeros(360, np.float16),
                 describe(frame),
             ),
             T,

@@ -14,7 +14,7 @@ from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.place_views import base_poses, drives, grid, landmarks, parts, paths_xy, summary
 from omnid.core.stereo.triangulation import view
-from tests.omnid.core.mapping.rooms import box, pose, scan_of
+from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
 
 CYLINDER = Cylinder(1200, 400, 150.0)
 # The rig stands 0.5 m above the base and looks to its left.
@@ -27,7 +27,8 @@ def keyframe(id: int, T: np.ndarray, session: int = 0) -> PlaceKeyframe:
     views = view(se3.apply(se3.inverse(T), LANDMARK), CYLINDER, RIG.baseline_m).astype(np.float32)
     features = PlaceFeatures(np.zeros((1, 128), np.uint8), views)
     scan = scan_of(ROOM, T).astype(np.float16)
-    return PlaceKeyframe(id, session, 10**9 * id, T, np.eye(6), np.zeros((16, 128), np.int8), scan, features)
+    small, free_m = np.zeros((16, 128), np.int8), OPEN.astype(np.float16)
+    return PlaceKeyframe(id, session, 10**9 * id, T, np.eye(6), small, scan, free_m, features)
 
 
 def places(count: int = 6) -> PlaceMap:

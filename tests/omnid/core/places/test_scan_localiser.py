@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calib import se3
+from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.localisation import MapLocaliser
@@ -18,6 +19,7 @@ from tests.omnid.core.mapping.rooms import pose, scan_of
 from tests.omnid.core.places.test_particle_filter import CORNERED, MAPPED, SYMMETRIC, drive
 from tests.omnid.core.scenery import Array, RenderedCameras
 
+NOT_FREE = np.zeros(SECTORS, np.float32)  # as in maps of earlier versions
 OUT = drive(pose(-0.6, 0.2, 2.0), 24, 0.3)
 
 
@@ -35,6 +37,7 @@ def saved(walls: Array, path: Array = MAPPED) -> PlaceMap:
                 np.eye(6),
                 np.zeros((16, 128), np.int8),
                 scan_of(walls, T, 0.02, id).astype(np.float16),
+                NOT_FREE.astype(np.float16),
                 nothing,
             ),
             T,
@@ -58,6 +61,7 @@ def poses(cameras: RenderedCameras, walls: Array, limits: PlaceLimits) -> list[M
             0,
             True,
             lambda T=T, number=number: scan_of(walls, T, 0.02, 100 + number),
+            lambda: NOT_FREE,
         )
         found.append(localiser.process(frame))
     return found
