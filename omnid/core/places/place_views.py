@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.occupancy_grid import Grid
-from omnid.core.mapping.scan_grid import scan_grid
+from omnid.core.mapping.scan_grid import ScanGrid, scan_grid
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig
@@ -134,12 +134,17 @@ def _of_base(T_map_rect: Array, rig: PlaceRig) -> Array:
 
 
 def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
-    """Return the occupancy grid of the keyframes' range scans, the newest evidence last."""
+    """Return the occupancy grid of the keyframes' range scans and free floor, the newest evidence last."""
+    return scans_of(places, rig, cell_m).grid()
+
+
+def scans_of(places: PlaceMap, rig: PlaceRig, cell_m: float) -> ScanGrid:
+    """Return what the grid is made of."""
     ids = sorted(places.keyframes, key=lambda id: (places.keyframes[id].session, places.keyframes[id].stamp_ns, id))
     poses = np.array([rig.T_base_rect @ places.poses[id] for id in ids]).reshape(-1, 4, 4)
     scans = [places.keyframes[id].scan.astype(np.float32) for id in ids]
     free_m = [places.keyframes[id].free_m.astype(np.float32) for id in ids]
-    return scan_grid(scans, free_m, poses, cell_m).grid()
+    return scan_grid(scans, free_m, poses, cell_m)
 
 
 def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:
