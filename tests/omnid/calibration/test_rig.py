@@ -47,7 +47,6 @@ def test_what_is_saved_is_the_rig(found: RigResult, tmp_path: Path) -> None:
 
 
 def test_a_baseline_far_from_the_expected_one_is_refused(found: RigResult) -> None:
-    """The command refuses it as well, in test_calibrate_rig.py."""
     with pytest.raises(OmnidError, match=r"--square-mm .* would explain it"):
         _check_baseline(found.calibration, BOARD, 0.21)
 
