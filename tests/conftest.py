@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -31,6 +32,17 @@ def pytest_xdist_auto_num_workers() -> int:
     """Return the number of workers of `-n auto`: one more than cores, as live tests wait, unless the cores are busy."""
     cores = len(os.sched_getaffinity(0))
     return cores + (os.getloadavg()[0] < cores)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect no garbage while tests are collected, nor ever search what was made by then: it stays to the end."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

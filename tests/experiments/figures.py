@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 
 from calib.models.camera import Array
 from omnid.simulation.rendering.surfaces import Rectangle
 from tests.simulation.recipes import SimulatedRun
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 DPI = 110
 STYLES = (("0.65", ":"), ("0.5", "--"), ("0.0", "-"))
-mpl.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "omnid"})
+LOOK = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "omnid"}
+
+
+def _figure(width: float, height: float) -> Figure:
+    """Return an empty figure [inches]; matplotlib is loaded here, as most tests that load this module draw nothing."""
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    mpl.rcParams.update(LOOK)
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -24,7 +34,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 def wall(clouds: dict[str, Array], wall_m: float, path: Path) -> None:
     """Draw the points (N, 3) of each method from above and from the front, side by side (fig. 8)."""
-    figure = Figure(figsize=(4 * len(clouds), 5.6), layout="constrained")
+    figure = _figure(4 * len(clouds), 5.6)
     axes = figure.subplots(2, len(clouds), sharex="row", sharey="row", height_ratios=[1.5, 1])
     for (name, points), (above, front) in zip(clouds.items(), axes.T, strict=True):
         above.scatter(points[:, 1], points[:, 0], s=0.15, c="0.0", linewidths=0)
@@ -42,7 +52,7 @@ def wall(clouds: dict[str, Array], wall_m: float, path: Path) -> None:
 
 def turns(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw the right features over the angle of the turn, median of all seeds (fig. 7, at every angle, both ways)."""
-    figure = Figure(figsize=(7, 3), layout="constrained")
+    figure = _figure(7, 3)
     axes = figure.subplots()
     for name, (shade, dash) in zip(rows[0]["found"], STYLES, strict=True):
         right = [[row["found"][name]["right"] for row in rows if row["turn_deg"] == a] for a in _angles(rows)]
@@ -62,7 +72,7 @@ def _angles(rows: list[dict[str, Any]]) -> list[float]:
 
 def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], path: Path) -> None:
     """Draw paths over the true one, and the distance of each from it at every pair (fig. 9)."""
-    figure = Figure(figsize=(8, 5.4), layout="constrained")
+    figure = _figure(8, 5.4)
     above, error = figure.subplots(2, 1, height_ratios=[1, 1.2])
     true_xy = np.array(truth)
     above.plot(*true_xy.T, color="0.75", lw=5, label="truth", solid_capstyle="round")
@@ -77,7 +87,7 @@ def paths(estimates: dict[str, list[list[float]]], truth: list[list[float]], pat
 
 def floor_plan(run: SimulatedRun, points: Array, path_xy: dict[str, Array], path: Path) -> None:
     """Draw the map's points (N, 3) in the world, black, and paths (N, 2) over the true floor plan, grey (fig. 10)."""
-    figure = Figure(figsize=(9, 6.8), layout="constrained")
+    figure = _figure(9, 6.8)
     axes = figure.subplots()
     standing = points[(points[:, 2] > 0.1) & (points[:, 2] < 2.2)]
     for r in filter(_is_upright, run.scene.rectangles):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -25,23 +26,32 @@ from tests.experiments.rendering import cast_log, render_log
 from tests.experiments.scenes import EXPERIMENTS, RigOptions, build
 from tests.experiments.truth import cast, sees, surface_distance_m
 from tests.experiments.views import Experiment
+from tests.simulation import SimulatedRun, corridor
 
 needs_povray = pytest.mark.skipif(not available(), reason=f"POV-Ray is not installed: {INSTALL}")
 MISALIGNED = (1.0, -2.0, 20.0)
 
 
+@cache
+def _built(name: str, seed: int) -> SimulatedRun:
+    """Return the run of a name and a seed: a building takes a second."""
+    return build(name, seed, 96)
+
+
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_a_seed_determines_the_run(name: str) -> None:
-    one, again, other = (build(name, seed, 96, 5) for seed in (3, 3, 4))
+    one, other = _built(name, 3), _built(name, 4)
+    corridor.cache_clear()
+    again = build(name, 3, 96)
     np.testing.assert_array_equal(one.poses, again.poses)
     walls, same, others = (run.scene.rectangles for run in (one, again, other))
     assert all((a.texture == b.texture).all() for a, b in zip(walls, same, strict=True))
     assert not all(np.array_equal(a.texture, b.texture) for a, b in zip(walls, others, strict=False))
 
 
-@pytest.mark.parametrize("seed", [1, 3, 5])
+@pytest.mark.parametrize("seed", [3, 4])
 def test_the_round_through_the_building_closes_and_keeps_its_distance_from_walls(seed: int) -> None:
-    run = build("building", seed, 96)
+    run = _built("building", seed)
     steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
     heading = np.unwrap([float(se3.yaw(T)) for T in run.poses])
     assert len(run.poses) == 349 and 25 < steps.sum() < 40
@@ -87,7 +97,7 @@ def test_the_ray_caster_writes_the_same_files(tmp_path: Path) -> None:
 
 
 def test_the_smooth_wall_has_contrast_and_no_edges() -> None:
-    front = build("smooth", 3, 96).scene.rectangles[0]
+    front = _built("smooth", 3).scene.rectangles[0]
     steps = np.abs(np.diff(front.texture.astype(int), axis=0))
     assert front.name == "wall" and front.texture.std() > 20 and np.percentile(steps, 99) < 6
 

@@ -151,10 +151,10 @@ def test_a_result_is_a_table(result: omnid.RunResult, monkeypatch: pytest.Monkey
         result.to_dataframe()
 
 
-def test_a_replay_reports_its_progress(scene: Path) -> None:
+def test_a_replay_reports_its_progress(scene: Path, start: Path) -> None:
     seen: list[tuple[int, int | None]] = []
-    omnid.replay(scene / "log.mcap", rig=scene / "rig.toml", progress=lambda *counts: seen.append(counts))
-    assert seen[-1] == (PAIRS, PAIRS) and [done for done, _ in seen] == sorted(done for done, _ in seen)
+    omnid.replay(start, rig=scene / "rig.toml", progress=lambda *counts: seen.append(counts))
+    assert seen[-1] == (FEW, FEW) and [done for done, _ in seen] == sorted(done for done, _ in seen)
 
 
 def test_replay_takes_settings_a_rig_and_a_method(scene: Path, start: Path, result: omnid.RunResult) -> None:
@@ -300,9 +300,9 @@ def test_one_error_class_for_all_wrong_input(scene: Path, arguments: tuple[str, 
         omnid.Odometry(scene / "rig.toml", overrides=["sterio.noise_px=1"])
 
 
-def test_without_collection_counters_and_no_arrays(tmp_path: Path, scene: Path) -> None:
-    found = run_log(scene / "log.mcap", omnid.Config(), ReplayOptions(rig=scene / "rig.toml"))
-    assert found.counters.poses == PAIRS and found.stamps_ns.shape == (0,) and found.map is None
+def test_without_collection_counters_and_no_arrays(tmp_path: Path, scene: Path, start: Path) -> None:
+    found = run_log(start, omnid.Config(), ReplayOptions(rig=scene / "rig.toml"))
+    assert found.counters.poses == FEW and found.stamps_ns.shape == (0,) and found.map is None
     with pytest.raises(OmnidError, match="collect=True"):
         found.save_tum(tmp_path / "a")
     with pytest.raises(OmnidError, match="no map"):
@@ -310,12 +310,12 @@ def test_without_collection_counters_and_no_arrays(tmp_path: Path, scene: Path) 
     assert not (tmp_path / "a").exists()
 
 
-def test_settings_that_a_replay_ignores_are_warnings_or_errors(tmp_path: Path, scene: Path) -> None:
+def test_settings_that_a_replay_ignores_are_warnings_or_errors(tmp_path: Path, scene: Path, start: Path) -> None:
     (tmp_path / "omnid.toml").write_text("[live]\nstatus_s = 2.0\n")
-    found = omnid.replay(scene / "log.mcap", scene / "rig.toml", config=tmp_path / "omnid.toml")
+    found = omnid.replay(start, scene / "rig.toml", config=tmp_path / "omnid.toml")
     assert "live.status_s" in found.warnings[0]
     with pytest.raises(OmnidError, match=r"live\.status_s"):
-        omnid.replay(scene / "log.mcap", scene / "rig.toml", overrides=["live.status_s=2.0"])
+        omnid.replay(start, scene / "rig.toml", overrides=["live.status_s=2.0"])
 
 
 def test_a_file_that_cannot_be_written_is_named(tmp_path: Path, result: omnid.RunResult) -> None:

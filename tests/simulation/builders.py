@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters, wall
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
+
+# Number of worlds of each kind that are kept, as many tests show the same; their textures are a few megabytes each.
+KEPT = 6
 
 
 def _flat(rng: Random, kind: str, low: Point, high: Point) -> tuple[Rectangle, Rectangle]:
@@ -28,6 +33,7 @@ def _enclosed(rng: Random, kinds: tuple[str, ...], low: Point, high: Point) -> l
     return [*walls, *_flat(rng, kinds[4], low, high)]
 
 
+@lru_cache(KEPT)
 def corridor(seed: int, length_m: float = 8.0, kinds: tuple[str, ...] | None = None, posters_per_8m: int = 6) -> Scene:
     """Return two walls 1.5 to 3 m apart along x with end walls, floor, ceiling, posters and a few low boxes.
 
@@ -57,6 +63,7 @@ def _by_a_wall(rng: Random, x: float, walls: Point) -> list[Rectangle]:
     return box(rng, (x + rng.uniform(-0.5, 0.5), y), size, rng.uniform(-0.15, 0.15))
 
 
+@lru_cache(KEPT)
 def room(seed: int, size_m: Point = (6.0, 5.0), boxes: int = 8, kinds: tuple[str, ...] | None = None) -> Scene:
     """Return a room about the origin with posters and boxes up to 1.5 m high at its walls; 1.3 m around 0 are free."""
     rng = np.random.default_rng([seed, 2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from tests.simulation import paths
-from tests.simulation.builders import corridor, room
+from tests.simulation.builders import KEPT, corridor, room
 from tests.simulation.closed_worlds import bricks, ring, symmetric_room, twin_corridor, two_laps_path
 
 TURN_DEG = 94.0
@@ -33,8 +34,12 @@ class SimulatedRun:
 Recipe = Callable[[int, int, int], SimulatedRun]
 
 
+@lru_cache(KEPT)
 def mild_rig(seed: int, size: int) -> Rig:
-    """Return a rig with mirror scale, baseline and a small misalignment that depend on the seed."""
+    """Return a rig with mirror scale, baseline and a small misalignment that depend on the seed.
+
+    The same rig each time, because the renderer keeps the rays of a rig.
+    """
     rng = np.random.default_rng([seed, 7])
     scale, baseline = {1: (0.9, 0.18), 2: (1.0, 0.24)}.get(seed, rng.uniform((0.85, 0.15), (1.05, 0.26)))
     rotation_deg, lower = rng.uniform(0.4, 1.2, 3) * rng.choice([-1, 1], 3), rng.uniform(-0.5, 0.5, 2)

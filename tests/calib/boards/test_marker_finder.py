@@ -20,6 +20,7 @@ MOUNTED = MountedCamera(
 )
 CHARUCO = CharucoBoard(6, 5, 0.05, 0.0375, "4X4_50")
 GRID = AprilGrid(4, 3, 0.06, 0.3)
+FEW_MARKERS = CharucoBoard(4, 3, 0.05, 0.0375, "4X4_50")  # each costs a comparison with thousands of others
 
 
 def rendered(board: MarkerBoard, hidden: float = 0.0) -> BoardImage:
@@ -60,9 +61,9 @@ def test_a_grid_has_the_frame_of_kalibr() -> None:
 
 def test_another_dictionary_is_no_board_and_named() -> None:
     """In the mirror image of a print: in a rendered image a search that finds nothing tries all specks of noise."""
-    image = np.ascontiguousarray(print_of(CHARUCO)[0][:, ::-1])
-    assert find_marker_board(image, CharucoBoard(6, 5, 0.05, 0.0375, "6X6_50")) is None
+    image = np.ascontiguousarray(print_of(FEW_MARKERS)[0][:, ::-1])
+    assert find_marker_board(image, CharucoBoard(4, 3, 0.05, 0.0375, "6X6_50")) is None
     assert find_marker_board(image, GRID) is None
-    assert find_marker_board(image, CHARUCO) is not None
+    assert find_marker_board(image, FEW_MARKERS) is not None
     assert seen_dictionary(image, 1) == "4X4_50"
     assert seen_dictionary(np.full((100, 100), 90, np.uint8), 1) is None

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -214,30 +215,34 @@ def chunk(compression: str, size: int, packed: bytes, crc: int = 0) -> bytes:
     return struct.pack("<BQ", 6, len(body)) + body
 
 
-BOMB = bytes(400 * 2**20)
-HOSTILE = {
-    "a record longer than the file": struct.pack("<BQ", 6, 2**62),
-    "a record 200 MB longer than the file": struct.pack("<BQ", 6, 200 * 2**20),
-    "a schema longer than the file": struct.pack("<BQHI", 3, 6, 1, 2**32 - 1),
-    "a chunk's inner length": struct.pack("<BQQQQIIQ", 6, 40, 0, 0, 10, 0, 0, 2**63 + 5),
-    "an lz4 size": chunk("lz4", 2**40, lz4.frame.compress(b"x" * 99)),
-    "a zstd size": chunk("zstd", 2**40, zstandard.compress(b"x" * 99)),
-    "an lz4 bomb": chunk("lz4", 1000, lz4.frame.compress(BOMB)),
-    "a zstd bomb": chunk("zstd", 1000, zstandard.compress(BOMB)),
-    "an lz4 bomb with its true size": chunk("lz4", len(BOMB), lz4.frame.compress(BOMB)),
-    "a zstd bomb with its true size": chunk("zstd", len(BOMB), zstandard.compress(BOMB)),
-    "a message in a chunk": chunk("", 31, struct.pack("<BQHIQQ", 5, 2**61, 1, 0, 0, 0)),
-    "an unknown compression": chunk("rar", 5, b"12345"),
+def bomb(name: str, pack: Callable[[bytes], bytes], size: int | None = None) -> bytes:
+    """Return a chunk that becomes 400 MB, and says so or another size."""
+    data = bytes(400 * 2**20)
+    return chunk(name, len(data) if size is None else size, pack(data))
+
+
+HOSTILE: dict[str, Callable[[], bytes]] = {
+    "a record longer than the file": lambda: struct.pack("<BQ", 6, 2**62),
+    "a record 200 MB longer than the file": lambda: struct.pack("<BQ", 6, 200 * 2**20),
+    "a schema longer than the file": lambda: struct.pack("<BQHI", 3, 6, 1, 2**32 - 1),
+    "a chunk's inner length": lambda: struct.pack("<BQQQQIIQ", 6, 40, 0, 0, 10, 0, 0, 2**63 + 5),
+    "an lz4 size": lambda: chunk("lz4", 2**40, lz4.frame.compress(b"x" * 99)),
+    "a zstd size": lambda: chunk("zstd", 2**40, zstandard.compress(b"x" * 99)),
+    "an lz4 bomb": lambda: bomb("lz4", lz4.frame.compress, 1000),
+    "a zstd bomb": lambda: bomb("zstd", zstandard.compress, 1000),
+    "an lz4 bomb with its true size": lambda: bomb("lz4", lz4.frame.compress),
+    "a zstd bomb with its true size": lambda: bomb("zstd", zstandard.compress),
+    "a message in a chunk": lambda: chunk("", 31, struct.pack("<BQHIQQ", 5, 2**61, 1, 0, 0, 0)),
+    "an unknown compression": lambda: chunk("rar", 5, b"12345"),
 }
-del BOMB
 
 
-@pytest.mark.parametrize("records", HOSTILE.values(), ids=HOSTILE.keys())
-def test_wrong_lengths_need_no_memory(tmp_path: Path, records: bytes) -> None:
+@pytest.mark.parametrize("name", HOSTILE)
+def test_wrong_lengths_need_no_memory(tmp_path: Path, name: str) -> None:
     whole = write_log(tmp_path / "log.mcap", pairs(2)).read_bytes()
     path = tmp_path / "hostile.mcap"
     at = len(MAGIC) + 9 + struct.unpack_from("<Q", whole, len(MAGIC) + 1)[0]
-    path.write_bytes(whole[:at] + records + whole[at:])
+    path.write_bytes(whole[:at] + HOSTILE[name]() + whole[at:])
     tracemalloc.start()
     try:
         found = survivors(path)

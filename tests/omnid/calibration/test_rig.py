@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,12 @@ def test_what_is_saved_is_the_rig(found: RigResult, tmp_path: Path) -> None:
 
 
 def test_a_baseline_far_from_the_expected_one_is_refused(found: RigResult) -> None:
-    """The command refuses it as well, in test_calibrate_rig.py."""
     with pytest.raises(OmnidError, match=r"--square-mm .* would explain it"):
         _check_baseline(found.calibration, BOARD, 0.21)
+
+
+def test_a_baseline_that_no_rig_has_is_refused(found: RigResult) -> None:
+    T = found.calibration.T_upper_lower.copy()
+    T[:3, 3] /= 100
+    with pytest.raises(OmnidError, match=r"a baseline of 10 to 3000 mm, found 1\.80"):
+        _check_baseline(replace(found.calibration, T_upper_lower=T), BOARD, None)

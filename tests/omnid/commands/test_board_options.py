@@ -12,7 +12,7 @@ from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
 from calib.camera_file import read_camera
 from omnid.cli import main
 from omnid.simulation.rendering.sensor import Sensor
-from tests.calib.boards.test_marker_finder import CHARUCO, GRID, MOUNTED
+from tests.calib.boards.test_marker_finder import CHARUCO, FEW_MARKERS, GRID, MOUNTED
 from tests.simulation.boards import board_poses_around_camera
 from tests.simulation.marker_boards import frame_board, print_of, render_marker_board
 
@@ -89,7 +89,8 @@ def test_names_what_is_wrong_with_the_options(
 
 
 def test_names_the_dictionary_that_was_seen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cv2.imwrite(str(tmp_path / "a.png"), np.ascontiguousarray(print_of(CHARUCO)[0][:, ::-1]))
-    words = [*CHARUCO_WORDS, "--dictionary", "5X5_50"]
-    assert main(["calibrate", "camera", str(tmp_path), *words, "--quiet", "-o", str(tmp_path / "c.toml")]) == 2
+    cv2.imwrite(str(tmp_path / "a.png"), np.ascontiguousarray(print_of(FEW_MARKERS)[0][:, ::-1]))
+    words = ["4x3" if word == "6x5" else word for word in CHARUCO_WORDS]
+    words += ["--dictionary", "5X5_50", "--quiet"]
+    assert main(["calibrate", "camera", str(tmp_path), *words, "-o", str(tmp_path / "c.toml")]) == 2
     assert "try --dictionary 4X4_50" in capsys.readouterr().err

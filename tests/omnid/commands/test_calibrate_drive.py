@@ -12,6 +12,7 @@ import pytest
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
+from drivers.errors import DriverError
 from omnid import OmnidError, calibrate_drive, replay
 from omnid.cli import main
 from omnid.formats.tum import read_tum
@@ -39,11 +40,12 @@ def test_a_short_drive_is_refused(scene: Path, short: Path, tmp_path: Path, caps
     assert not (tmp_path / "rig.toml").exists()
 
 
-def test_logs_and_the_rig_may_be_names_of_files(scene: Path, short: Path) -> None:
-    """The command gives a list of paths."""
-    for logs in (str(short), [str(short)]):
-        with pytest.raises(OmnidError, match="take a longer drive"):
-            calibrate_drive(logs, str(scene / "rig.toml"))
+def test_a_log_and_the_rig_may_be_names_of_files(scene: Path, short: Path) -> None:
+    """The command gives a list of paths, as above."""
+    with pytest.raises(OmnidError, match="take a longer drive"):
+        calibrate_drive(str(short), str(scene / "rig.toml"))
+    with pytest.raises((OmnidError, DriverError), match=r"absent\.mcap"):
+        calibrate_drive([str(short.with_name("absent.mcap"))], str(scene / "rig.toml"))
 
 
 @pytest.mark.parametrize(

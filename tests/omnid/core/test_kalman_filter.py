@@ -6,12 +6,13 @@ import subprocess
 import sys
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from omnid.core.kalman_filter import kalman_filter
 
 
 def test_the_filter_is_that_of_filterpy() -> None:
+    from filterpy.kalman import KalmanFilter  # here, because it loads scipy.stats, which no other test needs
+
     ours, theirs = kalman_filter(dim_x=4, dim_z=2), KalmanFilter(dim_x=4, dim_z=2)
     for one in (ours, theirs):
         random = np.random.default_rng(0)

@@ -13,12 +13,12 @@ from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.errors import OmnidError
 
 
-@pytest.mark.parametrize("duration_s", np.geomspace(1.001e-6, 999.0, 200).tolist())
-def test_quantiles_are_within_two_per_cent_over_nine_decades(duration_s: float) -> None:
-    histogram = Histogram()
-    for value_s in (duration_s, duration_s, 1e4):
-        histogram.add(value_s)
-    assert histogram.p(0.5) == pytest.approx(duration_s, rel=0.02)
+def test_quantiles_are_within_two_per_cent_over_nine_decades() -> None:
+    for duration_s in np.geomspace(1.001e-6, 999.0, 200).tolist():
+        histogram = Histogram()
+        for value_s in (duration_s, duration_s, 1e4):
+            histogram.add(value_s)
+        assert histogram.p(0.5) == pytest.approx(duration_s, rel=0.02)
 
 
 def test_quantiles_agree_with_sorting() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,11 +17,17 @@ from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.robot import Slip, make_robot, with_slips
+from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 
 SIZE = 160
-WORLD = load_world("room", 3)
 CONFIG = load_config(None, ["controller.collision.unknown=slow"])  # such small images show little of the floor
+
+
+@cache
+def world() -> World:
+    """Return the shipped room: its textures take a fifth of a second."""
+    return load_world("room", 3)
 
 
 def forward(moment: Moment) -> Iterator[Request]:
@@ -31,7 +38,7 @@ def forward(moment: Moment) -> Iterator[Request]:
 
 
 def drive(seed: int, seconds: float = 2.0, **options: object) -> SimulatedRun:
-    return simulate(WORLD, make_robot(SIZE), forward, seconds=seconds, seed=seed, config=CONFIG, **options)  # type: ignore[arg-type]
+    return simulate(world(), make_robot(SIZE), forward, seconds=seconds, seed=seed, config=CONFIG, **options)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -72,14 +79,14 @@ def test_a_goal_is_reached_by_the_true_robot() -> None:
             asked.append(moment.time_s)
             yield GoalRequest(NavigationFrame.ODOM, 0.5, 0.0)
 
-    run = simulate(WORLD, make_robot(SIZE), to_the_goal, seconds=5.0, seed=1, config=CONFIG)
+    run = simulate(world(), make_robot(SIZE), to_the_goal, seconds=5.0, seed=1, config=CONFIG)
     assert run.navigation[-1].state is NavigationState.REACHED
     assert np.hypot(*(run.truth_in_odom[-1][:2, 3] - (0.5, 0.0))) < 0.05
 
 
 def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
     run = simulate(
-        WORLD, with_slips(make_robot(SIZE), [Slip(1.5, 9.0, 0.9)]), forward, seconds=2.5, seed=1, config=CONFIG
+        world(), with_slips(make_robot(SIZE), [Slip(1.5, 9.0, 0.9)]), forward, seconds=2.5, seed=1, config=CONFIG
     )
     x_m = run.truth_in_odom[:, 0, 3]
     assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
@@ -97,7 +104,7 @@ def test_a_robot_that_was_lost_at_rest_finds_back_and_drives_again() -> None:
         if moment.time_s > 4.0:
             yield from forward(moment)
 
-    run = simulate(WORLD, blind, rest_and_drive, seconds=5.5, seed=1, config=CONFIG, faults=[Fault("dark", 1.0, 3.0)])
+    run = simulate(world(), blind, rest_and_drive, seconds=5.5, seed=1, config=CONFIG, faults=[Fault("dark", 1.0, 3.0)])
     at_s = (run.stamps_ns - run.stamps_ns[0]) * 1e-9
     states = np.array(run.states)
     assert "lost" in states[(at_s > 1.0) & (at_s < 3.1)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from omnid.config import load_config
 from omnid.core.control.collision_monitor import IMAGES_REMEDY, UNSEEN, UNWATCHED
 from omnid.simulation.lockstep import Fault, SimulatedRun, Tamper, simulate
 from omnid.simulation.robot import make_robot
+from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 from tests.benchmark.obstacle_stops import ahead
 from tests.faults.images import Frozen, sector
@@ -18,14 +20,19 @@ from tests.faults.images import Frozen, sector
 SIZE_PX = 256
 STARTS_S = 1.5
 CONFIG = load_config(None, ["places.enabled=false"])
-WORLD = load_world("room", 3)
 AHEAD, BEHIND = sector(SIZE_PX, 0.0, 180.0), sector(SIZE_PX, 180.0, 120.0)
+
+
+@cache
+def world() -> World:
+    """Return the shipped room: its textures take a fifth of a second."""
+    return load_world("room", 3)
 
 
 def drive(tamper: Tamper | None = None, *faults: Fault) -> SimulatedRun:
     """Return a drive ahead at 0.5 m/s."""
     return simulate(
-        WORLD,
+        world(),
         replace(make_robot(SIZE_PX), samples=1),
         ahead,
         seconds=3.0,
@@ -64,7 +71,7 @@ def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
 def test_in_the_dark_a_base_stops_although_wheels_carry_its_pose(gyro: bool) -> None:
     """Half a second, and the ramp."""
     run = simulate(
-        WORLD,
+        world(),
         replace(make_robot(SIZE_PX), samples=1, has_gyro=gyro),
         ahead,
         seconds=3.0,

@@ -238,17 +238,18 @@ def test_another_heading_after_a_gap_is_taken_and_the_reset_counter_tells_it(
 
 
 def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
-    odometry: VisualOdometry, frames: list[StereoFrame], cameras: RenderedCameras
+    frames: list[StereoFrame], cameras: RenderedCameras
 ) -> None:
     """The robot is carried into another corridor: no pose is accepted there, and then the reset counter rises."""
+    limits = OdometryLimits(restart_after=6)
+    odometry = visual_odometry(cameras.model, limits)
     before = run(odometry, frames[:4])[-1]
     elsewhere = replace(cameras, scene=corridor(7))
-    there = run(odometry, [elsewhere.frame(50 + k, PATH[k % 4]) for k in range(16)], first=False)
-    limits = OdometryLimits()
+    there = run(odometry, [elsewhere.frame(50 + k, PATH[k % 4]) for k in range(12)], first=False)
     restarted = limits.lost_after + limits.restart_after - 2
     assert all(estimate.inliers == 0 and estimate.state != TrackingState.TRACKING for estimate in there[:restarted])
     assert there[limits.lost_after].state == TrackingState.LOST
-    assert [estimate.resets for estimate in there[restarted:]] == [1] * (16 - restarted)
+    assert [estimate.resets for estimate in there[restarted:]] == [1] * (12 - restarted)
     assert all(estimate.state == TrackingState.TRACKING for estimate in there[restarted + 1 :])
     # Standing at a corner of that corridor, it moves there as it does here; the gap stays in the covariance.
     moved = se3.inverse(there[-2].T_odom_rect) @ there[-1].T_odom_rect
