@@ -2,8 +2,8 @@
 
 A simulated robot is driven at random through rooms full of things (`cluttered_room.py`) and maps them; the grid is that
 of `omnid map export --grid`. A cell counts to a thing whose outline from above covers its middle; of what is narrower
-than a cell, its middle line. The last column has the cells that are free where no ranges but those of stereo count: of
-things that are lower than 12 cm, or thin, stereo has none.
+than a cell, its middle line. The last column is the grid in which a cell is free where ranges of stereo pass through
+it: of things that are lower than 12 cm, or thin, stereo has none.
 """
 
 from __future__ import annotations

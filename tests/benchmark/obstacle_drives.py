@@ -91,15 +91,11 @@ def plan(seed: int) -> list[Planned]:
     ]
 
 
-def drive(planned: Planned) -> Drive:
-    """Make a drive, in a process of its own."""
-    return run(*planned)
-
-
 def known_drives() -> dict[str, Drive]:
     """Return the drives of this commit that LINES has, by name."""
     lines = (json.loads(line) for line in LINES.read_text().splitlines()) if LINES.exists() else ()
-    return {line["name"]: Drive(**line["drive"]) for line in lines if line["commit"] == commit()}
+    here = commit()
+    return {line["name"]: Drive(**line["drive"]) for line in lines if line["commit"] == here}
 
 
 def tables(seeds: Iterable[int], drives: dict[str, Drive]) -> list[ResultTable]:
@@ -131,16 +127,17 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs=2, required=True, metavar=("FIRST", "LAST"))
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
     arguments = parser.parse_args()
-    seeds, drives = range(arguments.seeds[0], arguments.seeds[1] + 1), known_drives()
+    here, drives = commit(), known_drives()
+    seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
     missing = [planned for seed in seeds for planned in plan(seed) if planned.name not in drives]
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool, LINES.open("a") as lines:
-        waiting = {pool.submit(drive, planned): planned for planned in missing}
+        waiting = {pool.submit(run, *planned): planned for planned in missing}
         for future in as_completed(waiting):
             name, made = waiting[future].name, future.result()
             drives[name] = made
             print(f"{name}: {made}", flush=True)
-            lines.write(json.dumps({"commit": commit(), "name": name, "drive": made._asdict()}) + "\n")
+            lines.write(json.dumps({"commit": here, "name": name, "drive": made._asdict()}) + "\n")
             lines.flush()
     for table in tables(seeds, drives):
         print(table.save())

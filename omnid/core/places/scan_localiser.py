@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.mapping.range_scan import RangeScan
+from omnid.core.mapping.range_scan import SECTORS, RangeScan
 from omnid.core.mapping.scan_grid import scan_grid
 from omnid.core.places.particle_filter import ParticleEstimate, ParticleFilter
 from omnid.core.places.place_map import PlaceMap
@@ -39,7 +39,6 @@ class ScanLocaliser:
     def __init__(self, places: PlaceMap) -> None:
         ids = sorted(places.keyframes)
         self._scans = [places.keyframes[id].scan.astype(np.float32) for id in ids]
-        self._free_m = [places.keyframes[id].free_m.astype(np.float32) for id in ids]
         self._poses = np.array([places.poses[id] for id in ids]).reshape(-1, 4, 4)
         self.ambiguous = 0  # scans that another pose explained as well
         self.restart()
@@ -63,7 +62,9 @@ class ScanLocaliser:
         """
         # 1. Draw the map when it is first asked for.
         if self._filter is None:
-            self._filter = ParticleFilter(scan_grid(self._scans, self._free_m, self._poses, CELL_M).open_grid())
+            # Where ranges pass the robot may stand: the floor need not have been seen.
+            no_floor = [np.zeros(SECTORS, np.float32)] * len(self._scans)
+            self._filter = ParticleFilter(scan_grid(self._scans, no_floor, self._poses, CELL_M).open_grid())
         # 2. Move the particles by odometry; a robot at rest shows nothing new.
         if self._last_T is not None:
             moved = se3.inverse(self._last_T) @ T_odom_rect
