@@ -1,4 +1,4 @@
-"""Status of the images' parts: which ones are frozen or blind, of which camera, about the base."""
+"""Status of the images' parts: which ones are frozen or blind, of which camera, about the base; and fixed ones."""
 
 from __future__ import annotations
 
@@ -13,18 +13,32 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.stages.geometry import Geometry
 from omnid.transport.codec import ERROR, OK, STALE
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import IMAGES, lost_parts_key
+from omnid.transport.status_names import FIXED_PERCENT, IMAGES, lost_parts_key
 
 LIVE = "all parts are live"
+FIXED = (
+    "a part of the panoramas ({:.0%}) shows what is fixed to a camera, such as the reflection of its lens: "
+    "obstacles are judged without it; a mask in the rig hides it from the start"
+)
 
 
 class ImagesStatus:
     """The entry; a call makes it from the newest pair."""
 
-    def __init__(self, geometry: Geometry, statistics: RunStatistics, report: Callable[[str], object]) -> None:
-        """report: takes a line for the log where the message changes."""
+    def __init__(
+        self,
+        geometry: Geometry,
+        statistics: RunStatistics,
+        report: Callable[[str], object],
+        fixed_share: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        """report: takes a line for the log where the message changes, and where fixed parts are found first.
+
+        fixed_share: share of the panoramas that shows what is fixed to a camera.
+        """
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
         self._statistics, self._report, self._message = statistics, report, LIVE
+        self._fixed_share, self._has_fixed = fixed_share, False
 
     def __call__(self) -> DiagnosticStatus:
         """Return the entry."""
@@ -37,7 +51,13 @@ class ImagesStatus:
         if message != self._message:
             self._report(f"images: {message}")
         self._message = message
+        fixed = self._fixed_share()
+        if fixed and not self._has_fixed:
+            self._report(f"images: {FIXED.format(fixed)}")
+        self._has_fixed = fixed > 0
         values = {lost_parts_key(side): f"{(newest.stamp_ns - tiles.since_ns[side]) * 1e-9:.0f}" for side in lost}
+        if fixed:
+            values[FIXED_PERCENT] = f"{100 * fixed:.0f}"
         return DiagnosticStatus(IMAGES, ERROR if lost else OK, message, values)
 
     def _named(self, side: Side, tiles: TileStates) -> str:

@@ -146,7 +146,9 @@ class LiveWiring:
     ) -> None:
         """Publish and record the status of all parts."""
         session, controller, sensors = self._session, self._controller, self._sensors
-        images = ImagesStatus(self._geometry, session.statistics, partial(self._report, logging.WARNING))
+        warn, obstacles = partial(self._report, logging.WARNING), stages.obstacles
+        fixed_share = (lambda: obstacles.fixed_share) if obstacles else (lambda: 0.0)
+        images = ImagesStatus(self._geometry, session.statistics, warn, fixed_share)
         status = [
             self._ladder.status,
             ThreadsStatus(),

@@ -43,6 +43,11 @@ class Obstacles:
         self._rings = PairRings(geometry, config.ring)
         self._last_ns: int | None = None
 
+    @property
+    def fixed_share(self) -> float:
+        """Return the share of the panoramas that shows what is fixed to a camera."""
+        return self._rings.fixed.share
+
     def process(self, odometry: OdometryUpdate) -> ObstacleRing | None:
         """Return the ring at a pair, None where it is not due."""
         if not self._is_due(odometry):

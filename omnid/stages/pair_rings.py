@@ -13,6 +13,7 @@ from omnid.core.floor import Floor
 from omnid.core.frames import of_base
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.obstacles.column import NEAREST_M, Columns, floor_plane
+from omnid.core.obstacles.fixed_parts import FixedParts
 from omnid.core.obstacles.grid import ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.pair_views import FOCAL_PX
@@ -36,6 +37,7 @@ class PairRings:
     def __init__(self, geometry: Geometry, settings: RingSettings) -> None:
         self._geometry, self._settings = geometry, settings
         self._of_floor: Floor | None = None  # floor for which the columns were made
+        self.fixed = FixedParts(geometry.cylinder)
         self._columns: Columns | None = None
         self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
@@ -57,6 +59,11 @@ class PairRings:
             # The place is not known. What is known in odom holds again when odometry finds its landmarks again.
             self._tracker.clear()
             return unknown
+        if self._finds_fixed_parts(odometry):
+            # What was known about the floor came from images of which a part does not show it.
+            self._of_floor = None
+            self._grid.begin_again()
+            self._tracker.clear()
         columns = self._columns_of(camera_floor, panoramas)
         if columns is None:
             return unknown
@@ -72,8 +79,16 @@ class PairRings:
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
 
+    def _finds_fixed_parts(self, odometry: OdometryUpdate) -> bool:
+        """Return True where a pair shows that more of the panoramas is fixed to a camera; frozen parts are not."""
+        panoramas = odometry.depth.panoramas
+        if any(dead.any() for dead in panoramas.tiles.dead.values()):
+            return False
+        heading_rad = float(se3.yaw(odometry.T_odom_rig))
+        return self.fixed.observe(heading_rad, panoramas.lower, panoramas.upper, panoramas.visible)
+
     def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
-        """Return the columns for the floor, None without one; all panoramas of a run show the same directions."""
+        """Return the columns for the floor and what is seen of it, None without a floor."""
         floor = camera_floor.floor
         if floor is not None and floor is not self._of_floor:
             geometry, settings = self._geometry, self._settings
@@ -86,7 +101,7 @@ class PairRings:
                 plane,
                 settings.heights_m,
                 (NEAREST_M, settings.max_range_m),
-                panoramas.visible,
+                panoramas.visible & ~self.fixed.pixels,
             )
             self._grid.set_floor(T_rect_floor, plane.height_m)
         return self._columns

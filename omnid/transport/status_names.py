@@ -46,6 +46,9 @@ DISARMED_BY_STOP: Final = ASKED  # the value of disarmed_by after a stop
 _TIME_SUFFIX: Final = "_ms"
 
 
+FIXED_PERCENT: Final = "fixed_percent"  # of the panoramas, which shows what is fixed to a camera
+
+
 class Key(StrEnum):
     """Keys that several entries have, or that omnid's own programs read."""
 

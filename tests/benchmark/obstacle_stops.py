@@ -58,6 +58,7 @@ FLOORS: Final = (TILES, "granite", "brick", "plaster", PHOTOGRAPHS)
 FALSE_M: Final = 1.0
 BESIDE_M: Final = 0.2  # of the robot's outline: what stands there may be its reason to stop
 WALKS_M: Final = 2.0  # nearer than this, a person who walks may be the reason to stop
+TURN_RADPS, TURN_S = 0.8, 10.0  # of a turn on the spot before a drive, with the time to come to rest
 OWN_MPS: Final = 0.05  # a contact at a lower speed is not the robot's own
 AHEAD: Final = slice(170, 190)  # sectors of the ring
 CASES: Final = {
@@ -91,6 +92,7 @@ class Conditions:
     build: str = USUAL  # of BUILDS
     floor: str = TILES  # of FLOORS; rooms of CLUTTER have their own where it is TILES
     disturbed: tuple[Disturbance, ...] = ()  # by what lenses and cameras do to its images (real_lenses.py)
+    turns_first: bool = False  # once on the spot, by which it learns what is fixed to its cameras
 
     def __str__(self) -> str:
         """Return all in which these conditions differ from the usual ones."""
@@ -101,6 +103,7 @@ class Conditions:
         parts += [f"floor of {self.floor}"] * (self.floor != TILES) + [f"{self.build} robot"] * (self.build != USUAL)
         if self.disturbed:
             parts += ["all disturbances" if self.disturbed == OF_CAMERAS else " and ".join(self.disturbed)]
+        parts += ["after a turn"] * self.turns_first
         return ", ".join(parts)
 
 
@@ -118,11 +121,14 @@ class Drive(NamedTuple):
     reasons: str
 
 
-def ahead(moment: Moment, speed_mps: float = SPEED_MPS) -> Iterator[Request]:
-    """Arm, and hold the stick ahead, or back at a negative speed."""
+def ahead(moment: Moment, speed_mps: float = SPEED_MPS, turn_s: float = 0.0) -> Iterator[Request]:
+    """Arm, turn once on the spot for turn_s, and hold the stick ahead, or back at a negative speed."""
     if moment.odometry is not None and not moment.controller.armed and moment.time_s < 2.0:
         yield "arm"
-    yield Setpoint(speed_mps, heading_rad=0.0)
+    if moment.time_s < turn_s:
+        yield Setpoint(0.0, heading_rad=min(TURN_RADPS * max(moment.time_s - 1.0, 0.0), math.tau))
+    else:
+        yield Setpoint(speed_mps, heading_rad=0.0)
 
 
 def run(case: str, seed: int, conditions: Conditions = Conditions(), overrides: Sequence[str] = ()) -> Drive:
@@ -136,13 +142,15 @@ def run(case: str, seed: int, conditions: Conditions = Conditions(), overrides: 
     world, edges = world_of(case, seed, conditions.floor)
     if not is_cluttered:
         world = replace(world, start=(0.0, 0.0, math.pi if is_backwards else 0.0))
+    turn_s = TURN_S if conditions.turns_first and not is_cluttered else 0.0  # in rooms the operator turns anyway
+    world = replace(world, people=tuple(replace(person, start_s=person.start_s + turn_s) for person in world.people))
     # The edge of a room is along x; odom begins with the heading of the start.
     towards_rad = -world.start[2] if case == AT_EDGE else None
     done = simulate(
         world,
         robot,
-        Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=conditions.speed_mps),
-        seconds=CASES[case],
+        Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=conditions.speed_mps, turn_s=turn_s),
+        seconds=CASES[case] + turn_s,
         seed=seed,
         config=load_config(None, ["places.enabled=false", *limits, *build.settings, *overrides]),
         tamper=tamper,
@@ -268,6 +276,7 @@ def main() -> None:
     parser.add_argument("--floor", choices=FLOORS, default=TILES)
     parser.add_argument("--disturb", nargs="+", default=(), choices=OF_CAMERAS, help="its images (real_lenses.py)")
     parser.add_argument("--real", action="store_const", dest="disturb", const=OF_CAMERAS, help="by all of these")
+    parser.add_argument("--turn", action="store_true", help="the robot turns once on the spot first")
     parser.add_argument("--jobs", type=int, default=1, help="runs at a time")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="KEY=VALUE")
     arguments = parser.parse_args()
@@ -277,6 +286,7 @@ def main() -> None:
         build=arguments.robot,
         floor=arguments.floor,
         disturbed=tuple(arguments.disturb),
+        turns_first=arguments.turn,
     )
     seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
     parts = [(case, replace(usual, speed_mps=speed_mps)) for case in arguments.cases for speed_mps in arguments.speeds]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     worn,
 )
 
+LIT_ROWS = slice(205, 225)  # of the floor 0.9 to 1.05 m away
 SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
 PERIOD_NS = 100_000_000
 
@@ -44,10 +46,17 @@ class Standing:
             0,
         )
 
-    def ring(self, pair: Panoramas, state: TrackingState = TrackingState.TRACKING, resets: int = 0) -> ObstacleRing:
+    def ring(
+        self,
+        pair: Panoramas,
+        state: TrackingState = TrackingState.TRACKING,
+        resets: int = 0,
+        heading_rad: float = 0.0,
+    ) -> ObstacleRing:
         """Return the ring at the next pair."""
         self._seq += 1
-        of_pose = np.eye(4), np.eye(6), np.zeros(6), np.eye(6)
+        T_odom_rig = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading_rad]))
+        of_pose = T_odom_rig, np.eye(6), np.zeros(6), np.eye(6)
         return self.rings.add(
             OdometryUpdate(self._seq, self._seq * PERIOD_NS, *of_pose, state, resets, 100, 100, StereoDepth(pair)),
             self._floor,
@@ -80,3 +89,37 @@ def test_floor_between_edges_is_free_where_the_rig_states_its_height_and_nothing
     ring = Standing(height_m).ring(Panoramas(0, 0, *panoramas(worn, 9.0, plain), SHOWN))
     assert np.isnan(ring.ranges_m).all()
     assert np.median(ring.free_m) > 2.0 if height_m else ring.free_m.max() == 0.0
+
+
+def _turned(heading_rad: float, light_grey: float) -> Panoramas:
+    """Return a pair of a base that has turned on the spot, with the light of a lens in its mirror in both images."""
+    c, s = math.cos(heading_rad), math.sin(heading_rad)
+    pair = panoramas(
+        lambda x_m, y_m: stains(c * x_m - s * y_m, s * x_m + c * y_m),
+        3.0,
+        lambda azimuth, height_m: uneven(azimuth + heading_rad, height_m),
+        seed=round(100 * heading_rad),
+    )
+    lit = []
+    for panorama in pair:
+        grey = panorama.image.astype(float)
+        grey[LIT_ROWS] += light_grey
+        lit.append(replace(panorama, image=np.clip(np.rint(grey), 0, 255).astype(np.uint8)))
+    return Panoramas(0, 0, lit[0], lit[1], SHOWN)
+
+
+def uneven(azimuth: np.ndarray, height_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of a wall that are others at each heading."""
+    return np.asarray(
+        120.0 + 30.0 * np.sin(13 * azimuth + 25 * height_m) + 20.0 * np.sin(7 * azimuth - 61 * height_m + 2)
+    )
+
+
+def test_the_reflection_of_a_lens_ends_the_free_floor_until_the_base_has_turned() -> None:
+    """Its borders look like floor that falls, and the base would stand for good."""
+    turning, standing = Standing(HEIGHT_M), Standing(HEIGHT_M)
+    for heading in np.arange(24) * math.tau / 16:
+        learned = turning.ring(_turned(heading, 60.0), heading_rad=heading)
+        ignorant = standing.ring(_turned(0.0, 60.0))
+    assert turning.rings.fixed.share > 0.05 and not standing.rings.fixed.share
+    assert np.median(ignorant.free_m) < 1.2 and np.quantile(learned.free_m, 0.1) > 2.0

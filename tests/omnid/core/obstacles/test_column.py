@@ -133,3 +133,26 @@ def test_cameras_that_see_no_floor_have_no_evidence_of_it() -> None:
     columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), visible)
     found = columns.evidence(*panoramas(stains, WALL_M, striped))
     assert np.isnan(found.floor).all() and found.nearest_floor_m == 0.0
+
+
+def test_floor_nearer_than_a_ring_that_no_direction_shows_is_not_used() -> None:
+    """People who cross the ring would be out of view on their way to the base."""
+    visible = VISIBLE.copy()
+    visible[160:175] = False  # 1.4 to 1.7 m away
+    whole, cut = (
+        Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), shown)
+        for shown in (VISIBLE, visible)
+    )
+    assert whole.nearest_floor_m < 1.0 and 1.7 < cut.nearest_floor_m < 2.4
+    floors_m = [one.at_1m / np.flatnonzero(np.isfinite(_floor_of(one)).any(axis=1)).max() for one in (whole, cut)]
+    assert floors_m[0] < 1.1 and floors_m[1] > 1.7
+    speck = VISIBLE.copy()
+    speck[160:175, 100:400] = False
+    assert Columns(
+        CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), speck
+    ).nearest_floor_m == pytest.approx(whole.nearest_floor_m)
+
+
+def _floor_of(columns: Columns) -> np.ndarray:
+    """Return the evidence (K, DIRECTIONS) of a floor with stains."""
+    return columns.evidence(*panoramas(stains, WALL_M, striped)).floor

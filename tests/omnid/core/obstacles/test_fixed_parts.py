@@ -1,0 +1,119 @@
+"""Parts that are fixed to a camera, learned from the views that a base has as it turns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.panorama import Cylinder
+from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
+from omnid.core.types.panorama import PaddedPanorama
+
+CYLINDER = Cylinder(872, 253, 86.0)
+RING = slice(200, 216)  # rows of the reflection of a lens
+SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
+LIGHT_GREY = 60.0
+PAD_PX, NOISE_GREY = 24, 1.0
+HALVES = [(n + 0.5) * math.tau / HEADINGS / 2 for n in range(2 * HEADINGS)]  # two pairs of each heading
+
+
+@lru_cache(maxsize=1)
+def world() -> NDArray[np.float32]:
+    """Return a panorama of texture of all sizes."""
+    rng = np.random.default_rng(3)
+    grey = np.full((CYLINDER.height, CYLINDER.width), 120.0, np.float32)
+    for sigma_px, contrast_grey in ((1.0, 8.0), (4.0, 8.0), (12.0, 8.0)):
+        noise = cv2.GaussianBlur(rng.normal(size=grey.shape), (0, 0), sigma_px)
+        grey += (contrast_grey / noise.std() * noise).astype(np.float32)
+    return grey
+
+
+def seen(heading_rad: float, ring_grey: float = 0.0, columns: slice = slice(None)) -> PaddedPanorama:
+    """Return the world at a heading, with light that is added by a reflection in some columns."""
+    grey = np.roll(world(), round(heading_rad / math.tau * CYLINDER.width), axis=1)
+    grey[RING, columns] += ring_grey
+    noise = np.random.default_rng(round(1e3 * heading_rad)).normal(0.0, NOISE_GREY, grey.shape)
+    image = np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
+    return PaddedPanorama(np.pad(image, ((0, 0), (PAD_PX, PAD_PX)), mode="wrap"), PAD_PX, NOISE_GREY)
+
+
+def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
+    parts = FixedParts(CYLINDER)
+    found = [parts.observe(heading, seen(heading), seen(heading, LIGHT_GREY), SHOWN) for heading in HALVES]
+    assert found.index(True) == 2 * (LEAST_HEADINGS - 1) and sum(found) == 1
+    rows = parts.pixels.mean(axis=1)
+    assert rows[RING].min() > 0.9 and parts.share == pytest.approx(rows.mean())
+    # The band-pass spreads a border over its 17 rows of 139 a radian.
+    assert not rows[: RING.start - 16].any() and not rows[RING.stop + 16 :].any()
+
+
+def test_only_the_directions_are_fixed_in_which_something_is() -> None:
+    parts = FixedParts(CYLINDER)
+    part = slice(200, 500)
+    for heading in HALVES:
+        parts.observe(heading, seen(heading, LIGHT_GREY, part), seen(heading), SHOWN)
+    columns = parts.pixels[RING].mean(axis=0)
+    assert columns[part].min() > 0.9 and not columns[: part.start - 10].any() and not columns[part.stop + 10 :].any()
+
+
+def test_a_world_without_fixed_parts_has_none() -> None:
+    parts = FixedParts(CYLINDER)
+    assert not any(parts.observe(heading, seen(heading), seen(heading), SHOWN) for heading in HALVES * 2)
+    assert not parts.pixels.any()
+
+
+def test_the_border_of_what_the_mirrors_show_is_no_fixed_part() -> None:
+    """It is fixed, and known: beyond it images are black."""
+    parts, shown = FixedParts(CYLINDER), SHOWN.copy()
+    shown[:20], shown[230:] = False, False
+    for heading in HALVES:
+        pair = [replace(seen(heading), image=seen(heading).image * _padded(shown)) for _ in range(2)]
+        parts.observe(heading, pair[0], pair[1], shown)
+    assert not parts.pixels.any()
+
+
+def _padded(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    return np.pad(shown, ((0, 0), (PAD_PX, PAD_PX)), mode="wrap").astype(np.uint8)
+
+
+def test_a_base_that_goes_to_and_fro_between_some_headings_learns_nothing() -> None:
+    """Lines along a corridor stay where they are, too."""
+    parts = FixedParts(CYLINDER)
+    few = HALVES[: 2 * (LEAST_HEADINGS - 1)]
+    assert not any(parts.observe(heading, *(seen(heading, LIGHT_GREY),) * 2, SHOWN) for heading in few * 3)
+
+
+def test_images_that_do_not_follow_the_heading_are_not_taken_for_fixed_ones() -> None:
+    """Wheels may carry the pose past images that do not change."""
+    parts, still = FixedParts(CYLINDER), seen(0.0)
+    assert not any(parts.observe(heading, still, still, SHOWN) for heading in HALVES)
+    assert not parts.pixels.any()
+
+
+def test_what_was_found_stays_and_more_is_found() -> None:
+    parts, half = FixedParts(CYLINDER), slice(0, CYLINDER.width // 2)
+    for heading in HALVES:
+        parts.observe(heading, seen(heading, LIGHT_GREY, half), seen(heading), SHOWN)
+    before = parts.pixels
+    for heading in HALVES * 2:
+        parts.observe(heading, seen(heading, LIGHT_GREY, slice(half.stop, None)), seen(heading), SHOWN)
+    assert before[RING, half].mean() > 0.9 and before[RING, half.stop + 10 : -10].mean() < 0.1
+    assert parts.pixels[before].all() and parts.pixels[RING].mean() > 0.9
+
+
+def test_sectors_have_fixed_parts_too() -> None:
+    sector = Cylinder(436, 253, 86.0, 872, 100)
+    parts = FixedParts(sector)
+    for heading in HALVES:
+        lower, upper = (
+            PaddedPanorama(np.ascontiguousarray(whole.panorama[:, 100:536]), 0, NOISE_GREY, turn_px=872, first=100)
+            for whole in (seen(heading), seen(heading, LIGHT_GREY))
+        )
+        parts.observe(heading, lower, upper, SHOWN[:, 100:536])
+    assert parts.pixels.shape == (253, 436) and parts.pixels[RING].mean() > 0.9
