@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from omnid.calibration.camera import calibrate_camera
     from omnid.calibration.drive import calibrate_drive
     from omnid.calibration.height import calibrate_height
+    from omnid.calibration.mask import calibrate_mask
     from omnid.calibration.rig import calibrate_rig
     from omnid.config import Config, load_config
     from omnid.errors import OmnidError
@@ -45,6 +46,7 @@ __all__ = [
     "calibrate_camera",
     "calibrate_drive",
     "calibrate_height",
+    "calibrate_mask",
     "calibrate_rig",
     "load_config",
     "replay",
@@ -60,6 +62,7 @@ _MODULES = {
     "calibrate_camera": "omnid.calibration.camera",
     "calibrate_drive": "omnid.calibration.drive",
     "calibrate_height": "omnid.calibration.height",
+    "calibrate_mask": "omnid.calibration.mask",
     "calibrate_rig": "omnid.calibration.rig",
     "load_config": "omnid.config",
     "replay": "omnid.api",

@@ -6,13 +6,23 @@ import argparse
 from importlib import import_module
 from typing import Final
 
-ACTIONS: Final = ("board", "camera", "live", "rig", "check", "drive", "height", "files")  # files: import, export
+ACTIONS: Final = (
+    "board",
+    "camera",
+    "live",
+    "rig",
+    "check",
+    "drive",
+    "height",
+    "mask",
+    "files",
+)  # files: import, export
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `calibrate` with its actions to the command line."""
     actions = add_listed(subparsers).add_subparsers(
-        dest="action", required=True, metavar="board|live|camera|rig|check|drive|height|import|export"
+        dest="action", required=True, metavar="board|live|camera|rig|check|drive|height|mask|import|export"
     )
     for name in ACTIONS:
         import_module(f"omnid.commands.calibrate_{name}").add_parser(actions)

@@ -58,6 +58,7 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "calibrate check": ("calibrate check drive.mcap --rig rig.toml",),
         "calibrate drive": ("calibrate drive drive.mcap --rig rig.toml -o better.toml",),
         "calibrate height": ("calibrate height drive.mcap --rig rig.toml --ruler-m 0.92 -o rig.toml",),
+        "calibrate mask": ("calibrate mask turn.mcap --rig rig.toml -o rig.toml",),
         "calibrate import": (
             "calibrate import camchain.yaml -o rig.toml",
             "calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml",

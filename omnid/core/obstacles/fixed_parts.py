@@ -63,6 +63,11 @@ class FixedParts:
         """Return the share of the panorama that is fixed."""
         return float(self.pixels.mean())
 
+    @property
+    def headings(self) -> int:
+        """Return the number of headings, of HEADINGS, that were seen."""
+        return len(self._views)
+
     def observe(self, heading_rad: float, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> bool:
         """Take a pair at a heading; return True where more pixels are fixed than before.
 
@@ -77,8 +82,10 @@ class FixedParts:
         self._views[heading] = np.stack([_texture(lower, shown), _texture(upper, shown)])
         self._new += 1
         # 2. Judged by all headings once as many are new as the least.
-        if self._new < LEAST_HEADINGS or len(self._views) < LEAST_HEADINGS:
-            return False
+        return self._new >= LEAST_HEADINGS and self.headings >= LEAST_HEADINGS and self.judge()
+
+    def judge(self) -> bool:
+        """Judge by all views so far; return True where more pixels are fixed than before."""
         self._new = 0
         found = self._judged()
         pixels = self.pixels | found
@@ -89,7 +96,7 @@ class FixedParts:
 
     def _judged(self) -> Flags:
         """Return the pixels (H, W) that show the same at all headings."""
-        count = len(self._views)
+        count = self.headings
         total, squares = np.zeros((2, 2, *self._size[::-1]), np.float32)
         for view in self._views.values():
             texture = view.astype(np.float32) / np.float32(UNITS)
