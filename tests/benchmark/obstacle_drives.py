@@ -2,14 +2,15 @@
 
 What is driven follows from the seed alone (`plan`). Each drive is a line of build/results/obstacle_drives.jsonl; the
 command goes on where it ended as long as the commit is the same. From all lines follow the two published tables: by
-what stands in the way, and by robot, camera and floor.
+what stands in the way, and by robot, camera and floor. With --real only the drives with all disturbances of images are
+made, which have a table of their own.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from multiprocessing import get_context
@@ -34,6 +35,7 @@ ROOMS: Final = (CLUTTER, AT_EDGE, WITH_PEOPLE)
 CHOSEN: Final = ("free", "low box", "edge 8 cm", "bar", "plain pole", "table", "chair", "person crosses", CLUTTER)
 USUALLY: Final = Conditions()
 FINE: Final = Conditions(size_px=960, rate_hz=30.0)
+REAL: Final = Conditions(disturbed=OF_CAMERAS, turns_first=True)
 OF_ALL: Final = "all drives"
 COLUMNS: Final = (
     Column("drives"),
@@ -80,7 +82,7 @@ def plan(seed: int) -> list[Planned]:
         *((case, Conditions(floor=floor)) for floor in FLOORS if floor != TILES for case in CHOSEN),
         *((case, Conditions(build=build)) for build in BUILDS if build != USUAL for case in CHOSEN),
         *((case, Conditions(disturbed=("jpeg",))) for case in CHOSEN),
-        *((case, Conditions(disturbed=OF_CAMERAS, turns_first=True)) for case in CHOSEN),
+        *((case, REAL) for case in CHOSEN),
         *((POLISHED + case, USUALLY) for case in ("free", "box", "pole", "person crosses")),
         *((case, FINE) for case in ("free", "low box", "edge 8 cm", "plain pole", "person crosses")),
     ]
@@ -97,13 +99,20 @@ def known_drives() -> dict[str, Drive]:
     return {line["name"]: Drive(**line["drive"]) for line in lines if line["commit"] == here}
 
 
-def tables(seeds: Iterable[int], drives: dict[str, Drive]) -> list[ResultTable]:
-    """Return the tables of all drives of seeds that were made, by case and by kind."""
-    made = [planned for seed in seeds for planned in plan(seed) if planned.name in drives]
+def of_real_images(planned: Iterable[Planned]) -> list[Planned]:
+    """Return the drives with all disturbances of images."""
+    return [one for one in planned if one.kind == str(REAL)]
+
+
+def tables(made: Sequence[Planned], drives: dict[str, Drive], *, real: bool = False) -> list[ResultTable]:
+    """Return the tables of drives that were made, by case and by kind; real: that of real images, by case."""
+    by_case = "what stands in the way"
     parts: list[tuple[str, str, Callable[[Planned], str]]] = [
-        ("obstacle_drives", "what stands in the way", lambda planned: planned.case),
+        ("obstacle_drives", by_case, lambda planned: planned.case),
         ("obstacle_drives_kinds", "robot, camera and floor", lambda planned: planned.kind),
     ]
+    if real:
+        parts = [("obstacle_drives_real", f"{by_case}, with {REAL}", lambda planned: planned.case)]
     found = []
     for name, by, key in parts:
         table = ResultTable(
@@ -124,11 +133,14 @@ def main() -> None:
     """Make the drives that are missing, print a line for each, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs=2, required=True, metavar=("FIRST", "LAST"))
+    parser.add_argument("--real", action="store_true", help="only the drives with all disturbances of images")
     parser.add_argument("--jobs", type=int, default=1, help="drives at a time")
     arguments = parser.parse_args()
     here, drives = commit(), known_drives()
     seeds = range(arguments.seeds[0], arguments.seeds[1] + 1)
-    missing = [planned for seed in seeds for planned in plan(seed) if planned.name not in drives]
+    wanted = [planned for seed in seeds for planned in plan(seed)]
+    wanted = of_real_images(wanted) if arguments.real else wanted
+    missing = [planned for planned in wanted if planned.name not in drives]
     LINES.parent.mkdir(parents=True, exist_ok=True)
     with ProcessPoolExecutor(arguments.jobs, get_context("spawn")) as pool, LINES.open("a") as lines:
         waiting = {pool.submit(run, *planned): planned for planned in missing}
@@ -138,7 +150,7 @@ def main() -> None:
             print(f"{name}: {made}", flush=True)
             lines.write(json.dumps({"commit": here, "name": name, "drive": made._asdict()}) + "\n")
             lines.flush()
-    for table in tables(seeds, drives):
+    for table in tables([planned for planned in wanted if planned.name in drives], drives, real=arguments.real):
         print(table.save())
 
 
