@@ -109,7 +109,6 @@ class Columns:
         self._visible = self._panoramas.sized(visible * np.uint8(255)) > 127
         in_view = self._visible[:, self._panoramas.shown].mean(axis=1) > 0.5
         self._first_row, self._last_row = _run_about(in_view, round(self._row0))
-        self._visible[self._last_row + 1 :] = False
         self._live = self._visible * np.uint8(255)
         self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()

@@ -12,6 +12,7 @@ from calib import se3
 from omnid.core.obstacles.cell_kernels import SURFACE
 from omnid.core.obstacles.grid import CELL_M
 from omnid.core.obstacles.settings import RingSettings
+from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.floor import CameraFloor
@@ -123,3 +124,16 @@ def test_the_reflection_of_a_lens_ends_the_free_floor_until_the_base_has_turned(
         ignorant = standing.ring(_turned(0.0, 60.0))
     assert turning.rings.fixed.share > 0.05 and not standing.rings.fixed.share
     assert np.median(ignorant.free_m) < 1.2 and np.quantile(learned.free_m, 0.1) > 2.0
+
+
+def test_a_frozen_part_of_the_images_is_not_learned() -> None:
+    """It is the same at all headings, too, until its driver writes it again."""
+    base, frozen = Standing(HEIGHT_M), np.zeros((TILE_ROWS, TILE_COLUMNS), bool)
+    frozen[:, :20] = True
+    none, columns = np.zeros_like(frozen), frozen.any(axis=0)
+    tiles = TileStates(
+        {"lower": frozen, "upper": none}, {"lower": none, "upper": none}, {"lower": columns, "upper": none.any(axis=0)}
+    )
+    for heading in np.arange(24) * math.tau / 16:
+        base.ring(replace(_turned(heading, 60.0), tiles=tiles), heading_rad=heading)
+    assert not base.rings.fixed.share
