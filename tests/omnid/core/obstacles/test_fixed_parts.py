@@ -20,6 +20,7 @@ RING = slice(200, 216)  # rows of the reflection of a lens
 SHOWN = np.ones((CYLINDER.height, CYLINDER.width), bool)
 LIGHT_GREY = 60.0
 PAD_PX, NOISE_GREY = 24, 1.0
+TURN = [(n + 0.5) * math.tau / HEADINGS for n in range(HEADINGS)]
 HALVES = [(n + 0.5) * math.tau / HEADINGS / 2 for n in range(2 * HEADINGS)]  # two pairs of each heading
 
 
@@ -56,7 +57,7 @@ def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
 def test_only_the_directions_are_fixed_in_which_something_is() -> None:
     parts = FixedParts(CYLINDER)
     part = slice(200, 500)
-    for heading in HALVES:
+    for heading in TURN:
         parts.observe(heading, seen(heading, LIGHT_GREY, part), seen(heading), SHOWN)
     columns = parts.pixels[RING].mean(axis=0)
     assert columns[part].min() > 0.9 and not columns[: part.start - 10].any() and not columns[part.stop + 10 :].any()
@@ -64,7 +65,7 @@ def test_only_the_directions_are_fixed_in_which_something_is() -> None:
 
 def test_a_world_without_fixed_parts_has_none() -> None:
     parts = FixedParts(CYLINDER)
-    assert not any(parts.observe(heading, seen(heading), seen(heading), SHOWN) for heading in HALVES * 2)
+    assert not any(parts.observe(heading, seen(heading), seen(heading), SHOWN) for heading in TURN * 2)
     assert not parts.pixels.any()
 
 
@@ -72,7 +73,7 @@ def test_the_border_of_what_the_mirrors_show_is_no_fixed_part() -> None:
     """It is fixed, and known: beyond it images are black."""
     parts, shown = FixedParts(CYLINDER), SHOWN.copy()
     shown[:20], shown[230:] = False, False
-    for heading in HALVES:
+    for heading in TURN:
         pair = [replace(seen(heading), image=seen(heading).image * _padded(shown)) for _ in range(2)]
         parts.observe(heading, pair[0], pair[1], shown)
     assert not parts.pixels.any()
@@ -85,23 +86,23 @@ def _padded(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
 def test_a_base_that_goes_to_and_fro_between_some_headings_learns_nothing() -> None:
     """Lines along a corridor stay where they are, too."""
     parts = FixedParts(CYLINDER)
-    few = HALVES[: 2 * (LEAST_HEADINGS - 1)]
+    few = TURN[: LEAST_HEADINGS - 1]
     assert not any(parts.observe(heading, *(seen(heading, LIGHT_GREY),) * 2, SHOWN) for heading in few * 3)
 
 
 def test_images_that_do_not_follow_the_heading_are_not_taken_for_fixed_ones() -> None:
     """Wheels may carry the pose past images that do not change."""
     parts, still = FixedParts(CYLINDER), seen(0.0)
-    assert not any(parts.observe(heading, still, still, SHOWN) for heading in HALVES)
+    assert not any(parts.observe(heading, still, still, SHOWN) for heading in TURN)
     assert not parts.pixels.any()
 
 
 def test_what_was_found_stays_and_more_is_found() -> None:
     parts, half = FixedParts(CYLINDER), slice(0, CYLINDER.width // 2)
-    for heading in HALVES:
+    for heading in TURN:
         parts.observe(heading, seen(heading, LIGHT_GREY, half), seen(heading), SHOWN)
     before = parts.pixels
-    for heading in HALVES * 2:
+    for heading in TURN * 2:
         parts.observe(heading, seen(heading, LIGHT_GREY, slice(half.stop, None)), seen(heading), SHOWN)
     assert before[RING, half].mean() > 0.9 and before[RING, half.stop + 10 : -10].mean() < 0.1
     assert parts.pixels[before].all() and parts.pixels[RING].mean() > 0.9
@@ -110,7 +111,7 @@ def test_what_was_found_stays_and_more_is_found() -> None:
 def test_sectors_have_fixed_parts_too() -> None:
     sector = Cylinder(436, 253, 86.0, 872, 100)
     parts = FixedParts(sector)
-    for heading in HALVES:
+    for heading in TURN:
         lower, upper = (
             PaddedPanorama(np.ascontiguousarray(whole.panorama[:, 100:536]), 0, NOISE_GREY, turn_px=872, first=100)
             for whole in (seen(heading), seen(heading, LIGHT_GREY))
