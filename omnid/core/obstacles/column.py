@@ -108,7 +108,7 @@ class Columns:
         self._first_bin = max(1, math.floor(self.at_1m / ranges_m[1]))
         self._visible = self._panoramas.sized(visible * np.uint8(255)) > 127
         in_view = self._visible[:, self._panoramas.shown].mean(axis=1) > 0.5
-        self._first_row, self._last_row = _run_about(in_view, round(self._row0))
+        self._first_row, self._last_row = _rows_in_use(in_view, round(self._row0))
         self._live = self._visible * np.uint8(255)
         self._unseen = _wide_runs(np.asarray(~self._visible[max(0, round(self._row0)) :].any(axis=0)))
         self._floor_bins, self._strips = self._made_floor_bins(), self._made_strips()
@@ -232,17 +232,18 @@ class Columns:
         return np.array(found, np.int32)
 
 
-def _run_about(shown: Flags, row: int) -> tuple[int, int]:
-    """Return the first and the last of the rows that are shown about a row, or of the nearest run of such rows.
+def _rows_in_use(shown: Flags, horizon: int) -> tuple[int, int]:
+    """Return the first row that is shown, and the last of the first run of such rows below the horizon.
 
     Floor nearer than a ring that no direction shows, such as the reflection of a lens, is not used: what comes would be
     out of view on its way there, and so would the floor on which a base drives.
     """
     rows = np.flatnonzero(shown)
-    begin = int(rows[np.abs(rows - row).argmin()])
-    others = np.flatnonzero(~shown)
-    before, after = others[others < begin], others[others > begin]
-    return int(before[-1]) + 1 if before.size else 0, int(after[0]) - 1 if after.size else len(shown) - 1
+    below = rows[rows > horizon]
+    if not below.size:
+        return int(rows[0]), int(rows[-1])
+    gaps = np.flatnonzero(np.diff(below) > 1)
+    return int(rows[0]), int(below[gaps[0]] if gaps.size else below[-1])
 
 
 def _wide_runs(flags: Flags) -> Flags:

@@ -7,8 +7,10 @@ textures (pair_views.py) have the mean m and the standard deviation s, a pixel i
 
     m sqrt(n) / s > T_0   and   m > m_0.
 
-Headings count, and not places, as lines along a corridor stay where they are while a base drives through it. A part
-without a border along columns, such as an even strut, has m = 0: it shows nothing, and is no evidence by itself.
+Headings count, and not places, as lines along a corridor stay where they are while a base drives through it. Only what
+lies well below the horizon is judged: the horizon itself, and walls far away, are where they are at all headings, and
+the rows next to them may be all that shows a bar as high as the cameras. A part without a border along columns, such
+as an even strut, has m = 0: it shows nothing, and is no evidence by itself.
 """
 
 from __future__ import annotations
@@ -40,6 +42,7 @@ SPECK: Final = np.ones((2, 3), np.uint8)  # smallest part, because noise is narr
 # The band-pass shows the border of a part; what is between two of them belongs to it.
 WITHIN: Final = np.ones((COARSE_ROWS, 9), np.uint8)
 MOST: Final = 0.3  # Share that may be fixed, because where more is, images do not follow the heading.
+LEAST_FALL: Final = math.tan(math.radians(20))  # Below the horizon: floor there is within 2.5 m of a base.
 LEAST_NEW: Final = 0.01  # share of the panorama that must be new, because it costs what was known about the floor
 
 
@@ -53,6 +56,7 @@ class FixedParts:
         self._shape = cylinder.height, cylinder.width
         rows = max(1, round(cylinder.height * FOCAL_PX / cylinder.focal_px))
         self._size = max(1, DIRECTIONS * cylinder.width // cylinder.turn_px), rows
+        self._first_row = round((cylinder.row0 + LEAST_FALL * cylinder.focal_px) * rows / cylinder.height)
         self._views: dict[int, Texture] = {}  # (2, rows, columns) of the lower and the upper panorama, by heading
         self._heading = -1  # of the pair before
         self._new = 0  # views since the last judgement
@@ -106,6 +110,7 @@ class FixedParts:
         variance = np.maximum((squares / count - mean * mean) * count / (count - 1), LEAST_SIGMA**2)
         same = (np.abs(mean) > LEAST_MEAN) & (mean * mean * count > LEAST_RATIO**2 * variance)
         pixels = np.asarray(same.any(axis=0)).view(np.uint8)
+        pixels[: max(0, self._first_row)] = 0
         large = cv2.morphologyEx(pixels, cv2.MORPH_OPEN, SPECK)
         whole = cv2.morphologyEx(large, cv2.MORPH_CLOSE, WITHIN)
         return np.asarray(cv2.resize(whole, self._shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0

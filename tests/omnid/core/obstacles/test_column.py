@@ -146,6 +146,12 @@ def test_floor_nearer_than_a_ring_that_no_direction_shows_is_not_used() -> None:
     assert whole.nearest_floor_m < 1.0 and 1.7 < cut.nearest_floor_m < 2.4
     floors_m = [one.at_1m / np.flatnonzero(np.isfinite(_floor_of(one)).any(axis=1)).max() for one in (whole, cut)]
     assert floors_m[0] < 1.1 and floors_m[1] > 1.7
+    # Floor below rows of the horizon that are hidden is seen as before.
+    horizon = VISIBLE.copy()
+    horizon[78:96] = False
+    assert Columns(
+        CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (0.06, 1.3), (NEAREST_M, 6.0), horizon
+    ).nearest_floor_m == pytest.approx(whole.nearest_floor_m)
     speck = VISIBLE.copy()
     speck[160:175, 100:400] = False
     assert Columns(

@@ -83,6 +83,16 @@ def _padded(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return np.pad(shown, ((0, 0), (PAD_PX, PAD_PX)), mode="wrap").astype(np.uint8)
 
 
+def test_the_horizon_is_at_all_headings_and_no_fixed_part() -> None:
+    """Without its rows a bar as high as the cameras would not be seen."""
+    parts, grey = FixedParts(CYLINDER), np.zeros((CYLINDER.height, CYLINDER.width + 2 * PAD_PX), np.uint8)
+    grey[: round(CYLINDER.row0) + 8] = 60  # the sky, and hills
+    for heading in TURN:
+        pair = [replace(seen(heading), image=seen(heading).image + grey) for _ in range(2)]
+        parts.observe(heading, pair[0], pair[1], SHOWN)
+    assert not parts.pixels.any()
+
+
 def test_a_base_that_goes_to_and_fro_between_some_headings_learns_nothing() -> None:
     """Lines along a corridor stay where they are, too."""
     parts = FixedParts(CYLINDER)
