@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib import se3
 from calib.panorama import remap_tables
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
@@ -69,7 +68,7 @@ def calibrate_mask(
     with closing(open_log(log, topics, rig)) as reader:
         for update in tracked_updates(reader, front_end, config, log):
             pair = update.depth.panoramas
-            parts.observe(float(se3.yaw(update.T_odom_rig)), pair.lower, pair.upper, pair.visible)
+            parts.observe(update.T_odom_rig, pair.lower, pair.upper, pair.visible)
             front_end.poses.after()
     if parts.headings < LEAST_HEADINGS:
         raise OmnidError(

@@ -38,6 +38,8 @@ class PairRings:
         self._geometry, self._settings = geometry, settings
         self._of_floor: Floor | None = None  # floor for which the columns were made
         self.fixed = FixedParts(geometry.cylinder)
+        self._left_out = self.fixed.pixels  # those of the columns
+        self._is_misled = False  # whether the grid holds what fixed parts have shown
         self._columns: Columns | None = None
         self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
@@ -59,11 +61,7 @@ class PairRings:
             # The place is not known. What is known in odom holds again when odometry finds its landmarks again.
             self._tracker.clear()
             return unknown
-        if self._finds_fixed_parts(odometry):
-            # What was known about the floor came from images of which a part does not show it.
-            self._of_floor = None
-            self._grid.begin_again()
-            self._tracker.clear()
+        self._leave_out_fixed_parts(odometry)
         columns = self._columns_of(camera_floor, panoramas)
         if columns is None:
             return unknown
@@ -79,13 +77,21 @@ class PairRings:
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
 
-    def _finds_fixed_parts(self, odometry: OdometryUpdate) -> bool:
-        """Return True where a pair shows that more of the panoramas is fixed to a camera; frozen parts are not."""
+    def _leave_out_fixed_parts(self, odometry: OdometryUpdate) -> None:
+        """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""
         panoramas = odometry.depth.panoramas
-        if any(dead.any() for dead in panoramas.tiles.dead.values()):
-            return False
-        heading_rad = float(se3.yaw(odometry.T_odom_rig))
-        return self.fixed.observe(heading_rad, panoramas.lower, panoramas.upper, panoramas.visible)
+        is_frozen = any(dead.any() for dead in panoramas.tiles.dead.values())
+        if is_frozen or not self.fixed.observe(
+            odometry.T_odom_rig, panoramas.lower, panoramas.upper, panoramas.visible
+        ):
+            return
+        if self.fixed.pixels is not self._left_out:
+            self._left_out, self._of_floor, self._is_misled = self.fixed.pixels, None, True
+        if self._is_misled and self.fixed.is_on_the_spot:
+            # The floor too near to be seen is taken to be free again: a base that came here might know better.
+            self._grid.begin_again()
+            self._tracker.clear()
+            self._is_misled = False
 
     def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
         """Return the columns for the floor and what is seen of it, None without a floor."""
@@ -101,7 +107,7 @@ class PairRings:
                 plane,
                 settings.heights_m,
                 (NEAREST_M, settings.max_range_m),
-                panoramas.visible & ~self.fixed.pixels,
+                panoramas.visible & ~self._left_out,
             )
             self._grid.set_floor(T_rect_floor, plane.height_m)
         return self._columns

@@ -16,16 +16,19 @@ as an even strut, has m = 0: it shows nothing, and is no evidence by itself.
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles.pair_views import COARSE_ROWS, CONTRAST_ROWS, DIRECTIONS, FOCAL_PX, TEXTURE_SHARE
 from omnid.core.types.panorama import PaddedPanorama
 
+Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Texture = NDArray[np.int8]
@@ -43,6 +46,7 @@ SPECK: Final = np.ones((2, 3), np.uint8)  # smallest part, because noise is narr
 WITHIN: Final = np.ones((COARSE_ROWS, 9), np.uint8)
 MOST: Final = 0.3  # Share that may be fixed, because where more is, images do not follow the heading.
 LEAST_FALL: Final = math.tan(math.radians(20))  # Below the horizon: floor there is within 2.5 m of a base.
+ON_THE_SPOT_M: Final = 0.2  # A base that has moved by less in a turn knows the floor beside it as at its start.
 LEAST_NEW: Final = 0.01  # share of the panorama that must be new, because it costs what was known about the floor
 
 
@@ -58,6 +62,7 @@ class FixedParts:
         self._size = max(1, DIRECTIONS * cylinder.width // cylinder.turn_px), rows
         self._first_row = round((cylinder.row0 + LEAST_FALL * cylinder.focal_px) * rows / cylinder.height)
         self._views: dict[int, Texture] = {}  # (2, rows, columns) of the lower and the upper panorama, by heading
+        self._places_m: deque[Array] = deque(maxlen=LEAST_HEADINGS)  # (2,) of the newest views
         self._heading = -1  # of the pair before
         self._new = 0  # views since the last judgement
         self.pixels: Flags = np.zeros(self._shape, bool)  # (H, W) that are fixed in either panorama
@@ -72,31 +77,39 @@ class FixedParts:
         """Return the number of headings, of HEADINGS, that were seen."""
         return len(self._views)
 
-    def observe(self, heading_rad: float, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> bool:
-        """Take a pair at a heading; return True where more pixels are fixed than before.
+    @property
+    def is_on_the_spot(self) -> bool:
+        """Return whether the newest views, of most of a turn, are of one place."""
+        places_m = np.array(self._places_m)
+        return len(places_m) == LEAST_HEADINGS and bool((np.ptp(places_m, axis=0) < ON_THE_SPOT_M).all())
+
+    def observe(self, T_odom_rig: Array, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> bool:
+        """Take a pair at a pose (4, 4); return True where it was judged what is fixed.
 
         visible (H, W): pixels that show the world as far as the rig knows, the same in all pairs.
         """
         # 1. One view of each heading, taken as the base turns to it.
-        heading = int(heading_rad % math.tau / math.tau * HEADINGS) % HEADINGS
+        heading = int(float(se3.yaw(T_odom_rig)) % math.tau / math.tau * HEADINGS) % HEADINGS
         if heading == self._heading:
             return False
         self._heading = heading
         shown = cv2.resize(visible.view(np.uint8), self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
         self._views[heading] = np.stack([_texture(lower, shown), _texture(upper, shown)])
+        self._places_m.append(T_odom_rig[:2, 3].copy())
         self._new += 1
         # 2. Judged by all headings once as many are new as the least.
-        return self._new >= LEAST_HEADINGS and self.headings >= LEAST_HEADINGS and self.judge()
+        if self._new < LEAST_HEADINGS or self.headings < LEAST_HEADINGS:
+            return False
+        self.judge()
+        return True
 
-    def judge(self) -> bool:
-        """Judge by all views so far; return True where more pixels are fixed than before."""
+    def judge(self) -> None:
+        """Add to the fixed pixels what the views so far show."""
         self._new = 0
         found = self._judged()
         pixels = self.pixels | found
-        if np.mean(found & ~self.pixels) < LEAST_NEW or pixels.mean() > MOST:
-            return False
-        self.pixels = pixels
-        return True
+        if np.mean(found & ~self.pixels) >= LEAST_NEW and pixels.mean() <= MOST:
+            self.pixels = pixels
 
     def _judged(self) -> Flags:
         """Return the pixels (H, W) that show the same at all headings."""

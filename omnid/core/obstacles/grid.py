@@ -86,7 +86,7 @@ class ObstacleGrid:
         self._usual, self._usual_thin = UsualFloor(CELLS), UsualFloor(CELLS)
         self._corner: NDArray[np.int64] | None = None  # cell (0, 0) in odom
         self._start_ns: int | None = None
-        self._nearest_m = 0.0  # range of the floor in view at the start
+        self._nearest_m = 0.0  # range of the nearest floor in view
         self._eye_m = np.zeros(2)  # viewpoint of the last pair
         self._place_m: Array | None = None  # of the last pair
         self._last_ns: int | None = None
@@ -112,10 +112,10 @@ class ObstacleGrid:
         self._eye_m = self.viewpoint(T_odom_base)[:2, 3]
         eye = self._eye_m / CELL_M - corner
         rows, columns = (slice(int(n) - VIEW_CELLS, int(n) + VIEW_CELLS + 1) for n in (at[1], at[0]))
+        self._nearest_m = evidence.nearest_floor_m
         if self._start_ns is None:
             # The robot is where nothing else can be: the floor too near to be seen counts until it is reached.
             self._start_ns = stamp_ns
-            self._nearest_m = evidence.nearest_floor_m
             self._assume_free(np.floor(eye).astype(np.int64), T_odom_base, evidence)
         passed_ns = FRESH_NS if self._last_ns is None else max(stamp_ns - self._last_ns, 0)
         self._last_ns = stamp_ns

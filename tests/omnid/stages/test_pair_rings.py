@@ -53,10 +53,12 @@ class Standing:
         state: TrackingState = TrackingState.TRACKING,
         resets: int = 0,
         heading_rad: float = 0.0,
+        x_m: float = 0.0,
     ) -> ObstacleRing:
         """Return the ring at the next pair."""
         self._seq += 1
         T_odom_rig = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading_rad]))
+        T_odom_rig[0, 3] = x_m
         of_pose = T_odom_rig, np.eye(6), np.zeros(6), np.eye(6)
         return self.rings.add(
             OdometryUpdate(self._seq, self._seq * PERIOD_NS, *of_pose, state, resets, 100, 100, StereoDepth(pair)),
@@ -125,6 +127,18 @@ def test_the_reflection_of_a_lens_ends_the_free_floor_until_the_base_has_turned(
         ignorant = standing.ring(pair)
     assert turning.rings.fixed.share > 0.05 and not standing.rings.fixed.share
     assert np.median(ignorant.free_m) < 1.2 and np.quantile(learned.free_m, 0.1) > 2.0
+
+
+def test_a_base_that_learns_as_it_drives_takes_no_floor_for_free_until_it_turns_on_the_spot() -> None:
+    """It may have come to something low, which is too near to be seen."""
+    base, free_m = Standing(HEIGHT_M), []
+    for n in range(26):
+        heading, x_m = (n + 0.5) * math.tau / 16, 0.03 * min(n, 12)
+        pair = _turned(heading, 60.0)
+        rings = [base.ring(pair, heading_rad=heading, x_m=x_m) for _ in range(2)]
+        free_m.append(float(np.median(rings[-1].free_m)))
+        assert (base.rings.fixed.share > 0.05) == (n >= 11)
+    assert max(free_m[11:23]) < 0.8 and min(free_m[23:]) > 2.0
 
 
 def test_a_frozen_part_of_the_images_is_not_learned() -> None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
 from omnid.core.types.panorama import PaddedPanorama
@@ -44,10 +45,17 @@ def seen(heading_rad: float, ring_grey: float = 0.0, columns: slice = slice(None
     return PaddedPanorama(np.pad(image, ((0, 0), (PAD_PX, PAD_PX)), mode="wrap"), PAD_PX, NOISE_GREY)
 
 
+def turned(heading_rad: float, x_m: float = 0.0) -> NDArray[np.float64]:
+    """Return a pose (4, 4)."""
+    T = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading_rad]))
+    T[0, 3] = x_m
+    return T
+
+
 def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
     parts = FixedParts(CYLINDER)
-    found = [parts.observe(heading, seen(heading), seen(heading, LIGHT_GREY), SHOWN) for heading in HALVES]
-    assert found.index(True) == 2 * (LEAST_HEADINGS - 1) and sum(found) == 1
+    found = [parts.observe(turned(heading), seen(heading), seen(heading, LIGHT_GREY), SHOWN) for heading in HALVES]
+    assert found.index(True) == 2 * (LEAST_HEADINGS - 1) and sum(found) == 1 and parts.is_on_the_spot
     rows = parts.pixels.mean(axis=1)
     assert rows[RING].min() > 0.9 and parts.share == pytest.approx(rows.mean())
     # The band-pass spreads a border over its 17 rows of 139 a radian.
@@ -58,15 +66,15 @@ def test_only_the_directions_are_fixed_in_which_something_is() -> None:
     parts = FixedParts(CYLINDER)
     part = slice(200, 500)
     for heading in TURN:
-        parts.observe(heading, seen(heading, LIGHT_GREY, part), seen(heading), SHOWN)
+        parts.observe(turned(heading), seen(heading, LIGHT_GREY, part), seen(heading), SHOWN)
     columns = parts.pixels[RING].mean(axis=0)
     assert columns[part].min() > 0.9 and not columns[: part.start - 10].any() and not columns[part.stop + 10 :].any()
 
 
 def test_a_world_without_fixed_parts_has_none() -> None:
     parts = FixedParts(CYLINDER)
-    assert not any(parts.observe(heading, seen(heading), seen(heading), SHOWN) for heading in TURN * 2)
-    assert not parts.pixels.any()
+    judged = [parts.observe(turned(heading), seen(heading), seen(heading), SHOWN) for heading in TURN * 2]
+    assert any(judged) and not parts.pixels.any()
 
 
 def test_the_border_of_what_the_mirrors_show_is_no_fixed_part() -> None:
@@ -75,7 +83,7 @@ def test_the_border_of_what_the_mirrors_show_is_no_fixed_part() -> None:
     shown[:20], shown[230:] = False, False
     for heading in TURN:
         pair = [replace(seen(heading), image=seen(heading).image * _padded(shown)) for _ in range(2)]
-        parts.observe(heading, pair[0], pair[1], shown)
+        parts.observe(turned(heading), pair[0], pair[1], shown)
     assert not parts.pixels.any()
 
 
@@ -89,7 +97,7 @@ def test_the_horizon_is_at_all_headings_and_no_fixed_part() -> None:
     grey[: round(CYLINDER.row0) + 8] = 60  # the sky, and hills
     for heading in TURN:
         pair = [replace(seen(heading), image=seen(heading).image + grey) for _ in range(2)]
-        parts.observe(heading, pair[0], pair[1], SHOWN)
+        parts.observe(turned(heading), pair[0], pair[1], SHOWN)
     assert not parts.pixels.any()
 
 
@@ -97,25 +105,32 @@ def test_a_base_that_goes_to_and_fro_between_some_headings_learns_nothing() -> N
     """Lines along a corridor stay where they are, too."""
     parts = FixedParts(CYLINDER)
     few = TURN[: LEAST_HEADINGS - 1]
-    assert not any(parts.observe(heading, *(seen(heading, LIGHT_GREY),) * 2, SHOWN) for heading in few * 3)
+    assert not any(parts.observe(turned(heading), *(seen(heading, LIGHT_GREY),) * 2, SHOWN) for heading in few * 3)
 
 
 def test_images_that_do_not_follow_the_heading_are_not_taken_for_fixed_ones() -> None:
     """Wheels may carry the pose past images that do not change."""
     parts, still = FixedParts(CYLINDER), seen(0.0)
-    assert not any(parts.observe(heading, still, still, SHOWN) for heading in TURN)
-    assert not parts.pixels.any()
+    judged = [parts.observe(turned(heading), still, still, SHOWN) for heading in TURN]
+    assert any(judged) and not parts.pixels.any()
 
 
 def test_what_was_found_stays_and_more_is_found() -> None:
     parts, half = FixedParts(CYLINDER), slice(0, CYLINDER.width // 2)
     for heading in TURN:
-        parts.observe(heading, seen(heading, LIGHT_GREY, half), seen(heading), SHOWN)
+        parts.observe(turned(heading), seen(heading, LIGHT_GREY, half), seen(heading), SHOWN)
     before = parts.pixels
     for heading in TURN * 2:
-        parts.observe(heading, seen(heading, LIGHT_GREY, slice(half.stop, None)), seen(heading), SHOWN)
+        parts.observe(turned(heading), seen(heading, LIGHT_GREY, slice(half.stop, None)), seen(heading), SHOWN)
     assert before[RING, half].mean() > 0.9 and before[RING, half.stop + 10 : -10].mean() < 0.1
     assert parts.pixels[before].all() and parts.pixels[RING].mean() > 0.9
+
+
+def test_a_base_that_turns_as_it_drives_is_not_on_the_spot() -> None:
+    parts = FixedParts(CYLINDER)
+    for n, heading in enumerate(TURN):
+        parts.observe(turned(heading, 0.03 * n), seen(heading, LIGHT_GREY), seen(heading), SHOWN)
+    assert parts.pixels.any() and not parts.is_on_the_spot
 
 
 def test_sectors_have_fixed_parts_too() -> None:
@@ -126,5 +141,5 @@ def test_sectors_have_fixed_parts_too() -> None:
             PaddedPanorama(np.ascontiguousarray(whole.panorama[:, 100:536]), 0, NOISE_GREY, turn_px=872, first=100)
             for whole in (seen(heading), seen(heading, LIGHT_GREY))
         )
-        parts.observe(heading, lower, upper, SHOWN[:, 100:536])
+        parts.observe(turned(heading), lower, upper, SHOWN[:, 100:536])
     assert parts.pixels.shape == (253, 436) and parts.pixels[RING].mean() > 0.9
