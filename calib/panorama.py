@@ -189,7 +189,7 @@ def _shared_view(rig: Rig, elevation_deg: tuple[float, float]) -> tuple[_Sector,
     shared_deg = math.degrees(math.atan(slopes.max()) - math.atan(slopes.min()))
     if shared_deg < MIN_SHARED_DEG:
         raise CalibError(
-            f"rig: the cameras share {shared_deg:.0f} degrees of elevation about the line through both "
+            f"rig: the cameras share {shared_deg:.1f} degrees of elevation about the line through both "
             f"viewpoints, expected {MIN_SHARED_DEG:g} or more: lenses back to back share too little; "
             "check the transforms and the masks"
         )

@@ -46,7 +46,8 @@ _MAX_ATTACHMENT_BYTES: Final = 16 * 2**20
 # The year 2116: two stamps differ by what fits 64 bits, and trajectories (omnid/formats/tum.py) have the same limit.
 _MAX_STAMP_NS: Final = 2**62
 _LONGEST_GAP_NS: Final = 3600 * 10**9  # Stamps of two successive images that differ by more are not those of one log.
-_SHORTEST_STEP_NS: Final = 100_000  # no camera gives 10,000 images a second
+# No pair of cameras takes 1,000 images a second, as those of one a second that are named by microseconds seem to.
+_SHORTEST_STEP_NS: Final = 1_000_000
 _NS_DIGITS: Final = 16
 _BITS_IMAGES: Final = 16  # images of a camera that show the bits of its samples
 # Lower whole numbers as names count images: seconds since 1970 are above since 2001, and no camera of a robot takes one
@@ -168,7 +169,7 @@ def _numbers_of(path: Path) -> list[tuple[int, str]]:
 def _require_plausible(files: Sequence[_StampedFile]) -> None:
     """Raise DriverError where images that follow each other lie more than an hour, or next to no time, apart."""
     steps_ns = sorted(after.stamp_ns - before.stamp_ns for before, after in pairwise(files))
-    if steps_ns and 0 < steps_ns[len(steps_ns) // 2] < _SHORTEST_STEP_NS:
+    if steps_ns and 0 < steps_ns[len(steps_ns) // 2] <= _SHORTEST_STEP_NS:
         raise DriverError(
             f"the images beside {str(files[0].path)!r} are {steps_ns[len(steps_ns) // 2] / 1000:g} us apart by their "
             "stamps: whole numbers of 16 and more digits are nanoseconds; give those in microseconds as seconds or "

@@ -129,7 +129,13 @@ def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None
         raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
     if lower is None or upper is None:
         missing = "lower" if lower is None else "upper"
-        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
+        advice = f"give --{missing} TOPIC"
+        if len(images) == 1:
+            advice += (
+                "; if its images hold both views, give it as --lower and --upper (to calibrate a rig, "
+                "--lower-area and --upper-area)"
+            )
+        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; {advice}")
     return {"lower": lower, "upper": upper}
 
 

@@ -63,6 +63,11 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
 
 def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None) -> PairedImages:
     """Read images of which each holds both views: of a folder, or of a log's topic."""
+    if areas[0] == areas[1]:
+        raise OmnidError(
+            "calibrate rig: --lower-area and --upper-area are the same, so the board would be found at one place for "
+            "both: give the rectangle of each view; views one around the other are not told apart by rectangles"
+        )
     if is_log(source):
         topic = image_topic(source, topic)
     images = read_images([str(source)], topic)

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import associated, evaluate
-    from omnid.recordings.scores import drift_text, hilti_score, kitti_drift
+    from omnid.recordings.scores import drift_text, hilti_score, hilti_text, kitti_drift
 
     estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
     alignment = args.align or ("rigid" if args.score == "hilti" else "origin")
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     if live is not None:
         print(f"as known while driving, of {args.live}\n{live}")
     if args.score == "hilti":
-        print(f"score (Hilti 2026)    {hilti_score(metrics):.2f} of 100")
+        print(hilti_text(metrics))
     elif args.score == "kitti":
         print(drift_text(drift))
     return 0

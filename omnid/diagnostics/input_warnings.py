@@ -14,7 +14,8 @@ from omnid.tracking_state import TrackingState
 
 DARK_SHARE: Final = 0.1  # Share of dark pairs from which there is a warning.
 LOST_PARTS_SHARE: Final = 0.1  # Share of pairs with lost parts from which there is a warning.
-LOST_SHARE: Final = 0.1  # Share of lost pairs; a smaller one is a gap, whose first pose may imply any speed.
+# Share of pairs without a sure pose; a smaller one is a gap, whose first pose may imply any speed.
+UNSURE_SHARE: Final = 0.1
 REPEATED: Final = {
     "drop": "their pairs were left out; a simulator without noise needs pair.repeated_images = 'use'",
     "use": "they were used, as pair.repeated_images says",
@@ -64,9 +65,10 @@ def _pose_warnings(statistics: RunStatistics, config: Config) -> Iterator[str]:
                 f"{statistics.poses} pairs: it was not used; clean the mirror, check the camera and its driver"
             )
     lost = statistics.states[TrackingState.LOST]
-    if statistics.too_fast and lost > statistics.poses * LOST_SHARE:
+    unsure = lost + statistics.states[TrackingState.DEGRADED]
+    if statistics.too_fast and unsure > statistics.poses * UNSURE_SHARE:
         yield (
-            f"the pose was lost in {lost} of {statistics.poses} pairs, and the images show up to "
+            f"the pose was lost or degraded in {unsure} of {statistics.poses} pairs, and the images show up to "
             f"{statistics.fastest_mps:.1f} m/s: poses that imply more than odometry.limits.max_speed_mps = "
             f"{config.odometry.limits.max_speed_mps:g} are refused; raise it if the robot is that fast"
         )

@@ -37,6 +37,13 @@ def hilti_score(metrics: Metrics) -> float:
     return 0.0 if metrics.coverage < HILTI_COVERAGE else 100.0 * math.exp(-HILTI_PER_M * metrics.ate_rmse_m)
 
 
+def hilti_text(metrics: Metrics) -> str:
+    """Return the score as a line, with the reason where it is 0."""
+    missing = f": {metrics.coverage:.1%} of the truth have a pose, expected {HILTI_COVERAGE:.0%}"
+    reason = missing if metrics.coverage < HILTI_COVERAGE else ""
+    return f"score (Hilti 2026)    {hilti_score(metrics):.2f} of 100{reason}"
+
+
 def kitti_drift(T_estimate: Array, T_true: Array) -> list[Drift]:
     """Return the drift over segments of 100 to 800 m of poses (N, 4, 4) at the same times; nothing where all stand.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -141,12 +142,14 @@ def test_images_hours_apart_are_a_question(tmp_path: Path, step: int, apart: str
         LogReader(folder)
 
 
-def test_images_named_by_microseconds_are_not_taken_for_nanoseconds(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("step_us", "apart"), [(33_333, "33.333"), (100_000, "100"), (1_000_000, "1000")])
+def test_images_named_by_microseconds_are_not_taken_for_nanoseconds(tmp_path: Path, step_us: int, apart: str) -> None:
+    """30, 10 and one image a second: as nanoseconds they are taken 1,000 times too fast."""
     numbers = {entry.log_time_ns: index // 2 for index, entry in enumerate(pairs(PAIRS))}
     folder = write_folders(
-        tmp_path / "images", pairs(PAIRS), lambda stamp: str(1_418_381_798_086_398 + 33_333 * numbers[stamp])
+        tmp_path / "images", pairs(PAIRS), lambda stamp: str(1_418_381_798_086_398 + step_us * numbers[stamp])
     )
-    with pytest.raises(DriverError, match=r"1418381798086398.* are 33\.333 us apart .*microseconds"):
+    with pytest.raises(DriverError, match=rf"1418381798086398.* are {re.escape(apart)} us apart .*microseconds"):
         LogReader(folder)
 
 

@@ -83,6 +83,7 @@ def test_one_topic_is_both_cameras_only_if_it_is_given_for_both(tmp_path: Path) 
             "no upper camera in log: found only /lower/a; give --upper",
         ),
         ({"/cam/image": IMAGE}, {}, "no lower camera in log: found only /cam/image"),
+        ({"/cam/image": IMAGE}, {}, "if its images hold both views, give it as --lower and --upper"),
         (
             {"/a": IMAGE, "/b": IMAGE},
             {},

@@ -322,3 +322,5 @@ def test_both_views_in_one_image_give_the_rig_of_the_whole_image(
     assert "both --lower-area and --upper-area" in capsys.readouterr().err
     assert run(tmp_path, "-o", out, *areas[:3], "600,0,480,480") == 2
     assert "within the image, which is 990x480 px" in capsys.readouterr().err
+    assert run(tmp_path, "-o", out, *areas[:3], areas[1]) == 2
+    assert "--lower-area and --upper-area are the same" in capsys.readouterr().err

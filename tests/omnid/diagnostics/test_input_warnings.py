@@ -18,7 +18,7 @@ from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image_message, write_log
 from tests.replay.command import Command
 from tests.replay.edited import dark, images, save
-from tests.simulation import corridor
+from tests.simulation import corridor, make_rig
 from tests.simulation import write_log as write_drive
 from tests.simulation.paths import spline_path
 from tests.simulation.rigs import lens, lens_rig, with_upper_rotated
@@ -57,6 +57,14 @@ def test_a_drive_faster_than_the_limit_is_named(omnid: Command, fast: Path, limi
         assert float(states[1]) <= 100 / 16 + 0.1
     else:
         assert "m/s" not in done.err, done
+
+
+def test_a_drive_faster_than_the_limit_is_named_where_no_pose_is_lost(omnid: Command, tmp_path: Path) -> None:
+    """In a mirror's corridor at 10 m/s poses that are refused alternate with wrong ones: all of them are degraded."""
+    write_drive(tmp_path, make_rig(size=384), spline_path(9, 14, 1.0), corridor(9, 22.0), seed=9)
+    done = omnid.replay(tmp_path / "log.mcap", rig=tmp_path / "rig.toml")
+    assert "degraded 92.9%, lost 0.0%" in done.out, done
+    assert "degraded in 13 of 14 pairs, and the images show up to 10.0 m/s" in done.err, done
 
 
 def test_after_poses_that_were_refused_a_few_landmarks_are_no_pose(tmp_path: Path) -> None:

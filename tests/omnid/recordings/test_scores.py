@@ -11,7 +11,7 @@ import pytest
 from calib import se3
 from omnid.formats.tum import Trajectory
 from omnid.recordings.evaluation import evaluate
-from omnid.recordings.scores import drift_text, hilti_score, kitti_drift
+from omnid.recordings.scores import drift_text, hilti_score, hilti_text, kitti_drift
 
 
 def straight(step_m: float, count: int, turn_rad: float = 0.0) -> np.ndarray:
@@ -29,6 +29,10 @@ def test_the_score_falls_with_the_error_and_is_zero_where_poses_are_missing() ->
     assert hilti_score(metrics) == 100.0
     assert hilti_score(replace(metrics, ate_rmse_m=1.0)) == pytest.approx(100 * math.exp(-0.46))
     assert hilti_score(replace(metrics, coverage=0.991)) == 100.0 and hilti_score(replace(metrics, coverage=0.985)) == 0
+    assert hilti_text(metrics).endswith("100.00 of 100"), "a score above 0 needs no reason"
+    assert hilti_text(replace(metrics, coverage=0.6)).endswith(
+        "0.00 of 100: 60.0% of the truth have a pose, expected 99%"
+    )
 
 
 @pytest.mark.parametrize(("step_m", "count", "lengths"), [(0.5, 3001, range(100, 801, 100)), (0.1, 101, range(1, 9))])
