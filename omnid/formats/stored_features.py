@@ -8,7 +8,8 @@ from typing import Final
 from drivers.bounded_sqlite import bound_work
 from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_rig import PlaceRig
-from omnid.formats.place_rows import BadRowError, checksum, read_features
+from omnid.formats.place_rows import checksum, read_features
+from omnid.formats.place_values import BadRowError
 
 MAX_INSTRUCTIONS: Final = 100_000  # Instructions that SQLite may take for one row; some 20 are needed.
 

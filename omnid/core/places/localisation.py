@@ -262,17 +262,10 @@ class MapLocaliser:
             ties = [id for id in self.places.keyframes if id not in self._fixed.known]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)
-        keyframe = PlaceKeyframe(
-            self.places.next_id,
-            self._session,
-            frame.stamp_ns,
-            frame.T_odom_rect,
-            frame.covariance,
-            small,
-            frame.scan().astype(np.float16),
-            frame.free_m().astype(np.float16),
-            features,
-        )
+        scan, free_m = frame.scan().astype(np.float16), frame.free_m().astype(np.float16)
+        of_odometry = frame.stamp_ns, frame.T_odom_rect, frame.covariance
+        id = self.places.next_id
+        keyframe = PlaceKeyframe(id, self._session, *of_odometry, small, scan, free_m, features)
         link = None if self._newest is None else by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._parts.add(keyframe.id)
@@ -301,8 +294,7 @@ class MapLocaliser:
         T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
         since = relative_covariance(T_keyframe_rect, newest.covariance, frame.covariance)
         hypothesis = Hypothesis(found, newest.id, T_keyframe_rect, since, frame.T_odom_rect)
-        consistent = self._hypotheses.add(hypothesis, self.places.poses)
-        if not consistent:
+        if not (consistent := self._hypotheses.add(hypothesis, self.places.poses)):
             return
         other = self._parts.number(found.id)
         if other != self._parts.current:
@@ -322,6 +314,7 @@ class MapLocaliser:
         return MapState.LOCALIZED if recent else MapState.ODOMETRY_ONLY
 
     def _pose(self, frame: OdometryFrame, state: MapState) -> MapPose:
+        """Return the pose of odom at a frame, relative to the newest keyframe where there is one."""
         is_unknown = self._recognised_at is None and bool(self._elsewhere())
         covariance = UNKNOWN_PLACE if is_unknown else self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
         newest = self._newest
