@@ -125,7 +125,7 @@ def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point
 
 
 def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps: float) -> bool:
-    """Return whether a base that has come to this pose drove over a point that was ahead of the edge that leads.
+    """True if a base that has come to this pose drove over a point that was ahead of its leading edge.
 
     Such a point is inside the outline or behind it, where a motion straight on does not take it nearer.
     """

@@ -106,7 +106,7 @@ class VisualOdometry:
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
         too_fast_mps = self._too_fast_mps(estimate, dt_s) if estimate and self._has_support(estimate) else 0.0
-        if searched and after_break and (self._is_doubtful(estimate) or not self._is_plausible(estimate, dt_s)):
+        if searched and after_break and self._is_doubtful(estimate, dt_s):
             estimate = self.relocalise(frame, self._exposures.predicted(frame, dt_s))
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
@@ -168,9 +168,9 @@ class VisualOdometry:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
         return estimate is not None and self._has_support(estimate) and not self._too_fast_mps(estimate, dt_s)
 
-    def _is_doubtful(self, estimate: PoseEstimate | None) -> bool:
-        """True if so few landmarks agree that the pose may be wrong where it is not known how far the vehicle came."""
-        if estimate is None:
+    def _is_doubtful(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
+        """True if a pose is not plausible, or has too few inliers to be relied on after an unknown motion."""
+        if estimate is None or not self._is_plausible(estimate, dt_s):
             return True
         return estimate.inliers < min(self._limits.good_inliers, AGAIN_SHARE * estimate.visible)
 
