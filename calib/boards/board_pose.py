@@ -9,8 +9,9 @@ from calib import se3
 from calib.boards.board import Board, CalibrationBoard
 from calib.models.camera import Array, OmniCamera
 
-MIN_CORNERS = 6  # a homography needs four; with two more, one that is off shows
-# Corners whose rays are off by this ratio of the median error, and by this angle, are left out; number of solutions.
+MIN_CORNERS = 6  # A homography needs four corners; with two more a wrong one has a large error.
+# A corner is an outlier if its error is above OUTLIER_RATIO times the median error and above MIN_OUTLIER_RAD. The pose
+# is solved again without outliers, up to ROUNDS times in all.
 OUTLIER_RATIO, MIN_OUTLIER_RAD, ROUNDS = 5.0, np.deg2rad(0.3), 4
 
 

@@ -56,21 +56,21 @@ class PairRings:
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         if odometry.state is TrackingState.LOST:
-            # The place is not known. What is known in odom holds again when odometry finds its landmarks again.
+            # The grid stays: it holds again once odometry recognises its landmarks.
             self._tracker.clear()
             return unknown
         if self._finds_fixed_parts(odometry):
-            # What was known about the floor came from images of which a part does not show it.
+            # The grid has evidence from pixels that do not show the world.
             self._of_floor = None
             self._grid.begin_again()
             self._tracker.clear()
         columns = self._columns_of(camera_floor, panoramas)
         if columns is None:
             return unknown
-        # 2. The evidence of the images without their dead and blind parts, where nothing is watched any longer.
+        # 2. The evidence of the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
-        # 3. The grid, its ring, and the obstacles that move.
+        # 3. The grid, its ring, and the moving obstacles.
         pose = transform(planar(T_odom_base))
         unseen = self._unwatched.directions(panoramas.tiles.unknown)
         ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched, unseen)
@@ -80,7 +80,7 @@ class PairRings:
         )
 
     def _finds_fixed_parts(self, odometry: OdometryUpdate) -> bool:
-        """Return True where a pair shows that more of the panoramas is fixed to a camera; frozen parts are not."""
+        """True if a pair shows more pixels that are fixed to a camera; pairs with frozen parts show none."""
         panoramas = odometry.depth.panoramas
         if any(dead.any() for dead in panoramas.tiles.dead.values()):
             return False
@@ -88,7 +88,7 @@ class PairRings:
         return self.fixed.observe(heading_rad, panoramas.lower, panoramas.upper, panoramas.visible)
 
     def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
-        """Return the columns for the floor and what is seen of it, None without a floor."""
+        """Return the columns for the floor, made again where the floor has changed; None while it is not known."""
         floor = camera_floor.floor
         if floor is not None and floor is not self._of_floor:
             geometry, settings = self._geometry, self._settings

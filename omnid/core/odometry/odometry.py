@@ -176,7 +176,7 @@ class VisualOdometry:
 
     def _too_fast_mps(self, estimate: PoseEstimate, dt_s: float) -> float:
         """Return the speed that a pose implies since the last accepted one if it is impossible, else 0."""
-        moved_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
+        moved_m = estimate.distance_m(self._T_odom_rect)
         since_s = self._since_fix_s(dt_s)
         return moved_m / since_s if moved_m > self._limits.max_speed_mps * since_s else 0.0
 
