@@ -69,7 +69,7 @@ def status_table(robot: str, state: RobotState, dropped: int) -> Iterator[str]:
         yield plain(f"  {_LEVELS[status.level % 4]:7s} {short_name(status.name):16s} {status.message}  {values}")
 
 
-def load_table(robot: str, state: RobotState) -> Iterator[str]:
+def load_table(robot: str, state: RobotState, dropped: int = 0) -> Iterator[str]:
     """Yield the share of a core that all threads take, and that of each, the largest first."""
     shares = dict(thread_shares(state))
     if not shares:
