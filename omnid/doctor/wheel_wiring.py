@@ -148,7 +148,8 @@ class WiringTest:
         # A busy computer may have paused this program already: the wheels move nevertheless, if only for a moment.
         while sent < LEAST_COMMANDS or time.monotonic() < begin_s + duration_s:
             sent += 1
-            with suppress(LateReplyError):  # the wheels go on turning: the controller's watchdog is far from its end
+            # Without an answer the wheels keep turning, because the controller's watchdog expires much later.
+            with suppress(LateReplyError):
                 motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
             next_s += period_s
             time.sleep(max(0.0, min(next_s, begin_s + duration_s) - time.monotonic()))

@@ -140,7 +140,7 @@ class RunPlaces:
         return True
 
     def _write(self, path: Path, places: PlaceMap) -> None:
-        """Write the map to its file, or beside it where another program has written that meanwhile."""
+        """Write the map to its file, or to one next to it where another program has written that file meanwhile."""
         if _version(path) not in (None, self._version):
             other = _beside(path)
             self._warn(
@@ -193,7 +193,7 @@ def _version(path: Path) -> tuple[int, int] | None:
 
 
 def _beside(path: Path) -> Path:
-    """Return the first name beside a file that is free."""
+    """Return the first free name next to a file."""
     return next(name for number in count(2) if not (name := path.with_stem(f"{path.stem}-{number}")).exists())
 
 

@@ -304,7 +304,7 @@ class NavigationStage:
 
 
 def _positions(ring: ObstacleRing, ranges_m: NDArray[np.float32]) -> Array:
-    """Return the positions (N, 2) in odom of what stands at finite ranges (SECTORS,) [m] of a ring."""
+    """Return the positions (N, 2) in odom of the obstacles at finite ranges (SECTORS,) [m] of a ring."""
     seen = np.isfinite(ranges_m)
     ranges_m, directions = ranges_m[seen].astype(np.float64), azimuths()[seen]
     points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))])

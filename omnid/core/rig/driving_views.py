@@ -1,6 +1,6 @@
 """Views of different places of a drive, and what they say about the rig, without a board.
 
-A robot that stands still views the same wall again and again, and a single wall may give biased points. So only views
+A robot at rest views the same wall again and again, and a single wall may give biased points. So only views
 of different places count, and of every place the newest view is kept.
 """
 
