@@ -175,7 +175,7 @@ def _stop(motor: SerialMotor) -> None:
 
 
 def wiring(first: Seen, second: Seen) -> dict[str, bool]:
-    """Return the settings of a base whose motors turn these wheels; they are different ones."""
+    """Return the settings of a base by the wheels that its two motors turn, which must be different wheels."""
     left, right = (first, second) if first.side == "left" else (second, first)
     return {"swapped": first.side == "right", "reverse_left": not left.forward, "reverse_right": not right.forward}
 

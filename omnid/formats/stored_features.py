@@ -15,7 +15,7 @@ MAX_INSTRUCTIONS: Final = 100_000  # Instructions that SQLite may take for one r
 
 
 class FeatureFile:
-    """An open map file: it is neither locked nor written, and one that is replaced meanwhile is read as it was."""
+    """An open map file, which is neither locked nor written; if the file is replaced meanwhile, the old one is read."""
 
     def __init__(self, database: sqlite3.Connection, rig: PlaceRig) -> None:
         """database: it is closed with this object."""

@@ -55,10 +55,10 @@ def is_suspicious(finding: StartFinding | None) -> bool:
 
 
 def other_rig(updates: Iterable[OdometryUpdate], front_end: FrontEnd, finding: StartFinding | None = None) -> str:
-    """Return by which the rig is that of other cameras, as far as it takes to know; empty where it is not, or unknown.
+    """Return the reason to believe that the rig is of other cameras; empty where there is none, or too little is known.
 
-    updates: poses of a log by the front end, with the rig as it is. finding: of its first pairs, if these were seen at
-    one time.
+    updates: poses of a log by the front end, read as far as needed. finding: of the first pairs, if their pixels were
+    exposed at once.
     """
     # 1. Keyframes; where poses are lost too often, the existing ones decide.
     start = _FirstPairs(DriveCollector(front_end.geometry, front_end.dense, LANDMARKS))

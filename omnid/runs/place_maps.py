@@ -127,7 +127,7 @@ class RunPlaces:
         return self._writes
 
     def save(self, places: PlaceMap) -> bool:
-        """Write a copy of the map, changed here, as far as it is joined; False where it has nothing new.
+        """Write the joined part of a copy of the map, which is cut to it; return False if the part has nothing new.
 
         Raises OmnidError if the file cannot be written.
         """
@@ -153,7 +153,7 @@ class RunPlaces:
         self._version = _version(path)
 
     def finish(self) -> RigPlaces | None:
-        """Return the map after the run, what is not joined to it left out; write it where it was extended.
+        """Return the joined part of the map after the run, and write it to its file if it was extended.
 
         Raises OmnidError if the file cannot be written.
         """

@@ -221,7 +221,7 @@ class _Replay:
         return graph.source("read", frames, wake=clock.wake)
 
     def _sinks(self, session: Session, front_end: FrontEnd) -> Sinks:
-        """Open all outputs before the run, so that one that cannot be opened ends it now."""
+        """Open all outputs; one that cannot be opened ends the run before it begins."""
         options, geometry = self._options, front_end.geometry
         recorder: Sink[Any] | None = None
         if options.observer:

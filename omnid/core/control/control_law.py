@@ -177,7 +177,7 @@ class ControlLaw:
     def step(
         self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False, motor_stopped: bool = False
     ) -> ControlOutput:
-        """Return the motion dt_s after the one that the base follows now, and take it for the one it follows next."""
+        """Return the motion that the base is to follow from now on; the previous one was commanded dt_s ago."""
         # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
         inputs = self.plausibility.added_to(self._inputs(now_ns, late_s, motor_failed, motor_stopped))
         deadlines = self._settings.deadlines

@@ -241,11 +241,11 @@ class MapLocaliser:
 
     @property
     def _is_in_fixed(self) -> bool:
-        """True if the current part is that of the keyframes that stay as they are."""
+        """True if the current part is a fixed map."""
         return bool(self._fixed.ids) and self._parts.number(self._fixed.ids[0]) == self._parts.current
 
     def _around(self, position: Array, slack_m: float) -> list[int]:
-        """Return the keyframes of this part; of those that stay as they are the ones that may be near or see tags."""
+        """Return the keyframes of this part; of a fixed map only keyframes that may be near, or that saw tags."""
         moving = [id for id in self._parts.ids() if id not in self._fixed.known]
         if not self._is_in_fixed or self._recognised_at is None:
             return moving

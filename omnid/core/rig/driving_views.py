@@ -75,7 +75,7 @@ class DrivingViews:
         return recent
 
     def _add_view(self, pair: PanoramaPair, exposure: Exposure | None) -> bool:
-        """Keep the view unless it is of the same place as the last one; return True if it was kept."""
+        """Keep a view unless the last one is from the same place; return True if it was kept."""
         thumbnail = _thumbnail(pair)
         same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
         if any(same_place[-1:]) or not thumbnail.any():
