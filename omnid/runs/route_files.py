@@ -57,7 +57,7 @@ class RouteFiles:
         self._written: TaughtRoute | None = None  # the one that was written last
 
     def put(self, command: NavigationCommand) -> None:
-        """Take a request. It waits for its file, if it needs one, and for requests before it that wait; halts never wait."""
+        """Take a request; it waits for its file, if it needs one, and for waiting requests before it; halts do not."""
         if is_halt(command.request) or not (self._waiting or _needs_file(command.request)):
             self._pass_on(command)
         elif len(self._waiting) >= MOST_WAITING:

@@ -66,9 +66,11 @@ class PanoramaSink:
         """Publish the panorama of a pose, with its features as the attachment, when it is due."""
         if odometry.stamp_ns < self._next_ns or not self._bus.is_received(PANORAMA):
             return
+        # 1. Encode the panorama.
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
         frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
+        # 2. Publish it with its features.
         features = odometry.features
         pixels = {"inliers": features.inliers, "rejected": features.rejected, "new": features.new}
         _, payload = image_cdr(frame, odometry.stamp_ns + self._offset_ns)
