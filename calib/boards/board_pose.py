@@ -11,7 +11,7 @@ from calib.models.camera import Array, OmniCamera
 
 MIN_CORNERS = 6  # A homography needs four corners; with two more a wrong one has a large error.
 # A corner is an outlier if its error is above OUTLIER_RATIO times the median error and above MIN_OUTLIER_RAD. The pose
-# is solved again without outliers, up to ROUNDS times in all.
+# is solved again without outliers, up to ROUNDS times in all. By judgement; not measured.
 OUTLIER_RATIO, MIN_OUTLIER_RAD, ROUNDS = 5.0, np.deg2rad(0.3), 4
 
 

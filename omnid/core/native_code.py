@@ -38,7 +38,7 @@ CONTIGUOUS, ALIGNED, WRITABLE = 0x1, 0x100, 0x400
 # rest is not used where arrays are made and freed by compiled functions only.
 HEADER_BYTES, DATA_FIELD = 64, 3
 
-# The widths of the fields of numpy's structs.
+# So many bits because the fields of numpy's structs have them.
 I8, I32, I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
 ADDRESS: Final = I8.as_pointer()
 

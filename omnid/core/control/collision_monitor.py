@@ -262,8 +262,8 @@ class CollisionMonitor:
         """
         edge_mps = abs(motion.velocity_mps)
         if motion.velocity_mps == 0.0:
-            # Corners swing as far as floor was seen. Where none was, what is there may be at the outline already: it
-            # does not keep the base from turning away.
+            # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
+            # would keep the base from turning away.
             unknown = self._stop_polygon(motion).parted(unknown)[1]
             edge_mps = abs(motion.yaw_rate_radps) * self._outline.radius_m
         least = 0.0 if policy == STOP else min(1.0, self._settings.slow_mps / edge_mps)

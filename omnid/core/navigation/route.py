@@ -39,7 +39,7 @@ FarKeyframe = Callable[[int], "KeyframePose | None"]
 class KeyframePose(NamedTuple):
     """A keyframe of the map."""
 
-    stamp_ns: int  # stamp of its images, which distinguishes it from one of the same number in another map
+    stamp_ns: int  # stamp of its images: another map may have another keyframe of the same number
     pose: Array  # x, y, yaw (3,) of the base in the map
 
 

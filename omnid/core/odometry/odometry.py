@@ -34,7 +34,8 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Sigma of the velocity while poses are refused [m/s, rad/s]; of one refused for its speed, that speed: it may be right.
+# Sigma of the velocity while poses are refused [m/s, rad/s]. If a pose is refused for its speed only, its speed is the
+# sigma, because it may be right.
 UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.

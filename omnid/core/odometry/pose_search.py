@@ -87,7 +87,7 @@ class PoseSearch:
         reach_m: float,
     ) -> PoseEstimate:
         """Return the likeliest pose within reach_m of the prediction, with its runner-up: runner_up_motions.py."""
-        # 1. Displacements there from which the images are alike, and the poses to which they lead.
+        # 1. Displacements within reach from which the scene has the same appearance, and the poses to which they lead.
         off_m = estimate.distance_m(T_predicted)
         peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
         exposure = self._exposures.predicted(frame, dt_s)

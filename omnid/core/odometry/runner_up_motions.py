@@ -150,7 +150,7 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     """
     if not others:
         return found
-    # 1. The estimate with the lowest cost, and those that contradict it; of these, the motion decides.
+    # 1. The estimate with the lowest cost, and estimates that contradict it; among all these the motion decides.
     near = [each for each in others if each.distance_m(T_predicted) < reach_m]
     views = [found, *(each for each in near if len(each.landmarks) >= LEAST_SHARE * each.in_view)]
     cheapest = min(views, key=lambda each: each.cost)

@@ -39,11 +39,11 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
-TIES: Final = 50  # newest keyframes that are kept where the map stays as it is, so that memory is bounded
+TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is bounded
 # Largest error of odometry, and its growth with the path; by trial on development seeds.
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
-TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
+TAG_SIGMAS: Final = 3.0  # Accepted error of a pose by a tag; 0.3 % of right poses exceed it.
 # After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.

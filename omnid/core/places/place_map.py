@@ -154,7 +154,7 @@ class PlaceMap:
 
     def drop(self, id: int) -> None:
         """Drop a keyframe; its links go on to its neighbour on the path: the next keyframe, else the one before."""
-        # 1. Its links, seen from it, and among them the one to its neighbour.
+        # 1. The links of the keyframe, turned so that they begin at it, and the link to the neighbour (`bridge`).
         touching = [link for link in self.links if id in (link.a, link.b)]
         self.links = [link for link in self.links if id not in (link.a, link.b)]
         leaving = [link if link.a == id else link.reversed() for link in touching]
