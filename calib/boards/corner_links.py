@@ -13,10 +13,8 @@ from calib.boards.corner_candidates import CornerCandidates, Grey, sample
 from calib.models.camera import Array
 
 # Number of nearest candidates among which an arm's neighbour is chosen: those of a board within three squares.
-# By judgement; not measured.
 NEAREST = 28
 # Largest angle between an arm and the line to its neighbour: edges in a mirror image are curved.
-# By judgement; not measured.
 MAX_TURN_RAD = np.deg2rad(22)
 # The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it. Its
 # two sides must differ by MIN_EDGE of the corners' contrast.

@@ -22,7 +22,6 @@ STRIP_INNER_PART = 1 / 16
 # Outer radius, in parts of the larger side: up to the border.
 STRIP_OUTER_PART = 1 / 2
 # Contrast limited adaptive histogram equalisation (CLAHE): clip limit, and number of tiles along each axis.
-# By judgement; not measured.
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
 
 

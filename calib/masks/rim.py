@@ -21,7 +21,6 @@ EDGE_FRACTION = 0.25
 # Number of pixels on either side over which the edge is measured, and beyond it that must be dark.
 EDGE_PX = 4
 # RANSAC: an azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
-# By judgement; not measured.
 INLIER_PX = 2.0
 MIN_SUPPORT = 0.6
 # Least part of the circle that lies in the image: less does not determine the centre.
@@ -37,7 +36,6 @@ MAX_CENTER_SHIFT = 0.25
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
 # dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.
-# By judgement; not measured.
 MAX_HUB = 0.4
 HUB_RING_PX = 5
 HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2

@@ -22,7 +22,7 @@ STILL_PART = 0.35
 # Percentiles that stand for the light and the dark level of a pixel over time: single glints must not count.
 LIGHT_PERCENTILE, DARK_PERCENTILE = 95, 5
 # Morphology: opening removes specks, closing fills gaps; components smaller than this part of the ring are dropped; the
-# rest is dilated by the blur at its edges. By judgement; not measured.
+# rest is dilated by the blur at its edges.
 OPEN_PX, CLOSE_PX = 3, 7
 MIN_SPECK_PART = 5e-4
 EDGE_PX = 2

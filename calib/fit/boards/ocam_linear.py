@@ -17,7 +17,6 @@ from calib.models.camera import Array
 from calib.models.ocam import View
 
 # Grid search for the centre: start half width in parts of the image, points per axis, factor per round, end width.
-# By judgement; not measured.
 SEARCH_PART = 0.16
 SEARCH_SIDE = 5
 SEARCH_SHRINK = 0.55

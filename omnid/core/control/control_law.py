@@ -34,9 +34,7 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.settings import knob
 
 TO_STAND: Final = Setpoint(0.0)
-# A larger change of the heading than the base can turn: odometry was corrected, or is wrong.
-# By judgement; not measured.
-JUMP_RAD: Final = 0.3
+JUMP_RAD: Final = 0.3  # A larger change of the heading than the base can turn: odometry was corrected, or is wrong.
 
 
 @dataclass(frozen=True, slots=True)

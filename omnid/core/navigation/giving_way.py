@@ -24,14 +24,12 @@ Array = NDArray[np.float64]
 SPACING_M: Final = 0.1  # Spacing of the kept places: the least spacing of a path.
 SHORTEST_M: Final = 0.3  # Least length of a way back, because a shorter one makes no room for anybody.
 CLEAR_M: Final = 1.0  # Least way back to a wider place: nearer to the block the base would still be in the way.
-BACK_MPS: Final = 0.2  # slower than forwards: people do not expect a robot to back up. By judgement; not measured.
+BACK_MPS: Final = 0.2  # slower than forwards: people do not expect a robot to back up
 LOOK_M: Final = 1.0  # Length of the way back that must be free now: the distance to stop, and a person's two steps.
 PASS_M: Final = 0.8  # Room next to the outline in which a person passes: shoulders of 0.6 m, and a margin.
 REST_S: Final = 3.0  # Least time before the base returns: a person needs it to go past a base.
-# Added to it, by the stamp of the pose: two robots that met then move at different times. By judgement; not measured.
-SPREAD_S: Final = 4
-# The base returns after this time in any case, to search a way; then after twice the time. By judgement; not measured.
-RETRY_S: Final = 10.0
+SPREAD_S: Final = 4  # Added to it, by the stamp of the pose: two robots that met then move at different times.
+RETRY_S: Final = 10.0  # The base returns after this time in any case, to search a way; then after twice the time.
 LONGEST_RETRY_S: Final = 300.0  # Twelve attempts an hour, so that a way that becomes free is found.
 FREE_S: Final = 1.0  # The way ahead must be free for this time: rings vote for half a second.
 ARRIVED_M: Final = 0.1  # The way ends this far from its last point; enough: it is one spacing.

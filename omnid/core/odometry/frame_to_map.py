@@ -30,7 +30,7 @@ MIN_LANDMARKS = 6
 # Squared Mahalanobis distance from which a view is an outlier: 4 sigma in one of its three components. Of views with
 # normal errors one in a thousand is farther away, so that hardly any is lost.
 OUTLIER_SQUARED = 16.0
-# Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before. By judgement; not measured.
+# Steps of Gauss-Newton in each round at most; a round takes the inliers of the one before.
 COARSE_STEPS, STEPS = (3,), (2, 4)
 FEW_RATIO = 0.6  # share of the tracks that are inliers, below which the velocity may have been wrong
 # Refinements of a recognised pose: the first one brings most patches into reach, the second one aligns them all.

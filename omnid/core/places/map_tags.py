@@ -14,7 +14,7 @@ from omnid.core.places.tags import TagEstimate, fused
 
 Array = NDArray[np.float64]
 
-MAX_VIEWS: Final = 24  # Most views of a tag that are kept: the most certain ones. By judgement; not measured.
+MAX_VIEWS: Final = 24  # Most views of a tag that are kept: the most certain ones.
 MOST_REJECTED: Final = 0.25  # share of the views of a tag that may contradict the others: it hangs in one place
 
 

@@ -18,8 +18,7 @@ from omnid.core.places.place_features import FeatureStore, PlaceFeatures, Stored
 
 Array = NDArray[np.float64]
 
-# Most loops that a dropped keyframe leaves to its neighbour: the most certain ones. By judgement; not measured.
-MOST_LOOPS = 4
+MOST_LOOPS = 4  # Most loops that a dropped keyframe leaves to its neighbour: the most certain ones.
 OVERHEAD_BYTES = 1500  # Bytes of a keyframe without its large arrays: poses, covariance, links.
 
 

@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 CELL_M: Final = 0.05  # Side of a cell, as in the grids.
 UPDATE_M: Final = 0.2  # motion after which a scan is compared; four cells; by trial on development seeds
 UPDATE_RAD: Final = math.radians(15)  # The same of the heading; by trial on development seeds.
-# m, rad: of height, roll and pitch, which a scan does not measure. By judgement; not measured.
-FLOOR_SIGMA: Final = (0.02, math.radians(0.5))
+FLOOR_SIGMA: Final = (0.02, math.radians(0.5))  # m, rad: of height, roll and pitch, which a scan does not measure
 LEAST_SIGMA: Final = (0.03, math.radians(0.5))  # m, rad: of the others, as cells and scans are no finer
 
 

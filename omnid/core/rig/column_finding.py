@@ -25,7 +25,6 @@ BROKEN_DEG: Final = 2.0
 # Weight of the shift's angle against the rotation's: a shifted viewpoint affects near points only.
 SHIFT_WEIGHT: Final = 0.2
 # Standard deviations subtracted from rotation and shift: an uncertain finding accuses no rig.
-# By judgement; not measured.
 SIGMAS: Final = 4.0
 # With a rig that is wrong by many degrees, points match by chance only. Corners in noise match nowhere either, so only
 # points with contrast are counted: a smaller part of them that match means a broken rig.

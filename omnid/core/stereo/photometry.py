@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
-TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought. By judgement; not measured.
+TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
 LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene
 NOTHING_BUT_NOISE = 0.5  # contrast to noise: corners and patches are then those of noise
 LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
