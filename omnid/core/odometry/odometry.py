@@ -127,11 +127,10 @@ class VisualOdometry:
         self._added = None
         exposure = self._exposures.predicted(frame, dt_s)
         self._requested = self._update_map(frame, usable, estimate, exposure)
-        features = Features(estimate.pixels, estimate.rejected, new)
-        if self._requested is None:
-            return self._result(estimate.tracked, estimate.inliers, features, self._exposures.now(frame))
+        features, is_keyframe = Features(estimate.pixels, estimate.rejected, new), self._requested is not None
+        exposure = exposure if is_keyframe else self._exposures.now(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
-        return replace(result, is_keyframe=True)
+        return replace(result, is_keyframe=is_keyframe)
 
     def _find(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
         """Return the likeliest pose of a frame in the map, with its runner-up; None: no landmarks were found."""
