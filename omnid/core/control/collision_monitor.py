@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 from calib.se2 import Point, Pose2, along_arc, composed, seen_from
 from omnid.core.control.collision_geometry import (
     TINY,
+    DrivenMotions,
     Outline,
     contact_s,
     driven_over,
@@ -23,7 +24,6 @@ from omnid.core.control.collision_geometry import (
 )
 from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
 from omnid.core.control.controller_ring import ControllerRing, MovingPoint
-from omnid.core.control.driven_motions import DrivenMotions
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.nanoseconds import S_PER_NS

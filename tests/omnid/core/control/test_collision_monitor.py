@@ -9,11 +9,10 @@ from dataclasses import replace
 import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
-from omnid.core.control.collision_geometry import Outline
+from omnid.core.control.collision_geometry import MOST_MOTIONS, Outline
 from omnid.core.control.collision_monitor import CollisionMonitor
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.controller_ring import ControllerRing, MovingPoint
-from omnid.core.control.driven_motions import MOST_MOTIONS
 from omnid.core.control.heading_controller import Twist
 
 S = 1_000_000_000
