@@ -2,4 +2,4 @@
 
 
 class CalibError(Exception):
-    """A calibration file or value that cannot be used; one line: what was expected, what was found, what to do."""
+    """An unusable calibration file or value; its text is one line: what was expected, what was found, what to do."""

@@ -1,9 +1,9 @@
 """Size of a JPEG, steps of its quantisation and order of its restart markers, from its bytes, before it is decoded.
 
-References are to ITU T.81. Cameras that send motion JPEG write a restart marker after each row of blocks or so. Where
-some were lost on the way, with the blocks between them, libjpeg goes on at the next one that it finds, and takes it for
-the one that it expects or not, by their numbers modulo 8: a part of the image is grey, or all below the gap is shown
-higher up. It reports success in both cases.
+References are to ITU T.81. Cameras that send motion JPEG write a restart marker after about each row of blocks. Where
+some were lost on the way, with the blocks between them, libjpeg continues at the next marker that it finds. Markers are
+numbered modulo 8: if the number differs from the expected one, a part of the image becomes grey; if it happens to be
+the same, all below the gap is shown higher up. libjpeg reports success in both cases.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class JpegHeader:
 def read_header(data: NDArray[np.uint8]) -> JpegHeader:
     """Return the header of a JPEG (B.1.1 and B.2.2).
 
-    All is zero where it has no frame header or several, or a marker that libjpeg skips and that has no length: a walk
-    that takes the bytes after it for a length would find another size than libjpeg does.
+    All fields are zero where there is no frame header or more than one, or a marker without a length that libjpeg
+    skips: the bytes after it are no length, and would lead to another frame header than libjpeg finds.
     """
     offset, interval = 2, 0  # after the start of image
     frames: list[int] = []

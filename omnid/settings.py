@@ -46,12 +46,11 @@ class Knob:
     low: float | None  # inclusive, as is high
     high: float | None
     choices: tuple[Any, ...]
-    finite: bool
 
     def allows(self, value: Any) -> bool:
         """True if a value of the right type is in range."""
         if isinstance(value, float) and not math.isfinite(value):
-            return not self.finite
+            return False
         if isinstance(value, str) and any("\ud800" <= letter <= "\udfff" for letter in value):
             return False  # an argument that was not UTF-8
         if self.choices:
@@ -75,10 +74,9 @@ def knob(
     low: float | None = None,
     high: float | None = None,
     choices: Sequence[Any] = (),
-    finite: bool = True,
 ) -> T:
-    """Declare a field: its default, a description with its unit, its range (`finite=False`: also inf, nan)."""
-    return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices), finite)})
+    """Declare a field: its default, a description with its unit, its range. Numbers are finite."""
+    return field(default=default, metadata={"knob": Knob(doc, low, high, tuple(choices))})
 
 
 def load(

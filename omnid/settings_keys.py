@@ -1,4 +1,4 @@
-"""Keys of the settings: those that exist, those of earlier versions, and those that are meant by a misspelt one."""
+"""Keys of the settings: the existing ones, the renamed ones of earlier versions, suggestions for a misspelt one."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _own_name(name: str) -> str:
 
 
 def _alike(path: Path, candidates: Sequence[Path]) -> list[Path]:
-    """Return the key whose last word is spelled most like that of a path, as a list of none or one."""
+    """Return the key whose last word is most similar to the last word of a path, as a list of one key or none."""
     last = {other[-1]: other for other in candidates}
     return [last[name] for name in difflib.get_close_matches(path[-1][:80], last, n=1, cutoff=0.7)]
 

@@ -9,8 +9,10 @@ from calib import se3
 from calib.boards.board import Board, CalibrationBoard
 from calib.models.camera import Array, OmniCamera
 
-MIN_CORNERS = 6  # a homography needs four; with two more, one that is off shows
-# Corners whose rays are off by this ratio of the median error, and by this angle, are left out; number of solutions.
+MIN_CORNERS = 6  # A homography needs four corners; with two more a wrong one has a large error.
+# A corner is an outlier if its error is above OUTLIER_RATIO times the median error: 5.9 sigma of errors of two normal
+# coordinates, which one right corner in 30 million exceeds. It must exceed MIN_OUTLIER_RAD too, because the median of
+# exact corners is near 0. ROUNDS bounds the work: the pose is solved again without the outliers.
 OUTLIER_RATIO, MIN_OUTLIER_RAD, ROUNDS = 5.0, np.deg2rad(0.3), 4
 
 

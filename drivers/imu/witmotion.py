@@ -98,7 +98,7 @@ class WitMotionGyro:
             rates = list(self._reader.feed(data))
             apart_s = 0.0
             if rates:
-                # A late read has as many more samples, so that the mean over them holds; after a pause it is too large.
+                # A late read brings more samples, so their mean period stays right; only after a pause it is too large.
                 mean_s = min(max(least_s, (now_ns * 1e-9 - received_s) / len(rates)), LONGEST_PERIOD_S)
                 period_s += (PERIOD_SHARE if period_s else 1.0) * (mean_s - period_s)
                 apart_s = min(period_s, mean_s)  # so that none is earlier than those of the read before

@@ -35,7 +35,7 @@ _TABLES: Final = (
     "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') "
     "AND sql LIKE 'CREATE TABLE%'"
 )
-# Columns that are computed are not in this list. The small ones come first, so that no row is read to its end for them.
+# The pragma lists no computed columns. The small columns come first, so that reading them never reads a whole row.
 _COLUMNS: Final = "SELECT name FROM pragma_table_info('messages') LIMIT 4"
 _EXPECTED: Final = ["id", "topic_id", "timestamp", "data"]
 _LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns

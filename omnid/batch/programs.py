@@ -50,7 +50,7 @@ def run_omnid(words: list[str], folder: Path, timeout_s: float) -> tuple[int | N
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """End a program that still runs: it is asked first, so that it leaves no wheel turning and no file half written."""
+    """End a running program: by SIGTERM first, so that it leaves no wheel turning and no file half written."""
     if process.poll() is None:
         process.terminate()
         try:

@@ -49,7 +49,7 @@ def local_workers(count: int) -> Iterator[Workers]:
     """Give workers that run `count` programs at a time."""
 
     def run(tasks: Sequence[Task[Result]]) -> Iterator[Result]:
-        # Threads only wait here: the work is done in programs of their own.
+        # Each thread only waits for a program, which does the work.
         with ThreadPoolExecutor(count) as pool:
             futures = [pool.submit(task.run) for task in tasks]
             try:

@@ -43,7 +43,7 @@ ROUNDS, MAX_ROUNDS = 2, 4
 # Relative change of lengths in a round below which no further round is needed: a third of the scale's sigma after a
 # drive (0.3 % in rendered rooms).
 SETTLED = 1e-3
-# A known distance is at least this long, so that a centimetre at its ends is a part of it that does not count. A
+# Least length of a known distance, so that an error of a centimetre at its ends is negligible. A
 # baseline that would change by more than MAX_SCALE_CHANGE shows a mistake, because a ruler measures it better.
 MIN_DISTANCE_M, MAX_SCALE_CHANGE = 1.0, 0.05
 # Distortion terms until the model is chosen: those of a camera tilted below its mirror.

@@ -22,20 +22,18 @@ from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
 from calib.image_area import ImageArea
-from calib.masks.rim import find_rim
-from calib.masks.stack_mask import find_mask
-from calib.models.camera import Mask
 from calib.models.names import sees_directly
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
-from calib.rig_frame import is_turned_over, rig_between
+from calib.rig_frame import is_turned_over
 from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
 from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
-from omnid.calibration.images import Image, Images, brightest
+from omnid.calibration.images import Image, Images
 from omnid.calibration.missing_views import missing_views
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
+from omnid.calibration.rig_masks import masked_rig
 from omnid.calibration.rig_report import rig_report_html
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
@@ -156,7 +154,20 @@ def calibrate_rig(
     # 7. Compare the baseline with what it can be.
     notes = [*images.notes, *_check_baseline(found, board, expected_baseline_m), *shown]
     # 8. Build the rig with masks and covariance, and predict the errors of drives.
-    rig, unmasked = _masked_rig(found, images, cameras, with_struts=with_struts)
+    return _result(found, images, cameras, notes, with_struts=with_struts, refined=refined)
+
+
+def _result(
+    found: RigCalibration,
+    images: PairedImages,
+    cameras: GivenCameras | None,
+    notes: Sequence[str],
+    *,
+    with_struts: bool,
+    refined: bool,
+) -> RigResult:
+    """Return the result with the rig of a calibration: its masks, its covariance, and the errors of drives with it."""
+    rig, unmasked = masked_rig(found, images, cameras, with_struts=with_struts)
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig) if refined else None
     missing = missing_views(found.views, rig) if drives else ""
@@ -296,34 +307,3 @@ def _order_notes(rig: Rig) -> list[str]:
         f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
         "the rig's z would point down"
     ]
-
-
-def _masked_rig(
-    found: RigCalibration, images: PairedImages, cameras: GivenCameras | None, *, with_struts: bool
-) -> tuple[Rig, list[str]]:
-    """Return the rig with its masks, and warnings about mirrors without a rim in the images."""
-    rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
-    masks = [
-        _mask(camera.center, side, file, with_struts=with_struts)
-        for camera, side, file in zip((found.lower, found.upper), images.sides, cameras or (None, None), strict=True)
-    ]
-    mirrors = [
-        name
-        for name, camera, mask in zip(SIDES, (found.lower, found.upper), masks, strict=True)
-        if mask is None and not sees_directly(camera)
-    ]
-    warnings = [
-        f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
-        f"add [{name}.mask] by hand"
-        for name in mirrors
-    ]
-    return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), warnings
-
-
-def _mask(center: tuple[float, float], images: Images, file: CameraFile | None, *, with_struts: bool) -> Mask | None:
-    """Return the mask with hub and struts, or that of the camera's file, or the rim in the maximum of all images."""
-    if with_struts:
-        return find_mask(list(images.values()), center)
-    if file is not None and file.mask is not None:
-        return file.mask
-    return find_rim(brightest(images.values()), center)

@@ -220,7 +220,7 @@ def _number(word: str) -> float | None:
 
 
 def _write_keys(path: Path, keys: TextIO | Iterable[str]) -> int:
-    """Write the Unix time of each line that is entered, as soon as it is; refuse to replace times that are there."""
+    """Write the Unix time of each entered line at once; refuse to replace an existing file of times."""
     if path.is_file() and path.stat().st_size:
         raise OmnidError(f"--keys {path}: expected a new file, found one of marks already taken; give another name")
     print("press Enter each time the point of the robot is over a mark: A, B, A, ...; Ctrl-D ends", file=sys.stderr)

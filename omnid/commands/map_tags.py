@@ -136,7 +136,7 @@ def _of_log(args: argparse.Namespace) -> Found:
             "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap"
         )
     config = settings_of(args, map_settings(args))
-    collectors: list[TagCollector] = []  # the one of the run, which makes it when it knows its rig
+    collectors: list[TagCollector] = []  # one, which the run makes once it knows its rig
 
     def observer(front_end: FrontEnd, _: Telemetry) -> TagCollector:
         collectors.append(TagCollector(front_end.geometry, {id: tag.size_m for id, tag in tags.items()}))

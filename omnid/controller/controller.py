@@ -119,7 +119,7 @@ class Controller:
         self._law.plausibility.add_command(now_ns, STOP if self.state.failed else Twist(*self._limited(command)))
         if status is not None:
             self._take_status(status, now_ns)
-        # 4. Times and the wheels' own motion.
+        # 4. Report times, and the motion that the wheels have measured.
         done_ns = self._clock_ns()
         to_wheel_s = self._to_wheel_s(done_ns) if status is not None else math.nan
         is_known = status is not None and math.isfinite(status.velocity_mps)
@@ -148,7 +148,7 @@ class Controller:
         before, answer = state.arm_answer, arming.answer
         if answer != before and (not answer.refusal or answer.refusal != before.refusal):
             self._report(f"arming is refused: {answer.refusal}" if answer.refusal else "armed by cmd/arm")
-        # The stop of a drive is reported with its reason; a fault that comes while the wheels stand ends no drive.
+        # `_count_stop` reports the end of a drive; a fault that comes while the wheels are at rest ends none.
         if state.armed and arming.needs_request and state.reason:
             self._report(f"disarmed while the wheels stand: {arming.reason}; {UNTIL_ARMED}")
         state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, answer
@@ -194,7 +194,7 @@ class Controller:
         """Send the command; return the motor controller's answer, None where it gave none."""
         try:
             status = self._driver.send(command)
-        except LateReplyError:  # the command was sent and most likely received: the law continues from its motion
+        except LateReplyError:  # The command was most likely received, so the law continues from its motion.
             self.state.late += 1
             return None
         except DriverError as error:
@@ -218,7 +218,7 @@ class Controller:
         if status.watchdog_expired:  # the base is at rest: the command was not obeyed
             self._law.stand()
         self._law.motor_heading(status.heading_rad, status.yaw_rate_radps)
-        # One that holds a heading decides about its yaw rate itself.
+        # A motor controller that holds a heading chooses the yaw rate itself, so it cannot contradict the command.
         yaw_rate_radps = math.nan if math.isfinite(status.heading_rad) else status.yaw_rate_radps
         self._law.plausibility.add_report(
             now_ns, MotorReport(Motion(status.velocity_mps, yaw_rate_radps), status.fault, status.battery_v)

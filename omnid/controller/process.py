@@ -111,8 +111,8 @@ def run_controller(channel: Channel) -> int:
 
 
 def prepare_process(settings: RealtimeSettings) -> str:
-    """Make the process as punctual as it is allowed to be; return what was refused, or an empty string."""
-    prepare(settings)  # what it refuses to this process it has refused to the daemon, which logs it
+    """Set priority, memory and garbage collection for punctual ticks; return what was refused, or an empty string."""
+    prepare(settings)  # What is refused here was refused to the daemon too, which logs it.
     refused: list[str] = []
     ThreadStart({THREAD_NAME: settings.motor_priority}, lambda _, line: refused.append(line))(THREAD_NAME)
     return " ".join(refused)

@@ -38,7 +38,7 @@ class ControllerState:
     blocked: bool = False  # it stops the base: the command leads to an obstacle
     obstacle_stops: int = 0  # how often it began to
     sent: int = 0  # commands that were answered
-    late: int = 0  # commands whose answer did not come in time; the wheels go on
+    late: int = 0  # commands whose answer did not come in time; the wheels keep turning
     errors: int = 0  # commands that failed
     expiries: int = 0  # how often the motor controller had stopped the wheels by itself
     missed: int = 0  # ticks that were left out

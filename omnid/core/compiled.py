@@ -29,7 +29,7 @@ _declared: list[Kernel[Any, Any]] = []
 
 
 class Kernel(Generic[P, R]):
-    """A function that is compiled before it is called first; callable with what its signature allows."""
+    """A function that is compiled before its first call, for the types of its signature."""
 
     def __init__(self, function: Callable[P, R], arguments: Sequence[Argument]) -> None:
         self.function, self.arguments = function, arguments

@@ -1,7 +1,20 @@
-"""Stamps are whole nanoseconds, durations are seconds: the factor between them."""
+"""Stamps are whole nanoseconds, durations are seconds: from one to the other."""
 
 from __future__ import annotations
 
 from typing import Final
 
-S_PER_NS: Final = 1e-9  # exact: what the prefix stands for
+S_PER_NS: Final = 1e-9  # exact, by the definition of the prefix
+
+
+class SecondsSinceFirst:
+    """Times since the first stamp, because seconds since 1970 have too few digits of a float."""
+
+    def __init__(self) -> None:
+        self._zero_ns: int | None = None
+
+    def seconds(self, stamp_ns: int) -> float:
+        """Return the time [s] since the first stamp that was asked for."""
+        if self._zero_ns is None:
+            self._zero_ns = stamp_ns
+        return (stamp_ns - self._zero_ns) * S_PER_NS

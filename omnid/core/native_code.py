@@ -5,8 +5,8 @@ they lie in memory (struct PyArrayObject, the same in numpy 1 and 2 on all proce
 layout and writability, and returns 0, the number of a wrong array below zero, or numba's status above zero. Of numba's
 library a function needs the memory of its arrays only; those few functions become part of its code.
 
-The functions within a function are compiled as far as LLVM's code only, and become part of it: numba's way, which
-optimises each of them and makes it callable as well, takes 1.5 times the processor time and gives the same bytes.
+Functions that a compiled function calls are compiled to LLVM's code only, and linked into the caller. numba would
+also optimise each of them and make it callable, which takes 1.5 times the processor time for the same bytes.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ CONTIGUOUS, ALIGNED, WRITABLE = 0x1, 0x100, 0x400
 # rest is not used where arrays are made and freed by compiled functions only.
 HEADER_BYTES, DATA_FIELD = 64, 3
 
-# So wide because the fields of numpy's structs are.
+# So many bits because the fields of numpy's structs have them.
 I8, I32, I64 = ir.IntType(8), ir.IntType(32), ir.IntType(64)
 ADDRESS: Final = I8.as_pointer()
 
 
 class _LinkedCode(JITCodeLibrary):  # type: ignore[misc]  # numba has no types
-    """Code that becomes part of other code, which is optimised and made into instructions once, as a whole."""
+    """Code of a function that is linked into another one: only the whole is optimised and made into instructions."""
 
     def _optimize_final_module(self) -> None:
-        """Do nothing: the code that this one becomes part of is optimised."""
+        """Do nothing, because the code into which this one is linked is optimised."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -143,7 +143,7 @@ def _write_entry(context: Any, module: Any, symbol: str, what: tuple[Any, Sequen
 
 
 def _is_wrong(builder: Any, array: Any, argument: Argument, array_type: Any) -> Any:
-    """Return a flag: no array of numpy, or another one than the signature says."""
+    """Return a flag: this is no array of numpy, or not one of the type that the signature names."""
     dtype = np.dtype(argument.kind)
     flags = ALIGNED | CONTIGUOUS * argument.is_contiguous | WRITABLE * argument.is_written
     # 1. Another object has none of the fields below, so it is refused first.

@@ -23,7 +23,7 @@ def motion_status(
     receiver: SensorReceiver | None = None,
     gyro: WitMotionGyro | None = None,
 ) -> Callable[[], DiagnosticStatus]:
-    """Return a function that returns the entry: what comes, what was estimated of its errors, and which one differs."""
+    """Return a function that returns the entry: samples, their estimated errors, and the sensor that differs."""
     sensors = odometry.sensors
 
     def status() -> DiagnosticStatus:

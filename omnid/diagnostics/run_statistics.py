@@ -31,10 +31,12 @@ class RunStatistics:
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Count a pose."""
+        # 1. The way.
         position = odometry.T_odom_rig[:3, 3]
         if self._position is not None:
             self.length_m += float(np.linalg.norm(position - self._position))
         self._position, self.newest = position, odometry
+        # 2. States of poses and images.
         self.states[odometry.state] += 1
         self.dark += odometry.light.is_too_dark
         columns = odometry.depth.panoramas.tiles.columns

@@ -148,7 +148,8 @@ class WiringTest:
         # A busy computer may have paused this program already: the wheels move nevertheless, if only for a moment.
         while sent < LEAST_COMMANDS or time.monotonic() < begin_s + duration_s:
             sent += 1
-            with suppress(LateReplyError):  # the wheels go on turning: the controller's watchdog is far from its end
+            # Without an answer the wheels keep turning, because the controller's watchdog expires much later.
+            with suppress(LateReplyError):
                 motor.send(VelocityCommand(0, velocity_mps, 0.0, yaw_rate_radps))
             next_s += period_s
             time.sleep(max(0.0, min(next_s, begin_s + duration_s) - time.monotonic()))
@@ -174,7 +175,7 @@ def _stop(motor: SerialMotor) -> None:
 
 
 def wiring(first: Seen, second: Seen) -> dict[str, bool]:
-    """Return the settings of a base whose motors turn these wheels; they are different ones."""
+    """Return the settings of a base by the wheels that its two motors turn, which must be different wheels."""
     left, right = (first, second) if first.side == "left" else (second, first)
     return {"swapped": first.side == "right", "reverse_left": not left.forward, "reverse_right": not right.forward}
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 def returns_within(action: Callable[[], None], timeout_s: float, name: str) -> bool:
     """Call an action in a thread; return whether it has returned in time.
 
-    One that has not goes on in its thread, which does not keep the program from ending. For the end of a run: what the
+    Otherwise it continues in its thread, which does not keep the program from ending. For the end of a run: what the
     action uses must not be used afterwards.
     """
     thread = threading.Thread(target=action, name=name, daemon=True)

@@ -46,7 +46,7 @@ def write_grid(path: Path, grid: Grid) -> None:
     height, width = grid.cells.shape
     rows = image[::-1].tobytes()  # the first row is the highest y
     try:
-        # Both are on the disk before one takes its name, because an image beside the text of another map is shifted.
+        # Both are on the disk before one takes its name: an image next to the text of another map would be shifted.
         with replacement(pixels) as new_image, replacement(path) as new_text:
             new_image.write_bytes(b"P5\n%d %d\n255\n" % (width, height) + rows)
             new_text.write_bytes(described)

@@ -26,7 +26,8 @@ from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.tags import MAX_TAG
 from omnid.errors import OmnidError
 from omnid.formats import place_rows
-from omnid.formats.place_rows import BadRowError, KeyframeRow
+from omnid.formats.place_rows import KeyframeRow
+from omnid.formats.place_values import BadRowError, require_covariances, require_rigid
 from omnid.formats.stored_features import FeatureFile
 from omnid.formats.whole_file import replacement
 
@@ -44,6 +45,7 @@ MAX_VALUE_BYTES: Final = 1 << 20  # Limit of one value in the database.
 MAX_KEYFRAMES: Final = 100_000
 MAX_LINKS: Final = 1_000_000
 MAX_TAG_VIEWS: Final = 100_000
+LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
 MAX_INSTRUCTIONS: Final = 50_000_000  # Instructions that SQLite may take to read a map.
 SCHEMA: Final = {
     "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
@@ -302,8 +304,8 @@ def _check_views(views: list[TagView], tags: Set[int], keyframes: Set[int]) -> N
         raise BadRowError("a view of a tag is of no tag, or of no keyframe")
     if any(count > MAX_VIEWS for count in Counter(view.tag for view in views).values()):
         raise BadRowError(f"a tag has more than {MAX_VIEWS} views")
-    place_rows.require_rigid([view.T_rect_tag for view in views])
-    place_rows.require_covariances([view.covariance for view in views], place_rows.LEAST_VARIANCE)
+    require_rigid([view.T_rect_tag for view in views])
+    require_covariances([view.covariance for view in views], LEAST_VARIANCE)
 
 
 def _check(keyframes: list[KeyframeRow], links: list[Link]) -> None:
@@ -311,9 +313,9 @@ def _check(keyframes: list[KeyframeRow], links: list[Link]) -> None:
     ids = {keyframe.id for keyframe in keyframes}
     if any(link.a not in ids or link.b not in ids or link.a == link.b for link in links):
         raise BadRowError("a link joins no two keyframes")
-    place_rows.require_rigid([k.T_map_rect for k in keyframes])
-    place_rows.require_rigid([k.T_odom_rect for k in keyframes])
-    place_rows.require_rigid([link.T_a_b for link in links])
-    place_rows.require_covariances([k.covariance for k in keyframes], 0.0)
-    place_rows.require_covariances([link.covariance for link in links if not link.is_loop], 0.0)
-    place_rows.require_covariances([link.covariance for link in links if link.is_loop], place_rows.LEAST_VARIANCE)
+    require_rigid([k.T_map_rect for k in keyframes])
+    require_rigid([k.T_odom_rect for k in keyframes])
+    require_rigid([link.T_a_b for link in links])
+    require_covariances([k.covariance for k in keyframes], 0.0)
+    require_covariances([link.covariance for link in links if not link.is_loop], 0.0)
+    require_covariances([link.covariance for link in links if link.is_loop], LEAST_VARIANCE)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
@@ -18,26 +17,29 @@ from omnid.core.places.place_features import DESCRIPTOR, PlaceFeatures, StoredFe
 from omnid.core.places.place_map import KeyframeUse, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.tags import MAX_NAME, MAX_TAG, SIZES_M
+from omnid.formats.place_values import (
+    MAX_INTEGER,
+    BadRowError,
+    arrays_of,
+    as_bytes,
+    integer,
+    number,
+    require_rigid,
+    rows_of,
+    transform_of,
+    transforms_of,
+)
 
 Array = NDArray[np.float64]
 Row: TypeAlias = tuple[Any, ...]
 
-MAX_INTEGER: Final = 1 << 62
 MAX_FEATURES: Final = 4096  # Most features of a keyframe.
 FEATURE_BYTES: Final = DESCRIPTOR + 3 * 4  # Size of a descriptor with its view.
-MAX_POSITION_M: Final = 1e5
 MAX_PIXELS: Final = 1 << 15  # Largest width and height of a panorama.
-MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
-LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
-RIGID: Final = 1e-6  # Largest difference of an element of R R^T from the identity.
 THUMBNAIL: Final = (16, 128)  # rows and columns
 INDEX_COLUMNS: Final = 11  # Columns of a keyframe up to its free ranges.
 MAX_HASH: Final = 128  # characters
 BASELINES_M: Final = (1e-3, 1e2)  # least and largest
-
-
-class BadRowError(ValueError):
-    """A row that no omnid has written."""
 
 
 class KeyframeRow(NamedTuple):
@@ -105,15 +107,15 @@ def keyframe_row(keyframe: PlaceKeyframe, T_map_rect: Array, use: KeyframeUse, w
         keyframe.stamp_ns,
         use.found,
         use.missed,
-        _bytes(T_map_rect[:3], "<f8"),
-        _bytes(keyframe.T_odom_rect[:3], "<f8"),
-        _bytes(keyframe.covariance, "<f8"),
-        _bytes(keyframe.thumbnail, "i1"),
-        _bytes(keyframe.scan, "<f2"),
-        _bytes(keyframe.free_m, "<f2"),
+        as_bytes(T_map_rect[:3], "<f8"),
+        as_bytes(keyframe.T_odom_rect[:3], "<f8"),
+        as_bytes(keyframe.covariance, "<f8"),
+        as_bytes(keyframe.thumbnail, "i1"),
+        as_bytes(keyframe.scan, "<f2"),
+        as_bytes(keyframe.free_m, "<f2"),
         keyframe.features.count,
-        _bytes(codes_of(features), "<u8"),
-        _bytes(azimuths_of(features, width), "u1"),
+        as_bytes(codes_of(features), "<u8"),
+        as_bytes(azimuths_of(features, width), "u1"),
     )
 
 
@@ -122,12 +124,12 @@ def features_row(keyframe: PlaceKeyframe) -> Row:
     features = keyframe.features.copied()
     if features.count != keyframe.features.count:
         raise BadRowError(f"the features of keyframe {keyframe.id} in the map that was read are damaged")
-    return keyframe.id, _bytes(features.descriptors, "u1"), _bytes(features.views, "<f4")
+    return keyframe.id, as_bytes(features.descriptors, "u1"), as_bytes(features.views, "<f4")
 
 
 def link_row(link: Link) -> Row:
     """Return the row of a link."""
-    return link.a, link.b, link.inliers, _bytes(link.T_a_b[:3], "<f8"), _bytes(link.covariance, "<f8")
+    return link.a, link.b, link.inliers, as_bytes(link.T_a_b[:3], "<f8"), as_bytes(link.covariance, "<f8")
 
 
 def tag_row(tag: MapTag) -> Row:
@@ -137,7 +139,7 @@ def tag_row(tag: MapTag) -> Row:
 
 def tag_view_row(view: TagView) -> Row:
     """Return the row of a view of a tag."""
-    return view.keyframe, view.tag, _bytes(view.T_rect_tag[:3], "<f8"), _bytes(view.covariance, "<f8")
+    return view.keyframe, view.tag, as_bytes(view.T_rect_tag[:3], "<f8"), as_bytes(view.covariance, "<f8")
 
 
 def map_row(rig: PlaceRig, places: PlaceMap) -> Row:
@@ -152,8 +154,8 @@ def map_row(rig: PlaceRig, places: PlaceMap) -> Row:
         rig.cylinder.height,
         float(rig.cylinder.row0),
         float(rig.baseline_m),
-        _bytes(rig.T_rig_rect[:3], "<f8"),
-        _bytes(rig.T_base_rig[:3], "<f8"),
+        as_bytes(rig.T_rig_rect[:3], "<f8"),
+        as_bytes(rig.T_base_rig[:3], "<f8"),
         rig.rig_hash,
     )
 
@@ -163,12 +165,12 @@ def read_map_row(row: Row) -> Head:
     keyframes, links, dropped, tags, tag_views, width, height, row0, baseline_m, T_rig_rect, T_base_rig, rig_hash = row
     if not isinstance(rig_hash, str) or len(rig_hash) > MAX_HASH or not rig_hash.isalnum():
         raise BadRowError("the hash of the rig is none")
-    cylinder = Cylinder(_integer(width, 1, MAX_PIXELS), _integer(height, 1, MAX_PIXELS), _number(row0, -1e6, 1e6))
+    cylinder = Cylinder(integer(width, 1, MAX_PIXELS), integer(height, 1, MAX_PIXELS), number(row0, -1e6, 1e6))
     rig = PlaceRig(
-        cylinder, _number(baseline_m, *BASELINES_M), _transform(T_rig_rect), _transform(T_base_rig), rig_hash
+        cylinder, number(baseline_m, *BASELINES_M), transform_of(T_rig_rect), transform_of(T_base_rig), rig_hash
     )
     require_rigid([rig.T_rig_rect, rig.T_base_rig])
-    return Head(rig, _integer(keyframes), _integer(links), _integer(dropped), _integer(tags), _integer(tag_views))
+    return Head(rig, integer(keyframes), integer(links), integer(dropped), integer(tags), integer(tag_views))
 
 
 def head_of_version_2(row: Row) -> Row:
@@ -189,21 +191,21 @@ def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
     ids, sessions, stamps, found, missed, T_map_rect, T_odom_rect, covariance, thumbnail, scan, free = (
         [row[column] for row in rows] for column in range(INDEX_COLUMNS)
     )
-    ranges, free_m = (_arrays(of, "<f2", (SECTORS,)) for of in (scan, free))
+    ranges, free_m = (arrays_of(of, "<f2", (SECTORS,)) for of in (scan, free))
     for known, may_be in ((ranges, np.isnan(ranges)), (free_m, False)):
         if not (may_be | ((known >= 0) & (known <= MAX_RANGE_M))).all():
             raise BadRowError(f"a range of a keyframe is outside 0 to {MAX_RANGE_M:g} m")
     return [
-        KeyframeRow(_integer(id), _integer(session), _integer(stamp_ns, -MAX_INTEGER), use, *arrays)
+        KeyframeRow(integer(id), integer(session), integer(stamp_ns, -MAX_INTEGER), use, *arrays)
         for id, session, stamp_ns, use, *arrays in zip(
             ids,
             sessions,
             stamps,
-            (KeyframeUse(_integer(a), _integer(b)) for a, b in zip(found, missed, strict=True)),
-            _transforms(T_map_rect),
-            _transforms(T_odom_rect),
-            _arrays(covariance, "<f8", (6, 6)),
-            _arrays(thumbnail, "i1", THUMBNAIL),
+            (KeyframeUse(integer(a), integer(b)) for a, b in zip(found, missed, strict=True)),
+            transforms_of(T_map_rect),
+            transforms_of(T_odom_rect),
+            arrays_of(covariance, "<f8", (6, 6)),
+            arrays_of(thumbnail, "i1", THUMBNAIL),
             ranges,
             free_m,
             strict=True,
@@ -213,7 +215,7 @@ def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
 
 def read_codes(rows: Sequence[Row]) -> KeyframeCodes:
     """Return the numbers of features and their codes. Raises BadRowError."""
-    counts = [_integer(row[INDEX_COLUMNS], 0, MAX_FEATURES) for row in rows]
+    counts = [integer(row[INDEX_COLUMNS], 0, MAX_FEATURES) for row in rows]
     for count, row in zip(counts, rows, strict=True):
         codes, azimuths = row[INDEX_COLUMNS + 1 :]
         if not isinstance(codes, bytes) or not isinstance(azimuths, bytes):
@@ -229,7 +231,7 @@ def read_codes(rows: Sequence[Row]) -> KeyframeCodes:
 
 def read_features(descriptors: object, views: object, rig: PlaceRig) -> PlaceFeatures:
     """Return the features of a keyframe. Raises BadRowError."""
-    features = PlaceFeatures(_rows(descriptors, "u1", DESCRIPTOR), _rows(views, "<f4", 3))
+    features = PlaceFeatures(rows_of(descriptors, "u1", DESCRIPTOR), rows_of(views, "<f4", 3))
     if len(features.descriptors) != len(features.views) or len(features.views) > MAX_FEATURES:
         raise BadRowError(f"{len(features.descriptors)} descriptors and {len(features.views)} views in a keyframe")
     column, lower, upper = features.views.T
@@ -244,10 +246,10 @@ def read_features(descriptors: object, views: object, rig: PlaceRig) -> PlaceFea
 
 def read_links(rows: Sequence[Row]) -> list[Link]:
     """Return links. Raises BadRowError. Their poses and covariances are not checked."""
-    T_a_b = _transforms([row[3] for row in rows])
-    covariance = _arrays([row[4] for row in rows], "<f8", (6, 6))
+    T_a_b = transforms_of([row[3] for row in rows])
+    covariance = arrays_of([row[4] for row in rows], "<f8", (6, 6))
     return [
-        Link(_integer(a), _integer(b), T, P, _integer(inliers))
+        Link(integer(a), integer(b), T, P, integer(inliers))
         for (a, b, inliers, *_), T, P in zip(rows, T_a_b, covariance, strict=True)
     ]
 
@@ -257,83 +259,11 @@ def read_tag_row(row: Row) -> MapTag:
     id, name, size_m = row
     if not isinstance(name, str) or not 0 < len(name) <= MAX_NAME or not name.isprintable():
         raise BadRowError("the name of a tag is none")
-    return MapTag(_integer(id, 0, MAX_TAG), name, _number(size_m, *SIZES_M))
+    return MapTag(integer(id, 0, MAX_TAG), name, number(size_m, *SIZES_M))
 
 
 def read_tag_view_row(row: Row) -> TagView:
     """Return a view of a tag. Raises BadRowError. Its pose and covariance are not checked."""
     keyframe, tag, T_rect_tag, covariance = row
-    P = _arrays([covariance], "<f8", (6, 6))[0]
-    return TagView(_integer(keyframe), _integer(tag), _transform(T_rect_tag), P)
-
-
-def require_rigid(transforms: Sequence[Array]) -> None:
-    """Check that all (4, 4) are rotations with translations up to MAX_POSITION_M. Raises BadRowError."""
-    if not transforms:
-        return
-    T = np.array(transforms)
-    R = T[:, :3, :3]
-    if not np.isfinite(T).all() or (np.abs(T[:, :3, 3]) > MAX_POSITION_M).any() or (np.abs(R) > 2).any():
-        raise BadRowError("a pose is not finite, or too far away")
-    if (np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)) > RIGID).any() or (np.linalg.det(R) < 0).any():
-        raise BadRowError("a pose is no rotation")
-
-
-def require_covariances(covariances: Sequence[Array], least: float) -> None:
-    """Check that all (6, 6) are symmetric, without an eigenvalue below `least` [m^2, rad^2]. Raises BadRowError."""
-    if not covariances:
-        return
-    P = np.array(covariances)
-    if not np.isfinite(P).all() or (np.abs(P) > MAX_VARIANCE).any():
-        raise BadRowError("a covariance is not finite, or too large")
-    rounding = 1e-9 * np.abs(P).max(axis=(1, 2))  # an eigenvalue that is 0 may be less by this
-    if (np.abs(P - np.swapaxes(P, 1, 2)).max(axis=(1, 2)) > rounding).any():
-        raise BadRowError("a covariance is not symmetric")
-    if (np.linalg.eigvalsh(P)[:, 0] < (least or -rounding)).any():
-        raise BadRowError("a covariance is not positive")
-
-
-def _bytes(values: NDArray[Any], dtype: str) -> bytes:
-    return np.ascontiguousarray(values, np.dtype(dtype)).tobytes()
-
-
-def _rows(value: object, dtype: DTypeLike, columns: int) -> NDArray[Any]:
-    """Return an array (N, columns) with any number of rows."""
-    kind = np.dtype(dtype)
-    if not isinstance(value, bytes) or len(value) % (kind.itemsize * columns):
-        raise BadRowError("an array has another size")
-    return np.frombuffer(value, kind).reshape(-1, columns).astype(kind.newbyteorder("="))
-
-
-def _arrays(values: Sequence[object], dtype: DTypeLike, shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return N arrays of one shape (...) as one array (N, ...), which can be written to."""
-    kind = np.dtype(dtype)
-    size = kind.itemsize * math.prod(shape)
-    known = [value for value in values if isinstance(value, bytes) and len(value) == size]
-    if len(known) != len(values):
-        raise BadRowError("an array has another size")
-    return (
-        np.frombuffer(bytearray(b"".join(known)), kind).reshape(-1, *shape).astype(kind.newbyteorder("="), copy=False)
-    )
-
-
-def _transforms(values: Sequence[object]) -> Array:
-    """Return transforms (N, 4, 4); a file holds their upper three rows."""
-    upper = _arrays(values, "<f8", (3, 4))
-    return np.concatenate([upper, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(upper), 1, 4))], axis=1)
-
-
-def _transform(value: object) -> Array:
-    return np.asarray(_transforms([value])[0])
-
-
-def _integer(value: object, low: int = 0, high: int = MAX_INTEGER) -> int:
-    if not isinstance(value, int) or not low <= value <= high:
-        raise BadRowError("a number is missing or outside its range")
-    return value
-
-
-def _number(value: object, low: float, high: float) -> float:
-    if not isinstance(value, float) or not low <= value <= high:
-        raise BadRowError("a number is missing or outside its range")
-    return value
+    P = arrays_of([covariance], "<f8", (6, 6))[0]
+    return TagView(integer(keyframe), integer(tag), transform_of(T_rect_tag), P)

@@ -8,13 +8,14 @@ from typing import Final
 from drivers.bounded_sqlite import bound_work
 from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_rig import PlaceRig
-from omnid.formats.place_rows import BadRowError, checksum, read_features
+from omnid.formats.place_rows import checksum, read_features
+from omnid.formats.place_values import BadRowError
 
 MAX_INSTRUCTIONS: Final = 100_000  # Instructions that SQLite may take for one row; some 20 are needed.
 
 
 class FeatureFile:
-    """An open map file: it is neither locked nor written, and one that is replaced meanwhile is read as it was."""
+    """An open map file, which is neither locked nor written; if the file is replaced meanwhile, the old one is read."""
 
     def __init__(self, database: sqlite3.Connection, rig: PlaceRig) -> None:
         """database: it is closed with this object."""

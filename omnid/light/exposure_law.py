@@ -14,17 +14,17 @@ from drivers.cameras.camera_exposure import ExposureRanges, ExposureSetting, Val
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.light.grey_levels import GreyLevels
 
-# Grey levels: the mean that is aimed at, the least one that bright spots may push it to, the highest of bright spots,
-# and the level from which they count as saturated.
+# Grey levels: the wanted mean, the least mean that bright spots may cause, the wanted level of bright spots, and the
+# level from which they count as saturated.
 TARGET, LEAST_MEAN, BRIGHT, SATURATED = 100.0, 60.0, 235.0, 250.0
 SATURATED_FACTOR: Final = 0.7  # The exposure is multiplied by this while bright spots are saturated.
-# No step for wanted factors between these: a step by one of them may not bring about the other one.
+# Wanted factors between these cause no step: after a step down the factor must not be large enough for a step up.
 LEAST_DOWN, LEAST_UP = 0.77, 1.4
 NEW_LIMIT: Final = 0.1  # Change of the limit of the exposure time from which it is taken: stamps have jitter.
 LARGEST_FACTOR: Final = 2.0  # Largest factor of a step.
 VERY_BRIGHT: Final = 0.6  # If the factor is smaller, the exposure is lowered at once, together with the gain.
 GAIN_STEPS: Final = 8  # The first step of the gain is its range by this number, since its unit is not known.
-# Between two steps. Each step against the one before doubles it, two in one direction end that: so it does not hunt.
+# Time between two steps. A step against the last one doubles it, two steps in one direction reset it, against hunting.
 STEP_S, LONGEST_STEP_S = 0.5, 32.0
 # A camera does not answer if this number of successive steps of the exposure time, by at least the factor, do not
 # change the mean as much as ANSWER while it is neither black nor white.

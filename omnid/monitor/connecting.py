@@ -14,10 +14,10 @@ _RETRY_S: Final = 0.5
 
 
 def connected_until(end_s: float, connect: Callable[[], T], signals: Sequence[int] = ()) -> T | None:
-    """Return a connection as soon as there is one; None where the time is over first, or a signal came.
+    """Try to connect until it succeeds; return None after end_s or a signal.
 
-    end_s: by time.monotonic(). connect: raises Unreachable while there is none; each new reason is printed once.
-    signals: those that came, to which the handler of the caller adds.
+    end_s: by time.monotonic(). connect: raises Unreachable without a connection; each new reason is printed once.
+    signals: numbers of the signals that came; a handler of the caller adds to it.
     """
     reason = ""
     while not signals and time.monotonic() < end_s:

@@ -27,7 +27,7 @@ MAX_ROBOTS: Final = 500
 _NAME_COLUMNS: Final = 20
 FLEET_TOPICS: Final = ("odom", "status")
 _POSE_HEAD: Final = f" {'x m':>9} {'y m':>9} {'yaw deg':>8} {'age ms':>7}"
-NARROW_COLUMNS: Final = 110  # a terminal with fewer shows no positions: what is wrong must be seen
+NARROW_COLUMNS: Final = 110  # A terminal with fewer columns shows no positions, to leave room for what is wrong.
 
 
 class FleetState:
@@ -44,7 +44,7 @@ class FleetState:
         state = self.robot(name)
         if state is not None:
             state.process(message._replace(topic=topic))
-            state.forget_ended()  # A message may arrive after the end of its daemon is noted.
+            state.forget_ended()  # The message may have arrived after its daemon's end was noted.
 
     def note_alive(self, name: str, alive: bool) -> None:
         """Note that the daemon of a robot came or went, for `take_alive`; from any thread."""

@@ -61,14 +61,14 @@ class RobotState:
         self.pose: Pose | None = None
         self.statuses: dict[str, DiagnosticStatus] = {}
         self.alive: bool | None = None  # the daemon's liveliness token; None while it is not known
-        self.robots_there = ""  # robots that were there when the connection was made, as a part of a sentence
+        self.robots_there = ""  # robots found at the time of connecting, as a part of a sentence
         self.poses = self.missed = self.broken = 0
-        self.ends = 0  # how often the daemon's token went
-        self.restarts = 0  # how often its poses were numbered from the start
+        self.ends = 0  # number of times that the daemon's token disappeared
+        self.restarts = 0  # number of times that the numbers of its poses began again
         self.age = Histogram()  # s, from the capture of a pose's images to its arrival; empty for a simulated clock
         self.network = Histogram()  # s, from the robot's network to the arrival of a pose
         self._arrivals_s: deque[float] = deque(maxlen=_RATE_WINDOW)
-        self._forgotten = 0  # ends of which the statuses are forgotten
+        self._forgotten = 0  # value of `ends` when the statuses were last forgotten
 
     def process(self, message: ReceivedMessage) -> Pose | None:
         """Count a message and return the pose in it, if it is one."""

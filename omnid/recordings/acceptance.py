@@ -22,7 +22,7 @@ from omnid.formats.tum import Trajectory
 Array = NDArray[np.float64]
 Mark = Literal["A", "B"]
 
-# A robot stands while it stays within this distance and angle of where it came to rest, for this time at least: more
+# A robot is at rest while it stays within this distance and angle of where it stopped, for this time at least: more
 # than the noise of the poses, less than the placing of a robot by hand.
 STAND_M: Final = 0.02
 STAND_RAD: Final = math.radians(2.0)
@@ -182,7 +182,7 @@ def accept(path: Trajectory, visits: Sequence[Visit], distance_m: float) -> Acce
 
 
 def _stands(path: Trajectory) -> list[tuple[float, Array]]:
-    """Return the middle time and the mean pose of every stand."""
+    """Return the middle time and the mean pose of each time at rest."""
     stamps_s, yaw = _seconds(path), np.unwrap(se3.yaw(path.T))
     found, first = list[tuple[float, Array]](), 0
     while first < len(stamps_s):
@@ -204,7 +204,7 @@ def _seconds(path: Trajectory) -> Array:
 
 
 def _pose_at(path: Trajectory, stamps_s: Array, time_s: float) -> Array:
-    """Return the pose at a time: the mean position about it while the robot stands, else between its neighbours."""
+    """Return the pose at a time: the mean position about it while the robot is at rest, else between its neighbours."""
     after = int(np.clip(np.searchsorted(stamps_s, time_s), 1, len(stamps_s) - 1))
     near = np.abs(stamps_s - time_s) <= STAND_S / 2
     positions = path.T[near, :3, 3]

@@ -34,7 +34,7 @@ from omnid.tracking_state import TrackingState
 # Scatter of the columns of matched points: up to 0.2 px with the right rig, with moving shadows and struts 0.4 px;
 # other mirrors give 0.3 to 7 px. So it does not decide; it says whether landmarks are examined.
 MAX_SPREAD_PX: Final = 0.3
-# Few keyframes are enough: the tolerances hold what they do not show, so that too few of them change nothing.
+# Few keyframes are enough: parameters that they do not show are held by their tolerances.
 KEYFRAMES: Final = 20
 LEAST_KEYFRAMES: Final = 5
 # Pairs that are read for them: ten seconds of a log at 30 Hz.
@@ -43,8 +43,8 @@ MOST_PAIRS: Final = 300
 KEYFRAME_M, KEYFRAME_RAD = 0.2, np.deg2rad(12)
 # Landmarks in view of a keyframe: the examination delays the start of a replay by 2 to 36 s.
 LANDMARKS: Final = 150
-# Pairs without a pose, in parts of those that are light enough, as in `calibrate drive`; and their least number, as
-# single pairs of a short log must not decide.
+# Share of the light enough pairs that may have no pose, as in `calibrate drive`; least number of pairs without one,
+# because single pairs of a short log must not decide.
 MAX_LOST: Final = 0.2
 LEAST_LOST: Final = 3
 
@@ -55,10 +55,10 @@ def is_suspicious(finding: StartFinding | None) -> bool:
 
 
 def other_rig(updates: Iterable[OdometryUpdate], front_end: FrontEnd, finding: StartFinding | None = None) -> str:
-    """Return by which the rig is that of other cameras, as far as it takes to know; empty where it is not, or unknown.
+    """Return the reason to believe that the rig is of other cameras; empty where there is none, or too little is known.
 
-    updates: poses of a log by the front end, with the rig as it is. finding: of its first pairs, if these were seen at
-    one time.
+    updates: poses of a log by the front end, read as far as needed. finding: of the first pairs, if their pixels were
+    exposed at once.
     """
     # 1. Keyframes; where poses are lost too often, the existing ones decide.
     start = _FirstPairs(DriveCollector(front_end.geometry, front_end.dense, LANDMARKS))

@@ -131,7 +131,8 @@ class RigRefinement:
             self._window, self._next_ns = None, update.stamp_ns + self._settings.refine_s * 1e9
             try:
                 self._child = _Estimate(request)
-            except OSError as error:  # no room in the temporary folder, no more processes: the run goes on without
+            except OSError as error:
+                # The temporary folder is full, or there are too many processes: the run continues without an estimate.
                 self._windows, self._failed = self._windows + 1, self._failed + 1
                 self._reason = f"the estimate cannot start: {error}"
 

@@ -127,7 +127,7 @@ class RunPlaces:
         return self._writes
 
     def save(self, places: PlaceMap) -> bool:
-        """Write a copy of the map, changed here, as far as it is joined; False where it has nothing new.
+        """Write the joined part of a copy of the map, which is cut to it; return False if the part has nothing new.
 
         Raises OmnidError if the file cannot be written.
         """
@@ -140,7 +140,7 @@ class RunPlaces:
         return True
 
     def _write(self, path: Path, places: PlaceMap) -> None:
-        """Write the map to its file, or beside it where another program has written that meanwhile."""
+        """Write the map to its file, or to one next to it where another program has written that file meanwhile."""
         if _version(path) not in (None, self._version):
             other = _beside(path)
             self._warn(
@@ -153,7 +153,7 @@ class RunPlaces:
         self._version = _version(path)
 
     def finish(self) -> RigPlaces | None:
-        """Return the map after the run, what is not joined to it left out; write it where it was extended.
+        """Return the joined part of the map after the run, and write it to its file if it was extended.
 
         Raises OmnidError if the file cannot be written.
         """
@@ -193,7 +193,7 @@ def _version(path: Path) -> tuple[int, int] | None:
 
 
 def _beside(path: Path) -> Path:
-    """Return the first name beside a file that is free."""
+    """Return the first free name next to a file."""
     return next(name for number in count(2) if not (name := path.with_stem(f"{path.stem}-{number}")).exists())
 
 

@@ -81,17 +81,17 @@ class ReplayOptions:
     record: Path | None = None
     collect: bool = False  # keep poses and map in memory for the result: see PoseCollector for how much that is
     publish: bool = False
-    bus_optional: bool = False  # without a bus, warn and go on
+    bus_optional: bool = False  # without a bus, warn and continue
     inline: bool = False
-    paced: bool = False  # at the pace of the log's stamps, as far as the computer holds it; else as fast as it can
-    drops: bool = False  # a stage that is late drops messages, as on the robot; else what comes before it waits
+    paced: bool = False  # at the pace of the log's stamps, unless the computer is slower; False: as fast as possible
+    drops: bool = False  # a late stage drops messages, as on the robot; False: the stages before it wait
     settings: Path | None = None  # file of the configuration, so that no output overwrites it
     progress: Callable[[RunStatistics, int | None], ProgressDisplay] | None = None  # of statistics, expected pairs
     observer: Callable[[FrontEnd, Telemetry], Sink[Outgoing]] | None = None  # of all messages; excludes record
     places: PlaceMap | None = None  # the map to begin with; it is extended
-    localize_only: bool = False  # ... it stays as it is
-    rig_places: RigPlaces | None = None  # the same with its rig, which is compared with that of the log
-    build: bool = False  # give the result a map with its rig, from nothing where there is no other
+    localize_only: bool = False  # the map to begin with is not extended
+    rig_places: RigPlaces | None = None  # such a map with its rig, which is compared with the rig of the log
+    build: bool = False  # give the result a map with its rig, a new one where there is none to begin with
     map_every_s: float = 0.0  # between two maps, by the stamps; 0: one, at the end
 
     @property
@@ -221,7 +221,7 @@ class _Replay:
         return graph.source("read", frames, wake=clock.wake)
 
     def _sinks(self, session: Session, front_end: FrontEnd) -> Sinks:
-        """Open all outputs before the run, so that one that cannot be opened ends it now."""
+        """Open all outputs; one that cannot be opened ends the run before it begins."""
         options, geometry = self._options, front_end.geometry
         recorder: Sink[Any] | None = None
         if options.observer:

@@ -60,7 +60,7 @@ def examined_rig(reader: LogReader, log: Path, place: Geometry, config: Config) 
 
 
 def _examine_panoramas(health: RigHealth, reader: LogReader, place: Geometry, config: Config) -> bool:
-    """Check the first pairs; return False where that takes odometry, as they were not exposed at one time."""
+    """Check the first pairs; return False if their pixels were not exposed at once, which takes odometry to check."""
     pairing, dewarp = Synchronise(place.rig, config.pair), Dewarp(place, config.panorama, config.camera)
     for frame in reader.frames():
         pair = pairing.process(frame)

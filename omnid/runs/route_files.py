@@ -57,7 +57,7 @@ class RouteFiles:
         self._written: TaughtRoute | None = None  # the one that was written last
 
     def put(self, command: NavigationCommand) -> None:
-        """Take a request: one that needs a file waits until that was read, those after it too, but for halts."""
+        """Take a request; it waits for its file, if it needs one, and for waiting requests before it; halts do not."""
         if is_halt(command.request) or not (self._waiting or _needs_file(command.request)):
             self._pass_on(command)
         elif len(self._waiting) >= MOST_WAITING:

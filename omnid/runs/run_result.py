@@ -45,8 +45,8 @@ class RunResult:
     warnings: tuple[str, ...]  # doubts about the input and what to do about them, one line each
     map: MapPoints | None  # points (M, 3) m in odom, with confidence, frames and age; None without a pair
     signal: int = 0  # number of the signal that ended the run early; 0: it came to its end
-    # Poses in the map as it is at the end, and as they were known at that time (live), with their states then; empty
-    # where places are not recognised.
+    # Poses in the map: by the map at the end, and as known while driving (live) with the states then. Empty if places
+    # are not recognised.
     T_map_rig: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
     T_map_rig_live: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (N, 4, 4)
     map_states: tuple[MapState, ...] = ()  # (N,)

@@ -1,4 +1,4 @@
-"""Steps that install omnid as a service: each says what it does before it does it."""
+"""Steps that install omnid as a service; each has a description that is printed before it is taken."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ T = TypeVar("T")
 
 
 class LockstepRequests:
-    """Requests to the navigation, as a source that never waits: it gives those that came since its last turn."""
+    """Requests to the navigation, as a source that never waits: each turn yields the requests since the last one."""
 
     def __init__(self) -> None:
         self._waiting: list[NavigationCommand] = []

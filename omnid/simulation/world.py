@@ -17,4 +17,4 @@ class World:
     people: tuple[Person, ...] = ()
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
     brightness: float = 1.0  # factor on the grey of all images
-    is_polished: bool = False  # the floor mirrors what stands on it
+    is_polished: bool = False  # the floor mirrors the objects on it

@@ -96,7 +96,7 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
         top.tables(key, most) for key, most in (("wall", MOST_WALLS), ("box", MOST_BOXES), ("person", MOST_PEOPLE))
     )
     x_m, y_m, heading_deg = top.numbers("start", 3)
-    # 1. What cannot be is refused before any texture is painted, which takes time and memory.
+    # 1. Refuse what cannot be, before textures are painted, which takes time and memory.
     if not space.contains((x_m, y_m)):
         top.fail("start", "a place within the space")
     for table in boxes:
@@ -109,18 +109,18 @@ def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World
     )
     if area_m2 > LARGEST_AREA_M2:
         raise CalibError(f"{name}: the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}")
-    # 2. Surfaces with their textures, in the order in which the seed is used.
-    standing = space.floor_and_ceiling(rng)
+    # 2. Paint the surfaces, always in the same order, because each takes its random numbers from the same generator.
+    surfaces = space.floor_and_ceiling(rng)
     for table in walls:
-        standing += _wall(rng, table, space.ceiling_m)
+        surfaces += _wall(rng, table, space.ceiling_m)
     for table in boxes:
-        standing += _box(rng, table)
+        surfaces += _box(rng, table)
     people = tuple(_person(rng, table) for table in persons)
     if options.other_posters:
-        standing = _exchanged(standing, options)
+        surfaces = _exchanged(surfaces, options)
     brightness = options.brightness * _within(top, "light", 0.05, 3.0, 1.0)
     start = x_m, y_m, math.radians(heading_deg)
-    return World(name, tuple(standing), people if options.people else (), start, brightness, space.is_polished)
+    return World(name, tuple(surfaces), people if options.people else (), start, brightness, space.is_polished)
 
 
 @dataclass(frozen=True, slots=True)
@@ -317,12 +317,12 @@ def _choice(table: ValidatedTable, key: str, options: Collection[str], default: 
     return table.choice(key, options) if table.has(key) else default
 
 
-def _exchanged(standing: list[Rectangle], options: WorldOptions) -> list[Rectangle]:
+def _exchanged(surfaces: list[Rectangle], options: WorldOptions) -> list[Rectangle]:
     """Return the rectangles with a share of the posters exchanged."""
     rng = np.random.default_rng([options.posters_seed, 42])
     return [
         replace(r, texture=textures.poster(rng, (r.texture.shape[1], r.texture.shape[0])))
         if r.name.startswith("poster") and rng.random() < options.other_posters
         else r
-        for r in standing
+        for r in surfaces
     ]

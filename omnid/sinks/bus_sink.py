@@ -31,12 +31,15 @@ class BusSink:
 
     def process(self, message: Outgoing) -> None:
         """Publish a message; a pose with its attachment, and what has changed: states, static frames, the path."""
+        # 1. The clock, before what is stamped by it.
         if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
             self._time_ns = message.stamp_ns
             self._bus.publish(CLOCK, clock_cdr(message.stamp_ns + self._encode.offset_ns))
+        # 2. The message itself.
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
+        # 3. What follows from it, where it has changed.
         if isinstance(message, OdometryUpdate | PlaceUpdate):
             for topic, _, payload in self._states(message):
                 self._bus.publish(topic, payload)
@@ -63,9 +66,11 @@ class PanoramaSink:
         """Publish the panorama of a pose, with its features as the attachment, when it is due."""
         if odometry.stamp_ns < self._next_ns or not self._bus.is_received(PANORAMA):
             return
+        # 1. Encode the panorama.
         self._next_ns = odometry.stamp_ns + self._period_ns
         _, jpeg = cv2.imencode(".jpg", odometry.depth.panoramas.lower.panorama)
         frame = Frame(odometry.seq, odometry.stamp_ns, "lower", "jpeg", jpeg)
+        # 2. Publish it with its features.
         features = odometry.features
         pixels = {"inliers": features.inliers, "rejected": features.rejected, "new": features.new}
         _, payload = image_cdr(frame, odometry.stamp_ns + self._offset_ns)

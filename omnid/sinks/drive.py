@@ -112,10 +112,12 @@ class ReplayDrive:
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Send a pose and the setpoint; DriverError where the motor controller has failed for FAILED_S."""
+        # 1. Send both as of now, and take the controller's reports.
         now_ns = time.monotonic_ns()
         self._link.send_pose(controller_pose(odometry, self._T_base_rig)._replace(stamp_ns=now_ns))
         self._link.send_setpoint(TimedSetpoint(now_ns, self._setpoint))
         self._link.receive_waiting()
+        # 2. End the run where the motor controller does not come back.
         if not self._link.statistics.state.failed:
             self._failed_since_ns = 0
             return

@@ -27,11 +27,13 @@ class PoseCollector:
 
     def process(self, odometry: OdometryUpdate) -> None:
         """Keep a pose."""
+        # 1. Double arrays that are full.
         if self._count == len(self._stamps_ns):
             self._stamps_ns, self._T_odom_rig, self._covariances = (
                 np.concatenate([full, np.zeros_like(full)])
                 for full in (self._stamps_ns, self._T_odom_rig, self._covariances)
             )
+        # 2. Write the pose.
         self._stamps_ns[self._count] = odometry.stamp_ns
         self._T_odom_rig[self._count] = odometry.T_odom_rig
         self._covariances[self._count] = odometry.covariance

@@ -120,9 +120,11 @@ class Recorder:
 
     def process(self, message: Recorded) -> None:
         """Record a message and, for a pose, the state of the odometry where it has changed."""
+        # 1. Messages of others that were stamped before.
         stamp_ns = message.stamp_ns + self._offset_ns
         is_pose = isinstance(message, OdometryUpdate)
         self._write_added(stamp_ns if is_pose else stamp_ns - _POSE_AGE_NS)
+        # 2. The message, and for poses static frames, path and states where they have changed.
         try:
             self._write(self._encoded(message, stamp_ns), stamp_ns)
             if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:

@@ -33,12 +33,15 @@ class SimulatedWheels:
 
     def process(self, command: VelocityCommand) -> None:
         """Let the base drive until the command's stamp, then send it."""
+        # 1. Drive on until the stamp.
         since_s = (command.stamp_ns - self._now_ns) * 1e-9 if self._now_ns else 0.0
         self._now_ns = command.stamp_ns
         self.base.advance(min(since_s, LONGEST_ADVANCE_S))
-        if since_s > self._rearm_s:  # its watchdog may have expired, after which it wants a stop first
+        # 2. Send the command. After a pause the watchdog may have expired: then the controller expects a stop first.
+        if since_s > self._rearm_s:
             self._motor.send(stop_command(command.stamp_ns))
         self._motor.send(command)
+        # 3. Count it, and each stop of wheels that moved.
         self._sent += 1
         self._stops += self._moves and is_stop(command)
         self._moves = not is_stop(command)

@@ -40,13 +40,16 @@ class DenseStereo:
         exposure: the motion during the exposures; None: unknown, or none is needed. May be called in several threads at
         the same time.
         """
+        # 1. Match the pixels of the lower panorama along their columns.
         correction = None if exposure is None else DenseCorrection.of(exposure, panoramas.visible.shape)
         columns, rows, found = self._match(panoramas, correction)
+        # 2. Correct rows and disparities to the stamp of the pair.
         views, by_motion = np.column_stack([columns, rows, rows + found]).astype(float), np.zeros(len(found))
         if correction is not None:
             views, by_motion = correction.corrected(columns, rows, found)
         disparity = np.full(panoramas.visible.shape, np.nan, np.float32)
         disparity[rows, columns] = views[:, 2] - views[:, 1]
+        # 3. Triangulate, with the variance of each point.
         points = triangulate(views, self._cylinder, self._baseline_m)
         kept = np.isfinite(points).all(axis=1)
         variance_m2 = self._variance_m2(points[kept], by_motion[kept])

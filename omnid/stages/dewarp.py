@@ -51,14 +51,17 @@ class Dewarp:
 
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
+        # 1. Rectify both images; the noise is measured in some of the pairs.
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
         lower, lower_light = self._remapped(pair.lower, self._lower, "lower", measured)
         upper, upper_light = self._remapped(pair.upper, self._upper, "upper", measured)
         lower_grey, upper_grey = self._inner(lower), self._inner(upper)
+        # 2. Gains for dim images, and the camera that shows less contrast, which decides how much light there is.
         by_level = gain_of(lower_light.level_grey), gain_of(upper_light.level_grey)
         lower_gain, upper_gain = pair_gains(lower_grey, upper_grey, self._visible, by_level)
         dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
+        # 3. Times of exposure of the pixels, and parts of the images that are dead or blind.
         times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
         tiles = self._tiles.update(pair.stamp_ns, {"lower": lower_grey, "upper": upper_grey}, self._noise_grey)
         return Panoramas(

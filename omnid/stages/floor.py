@@ -1,4 +1,4 @@
-"""The floor that a stage uses: the one that the rig states, or else the one that its pairs show."""
+"""The floor of a stage: as the rig states it, else as found in the points of its pairs."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ class FrontEnd:
     def __init__(
         self, geometry: Geometry, config: Config, health: RigHealth | None = None, *, load: Load = full_load
     ) -> None:
-        """health: state of the rig; None: one of its own, as the configuration checks it."""
+        """health: state of the rig; None: a new one, with the check of the configuration."""
         self.geometry = geometry
         self.health = health or RigHealth(geometry.cylinder, config.rig.check)
         self.dewarp = Dewarp(geometry, config.panorama, config.camera)

@@ -45,8 +45,10 @@ class LockstepDrive:
 
     def process(self, odometry: OdometryUpdate) -> VelocityCommand:
         """Return the command that follows from a pose, at its stamp."""
+        # 1. The ticks since the last pose, by which a gap in the log stops the wheels.
         stamp_ns = odometry.stamp_ns
         self._tick_until(stamp_ns)
+        # 2. The tick at this pose, whose command is recorded.
         self._law.set_pose(controller_pose(odometry, self._T_base_rig))
         output = self._step(stamp_ns)
         return VelocityCommand(stamp_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)

@@ -70,6 +70,7 @@ class Mapping:
 
     def process(self, odometry: OdometryUpdate) -> MapUpdate | None:
         """Add the points of a pair; return the map when it is due."""
+        # 1. The path has all poses, the map the points of those pairs that are due.
         self._newest = odometry.seq, odometry.stamp_ns
         self._path.add((float(odometry.T_odom_rig[0, 3]), float(odometry.T_odom_rig[1, 3])))
         if odometry.state == TrackingState.TRACKING and self._is_due(odometry):
@@ -79,6 +80,7 @@ class Mapping:
             sure = depth.variance_m2 < self._config.max_sigma_m**2
             points = se3.apply(odometry.T_odom_rig, depth.points[sure])
             self._map.insert(points, depth.variance_m2[sure], odometry.seq)
+        # 2. The map, where a period has passed since the last one.
         if not self._every_ns or odometry.stamp_ns - self._given_ns < self._every_ns:
             return None
         self._given_ns = odometry.stamp_ns

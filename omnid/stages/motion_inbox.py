@@ -30,7 +30,7 @@ class MotionInbox:
         self.dropped = 0  # because none took them, their stamps are far ahead, or their rates are not finite
 
     def add(self, sample: MotionSample) -> None:
-        """Add a sample; one whose rates are not finite is dropped, as it would make the poses so."""
+        """Add a sample, unless its rates are not finite, which would make the poses not finite too."""
         rates = (sample.velocity_mps,) if isinstance(sample, WheelSample) else _rates(sample)
         if not all(map(math.isfinite, rates)):
             self.dropped += 1

@@ -48,8 +48,8 @@ NavigationInput: TypeAlias = (
 )
 
 REPEAT_NS = 1_000_000_000  # the state is given again after that time, while nothing changes
-# Ends of the floor that are nearer are obstacles to a base that was stopped by one; farther ones are where the floor is
-# no longer seen well. A base that stops for one has it 0.4 m ahead, by the defaults of its outline.
+# Ends of the seen floor nearer than this are obstacles to a base that was stopped by one; at farther ones the floor is
+# merely no longer seen well. A base that stops has the end 0.4 m ahead, by the defaults of its outline.
 UNKNOWN_M = 1.2
 RING_NS = 2_000_000_000  # older rings show nothing of now: the collision monitor then stops the base
 MOST_ANSWERS = 64  # An update repeats as many answers as requests may wait: a sink may miss updates.
@@ -304,7 +304,7 @@ class NavigationStage:
 
 
 def _positions(ring: ObstacleRing, ranges_m: NDArray[np.float32]) -> Array:
-    """Return the positions (N, 2) in odom of what stands at finite ranges (SECTORS,) [m] of a ring."""
+    """Return the positions (N, 2) in odom of the obstacles at finite ranges (SECTORS,) [m] of a ring."""
     seen = np.isfinite(ranges_m)
     ranges_m, directions = ranges_m[seen].astype(np.float64), azimuths()[seen]
     points = np.column_stack([ranges_m * np.cos(directions), ranges_m * np.sin(directions), np.zeros(len(ranges_m))])

@@ -53,9 +53,11 @@ class Obstacles:
         if not self._is_due(odometry):
             return None
         self._last_ns = odometry.stamp_ns
+        # 1. The floor, from points of pairs whose pose is known, until it is known.
         if self.floor.wants_points and odometry.state is not TrackingState.LOST:
             # As they were matched: the fit leaves out by itself what is no floor.
             self.floor.add(self._dense.points(odometry.depth.panoramas, odometry.depth.exposure))
+        # 2. The ring.
         return self._rings.add(odometry, self.floor)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:

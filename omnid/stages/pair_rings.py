@@ -58,17 +58,17 @@ class PairRings:
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
         if odometry.state is TrackingState.LOST:
-            # The place is not known. What is known in odom holds again when odometry finds its landmarks again.
+            # The grid stays: it holds again once odometry recognises its landmarks.
             self._tracker.clear()
             return unknown
         self._leave_out_fixed_parts(odometry)
         columns = self._columns_of(camera_floor, panoramas)
         if columns is None:
             return unknown
-        # 2. The evidence of the images without their dead and blind parts, where nothing is watched any longer.
+        # 2. The evidence of the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
         evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
-        # 3. The grid, its ring, and the obstacles that move.
+        # 3. The grid, its ring, and the moving obstacles.
         pose = transform(planar(T_odom_base))
         unseen = self._unwatched.directions(panoramas.tiles.unknown)
         ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched, unseen)
@@ -94,7 +94,7 @@ class PairRings:
             self._is_misled = False
 
     def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
-        """Return the columns for the floor and what is seen of it, None without a floor."""
+        """Return the columns for the floor and what is left out, made anew where these change; None: no floor."""
         floor = camera_floor.floor
         if floor is not None and floor is not self._of_floor:
             geometry, settings = self._geometry, self._settings

@@ -119,7 +119,7 @@ class Places:
         return []
 
     def corrected(self, update: PlaceUpdate) -> Array:
-        """Return T_map_rig (4, 4) of an earlier pose as the map knows it now; as it was where its keyframe is gone."""
+        """Return T_map_rig (4, 4) of an earlier pose by the map of now; unchanged if its keyframe was dropped."""
         T_map_rect = self._localiser.places.poses.get(update.keyframe)
         if T_map_rect is None:
             return update.T_map_rig

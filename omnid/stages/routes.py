@@ -29,9 +29,9 @@ class RouteMap:
     """The map of places that routes are tied to, as the newest update has it."""
 
     def __init__(self, name: str, T_base_rig: Array, T_rig_rect: Array, *, is_new: bool) -> None:
-        """name: of its file; empty: it is not saved, so that no route can be tied to it.
+        """name: of the map's file; empty: the map is not saved, so no route can be tied to it.
 
-        is_new: it was empty before this run, and lies where odom began.
+        is_new: the map was empty before this run, and its frame is odom at the start.
         """
         self.name, self.is_new = name, is_new
         self._T_base_rig, self._T_rig_base = T_base_rig, se3.inverse(T_base_rig)

@@ -116,7 +116,7 @@ class FrameMatcher:
         self._waiting[frame.camera].remove(frame)
 
     def join(self, *pair: Frame) -> None:
-        """Make frames a pair: no later frame can match what waits from before them, so that is dropped and counted."""
+        """Make frames a pair. Older waiting frames can match no later one: they are dropped and counted."""
         for frame in pair:
             waiting = self._waiting[frame.camera]
             while waiting and waiting[0].stamp_ns <= frame.stamp_ns:

@@ -150,7 +150,7 @@ class Driver:
 
 
 def _happens(is_so: Callable[[], bool]) -> bool:
-    """Return True as soon as it is so, False after CONNECT_S."""
+    """Wait for a condition; return True once it holds, False after CONNECT_S."""
     deadline_s = time.monotonic() + CONNECT_S
     while not is_so():
         if time.monotonic() > deadline_s:

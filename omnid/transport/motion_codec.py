@@ -47,8 +47,9 @@ def gyro_cdr(sample: GyroSample, stamp_ns: int) -> bytes:
 def sample_from_cdr(
     payload: bytes, schema: str, offset_ns: int, joints: JointWheels | None = None
 ) -> MotionSample | None:
-    """Decode a sample from the network; None of other joints. offset_ns: from the stamps of images to the sender's
-    clock. joints: the wheels in a JointState.
+    """Decode a sample from the network; None for a JointState that has no wheel.
+
+    offset_ns: from the stamps of images to the sender's clock. joints: the wheels in a JointState.
 
     Raise OmnidError for a message without a stamp, with rates that are not finite or absurd, and for other bytes.
     """

@@ -30,9 +30,9 @@ _MAX_PENDING: Final = 1000
 _ACCEPT_TIMEOUT_MS: Final = 1000
 _MAX_COMMAND_BYTES: Final = 16_384  # Limit of all commands but paths.
 _MAX_SESSIONS: Final = 128  # each holds received fragments in memory
-# Of each link and key: zenoh ends each query that a ring drops by a message of its own, which takes time. What is
-# refused has an empty answer at once, so that a program that asks for one key in a loop, as fast as answers come over
-# loopback (0.1 ms), must ask again (`omnid.client` does).
+# Limit for each link and key: zenoh ends each query that a ring drops by a message of its own, which takes time. A
+# refused query has an empty answer at once. A program that asks for one key in a loop over loopback (0.1 ms an answer)
+# is refused some, and must ask again, as `omnid.client` does.
 _MAX_QUERIES_HZ: Final = 1000.0
 _TLS: Final = {
     "tls_ca": "root_ca_certificate",

@@ -13,7 +13,9 @@ from contextlib import ExitStack, contextmanager
 from importlib.resources import files
 from pathlib import Path
 
-from tests.replay.live import Base, Daemon, Operator, answers, free_port, started, wait_until
+from tests.ports import free_port
+from tests.replay.live import Base, Daemon, Operator, answers, started
+from tests.waiting import wait_until
 
 FOLDER, _, HZ = os.environ.get("OMNID_BENCHMARK_LOG", f"{files('omnid.sample')}:10").rpartition(":")
 RIG = ("--rig", f"{FOLDER}/rig.toml") if Path(FOLDER, "rig.toml").exists() else ()  # the sample's is attached

@@ -28,7 +28,8 @@ from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import decode_pose
 from tests.benchmark.results import Column, ResultTable
-from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, wait_until
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.benchmark
 RATE_HZ = 30.0

@@ -23,8 +23,9 @@ from omnid.client import Pose, Robot
 from omnid.transport.bus import Bus, BusConfig
 from tests.benchmark.results import Column, ResultTable
 from tests.benchmark.test_bus import cpu_s, publish, sink_on
-from tests.omnid.transport.bus_fixtures import free_endpoint, script, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, script
 from tests.omnid.web.servers import ROOT, WebServer, served
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.benchmark
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")

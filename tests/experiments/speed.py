@@ -117,7 +117,7 @@ def _one_thread() -> Iterator[None]:
 
 def _track(before: Panoramas, now: Panoramas) -> object:
     points = corners(before.lower, before.visible, FEATURES)
-    turn = correlation_peaks(before.lower.panorama, now.lower.panorama, now.visible, 1)[0]
+    turn = correlation_peaks(before.lower.panorama, now.lower.panorama, now.visible)[0]
     shift = np.array([turn * before.lower.width / (2 * np.pi), 0.0])
     return track(before.lower, now.lower, points, points + shift, KltSettings())
 

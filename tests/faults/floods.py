@@ -21,7 +21,8 @@ import zenoh
 from omnid.transport.codec import twist_stamped_cdr
 from tests.benchmark.results import Column, ResultTable
 from tests.faults.crowds import timed_stop
-from tests.replay.live import ROOT, Operator, free_port, robot
+from tests.ports import free_port
+from tests.replay.live import ROOT, Operator, robot
 
 KEYS: Final = ("cmd/imu", "cmd/route", "cmd/arm", "cmd/twist", "cmd/stop", "cmd/nothing", "@request/arm")
 SENDERS: Final = 2

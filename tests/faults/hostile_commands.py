@@ -12,7 +12,8 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.transport import codec
 from tests.benchmark.results import Column, ResultTable
 from tests.faults.mutation import mutated
-from tests.replay.live import Operator, robot, wait_until
+from tests.replay.live import Operator, robot
+from tests.waiting import wait_until
 
 MOTIONS: Final = ("cmd/heading", "cmd/twist", "cmd/planner/twist", "cmd/unknown")
 MANUAL: Final = ("--set", "controller.arming=manual")

@@ -38,7 +38,9 @@ from tests.faults.stop_times import (
     failed_cells,
     measured,
 )
-from tests.replay.live import Base, Operator, answers, free_port, started, wait_until
+from tests.ports import free_port
+from tests.replay.live import Base, Operator, answers, started
+from tests.waiting import wait_until
 
 PATIENCE_S: Final = 120.0
 DRIVES_MPS: Final = 0.25

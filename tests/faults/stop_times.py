@@ -19,7 +19,8 @@ import numpy as np
 
 from tests.benchmark.results import Column, ResultTable
 from tests.faults.trials.trial import FAULTY_DAEMON
-from tests.replay.live import Base, Daemon, Operator, robot, wait_until
+from tests.replay.live import Base, Daemon, Operator, robot
+from tests.waiting import wait_until
 
 SPEED_MPS: Final = 0.3
 POLL_S: Final = 0.002

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,7 +14,7 @@ class Stereo:
     ratio: float = knob(0.8, "second best over best, 1", low=0.0, high=1.0)
     method: str = knob("sad", "cost of a match", choices=("sad", "census"))
     subpixel: bool = knob(True, "whether to refine")
-    horizon_s: float = knob(math.inf, "how long a match is kept, s", low=0.0, finite=False)
+    horizon_s: float = knob(1.5, "how long a match is kept, s", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)

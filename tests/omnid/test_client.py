@@ -25,7 +25,8 @@ from omnid.transport.decode import decode_cloud, decode_diagnostics, decode_map,
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script
+from tests.waiting import wait_until
 
 
 @contextlib.contextmanager

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,26 +22,12 @@ from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import SimulatedMotor
 from omnid.transport import codec
 from omnid.transport.records import OdometryRecord
+from tests.ports import free_port
+from tests.waiting import ended, wait_until
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 60.0  # timeout of a wait on a loaded machine; not a measured time
 COMMAND_PERIOD_S = 0.05  # of the operator's commands
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-
-
-def wait_until(happens: Callable[[], object], what: str = "it", patience_s: float = PATIENCE_S) -> None:
-    """Return once it happens; raise AssertionError after the timeout."""
-    deadline_s = time.monotonic() + patience_s
-    while not happens():
-        assert time.monotonic() < deadline_s, f"{what} did not happen within {patience_s:g} s"
-        time.sleep(0.02)
-
-
-def free_port() -> int:
-    """Return a port that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def answers(port: int) -> bool:
@@ -204,9 +190,7 @@ class Daemon:
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
         """Send a signal and return the exit code and stderr."""
-        self.process.send_signal(number)
-        _, err = self.process.communicate(timeout=PATIENCE_S)
-        return self.process.returncode, err
+        return ended(self.process, number)
 
 
 def command_line(scene: Path, port: int, motor: Path | None, *words: object, module: str = "omnid") -> list[str]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.replay.live import Base, Operator, answers, command_line, free_port, patient, started, wait_until
+from tests.ports import free_port
+from tests.replay.live import Base, Operator, answers, command_line, patient, started
+from tests.waiting import wait_until
 
 
 def recorded_run(scene: Path, folder: Path, poses: int) -> Path:

@@ -15,8 +15,10 @@ import pytest
 from omnid.client import Robot
 from omnid.core.control.command_sources import LOWER_PRIORITY, OPERATOR, OTHER_SENDER, PLANNER
 from omnid.core.control.safety_rules import FAILED
+from tests.ports import free_port
 from tests.replay.command import Command
-from tests.replay.live import PATIENCE_S, ROOT, Base, Daemon, Operator, free_port, patient, robot, wait_until
+from tests.replay.live import ROOT, Base, Daemon, Operator, patient, robot
+from tests.waiting import PATIENCE_S, wait_until
 
 # At half the speed of the log: the tests look at what is commanded.
 MANUAL = (

@@ -24,9 +24,11 @@ from omnid.runs.run_result import RunFailedError
 from omnid.tracking_state import MapState
 from omnid.transport.status_names import Key
 from tests.conftest import PAIRS
+from tests.ports import free_port
 from tests.replay.command import Command
-from tests.replay.live import Daemon, Operator, answers, command_line, free_port, started, wait_until
+from tests.replay.live import Daemon, Operator, answers, command_line, started
 from tests.simulation.rigs import with_upper_rotated
+from tests.waiting import wait_until
 
 
 @pytest.fixture(scope="module")

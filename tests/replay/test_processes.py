@@ -7,8 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -25,13 +24,14 @@ from omnid.transport.records import OdometryRecord
 from tests.busy import stopped_by_turns
 from tests.conftest import PAIRS
 from tests.ply import read_ply
+from tests.ports import free_port
 from tests.replay.command import Command, Result, rows
 from tests.replay.edited import images, save
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 
 ROOT = Path(__file__).parents[2]
-PATIENCE_S = 60.0
 SLICE_S = 0.1
 PAUSE_PAIRS = 36_000  # an hour
 FEW = ("--seconds", 0.55)  # of the scene, where the end of a run is looked at
@@ -61,13 +61,6 @@ def started(command: list[str]) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
-
-
-def wait_until(happens: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + PATIENCE_S
-    while not happens():
-        assert time.monotonic() < deadline_s, "timeout"
-        time.sleep(0.02)
 
 
 @pytest.fixture(scope="module")
@@ -110,8 +103,8 @@ def test_signals_leave_whole_results(tmp_path: Path, paused: Path, number: int, 
     assert written - Result(process.returncode, out, err).count("queue") <= recorded <= written
 
 
-def test_another_process_receives_the_poses(tmp_path: Path, scene: Path, unused_tcp_port: int) -> None:
-    endpoint = f"tcp/127.0.0.1:{unused_tcp_port}"
+def test_another_process_receives_the_poses(tmp_path: Path, scene: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     poses: list[OdometryRecord] = []
     config = zenoh.Config()
     for key, value in (("listen/endpoints", f'["{endpoint}"]'), ("scouting/multicast/enabled", "false")):

@@ -16,21 +16,11 @@ import numpy as np
 import pytest
 
 from omnid.formats.tum import read_tum
+from tests.ports import free_port
 from tests.replay.command import Command
 from tests.replay.edited import images, save
-from tests.replay.live import (
-    PATIENCE_S,
-    ROOT,
-    Base,
-    Operator,
-    answers,
-    command_line,
-    free_port,
-    patient,
-    robot,
-    started,
-    wait_until,
-)
+from tests.replay.live import ROOT, Base, Operator, answers, command_line, patient, robot, started
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from tests.replay.live import PATIENCE_S, ROOT, patient, robot, wait_until
+from tests.replay.live import ROOT, patient, robot
+from tests.waiting import PATIENCE_S, wait_until
 
 UP = b"\x1b[A"
 MANUAL = (*patient("controller.arming=manual"), "--pace", "0.5")  # what is seen matters little

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from omnid.core.control.safety_rules import ASKED, FAILED
-from tests.replay.live import command_line, robot, started, wait_until
+from tests.replay.live import command_line, robot, started
 from tests.replay.test_arming import MANUAL
+from tests.waiting import wait_until
 
 pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
 pytest.importorskip("websockets", reason="needs the packages of omnid[web]")

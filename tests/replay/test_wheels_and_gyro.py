@@ -34,8 +34,9 @@ from omnid.transport.status_names import MOTION, REFUSED_PREFIX
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, UPPER, Entry, compressed, write_log
 from tests.replay.edited import dark, images
-from tests.replay.live import robot, wait_until
+from tests.replay.live import robot
 from tests.simulation.motion_samples import SensorErrors, motion_samples
+from tests.waiting import wait_until
 
 DARK = range(12, 18)
 ERRORS = SensorErrors(distance=1.02, turn=0.97, wheel_offset_s=0.01, bias_radps=(0.0, 0.0, 0.01))

@@ -1,4 +1,4 @@
-"""Time until the outline of a moving base touches a point, on the arc of its motion; exact, in plain Python.
+"""A moving base: the way that it drove, and the time until its outline touches a point; exact, in plain Python.
 
 The base moves with (v, w): in its own frame a point at rest turns with -w about the centre (0, v / w).
 """
@@ -6,17 +6,20 @@ The base moves with (v, w): in its own frame a point at rest turns with -w about
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from typing import Final, NamedTuple
 
-from calib.se2 import Point, Pose2, seen_from
+from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
 from omnid.core.control.heading_controller import Twist
+from omnid.core.nanoseconds import S_PER_NS
 
 # Slower turns count as none; at 0.5 m/s an arc of 500 m, which errs by 4 mm in 2 m: enough.
 STRAIGHT_RADPS: Final = 1e-3
 SPARE_M: Final = 0.1  # Added to a reach beyond which nothing can lie, so that rounding does not count.
 TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
+MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
 
 
 class Outline(NamedTuple):
@@ -125,7 +128,7 @@ def within_reach(points: list[Point], pose: Pose2, reach_m: float) -> list[Point
 
 
 def driven_over(outline: Outline, points: list[Point], pose: Pose2, velocity_mps: float) -> bool:
-    """Return whether a base that has come to this pose drove over a point that was ahead of the edge that leads.
+    """True if a base that has come to this pose drove over a point that was ahead of its leading edge.
 
     Such a point is inside the outline or behind it, where a motion straight on does not take it nearer.
     """
@@ -167,3 +170,35 @@ def sector_directions(count: int) -> tuple[tuple[float, float, float], ...]:
     """Return the azimuth of the middle of each sector of a ring, its cosine and its sine."""
     azimuths = ((k + 0.5) * (math.tau / count) - math.pi for k in range(count))
     return tuple((azimuth, math.cos(azimuth), math.sin(azimuth)) for azimuth in azimuths)
+
+
+class DrivenMotions:
+    """The newest MOST_MOTIONS motions, each from its stamp until that of the next one."""
+
+    def __init__(self) -> None:
+        self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
+
+    def add(self, now_ns: int, motion: Twist) -> None:
+        """Take the motion that the base follows from now on."""
+        self._motions.append((now_ns, motion))
+
+    def reach_back_to(self, stamp_ns: int) -> bool:
+        """True if no motion after a stamp was forgotten."""
+        return len(self._motions) < MOST_MOTIONS or self._motions[0][0] <= stamp_ns
+
+    def since(self, stamp_ns: int, now_ns: int) -> Pose2:
+        """Return the pose of the base now, in its own frame at a stamp."""
+        # 1. The motions since the stamp and their durations, newest first.
+        pieces, until_ns = [], now_ns
+        for at_ns, motion in reversed(self._motions):
+            begin_ns = max(at_ns, stamp_ns)
+            if until_ns > begin_ns:
+                pieces.append((motion, (until_ns - begin_ns) * S_PER_NS))
+            until_ns = min(until_ns, begin_ns)
+            if at_ns <= stamp_ns:
+                break
+        # 2. The poses along them, oldest first.
+        pose = IDENTITY
+        for motion, dt_s in reversed(pieces):
+            pose = composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, dt_s))
+        return pose

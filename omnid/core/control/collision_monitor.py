@@ -9,12 +9,12 @@ Unknown directions are not free. Plain Python: it runs in the process that steer
 from __future__ import annotations
 
 import math
-from collections import deque
 from typing import Final, NamedTuple
 
-from calib.se2 import IDENTITY, Point, Pose2, along_arc, composed, seen_from
+from calib.se2 import Point, Pose2, along_arc, composed, seen_from
 from omnid.core.control.collision_geometry import (
     TINY,
+    DrivenMotions,
     Outline,
     contact_s,
     driven_over,
@@ -28,10 +28,9 @@ from omnid.core.control.heading_controller import Twist
 from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.nanoseconds import S_PER_NS
 
-MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
-# Slope of the way towards what is unknown beside it, up to which it leads along that: a correction of the heading by
-# three degrees. The nearest corner would be 5 cm nearer after 1 m, before which newer rings judge again.
+# A way that approaches an unknown region at its side by no more than this slope runs along it, because a correction of
+# the heading by three degrees does. The nearest corner is then 5 cm nearer after 1 m, before which newer rings judge.
 ALONG_SLOPE: Final = 0.05
 # A base that was stopped resumes in that direction only faster than this (half as fast as a slower command), because
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
@@ -90,7 +89,7 @@ class CollisionMonitor:
         self._unwatched: list[Point] = []  # around the outline, where the images show nothing
         self._is_blind = False  # they show nothing at all
         self._moving: tuple[MovingPoint, ...] = ()
-        self._motions: deque[tuple[int, Twist]] = deque(maxlen=MOST_MOTIONS)
+        self._motions = DrivenMotions()
         self.reason = ""  # why the last step changed the motion
         self.share = 1.0  # share of the motion that was allowed; 0 also where only a turn on the spot was
         self._stopped_mps = 0.0  # motion that the last step stopped
@@ -117,7 +116,7 @@ class CollisionMonitor:
         """Return the part of a motion that is allowed now; speed and yaw rate are reduced together, as on one arc.
 
         to_heading: the yaw rate leads to a heading, to which the base turns on the spot where it may not drive.
-        Otherwise it would stand for good where the arc to a free direction is closed.
+        Otherwise it would never move again where the arc to a free direction is closed.
         """
         # 1. Judge the motion by the obstacles; a base that was stopped stays so while it could only creep on.
         allowance = self._held(self._judged(now_ns, motion), motion)
@@ -141,48 +140,72 @@ class CollisionMonitor:
 
     def follow(self, now_ns: int, motion: Twist) -> None:
         """Take the motion that the base follows from now on."""
-        self._motions.append((now_ns, motion))
+        self._motions.add(now_ns, motion)
 
     def _judged(self, now_ns: int, motion: Twist) -> Allowance:
         """Return the strictest allowance of all rules."""
-        # 1. Without a recent ring nothing is known: the settings say whether the base stops, drives slowly or drives.
         settings = self._settings
         if not settings.check or (motion.velocity_mps == 0.0 and motion.yaw_rate_radps == 0.0):
             return FREE
+        # 1. Without a recent ring nothing is known.
         age_s = math.inf if self._stamp_ns is None else (now_ns - self._stamp_ns) * S_PER_NS
-        is_stale = not abs(age_s) <= settings.stale_s or self._has_forgotten()
-        if is_stale and settings.stale == IGNORE:
-            return FREE
-        if is_stale or (self._is_blind and settings.stale != IGNORE):
-            return self._capped(
-                motion, 0.0 if settings.stale == STOP else settings.slow_mps, RING_STALE if is_stale else UNSEEN
-            )
-        # 2. The distance within which obstacles matter: the way until the base stops, or of time_s if that is longer.
-        moved = self._moved_since(self._stamp_ns or now_ns, now_ns)
-        speed_mps = abs(motion.velocity_mps)
-        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
-        reach_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
-        reach_m += way_m + self._outline.radius_m
-        # 3. What the base has driven over since the ring's images is not passed as if it were free.
-        unknown = self._unknown + self._gaps, settings.unknown, UNKNOWN
-        known = (self._points, STOP, BLOCKED), unknown, (self._unwatched, settings.stale, UNWATCHED)
-        for points, policy, reason in known if speed_mps > 0.0 else ():
-            if policy == STOP and driven_over(self._outline, points, moved, motion.velocity_mps):
-                return Allowance(0.0, reason)
-        # 4. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
+        without_ring = self._without_ring(age_s, motion)
+        if without_ring is not None:
+            return without_ring
+        # 2. What the base has driven over since the ring's images is not passed as if it were free.
+        moved, is_driving = self._motions.since(self._stamp_ns or now_ns, now_ns), motion.velocity_mps != 0.0
+        reason = self._driven_over(moved, motion.velocity_mps) if is_driving else ""
+        if reason:
+            return Allowance(0.0, reason)
+        # 3. Each rule by itself: obstacles, unknown and unwatched directions, moving obstacles.
+        reach_m = self._reach_m(abs(motion.velocity_mps))
         points = within_reach(self._points, moved, reach_m)
         allowances = [self._before(points, motion), self._near(points, motion)]
         if settings.unknown != IGNORE:
-            # Who stood beside or behind the base would hide the surface there; a thin thing was passed by the front.
+            # Gaps count ahead only: next to or behind the base a person would hide the surface that ends a gap, and
+            # the front of the base has already passed where a thin object could be.
             gaps = self._ahead(within_reach(self._gaps, moved, reach_m), motion)
             ends = within_reach(self._unknown, moved, reach_m) + gaps
             allowances.append(self._into_unknown(ends, motion, settings.unknown, UNKNOWN))
-        if settings.stale != IGNORE and self._unwatched and speed_mps > 0.0:
+        if settings.stale != IGNORE and self._unwatched and is_driving:
             ends = within_reach(self._unwatched, moved, reach_m)
             allowances.append(self._into_unknown(ends, motion, settings.stale, UNWATCHED))
         if self._moving:
             allowances += [self._before_moving(moved, age_s, motion), self._beside_moving(moved, age_s, motion)]
         return min(allowances)
+
+    def _without_ring(self, age_s: float, motion: Twist) -> Allowance | None:
+        """Return the allowance that the settings give where no recent ring shows anything; None: a ring does.
+
+        age_s: of the ring's images.
+        """
+        settings = self._settings
+        is_stale = not abs(age_s) <= settings.stale_s or not self._motions.reach_back_to(self._stamp_ns or 0)
+        if settings.stale == IGNORE:
+            return FREE if is_stale else None
+        if not is_stale and not self._is_blind:
+            return None
+        most_mps = 0.0 if settings.stale == STOP else settings.slow_mps
+        return self._capped(motion, most_mps, RING_STALE if is_stale else UNSEEN)
+
+    def _driven_over(self, moved: Pose2, velocity_mps: float) -> str:
+        """Return the reason to stop if the base drove over what the ring shows ahead of it, else an empty string."""
+        settings = self._settings
+        for points, policy, reason in (
+            (self._points, STOP, BLOCKED),
+            (self._unknown + self._gaps, settings.unknown, UNKNOWN),
+            (self._unwatched, settings.stale, UNWATCHED),
+        ):
+            if policy == STOP and driven_over(self._outline, points, moved, velocity_mps):
+                return reason
+        return ""
+
+    def _reach_m(self, speed_mps: float) -> float:
+        """Return the distance within which obstacles matter: of the way to a stop, or of time_s if that is longer."""
+        settings = self._settings
+        way_m = max(speed_mps * settings.time_s, speed_mps**2 / (2 * BRAKING_SHARE * self._deceleration))
+        reach_m = max(settings.stop_m + settings.slow_m, settings.side_m, settings.slow_side_m)
+        return reach_m + (way_m + self._outline.radius_m)
 
     def _before(self, points: list[Point], motion: Twist) -> Allowance:
         """Keep the time to collision, and stop before what is in the stop polygon."""
@@ -239,8 +262,8 @@ class CollisionMonitor:
         """
         edge_mps = abs(motion.velocity_mps)
         if motion.velocity_mps == 0.0:
-            # Corners swing as far as floor was seen. Where none was, what is there may be at the outline already: it
-            # does not keep the base from turning away.
+            # Corners may swing as far as floor was seen. An unknown region at the outline itself does not count: it
+            # would keep the base from turning away.
             unknown = self._stop_polygon(motion).parted(unknown)[1]
             edge_mps = abs(motion.yaw_rate_radps) * self._outline.radius_m
         least = 0.0 if policy == STOP else min(1.0, self._settings.slow_mps / edge_mps)
@@ -276,8 +299,9 @@ class CollisionMonitor:
         return slow
 
     def _beside_moving(self, moved: Pose2, age_s: float, motion: Twist) -> Allowance:
-        """Drive so slowly beside a person that the base stands by the time the person, turned round, or somebody who
-        was hidden could reach it: with a gap g `g = WALK_MPS (TURN_S + v / a)`. Who is behind does not count.
+        """Drive so slowly next to a person that the base is at rest before that person, or a hidden one, reaches it.
+
+        The person may turn round. With a gap g: `g = WALK_MPS (TURN_S + v / a)`. Persons behind the base do not count.
         """
         side, braking_mps2 = math.copysign(1.0, motion.velocity_mps), BRAKING_SHARE * self._deceleration
         now = [(one.x_m + one.vx_mps * age_s, one.y_m + one.vy_mps * age_s) for one in self._moving]
@@ -297,22 +321,3 @@ class CollisionMonitor:
             return Allowance(0.0, reason)
         edge_mps = max(abs(motion.velocity_mps), abs(motion.yaw_rate_radps) * self._outline.radius_m)
         return FREE if edge_mps <= speed_mps else Allowance(speed_mps / edge_mps, reason)
-
-    def _has_forgotten(self) -> bool:
-        """Return whether motions since the ring's images are remembered no more."""
-        return len(self._motions) == MOST_MOTIONS and self._motions[0][0] > (self._stamp_ns or 0)
-
-    def _moved_since(self, stamp_ns: int, now_ns: int) -> Pose2:
-        """Return the pose of the base now in the frame of the ring, by the motions since its images."""
-        pose, until_ns = IDENTITY, now_ns
-        pieces = []
-        for at_ns, motion in reversed(self._motions):
-            begin_ns = max(at_ns, stamp_ns)
-            if until_ns > begin_ns:
-                pieces.append((motion, (until_ns - begin_ns) * S_PER_NS))
-            until_ns = min(until_ns, begin_ns)
-            if at_ns <= stamp_ns:
-                break
-        for motion, dt_s in reversed(pieces):
-            pose = composed(pose, along_arc(motion.velocity_mps, motion.yaw_rate_radps, dt_s))
-        return pose

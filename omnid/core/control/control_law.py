@@ -167,7 +167,7 @@ class ControlLaw:
         self.arming.request(request)
 
     def stand(self) -> None:
-        """Take the base to stand now, because its motor controller has stopped it: the next step starts from there."""
+        """Take the base to be at rest, because its motor controller has stopped it: the next step starts from there."""
         self.motion = STOP
 
     def end(self) -> None:
@@ -177,7 +177,7 @@ class ControlLaw:
     def step(
         self, now_ns: int, dt_s: float, *, late_s: float = 0.0, motor_failed: bool = False, motor_stopped: bool = False
     ) -> ControlOutput:
-        """Return the motion dt_s after the one that the base follows now, and take it for the one it follows next."""
+        """Return the motion that the base is to follow from now on; the previous one was commanded dt_s ago."""
         # 1. Faults, from deadlines and from motion that does not fit together, disarm; requests to arm are answered.
         inputs = self.plausibility.added_to(self._inputs(now_ns, late_s, motor_failed, motor_stopped))
         deadlines = self._settings.deadlines
@@ -197,7 +197,7 @@ class ControlLaw:
         self._pose_jumped = False
         if self.reason:
             self._void_ns = now_ns
-        # 3. The motion: a ramp to a stand, or towards the setpoint as far as trust and obstacles allow.
+        # 3. The motion: a ramp to rest, or towards the setpoint as far as trust and obstacles allow.
         pose, command = self._pose, self.commands.current
         if self.reason or pose is None or command is None:
             self.motion, heading_rad = self._settings.limits.step(STOP, self.motion, dt_s), self._goal.stay()
@@ -216,7 +216,7 @@ class ControlLaw:
         wanted = self._heading_controller.step(setpoint, heading_rad, dt_s, self.motion)
         limits = self._settings.limits
         motion = limits.step(self.plausibility.slowed(wanted, limits), self.motion, dt_s)
-        # Last of all, the part of this motion that obstacles allow, reached with the deceleration of the limits.
+        # The collision monitor comes last; what it allows is reached with the deceleration of the limits.
         allowed = self.collision.step(now_ns, motion, to_heading=setpoint.heading_rad is not None)
         self.motion = limits.step(allowed, self.motion, dt_s)
         turn_rad = self.motion.yaw_rate_radps * min(max(dt_s, 0.0), LONGEST_TICK_S)
@@ -226,7 +226,7 @@ class ControlLaw:
     def _jumps(self, before: ControllerPose, pose: ControllerPose) -> bool:
         """True if the heading has changed by more than the base can have turned since the last pose.
 
-        That is: by more than it turns from a stand, and by more than it turns with the yaw rate of the last pose.
+        That is: by more than it turns from rest, and by more than it turns with the yaw rate of the last pose.
         """
         limits, passed_s = self._settings.limits, abs(pose.stamp_ns - before.stamp_ns) * S_PER_NS
         turned_rad = abs(wrap_angle(pose.heading_rad - before.heading_rad))

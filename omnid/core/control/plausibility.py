@@ -17,7 +17,7 @@ MOTION_DOUBTFUL: Final = "the motion that is seen or reported is not the command
 
 
 class MotorReport(NamedTuple):
-    """The part of a motor controller's status that is judged; NaN where it knows a number not."""
+    """The part of a motor controller's status that is judged; NaN: the controller does not report this value."""
 
     motion: Motion
     fault: int = 0  # its own number; 0: none

@@ -80,9 +80,9 @@ def _disagree(reason: str) -> Rule:
     return Rule(reason, True, lambda now, _: now.disagreement == reason)
 
 
-# The first rule that holds is reported. A NaN is a reason, and so is an age as far below 0 as it may be above: no pose
-# comes from the future. The end and a stop are no faults: nothing follows the end, and a stop latches in any mode. A
-# heading that jumps is no reason: odometry has closed a gap, and only setpoints from before it are void.
+# The first rule that holds is reported. A NaN is a reason. A pose from the future by more than the deadline is one too.
+# The end and a stop are no faults: nothing follows the end, and a stop latches in any mode. A heading that jumps is no
+# reason: odometry has closed a gap, and only setpoints from before the jump are void.
 RULES: Final = (
     Rule(ENDS, False, lambda now, _: now.ending),
     Rule(ASKED, False, lambda now, _: now.stop_asked),

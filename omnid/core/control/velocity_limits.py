@@ -54,7 +54,7 @@ class VelocityLimits:
         if goal_mps >= speed_mps:
             speed_mps = min(goal_mps, speed_mps + self.acceleration_mps2 * dt_s)
         else:
-            # The time left after a stand; without one it has no effect, as the goal is not beyond it.
+            # The time that is left once the base is at rest; it has an effect only where the goal is of the other sign.
             left_s = max(0.0, dt_s - speed_mps / self.deceleration_mps2)
             slowed_mps = max(goal_mps, 0.0, speed_mps - self.deceleration_mps2 * dt_s)
             speed_mps = max(min(goal_mps, slowed_mps), slowed_mps - self.acceleration_mps2 * left_s)

@@ -92,7 +92,7 @@ class ScanGrid:
         return self._grid(np.maximum(self._odds, self._floor_odds))
 
     def open_grid(self) -> Grid:
-        """Return the same, but a cell is free where views passed through it: something low or thin may stand there."""
+        """Return the same, but a cell is free where views passed through it: something low or thin may be there."""
         return self._grid(self._odds)
 
     def _grid(self, odds: Cells) -> Grid:

@@ -123,13 +123,13 @@ class Follower:
         return Following(STAND, left_m, approach.offset_m, True)
 
     def _align(self, pose: Array, speed_mps: float, yaw_rate_radps: float) -> Following:
-        """Turn to the heading of the goal, standing; then drive what is missing, or end."""
+        """Turn to the heading of the goal on the spot; then drive the distance that is missing, or end."""
         goal_rad, missing = self.path.final_heading_rad, self.path.goal - pose[:2]
         missing_m = float(np.hypot(*missing))
         error_rad = 0.0 if goal_rad is None else wrap_angle(goal_rad - float(pose[2]))
-        stands = abs(speed_mps) < SETTLED_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
+        is_at_rest = abs(speed_mps) < SETTLED_MPS and abs(yaw_rate_radps) < SETTLED_RADPS
         within = abs(error_rad) <= math.radians(self._settings.goal_deg)
-        self._settled = self._settled + 1 if stands and within else 0
+        self._settled = self._settled + 1 if is_at_rest and within else 0
         setpoint = STAND if goal_rad is None else Setpoint(0.0, goal_rad)
         if self._settled < SETTLED:
             return Following(setpoint, missing_m, 0.0, True)

@@ -33,7 +33,7 @@ RETRY_S: Final = 10.0  # The base returns after this time in any case, to search
 LONGEST_RETRY_S: Final = 300.0  # Twelve attempts an hour, so that a way that becomes free is found.
 FREE_S: Final = 1.0  # The way ahead must be free for this time: rings vote for half a second.
 ARRIVED_M: Final = 0.1  # The way ends this far from its last point; enough: it is one spacing.
-FAR_M: Final = 1e3  # Distance where nothing is seen, so that it is larger than any that is measured.
+FAR_M: Final = 1e3  # Distance in directions without an obstacle: larger than any measured one.
 NARROWER_M: Final = 0.005  # Least change of width between two places of the way: more than rounding.
 
 

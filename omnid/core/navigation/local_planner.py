@@ -136,7 +136,7 @@ class LocalPlanner:
             self._standing_room_m,
         )
         share, coming = yielding(path, leg_left_m, moving, pace)
-        # 3. The base goes around those that would reach it where it waits.
+        # 3. The base goes around moving obstacles that would reach it where it waits for them.
         outlines = moving.outlines(coming, pose[:2], SHARE * pursuit.velocity_mps)
         obstacles = np.vstack([moving.others(obstacles), outlines])
         detour = self._around_standing(pose, path, obstacles, wanted, leg_left_m, moving)

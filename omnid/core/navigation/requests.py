@@ -122,7 +122,7 @@ def navigation_verb(text: str) -> NavigationVerb:
 
 
 def route_name(text: str) -> str:
-    """Return a name that is one, so that it can be a part of a file name. Raise OmnidError for any other text."""
+    """Return the name of a route, which can be part of a file name. Raise OmnidError for a text that cannot."""
     if not _NAME.fullmatch(text):
         raise OmnidError(
             f"{_shown(text)} is no name of a route: expected letters, digits, '-' and '_', a letter or "

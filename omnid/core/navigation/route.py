@@ -39,7 +39,7 @@ FarKeyframe = Callable[[int], "KeyframePose | None"]
 class KeyframePose(NamedTuple):
     """A keyframe of the map."""
 
-    stamp_ns: int  # stamp of its images, which distinguishes it from one of the same number in another map
+    stamp_ns: int  # stamp of its images: another map may have another keyframe of the same number
     pose: Array  # x, y, yaw (3,) of the base in the map
 
 
@@ -63,7 +63,7 @@ class Route:
 
     @property
     def is_closed(self) -> bool:
-        """True if it ends where it began, so that it is driven in rounds."""
+        """True if the route ends at its start: then it is driven in rounds."""
         return math.dist(self.poses[0, :2], self.poses[-1, :2]) <= CLOSED_M
 
     def fits(self, keyframe: FarKeyframe) -> bool:
@@ -72,7 +72,7 @@ class Route:
         return found > 0 and found >= SAME_MAP * len(self.stamps_ns)
 
     def in_map(self, keyframe: FarKeyframe) -> Array:
-        """Return the poses (N, 3) in the map as it is now; where a keyframe is gone, moved as its neighbours are."""
+        """Return the poses (N, 3) in the map of now; those of dropped keyframes move with their neighbours."""
         moved = np.full((len(self.poses), 3), np.nan)
         for id in np.unique(self.keyframes):
             now = keyframe(int(id)) if id != NO_KEYFRAME else None

@@ -68,6 +68,10 @@ class PoseEstimate:
             assumed=NOTHING_ASSUMED,
         )
 
+    def distance_m(self, T_odom_rect: Array) -> float:
+        """Return the distance [m] of the pose from another one (4, 4)."""
+        return float(np.linalg.norm(self.T_odom_rect[:3, 3] - T_odom_rect[:3, 3]))
+
     @property
     def inlier_ratio(self) -> float:
         """Share of the tracked landmarks that are inliers."""

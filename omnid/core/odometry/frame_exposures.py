@@ -86,7 +86,7 @@ class FrameExposures:
         self._first = None if frame.times.is_at_once else frame
 
     def forget_first(self) -> None:
-        """Keep the map as it was started: a pose was refused, so that the next one is no step from its first frame."""
+        """Keep the map as it is: after a refused pose the next one shows no velocity at the first frame."""
         self._first = None
 
     def start_again(

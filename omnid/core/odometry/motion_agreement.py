@@ -39,22 +39,23 @@ from omnid.core.control.motion_monitor import (
     Difference,
     Witness,
 )
+from omnid.core.nanoseconds import SecondsSinceFirst
 
 Array = NDArray[np.float64]
 
 # A delay of 0.3 s is 0.15 m at 0.5 m/s, what the collision monitor keeps as distance; 10 % of 3 m is twice that.
 WINDOW_S, WINDOW_M, SCALE_SHARE, ALLOWED_LAG_S = 10.0, 3.0, 0.1, 0.3
-# Lags that are looked at: buffers of cameras hold up to a second or so, because drivers keep a handful of images.
+# Lags that are compared: buffers of cameras hold up to a second or so, because drivers keep a handful of images.
 LEAST_LAG_S, MOST_LAG_S, LAG_STEP_S = -0.5, 1.5, 0.05
-# Sigma of the lag of clocks that are in order, because motors follow commands and exposures last; motion within it may
-# be shown by one account before the other.
+# Sigma of a lag that is in order, because motors follow commands late and exposures last: of two accounts one may show
+# a motion so much before the other.
 LAG_SIGMA_S: Final = 0.1
 DOUBT_SHARE: Final = 0.5  # Share of a limit from which on the base drives slowly; by trial on development seeds.
 # The same of the newest second alone: 0.1 m, and a third of the way, as of images that play at half of the speed.
 SOON_S, SOON_M, SOON_SHARE = 1.0, 0.1, 1 / 3
 # Motion to the side as a share of the way: 0.15 m a metre ahead, as much as the collision monitor keeps as distance.
 ASIDE_SHARE: Final = 0.15
-STRAIGHT_RADPM: Final = 0.1  # Most turn of a straight way, because in a curve an offset of the rig shows motion aside.
+STRAIGHT_RADPM: Final = 0.1  # Most turn of a straight way, because in a curve an offset of the rig moves to the side.
 LEAST_M: Final = 0.05  # Least motion that counts, because an allowed delay moves a base of 0.2 m/s so far.
 TURN_RAD: Final = np.radians(5.0)  # because a gyro's bias is estimated to less than half a degree a second
 # Wheels whose diameters differ by 0.7 %, as those of the simulation, turn by 4 degrees over 3 m: that is no doubt yet.
@@ -155,8 +156,7 @@ class _Travel:
         if self.is_unknown:
             return np.full(starts_s.shape, np.nan)
         times, totals = np.array(self._times), np.array(self._totals)
-        at = (np.interp(when, times, totals, np.nan, np.nan) for when in (starts_s, ends_s))
-        start, end = at
+        start, end = (np.interp(when, times, totals, np.nan, np.nan) for when in (starts_s, ends_s))
         return np.asarray(end - start)
 
 
@@ -167,7 +167,7 @@ class MotionAgreement:
         self._steps: deque[_Step] = deque(maxlen=MOST_KEPT)
         self._wheels_m, self._wheels_rad, self._gyro_rad = _Travel(), _Travel(), _Travel()
         self._lags_s = np.arange(LEAST_LAG_S, MOST_LAG_S + LAG_STEP_S / 2, LAG_STEP_S)
-        self._zero_ns: int | None = None
+        self._clock = SecondsSinceFirst()
         self._compared_s = -np.inf
         self._late_since_s: float | None = None
         self.result = AGREE
@@ -175,7 +175,7 @@ class MotionAgreement:
     def add(self, samples: Iterable[MotionSample], gyro_bias_radps: float) -> None:
         """Add samples of wheels and gyro."""
         for sample in samples:
-            at_s = self._seconds(sample.stamp_ns)
+            at_s = self._clock.seconds(sample.stamp_ns)
             if isinstance(sample, WheelSample):
                 self._wheels_m.add(at_s, sample.velocity_mps)
                 self._wheels_rad.add(at_s, sample.yaw_rate_radps)
@@ -187,14 +187,14 @@ class MotionAgreement:
 
         aside_m: along its y axis.
         """
-        step = _Step(self._seconds(start_ns), self._seconds(end_ns), distance_m, turn_rad, aside_m)
+        step = _Step(self._clock.seconds(start_ns), self._clock.seconds(end_ns), distance_m, turn_rad, aside_m)
         self._steps.append(step)
         while self._steps and self._steps[0].end_s < step.end_s - WINDOW_S:
             self._steps.popleft()
         if step.end_s - self._compared_s < EVERY_S:
             return
         self._compared_s = step.end_s
-        if self._stand():
+        if self._is_at_rest():
             while self._steps and self._steps[0].end_s < step.end_s - STILL_S:
                 self._steps.popleft()
             self._late_since_s, self.result = None, AGREE
@@ -237,9 +237,7 @@ class MotionAgreement:
         """Compare the motion seen (N,) in steps with that of a sensor, both in metres or radians."""
         if travel.is_unknown:
             return _UNKNOWN
-        starts_s, ends_s, ways_m = spans
-        is_distance = quantity is DISTANCE
-        by_lag = travel.between(starts_s - self._lags_s[:, None], ends_s - self._lags_s[:, None])
+        by_lag = travel.between(spans.starts_s - self._lags_s[:, None], spans.ends_s - self._lags_s[:, None])
         near = int(np.argmin(np.abs(self._lags_s)))
         # 1. Delay; the newest steps have no samples of later times yet.
         known = np.isfinite(by_lag).all(axis=0) & np.isfinite(seen)
@@ -248,25 +246,31 @@ class MotionAgreement:
             if is_late:
                 lag_s = float(self._lags_s[best])
                 return _Finding(lag_s, 0.0, f"by {abs(lag_s):.1f} s")
-        # 2. Scale.
-        known = np.isfinite(by_lag[near]) & np.isfinite(seen)
+        # 2. Scale, at the likeliest of the allowed lags.
+        return self._scale(spans, seen, by_lag[near], quantity)
+
+    @staticmethod
+    def _scale(spans: _Spans, seen: Array, moved: Array, quantity: _Quantity) -> _Finding:
+        """Compare the sums of the motion seen (N,) and of that of a sensor (N,), over the newest WINDOW_M."""
+        starts_s, ends_s, ways_m = spans
+        is_distance = quantity is DISTANCE
+        known = np.isfinite(moved) & np.isfinite(seen)
         if known.sum() < LEAST_STEPS:
             return _UNKNOWN
-        moved, seen = by_lag[near, known][::-1], seen[known][::-1]  # the newest first
+        # 1. Both sums, of the newest steps.
+        moved, seen = moved[known][::-1], seen[known][::-1]
         path = np.cumsum(np.abs(moved))
         count = int(np.searchsorted(path if is_distance else np.cumsum(np.abs(ways_m[known][::-1])), WINDOW_M)) + 1
         length = float(path[min(count, len(path)) - 1])
         apart = float((moved[:count] - seen[:count]).sum())
         difference = abs(apart)
+        # 2. The limit: a share of the way, and the motion within the lag that is in order.
         is_whole = count <= len(path) or ends_s[-1] - starts_s[0] >= WINDOW_S - LEAST_STEPS * EVERY_S
-        limit = (
-            max(SCALE_SHARE * (length if is_whole else WINDOW_M), quantity.least)
-            if is_distance
-            else max(SCALE_SHARE * length, quantity.least)
-        )
+        limit = max(SCALE_SHARE * (length if is_whole or not is_distance else WINDOW_M), quantity.least)
         steps_s = ends_s[known] - starts_s[known]
         duration_s = float(steps_s[::-1][:count].sum())
         limit += LAG_SIGMA_S * float((np.abs(seen[::-1]) / np.maximum(steps_s, LEAST_SAMPLE_S)).max())
+        # 3. Of a distance the newest second alone as well, which may show a doubt sooner.
         if is_distance:
             soon = int(np.searchsorted(ends_s[-1] - ends_s[known][::-1], SOON_S))
             lacking = abs(float((moved[:soon] - seen[:soon]).sum()))
@@ -305,7 +309,7 @@ class MotionAgreement:
         is_strong = squares[near] - squares[best] > EVIDENCE * variance and squares[near] > WORSE * squares[best]
         return best, near, bool(is_strong and not is_allowed[best])
 
-    def _stand(self) -> bool:
+    def _is_at_rest(self) -> bool:
         """True if images and wheels have shown no motion for STILL_S."""
         now_s = self._steps[-1].end_s
         if self._steps[0].start_s > now_s - STILL_S:
@@ -316,12 +320,6 @@ class MotionAgreement:
         turns_rad = (sum(step.turn_rad for step in newest), *self._wheels_rad.between(starts_s, ends_s))
         # Wheels that say nothing (NaN) have not moved.
         return not any(abs(way) > STILL_M for way in ways_m) and not any(abs(turn) > STILL_RAD for turn in turns_rad)
-
-    def _seconds(self, stamp_ns: int) -> float:
-        """Return the time since the first stamp."""
-        if self._zero_ns is None:
-            self._zero_ns = stamp_ns
-        return (stamp_ns - self._zero_ns) * 1e-9
 
 
 _UNKNOWN: Final = _Finding()

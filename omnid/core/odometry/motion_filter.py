@@ -55,7 +55,7 @@ class MotionFilter:
         return F @ self._filter.x[:, 0], np.asarray((P + P.T) / 2)
 
     def after(self, T_prev_curr: Array, covariance: Array, dt_s: float) -> tuple[Array, Array]:
-        """Return the `motion` that an update with that measurement would lead to; the filter stays as it is."""
+        """Return the `motion` after an update with a measurement; the filter itself is not updated."""
         kept = self._filter.x.copy(), self._filter.P.copy()
         self.update(T_prev_curr, covariance, dt_s)
         found = self.motion(dt_s)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.kalman_filter import kalman_filter
+from omnid.core.nanoseconds import SecondsSinceFirst
 from omnid.core.odometry.sensed_motion import RateHistory, RateIntegral, SensedMotion
 
 Array = NDArray[np.float64]
@@ -64,7 +65,7 @@ class MotionSensors:
         self._filter = kalman_filter(dim_x=len(START), dim_z=1)
         self._filter.x = START[:, None].copy()
         self._filter.P = np.diag(START_SIGMA**2)
-        self._zero_ns: int | None = None  # stamp of time 0
+        self._clock = SecondsSinceFirst()
         self._outliers = {WheelSample: 0, GyroSample: 0}
         self.slips = self.refused = self.steps = 0
         self.is_slipping = False  # True if the wheels slipped in the last steps that the cameras saw
@@ -92,9 +93,9 @@ class MotionSensors:
         gyro: list[tuple[float, ...]] = []
         for sample in samples:
             if isinstance(sample, WheelSample):
-                wheels.append((self._seconds(sample.stamp_ns), sample.velocity_mps, sample.yaw_rate_radps))
+                wheels.append((self._clock.seconds(sample.stamp_ns), sample.velocity_mps, sample.yaw_rate_radps))
             else:
-                gyro.append((self._seconds(sample.stamp_ns), sample.x_radps, sample.y_radps, sample.z_radps))
+                gyro.append((self._clock.seconds(sample.stamp_ns), sample.x_radps, sample.y_radps, sample.z_radps))
         for history, rows in ((self._wheels, wheels), (self._gyro, gyro)):
             if rows:
                 table = np.array(rows)
@@ -107,7 +108,7 @@ class MotionSensors:
         from that of the gyro twice in a row.
         """
         # 1. What the sensors measured in this time; the wheels only while they can be trusted.
-        start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
+        start_s, end_s = self._clock.seconds(start_ns), self._clock.seconds(end_ns)
         dt_s = end_s - start_s
         trusted = self.wheels_are_sane and not self.is_slipping
         wheels = self._of_wheels(start_s, end_s) if trusted else None
@@ -167,7 +168,7 @@ class MotionSensors:
     def observe(self, T_prev_curr: Array, covariance: Array, start_ns: int, end_ns: int) -> None:
         """Estimate the states by a step of the rectified frame that the cameras measured, with covariance (6, 6)."""
         # 1. The step and its variances in the frame of the base.
-        start_s, end_s = self._seconds(start_ns), self._seconds(end_ns)
+        start_s, end_s = self._clock.seconds(start_ns), self._clock.seconds(end_ns)
         dt_s = end_s - start_s
         seen = self._to_base @ se3.log(T_prev_curr)
         variance = np.diag(self._to_base @ covariance @ self._to_base.T)
@@ -181,12 +182,6 @@ class MotionSensors:
             self._learn_wheels(wheels, seen, variance)
         if gyro is not None:
             self._learn_gyro(gyro, seen[3:], variance[3:], dt_s)
-
-    def _seconds(self, stamp_ns: int) -> float:
-        """Return the time since the first stamp: a number of seconds since 1970 has too few digits."""
-        if self._zero_ns is None:
-            self._zero_ns = stamp_ns
-        return (stamp_ns - self._zero_ns) * 1e-9
 
     def _learn_wheels(self, wheels: RateIntegral, seen: Array, variance: Array) -> None:
         """Learn scales and offset of the wheels from the cameras' twist (6,) with variances (6,)."""

@@ -41,7 +41,7 @@ class NewLandmarks:
 def located(
     frame: StereoFrame, corners: Array, model: StereoModel, klt: KltSettings, exposure: Exposure, known: Array
 ) -> NewLandmarks:
-    """Return those of the corners (N, 2) of the lower panorama that are found in the upper one as well.
+    """Return the corners (N, 2) of the lower panorama that the upper panorama shows too.
 
     They are located by SAD (eq. 8), and then by KLT and by their patches to a fraction of a pixel. known (M, 3) [px]:
     views of the map's landmarks.

@@ -34,7 +34,8 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Sigma of the velocity while poses are refused [m/s, rad/s]; of one refused for its speed, that speed: it may be right.
+# Sigma of the velocity while poses are refused [m/s, rad/s]. If a pose is refused for its speed only, its speed is the
+# sigma, because it may be right.
 UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
@@ -106,7 +107,7 @@ class VisualOdometry:
         # 5. Accept or refuse, by the inliers and the speed that the pose implies; after a break, relocalise.
         after_break = after_refusal or dt_s > self._limits.max_gap_s
         too_fast_mps = self._too_fast_mps(estimate, dt_s) if estimate and self._has_support(estimate) else 0.0
-        if searched and after_break and (self._is_doubtful(estimate) or not self._is_plausible(estimate, dt_s)):
+        if searched and after_break and self._is_doubtful(estimate, dt_s):
             estimate = self.relocalise(frame, self._exposures.predicted(frame, dt_s))
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
@@ -126,11 +127,10 @@ class VisualOdometry:
         self._added = None
         exposure = self._exposures.predicted(frame, dt_s)
         self._requested = self._update_map(frame, usable, estimate, exposure)
-        features = Features(estimate.pixels, estimate.rejected, new)
-        if self._requested is None:
-            return self._result(estimate.tracked, estimate.inliers, features, self._exposures.now(frame))
+        features, is_keyframe = Features(estimate.pixels, estimate.rejected, new), self._requested is not None
+        exposure = exposure if is_keyframe else self._exposures.now(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
-        return replace(result, is_keyframe=True)
+        return replace(result, is_keyframe=is_keyframe)
 
     def _find(self, frame: StereoFrame, usable: Flags, T_predicted: Array, dt_s: float) -> PoseEstimate | None:
         """Return the likeliest pose of a frame in the map, with its runner-up; None: no landmarks were found."""
@@ -168,15 +168,15 @@ class VisualOdometry:
         """True if the pose has enough inliers and implies no impossible speed since the last accepted one."""
         return estimate is not None and self._has_support(estimate) and not self._too_fast_mps(estimate, dt_s)
 
-    def _is_doubtful(self, estimate: PoseEstimate | None) -> bool:
-        """True if so few landmarks agree that the pose may be wrong where it is not known how far the vehicle came."""
-        if estimate is None:
+    def _is_doubtful(self, estimate: PoseEstimate | None, dt_s: float) -> bool:
+        """True if a pose is not plausible, or has too few inliers to be relied on after an unknown motion."""
+        if estimate is None or not self._is_plausible(estimate, dt_s):
             return True
         return estimate.inliers < min(self._limits.good_inliers, AGAIN_SHARE * estimate.visible)
 
     def _too_fast_mps(self, estimate: PoseEstimate, dt_s: float) -> float:
         """Return the speed that a pose implies since the last accepted one if it is impossible, else 0."""
-        moved_m = float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - self._T_odom_rect[:3, 3]))
+        moved_m = estimate.distance_m(self._T_odom_rect)
         since_s = self._since_fix_s(dt_s)
         return moved_m / since_s if moved_m > self._limits.max_speed_mps * since_s else 0.0
 

@@ -87,8 +87,8 @@ class PoseSearch:
         reach_m: float,
     ) -> PoseEstimate:
         """Return the likeliest pose within reach_m of the prediction, with its runner-up: runner_up_motions.py."""
-        # 1. Displacements there from which the images are alike, and the poses to which they lead.
-        off_m = _off_m(estimate, T_predicted)
+        # 1. Displacements within reach from which the scene has the same appearance, and the poses to which they lead.
+        off_m = estimate.distance_m(T_predicted)
         peaks = displacements(self._map, self._model, frame.lower, estimate.T_odom_rect, reach_m + off_m)
         exposure = self._exposures.predicted(frame, dt_s)
         is_good, others = is_good_enough(estimate, self._limits, is_near=False), []
@@ -97,7 +97,7 @@ class PoseSearch:
                 continue
             T_guess = estimate.T_odom_rect @ se3.exp([x, y, 0.0, 0.0, 0.0, 0.0])
             other = self._estimate(frame, T_guess, exposure, last, dt_s, is_near=True)
-            others += [other] if other is not None and _off_m(other, T_predicted) < reach_m else []
+            others += [other] if other is not None and other.distance_m(T_predicted) < reach_m else []
         # 2. Where many tracks are outliers, the pose by these: their depths may be right, and the inliers' wrong. The
         #    same where the inliers show no motion of a vehicle: they may be on a person who walks along, and what is
         #    nearer to the prediction is right.
@@ -147,10 +147,6 @@ class PoseSearch:
         T_unturned = last.T_odom_rect.copy()
         T_unturned[:3, 3] = T_predicted[:3, 3]
         yield self._frame_to_map.best_yaw(frame, T_unturned, peaks + steps(), likely=len(peaks)), False
-
-
-def _off_m(estimate: PoseEstimate, T_predicted: Array) -> float:
-    return float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
 
 
 def is_good_enough(estimate: PoseEstimate | None, limits: OdometryLimits, *, is_near: bool) -> bool:

@@ -150,12 +150,12 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     """
     if not others:
         return found
-    # 1. The estimate with the lowest cost, and those that contradict it; of these, the motion decides.
-    near = [each for each in others if _apart_m(each, T_predicted) < reach_m]
+    # 1. The estimate with the lowest cost, and estimates that contradict it; among all these the motion decides.
+    near = [each for each in others if each.distance_m(T_predicted) < reach_m]
     views = [found, *(each for each in near if len(each.landmarks) >= LEAST_SHARE * each.in_view)]
     cheapest = min(views, key=lambda each: each.cost)
     opposed = [each for each in (found, *near) if contradict(each, cheapest)]
-    best = min([cheapest, *opposed], key=lambda each: _apart_m(each, T_predicted))
+    best = min([cheapest, *opposed], key=lambda each: each.distance_m(T_predicted))
     # 2. The others are at the same pose, or runners-up if they contradict the best one or cost little more.
     candidates = list({id(each): each for each in (*views, *opposed)}.values())
     steps = [(each, se3.log(se3.inverse(best.T_odom_rect) @ each.T_odom_rect)) for each in candidates]
@@ -163,7 +163,7 @@ def likeliest(found: PoseEstimate, others: list[PoseEstimate], T_predicted: Arra
     runners_up = [
         step
         for each, step in steps
-        if np.linalg.norm(step[:3]) > SAME_M and _rivals(each, best) and _apart_m(each, T_predicted) < reach_m
+        if np.linalg.norm(step[:3]) > SAME_M and _rivals(each, best) and each.distance_m(T_predicted) < reach_m
     ]
     farthest = max(runners_up, key=lambda step: float(np.linalg.norm(step[:3])), default=None)
     # 3. Landmarks of contradicting poses that do not support the chosen one.
@@ -185,11 +185,6 @@ def contradict(a: PoseEstimate, b: PoseEstimate) -> bool:
     common = len(np.intersect1d(a.landmarks, b.landmarks, assume_unique=True))
     fewest = min(len(a.landmarks), len(b.landmarks))
     return min(shares) >= EQUAL_SHARE * max(shares) and common <= COMMON_SHARE * fewest
-
-
-def _apart_m(estimate: PoseEstimate, T_predicted: Array) -> float:
-    """Return the distance [m] of a pose from the predicted one."""
-    return float(np.linalg.norm(estimate.T_odom_rect[:3, 3] - T_predicted[:3, 3]))
 
 
 def displacements(

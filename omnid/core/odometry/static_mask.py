@@ -18,8 +18,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
-# Columns in which the world should have moved less are not compared: by an angle, and in pixels at half resolution. In
-# a small panorama the angle alone is a pixel, and much of a view that moved so little looks as if it had not.
+# Columns are compared only if the world should have moved by this angle, and by these pixels at half resolution: in a
+# small panorama the angle is one pixel, by which most of a view hardly changes.
 MIN_FLOW_RAD, MIN_FLOW_PX = 0.04, 2.0
 MOVED_RATIO = 0.5  # share of the columns that must have moved before a comparison is made
 USUAL_RANGE_M = 3.0  # range at which a translation is converted to an angle

@@ -18,10 +18,10 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 NEIGHBOURS = 5  # known landmarks whose median disparity counts: two of them may be of another surface
-# Ratio of disparities beyond which they are not of one surface: slopes change them by 0.15 px/px.
+# Two disparities whose ratio is larger are of two surfaces: the slope of one surface changes them by 0.15 px/px.
 OTHER_RATIO = 1.25
 SIDE_PX = 15  # Side of a patch, as the tracker's window.
-# Rows about the neighbours' disparity in which the patch is searched, as a share of it: that of the slopes.
+# The patch is searched within this share of the neighbours' disparity, because slopes change it by less.
 SEARCH_SHARE = 0.2
 # By how much the correlation of the patch at its own disparity must exceed that at the neighbours': identical bricks
 # differ by less than 0.05, other textures by 0.3 and more.

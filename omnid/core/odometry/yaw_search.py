@@ -28,7 +28,7 @@ def steps() -> list[float]:
     return [0.0, *both, 10 * STEP_RAD]
 
 
-def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PEAKS, turn_px: int = 0) -> list[float]:
+def correlation_peaks(before: Image, after: Image, usable: Flags, turn_px: int = 0) -> list[float]:
     """Return the likeliest turns to the left [rad] from one panorama (H, W) to the next, best first, in [-pi, pi).
 
     Circular correlation of the horizontal gradients over azimuth, exact at the seam because nothing is padded.
@@ -40,7 +40,7 @@ def correlation_peaks(before: Image, after: Image, usable: Flags, most: int = PE
     score = np.fft.irfft(spectrum.sum(axis=0), width)
     apart = width // PEAKS_APART
     peaks = []
-    for _ in range(most):
+    for _ in range(PEAKS):
         shift = int(score.argmax())
         peaks.append(((shift + width / 2) % width - width / 2) * 2 * math.pi / width)
         score[np.arange(shift - apart, shift + apart + 1) % width] = -np.inf

@@ -85,7 +85,7 @@ class Hypotheses:
         return True
 
     def add(self, new: Hypothesis, poses: Mapping[int, Array]) -> list[Hypothesis]:
-        """Add a recognition; return those that agree with it, itself last, where they are enough; else none."""
+        """Add a recognition; return the consistent ones, the new one last; none if there are fewer than CONSISTENT."""
         known = [kept for kept in self._kept if kept.recognition.id in poses and kept.keyframe in poses]
         self._kept.append(new)
         distinct: list[Hypothesis] = []

@@ -39,11 +39,11 @@ from omnid.tracking_state import MapState
 Array = NDArray[np.float64]
 
 LOCAL_M: Final = 3.0  # Loops closer along the path are ignored, because odometry itself still sees what is that near.
-TIES: Final = 50  # newest keyframes that are kept where the map stays as it is, so that memory is bounded
+TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is bounded
 # Largest error of odometry, and its growth with the path; by trial on development seeds.
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
-TAG_SIGMAS: Final = 3.0  # error of a pose by a tag that is accepted, so that 0.3 % of right ones exceed it
+TAG_SIGMAS: Final = 3.0  # Accepted error of a pose by a tag; 0.3 % of right poses exceed it.
 # After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
 RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
@@ -241,11 +241,11 @@ class MapLocaliser:
 
     @property
     def _is_in_fixed(self) -> bool:
-        """True if the current part is that of the keyframes that stay as they are."""
+        """True if the current part is a fixed map."""
         return bool(self._fixed.ids) and self._parts.number(self._fixed.ids[0]) == self._parts.current
 
     def _around(self, position: Array, slack_m: float) -> list[int]:
-        """Return the keyframes of this part; of those that stay as they are the ones that may be near or see tags."""
+        """Return the keyframes of this part; of a fixed map only keyframes that may be near, or that saw tags."""
         moving = [id for id in self._parts.ids() if id not in self._fixed.known]
         if not self._is_in_fixed or self._recognised_at is None:
             return moving
@@ -262,17 +262,10 @@ class MapLocaliser:
             ties = [id for id in self.places.keyframes if id not in self._fixed.known]
             for id in ties[: len(ties) - TIES + 1]:
                 self.places.drop(id)
-        keyframe = PlaceKeyframe(
-            self.places.next_id,
-            self._session,
-            frame.stamp_ns,
-            frame.T_odom_rect,
-            frame.covariance,
-            small,
-            frame.scan().astype(np.float16),
-            frame.free_m().astype(np.float16),
-            features,
-        )
+        scan, free_m = frame.scan().astype(np.float16), frame.free_m().astype(np.float16)
+        of_odometry = frame.stamp_ns, frame.T_odom_rect, frame.covariance
+        id = self.places.next_id
+        keyframe = PlaceKeyframe(id, self._session, *of_odometry, small, scan, free_m, features)
         link = None if self._newest is None else by_odometry(self._newest, keyframe)
         self.places.add(keyframe, self._T_map_odom @ frame.T_odom_rect, link)
         self._parts.add(keyframe.id)
@@ -301,8 +294,7 @@ class MapLocaliser:
         T_keyframe_rect = se3.inverse(newest.T_odom_rect) @ frame.T_odom_rect
         since = relative_covariance(T_keyframe_rect, newest.covariance, frame.covariance)
         hypothesis = Hypothesis(found, newest.id, T_keyframe_rect, since, frame.T_odom_rect)
-        consistent = self._hypotheses.add(hypothesis, self.places.poses)
-        if not consistent:
+        if not (consistent := self._hypotheses.add(hypothesis, self.places.poses)):
             return
         other = self._parts.number(found.id)
         if other != self._parts.current:
@@ -322,6 +314,7 @@ class MapLocaliser:
         return MapState.LOCALIZED if recent else MapState.ODOMETRY_ONLY
 
     def _pose(self, frame: OdometryFrame, state: MapState) -> MapPose:
+        """Return the pose of odom at a frame, relative to the newest keyframe where there is one."""
         is_unknown = self._recognised_at is None and bool(self._elsewhere())
         covariance = UNKNOWN_PLACE if is_unknown else self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
         newest = self._newest

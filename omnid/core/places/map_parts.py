@@ -19,7 +19,7 @@ class MapParts:
     """The part of each keyframe, and the part that grows now; parts have numbers, the oldest has the lowest."""
 
     def __init__(self, places: PlaceMap) -> None:
-        """places: its keyframes are one part; the run that begins now is another one."""
+        """places: a map whose keyframes are one part; the keyframes of this run begin another part."""
         self._places = places
         self._part_of = dict.fromkeys(places.keyframes, 0)
         self.current = 1 if places.keyframes else 0

@@ -41,7 +41,7 @@ def merge(places: PlaceMap, other: PlaceMap, model: StereoModel) -> int:
     renumbered = _renumbered(other, places)
     search, ids = PlaceSearch(model), sorted(places.keyframes)
     others = _evenly_spread(sorted(renumbered.keyframes))
-    # 1. Recognise keyframes of the other map until enough agree; each recognition tells where that map lies.
+    # 1. Recognise keyframes of the other map until enough agree; each recognition gives the pose of that map.
     loops, located = list[Link](), list[Array]()
     consistent, best = list[list[int]](), list[int]()
     while others and len(best) < max(ENOUGH_CONSISTENT, MIN_SHARE * len(located)):
@@ -96,7 +96,7 @@ def _located(loop: Link, places: PlaceMap, other: PlaceMap) -> Array:
 
 
 def _renumbered(other: PlaceMap, places: PlaceMap) -> PlaceMap:
-    """Return a map whose ids and sessions go on after those of `places`."""
+    """Return a map whose ids and sessions follow those of `places`."""
     first_session = 1 + max((keyframe.session for keyframe in places.keyframes.values()), default=-1)
     new = {id: places.next_id + n for n, id in enumerate(sorted(other.keyframes))}
     found = PlaceMap()

@@ -1,7 +1,7 @@
 """Particle filter on a map (Monte Carlo localisation): for places that the panorama cannot tell, or no longer knows.
 
 Thrun, Burgard, Fox 2005, "Probabilistic Robotics", chapter 8. Particles move by odometry and are weighted by the range
-scan. Particles alone do not tell an ambiguity, because one of two equal groups dies out by chance: so a pose counts
+scan. Particles alone do not show an ambiguity, because one of two equal groups dies out by chance: so a pose counts
 only if a search of the whole map finds no other one that explains the last scans as well.
 """
 
@@ -31,7 +31,7 @@ BEST_DRAWN: Final = 200  # The best of them, which are improved.
 ROUNDS: Final = 6  # Rounds of improvement: random changes, smaller each time.
 CHANGE: Final = np.array([0.15, 0.15, 0.15])  # m, rad: standard deviation of the changes of the first round
 SEED_SIGMA: Final = np.array([0.2, 0.2, 0.1])  # m, rad: standard deviation of the poses that signatures propose.
-SEEDED: Final = 0.7  # share of the particles at the start that stand at such poses
+SEEDED: Final = 0.7  # share of the particles at the start that are at such poses
 MOTION_SIGMA: Final = np.array([0.02, 0.02, 0.01])  # m, rad: added with each motion, so that particles differ
 MOTION_RATIO: Final = 0.05  # The same by the length of the motion.
 SCANS: Final = 8  # last scans that decide whether there is another pose
@@ -135,7 +135,7 @@ class ParticleFilter:
         drawn = drawn[~_is_near(drawn, pose)]
         if not len(drawn):
             return None
-        # The newest and the oldest scan together, as many places look alike from one pose only.
+        # The newest and the oldest scan together, because many places resemble each other from one pose only.
         fit = sum(
             self._model.log_likelihood(self._at(drawn, odometry), scan, coarse=True)
             for scan, odometry in (self._scans[0], self._scans[-1])

@@ -39,9 +39,10 @@ def compare(
     enough: int,
     model: StereoModel,
 ) -> dict[int, Recognition | None]:
-    """Return what a frame shows of those keyframes (at most `most`) that its features vote for, best one first.
+    """Compare a frame with the keyframes that most of its features vote for; return the recognition or None of each.
 
-    known: features of each keyframe; poses: (4, 4) of each. It ends at a recognition with enough inliers.
+    known: features of each keyframe; poses: (4, 4) of each. At most `most` are compared, best first, until one is
+    recognised with `enough` inliers.
     """
     ids = list(known)
     voted = [votes(here, known[id], model.cylinder.width) for id in ids]

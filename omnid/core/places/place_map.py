@@ -153,11 +153,13 @@ class PlaceMap:
         return len(self) > self._max_keyframes or (self._max_bytes is not None and self.nbytes > self._max_bytes)
 
     def drop(self, id: int) -> None:
-        """Drop a keyframe; what was linked to it is linked to the next one on its path, or to the one before."""
+        """Drop a keyframe; its links go on to its neighbour on the path: the next keyframe, else the one before."""
+        # 1. The links of the keyframe, turned so that they begin at it, and the link to the neighbour (`bridge`).
         touching = [link for link in self.links if id in (link.a, link.b)]
         self.links = [link for link in self.links if id not in (link.a, link.b)]
         leaving = [link if link.a == id else link.reversed() for link in touching]
         bridge = min((link for link in leaving if not link.is_loop), key=lambda link: link.b <= id, default=None)
+        # 2. Links of the other keyframes to the neighbour, of loops the most certain ones.
         if bridge is not None:
             joined = [link.reversed().then(bridge) for link in leaving if link is not bridge and link.b != bridge.b]
             loops = sorted((link for link in joined if link.is_loop), key=lambda link: float(np.trace(link.covariance)))
@@ -165,6 +167,7 @@ class PlaceMap:
                 link if link.a < link.b else link.reversed()
                 for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])
             ]
+        # 3. The neighbour takes over the tags, and the keyframe leaves the map.
         self._move_tag_views(id, bridge)
         del self.keyframes[id], self.poses[id]
         self.uses.pop(id, None)

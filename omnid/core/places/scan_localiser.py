@@ -62,7 +62,7 @@ class ScanLocaliser:
         """
         # 1. Draw the map when it is first asked for.
         if self._filter is None:
-            # Where ranges pass the robot may stand: the floor need not have been seen.
+            # The robot may be wherever ranges pass, even where the floor was not seen.
             no_floor = [np.zeros(SECTORS, np.float32)] * len(self._scans)
             self._filter = ParticleFilter(scan_grid(self._scans, no_floor, self._poses, CELL_M).open_grid())
         # 2. Move the particles by odometry; a robot at rest shows nothing new.

@@ -43,7 +43,10 @@ class TagRecogniser:
         return self._finder.process(frame.lower, frame.upper)
 
     def recognise(self, seen: Sequence[TagPose], among: Container[int]) -> Recognition | None:
-        """Return the place of a frame by the tag that determines it best, among keyframes (ids) that saw it."""
+        """Return the place of a frame by the tag that gives it most certainly.
+
+        among: ids of the keyframes to which the place may be relative.
+        """
         found = [place for place in (self._place(tag, among) for tag in seen) if place is not None]
         return min(found, key=lambda place: float(np.trace(place.covariance[:3, :3])), default=None)
 

@@ -1,6 +1,6 @@
 """Views of different places of a drive, and what they say about the rig, without a board.
 
-A robot that stands still views the same wall again and again, and a single wall may give biased points. So only views
+A robot at rest views the same wall again and again, and a single wall may give biased points. So only views
 of different places count, and of every place the newest view is kept.
 """
 
@@ -75,7 +75,7 @@ class DrivingViews:
         return recent
 
     def _add_view(self, pair: PanoramaPair, exposure: Exposure | None) -> bool:
-        """Keep the view unless it is of the same place as the last one; return True if it was kept."""
+        """Keep a view unless the last one is from the same place; return True if it was kept."""
         thumbnail = _thumbnail(pair)
         same_place = [float(thumbnail @ view.thumbnail) > SAME_VIEW_CORRELATION for view in self._views]
         if any(same_place[-1:]) or not thumbnail.any():

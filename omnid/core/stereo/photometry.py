@@ -53,7 +53,7 @@ class Light:
 
     @property
     def shows_nothing(self) -> bool:
-        """True if a dim image has so little contrast that its corners are noise: a map of them would be wrong."""
+        """True if the corners of a dim image are noise, so that a map of them would be wrong."""
         return self.level_grey < TARGET_LEVEL and self.contrast_to_noise < NOTHING_BUT_NOISE
 
 

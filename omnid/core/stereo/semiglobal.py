@@ -27,7 +27,7 @@ SUBPIXEL = 16  # StereoSGBM returns sixteenths of a pixel; exact, by OpenCV
 STEP_ROWS = 16  # StereoSGBM searches a multiple of this number of disparities; exact, by OpenCV
 SCALE = 2  # the prior is computed at half the resolution: at a quarter the courses of a brick wall are one grey
 FILL_PX = 5  # Unknown pixels of the prior take the largest disparity within this distance: no holes.
-REACH_PX = 2  # Reach of the search about the prior; because a pixel of the prior is two here.
+REACH_PX = 2  # The search reaches this far from the prior, because a pixel of the prior is two pixels here.
 
 
 class ColumnShift(NamedTuple):
@@ -60,7 +60,7 @@ class SemiGlobalPrior:
     def disparity(self, lower: Image, upper: Image) -> tuple[Floats, NDArray[np.bool_]]:
         """Return disparities (H, W) float32 [px at full size], good to about a pixel, and flags of the known ones.
 
-        Unknown ones are those of known neighbours, or 0.
+        An unknown pixel has the largest disparity of its known neighbours, or 0 where there are none.
         """
         found = self._matcher.compute(self._transposed_small(lower), self._transposed_small(upper))
         small = np.maximum(found[:, : self._rows - 1 : -1].T, 0)

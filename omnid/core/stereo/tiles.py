@@ -170,7 +170,7 @@ class TileMonitor:
         may_be_dead = is_still & ((contrast > TEXTURE_GREY) | (lively > LIVELY_SHARE))
         enough = (shows & ~is_still).sum() >= LEAST_ALIVE * max(1, int(shows.sum()))
         self._still[side] = np.where(may_be_dead & enough, self._still[side] + 1, 0)
-        # While it is dead, a tile counts as what it was before.
+        # While a tile is still, its liveliness stays as it was before.
         self._lively[side] = np.where(self._still[side] > 0, lively, lively + LIVELY_GAIN * (~is_still - lively))
         return np.asarray(self._still[side] >= IN_A_ROW)
 

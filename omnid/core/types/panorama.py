@@ -18,14 +18,14 @@ Flags = NDArray[np.bool_]
 class PaddedPanorama:
     """Panorama with pad_px columns more on either side, so that windows run across the seam of a full turn.
 
-    Those of a full turn repeat its first and last columns; those of a sector show what the images show there.
+    The padding of a full turn repeats its last and first columns; that of a sector shows what the camera sees there.
     """
 
     image: Image  # (H, W + 2 pad) uint8
     pad_px: int
     noise_grey: float = 1.0  # standard deviation of the noise, grey levels
     gain: float = 1.0  # factor that was applied because the image was dim
-    turn_px: int = 0  # columns of a full turn, of which this shows a sector; 0: all of them
+    turn_px: int = 0  # columns of the full turn of which this is a sector; 0: this is a full turn
     first: int = 0  # column of the full turn that is column 0
     jpeg_steps: Steps = ()  # of the quantisation of the image's JPEG, (): none
 
@@ -45,7 +45,7 @@ class PaddedPanorama:
         return self.image[:, self.pad_px : self.pad_px + self.width]
 
     def own(self, columns: Array) -> Array:
-        """Return columns (N,) as those of the panorama: in [0, W) of a full turn, as they are of a sector."""
+        """Return columns (N,) of the panorama: wrapped into [0, W) for a full turn, unchanged for a sector."""
         return columns if self.period_px > self.width else np.asarray(columns % self.width)
 
     def in_turn(self, columns: Array) -> Array:
@@ -53,13 +53,13 @@ class PaddedPanorama:
         return np.asarray((columns + self.first) % self.period_px)
 
     def padded(self, columns: Array) -> Array:
-        """Return columns (N,) of the padded image: of a full turn within it, for a sector at most at its border."""
+        """Return columns (N,) of the padded image: wrapped for a full turn, kept within it for a sector."""
         if self.period_px > self.width:
             return np.asarray(np.clip(columns, -self.pad_px, self.width - 1 + self.pad_px) + self.pad_px)
         return self.own(columns) + self.pad_px
 
     def unpadded(self, columns: Array) -> tuple[Array, Flags]:
-        """Return columns (N,) of the panorama from those of the padded image, and flags (N,) of those that it has."""
+        """Return columns (N,) of the panorama for columns of the padded image, and flags (N,): it has the column."""
         own = columns - self.pad_px
         if self.period_px > self.width:
             return own, np.asarray((own >= 0) & (own <= self.width - 1))

@@ -1,4 +1,4 @@
-"""Images of a world whose floor is polished: it mirrors what stands on it.
+"""Images of a world whose floor is polished: it mirrors the objects on it.
 
 A reflection in a plane is the image of the world mirrored in that plane, seen where the plane is seen. Polished stone,
 lacquered wood and wet tiles reflect by Fresnel's equations for n = 1.5: 4 % straight down, 9 % at 60 degrees from the

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import random
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -13,24 +12,19 @@ from collections.abc import Iterator
 
 from omnid.transport import codec
 from tests.faults.trials.trial import Outcome, Setting, driving, ended, expect_motion, expect_stop, trial
-from tests.replay.live import ROOT, Base, Operator, command_line, free_port, wait_until
+from tests.ports import free_port, listening
+from tests.replay.live import ROOT, Base, Operator, command_line
+from tests.waiting import wait_until
 
 
 @trial("bus port taken at the start")
 def port_taken(setting: Setting) -> Outcome:
     """Another program listens on the port."""
-    with contextlib.closing(Base(setting.folder)) as base, driving_nothing() as port:
+    with contextlib.closing(Base(setting.folder)) as base, listening() as port:
         code, err = ended(command_line(setting.scene, port, base.port))
         assert code == 2 and err.count("\n") == 1 and "bus.listen" in err, err
         assert not base.line.moved_since(0.0)
     return Outcome("one line, exit 2", "never turned", err.strip())
-
-
-@contextlib.contextmanager
-def driving_nothing() -> Iterator[int]:
-    """Open a port on which this program listens."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        yield int(server.getsockname()[1])
 
 
 @trial("operator's peer gone and back")

@@ -6,7 +6,8 @@ from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN
 from omnid.core.control.safety_rules import POSE_LOST, POSE_STALE
 from omnid.transport.status_names import STOPPED_PREFIX
 from tests.faults.trials.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
-from tests.replay.live import patient, wait_until
+from tests.replay.live import patient
+from tests.waiting import wait_until
 
 
 def camera_fault(setting: Setting, line: str, part: str, word: str) -> Outcome:

@@ -7,7 +7,9 @@ import time
 
 from omnid.core.control.safety_rules import FAILED
 from tests.faults.trials.trial import Outcome, Setting, driving, ended, expect_motion, expect_stop, trial
-from tests.replay.live import command_line, free_port, wait_until
+from tests.ports import free_port
+from tests.replay.live import command_line
+from tests.waiting import wait_until
 
 
 @trial("serial port unplugged and back")

@@ -12,7 +12,8 @@ from pathlib import Path
 from omnid.core.control.safety_rules import POSE_STALE
 from omnid.transport import codec
 from tests.faults.trials.trial import FAULTY_DAEMON, Outcome, Setting, driving, expect_motion, expect_stop, trial
-from tests.replay.live import PATIENCE_S, Base, Operator, robot, wait_until
+from tests.replay.live import Base, Operator, robot
+from tests.waiting import PATIENCE_S, wait_until
 
 
 @trial("SIGTERM in the middle of frames")

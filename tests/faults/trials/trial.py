@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.replay.live import Base, Daemon, Operator, robot, started, wait_until
+from tests.replay.live import Base, Daemon, Operator, robot, started
+from tests.waiting import wait_until
 
 WATCH_S = 1.5  # time in which stopped wheels must not turn
 FAULTY_DAEMON = "tests.replay.faulty"

@@ -10,8 +10,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from importlib.resources import files
 from pathlib import Path
@@ -24,6 +22,7 @@ from omnid.batch.job_runner import OK, run_job, stored_result
 from omnid.batch.jobs import BatchOptions, find_logs, jobs
 from omnid.cli import main
 from omnid.errors import OmnidError
+from tests.waiting import wait_until
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 BYTES = 450_000  # of the sample: some pairs and the rig that is attached
@@ -52,13 +51,6 @@ def omnid(*words: object) -> subprocess.CompletedProcess[str]:
 def rows(out: Path) -> dict[str, dict[str, str]]:
     with (out / "results.csv").open(newline="") as file:
         return {row["name"]: row for row in csv.DictReader(file)}
-
-
-def wait_until(done: Callable[[], bool]) -> None:
-    end_s = time.monotonic() + DEADLINE_S
-    while not done():
-        assert time.monotonic() < end_s, "nothing happened in time"
-        time.sleep(0.02)
 
 
 def replays_of(log: Path) -> list[int]:

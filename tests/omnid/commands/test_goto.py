@@ -13,7 +13,9 @@ from omnid.cli import main
 from omnid.client import Robot
 from omnid.errors import OmnidError
 from omnid.formats.tum import read_tum
-from tests.replay.live import free_port, started, wait_until
+from tests.ports import free_port
+from tests.replay.live import started
+from tests.waiting import wait_until
 
 GOAL = (0.6, 0.1, 45.0)  # m, m, deg
 NEAR_M, NEAR_DEG = 0.05, 2.0

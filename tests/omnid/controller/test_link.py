@@ -31,7 +31,8 @@ from omnid.core.control.velocity_limits import VelocityLimits
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
-from tests.replay.live import ROOT, Base, wait_until
+from tests.replay.live import ROOT, Base
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 

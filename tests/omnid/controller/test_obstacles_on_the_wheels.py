@@ -20,7 +20,8 @@ from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
 from tests.omnid.controller.test_link import DEADLINES, pose, start_message
-from tests.replay.live import Base, wait_until
+from tests.replay.live import Base
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 FREE = (math.inf,) * 360

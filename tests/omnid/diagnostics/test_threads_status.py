@@ -20,7 +20,7 @@ from omnid.diagnostics.threads_status import (
 )
 from omnid.engine.realtime import name_thread
 from omnid.transport.status_names import Key
-from tests.replay.live import wait_until
+from tests.waiting import wait_until
 
 BURNT_S = 0.15
 TICK_S = 0.03  # the kernel counts ticks of 0.01 s, in the program and in the kernel, and rounds both down

@@ -21,7 +21,7 @@ from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor.wheel_wiring import Seen, WiringTest, toml_with, wiring
 from omnid.errors import OmnidError
 from tests.replay.command import Command
-from tests.replay.live import wait_until
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
 RADIUS_M = 0.02

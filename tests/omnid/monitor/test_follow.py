@@ -29,8 +29,9 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import WHEELS
-from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, free_endpoint
 from tests.replay.command import Command, rows
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.usefixtures("default_signals")
 

@@ -21,7 +21,8 @@ from omnid.transport.requests import Answer, Request
 from omnid.transport.status_names import NAVIGATION, Key
 from omnid.transport.topics import NAVIGATION as NAVIGATION_TOPIC
 from omnid.transport.topics import command_topics
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.waiting import wait_until
 
 COMMAND_NS = 7
 GOTO = ("goto", "1", "0")

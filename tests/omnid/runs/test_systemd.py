@@ -12,7 +12,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,6 +22,7 @@ from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.runs.systemd import Service, StatusLine, notify, print_stacks_when_killed, stalled_stages, watchdog_s
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
 TIMEOUT_S = 20.0  # reached by a broken service only
@@ -54,13 +55,6 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
     manager = Manager(str(tmp_path / "notify"))
     yield manager
     manager.close()
-
-
-def wait_until(true: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + TIMEOUT_S
-    while not true():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.002)
 
 
 def test_notifies_systemd_of_a_state(manager: Manager) -> None:

@@ -17,7 +17,9 @@ from omnid.formats.tum import read_tum
 from omnid.transport.bus_config import BusConfig
 from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, THREADS, WHEELS, Key
 from tests.busy import stopped_by_turns
-from tests.replay.live import free_port, started, wait_until
+from tests.ports import free_port
+from tests.replay.live import started
+from tests.waiting import wait_until
 
 STOPPED_S, RUNNING_S = 0.6, 0.3  # longer than the deadlines of poses and commands; share of a computer that is left
 NEAR_M = 0.05

@@ -23,7 +23,8 @@ from omnid.sinks.encoder import Encoder, MapEncoding
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.decode import decode_pose
 from omnid.transport.features_attachment import features_from_bytes
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.waiting import wait_until
 
 OFFSET_NS = 10**18
 IMAGE = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (64, 160), np.uint8), (0, 0), 4)

@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calib.rig_file import read_rig
 from omnid.config import Config
 from omnid.messages import Panoramas
 from omnid.stages.dense_stereo import DenseStereo
-from omnid.stages.geometry import Geometry, geometry
+from omnid.stages.geometry import geometry
 from tests.omnid.core.scenery import texture, wrapped
 from tests.simulation import make_rig
 
 CONFIG = Config()
-
-
-@pytest.fixture(scope="module")
-def rig_geometry(scene: Path) -> Geometry:
-    return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
 
 
 @pytest.mark.parametrize(("min_range_m", "found"), [(0.5, True), (3.0, False)])

@@ -3,45 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 
 from calib import se3
 from calib.panorama import remap_tables
-from calib.rig_file import read_rig
 from drivers.frame import Frame
-from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.messages import FramePair, StereoDepth
+from omnid.messages import FramePair
 from omnid.stages.dewarp import Dewarp
-from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
-from tests.omnid.stages.test_stages import run_pairs
+from tests.omnid.stages.scene_parts import CONFIG, depth_of, front_end, run_pairs
 from tests.simulation import build, render_grey
-
-CONFIG = Config()
-
-
-@pytest.fixture(scope="module")
-def frames(scene: Path) -> list[Frame]:
-    return list(LogReader(scene / "log.mcap").frames())
-
-
-@pytest.fixture(scope="module")
-def rig_geometry(scene: Path) -> Geometry:
-    return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
-
-
-def front_end(rig_geometry: Geometry) -> FrontEnd:
-    return FrontEnd(rig_geometry, CONFIG)
-
-
-def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
-    (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    return StereoDepth(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
 
 
 def test_points_project_to_the_pixels_they_were_matched_at() -> None:

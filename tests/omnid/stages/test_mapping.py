@@ -2,43 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
-import pytest
 
-from calib.rig_file import read_rig
 from drivers.frame import Frame
-from drivers.logs.log_reader import LogReader
-from omnid.config import Config, MappingConfig
-from omnid.messages import StereoDepth
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.front_end import FrontEnd
-from omnid.stages.geometry import Geometry, geometry
+from omnid.config import MappingConfig
+from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import Mapping
 from tests.omnid.core.test_frames import odometry
-from tests.omnid.stages.test_stages import run_pairs
-
-CONFIG = Config()
-
-
-@pytest.fixture(scope="module")
-def frames(scene: Path) -> list[Frame]:
-    return list(LogReader(scene / "log.mcap").frames())
-
-
-@pytest.fixture(scope="module")
-def rig_geometry(scene: Path) -> Geometry:
-    return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
-
-
-def front_end(rig_geometry: Geometry) -> FrontEnd:
-    return FrontEnd(rig_geometry, CONFIG)
-
-
-def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
-    (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    return StereoDepth(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
+from tests.omnid.stages.scene_parts import depth_of, front_end
 
 
 def test_maps_certain_points_at_tracked_poses_only(rig_geometry: Geometry, frames: list[Frame]) -> None:

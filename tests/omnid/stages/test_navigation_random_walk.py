@@ -44,6 +44,7 @@ from omnid.runs.route_files import RouteFiles
 from omnid.stages.navigation import NavigationStage
 from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
+from tests.omnid.core.navigation.driven_base import wheel_state
 from tests.omnid.stages.test_navigation import FixedMap
 
 Array = NDArray[np.float64]
@@ -87,10 +88,7 @@ class Walk:
 
     def wheels(self) -> WheelState:
         """Return the state of the wheels, as the daemon reads it from the controller."""
-        arming, law = self.law.arming, self.law
-        source = "" if law.reason or law.commands.current is None else law.commands.current.source
-        held_by = law.collision.reason if law.collision.share == 0.0 else ""
-        return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
+        return wheel_state(self.law)
 
     def run(self, poses: int) -> Counter[str]:
         """Return how often what happened."""

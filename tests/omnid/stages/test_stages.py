@@ -10,48 +10,24 @@ import numpy as np
 import pytest
 
 from calib import se3
-from calib.rig_file import read_rig
 from drivers.frame import Camera, Frame
-from drivers.logs.log_reader import LogReader
-from omnid.camera_config import PairConfig
-from omnid.config import Config
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.engine.graph import Graph, Stream
+from omnid.engine.graph import Graph
 from omnid.formats.tum import read_tum
-from omnid.messages import DensePoints, FramePair, MapUpdate, OdometryUpdate, StereoDepth
+from omnid.messages import DensePoints, MapUpdate, OdometryUpdate
 from omnid.runs.pipeline import RunParts, Sinks, wire
-from omnid.stages.dewarp import Dewarp
-from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
-from omnid.stages.synchronise import Synchronise
 from tests.conftest import PAIRS
+from tests.omnid.stages.scene_parts import CONFIG, depth_of, front_end, paired, run_pairs
 from tests.simulation import make_rig
 
-CONFIG = Config()
 MS = 1_000_000
-
-
-@pytest.fixture(scope="module")
-def frames(scene: Path) -> list[Frame]:
-    return list(LogReader(scene / "log.mcap").frames())
-
-
-@pytest.fixture(scope="module")
-def rig_geometry(scene: Path) -> Geometry:
-    return geometry(read_rig(scene / "rig.toml"), CONFIG.panorama)
 
 
 def stamped(frames: list[Frame], *order: tuple[Camera, int]) -> list[Frame]:
     """Return frames of these cameras with these stamps [ms]."""
     first = {frame.camera: frame for frame in reversed(frames)}
     return [replace(first[camera], stamp_ns=stamp * MS) for camera, stamp in order]
-
-
-def run_pairs(rig_geometry: Geometry, frames: list[Frame]) -> tuple[list[FramePair], dict[str, int]]:
-    sync = Synchronise(rig_geometry.rig, PairConfig())
-    made = [pair for frame in frames if (pair := sync.process(frame)) is not None]
-    sync.finish()
-    return made, sync.counts
 
 
 def test_a_pair_has_the_image_of_each_camera(rig_geometry: Geometry, frames: list[Frame]) -> None:
@@ -68,15 +44,6 @@ def test_panoramas_are_scaled_but_not_their_elevations() -> None:
     assert half.height == pytest.approx(full.height / 2, rel=0.02)
     assert half.row0 / half.focal_px == pytest.approx(full.row0 / full.focal_px, abs=0.01)
     assert geometry(rig, replace(CONFIG.panorama, width_px=800, scale=0.5)).cylinder.width == 800
-
-
-def front_end(rig_geometry: Geometry) -> FrontEnd:
-    return FrontEnd(rig_geometry, CONFIG)
-
-
-def depth_of(rig_geometry: Geometry, frames: list[Frame]) -> StereoDepth:
-    (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    return StereoDepth(Dewarp(rig_geometry, CONFIG.panorama).process(pair))
 
 
 def points_of(rig_geometry: Geometry, frames: list[Frame]) -> DensePoints:
@@ -102,11 +69,6 @@ def test_the_variance_of_a_point_follows_from_its_disparity(rig_geometry: Geomet
     disparity = rig_geometry.cylinder.focal_px * rig_geometry.rig.baseline_m / np.hypot(rect[:, 0], rect[:, 1])
     moved = range_m * CONFIG.stereo.noise_px / disparity
     np.testing.assert_allclose(np.sqrt(depth.variance_m2), moved, rtol=0.01)
-
-
-def paired(graph: Graph, rig_geometry: Geometry, frames: list[Frame]) -> tuple[Synchronise, Stream[FramePair]]:
-    pair = Synchronise(rig_geometry.rig, CONFIG.pair)
-    return pair, graph.stage("pair", pair, graph.source("read", lambda: frames))
 
 
 def test_a_slow_bus_drops_messages_and_delays_no_pose(rig_geometry: Geometry, frames: list[Frame]) -> None:

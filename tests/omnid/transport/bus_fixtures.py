@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +18,7 @@ from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.requests import Request
 from omnid.transport.topics import command_topics
+from tests.ports import free_port
 
 DEADLINE_S = 30.0
 
@@ -50,9 +49,7 @@ with zenoh.open(config) as session:
 
 
 def free_endpoint(protocol: str = "tcp") -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"{protocol}/127.0.0.1:{probe.getsockname()[1]}"
+    return f"{protocol}/127.0.0.1:{free_port()}"
 
 
 def odometry(i: int) -> bytes:
@@ -76,14 +73,6 @@ def numbers(path: Path) -> list[int]:
     """Return the numbers that a subscriber has written so far."""
     lines = path.read_text().splitlines(keepends=True) if path.exists() else []
     return [int(line) for line in lines if line.endswith("\n")]
-
-
-def wait_until(condition: Callable[[], bool], pause_s: float = 0.02) -> None:
-    """Wait for a condition; fail after DEADLINE_S."""
-    deadline_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"not within {DEADLINE_S:g} s"
-        time.sleep(pause_s)
 
 
 @contextlib.contextmanager

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import zenoh
 
 from omnid.transport.topics import command_topics
-from tests.omnid.transport.bus_fixtures import wait_until
+from tests.waiting import wait_until
 
 
 @contextlib.contextmanager

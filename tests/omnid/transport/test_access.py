@@ -18,7 +18,8 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.requests import Request
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.waiting import wait_until
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
 

@@ -20,8 +20,9 @@ from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import OK, WARN
-from tests.omnid.transport.bus_fixtures import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script, wait_until
+from tests.omnid.transport.bus_fixtures import DEADLINE_S, ROUTER, free_endpoint, numbers, odometry, script
 from tests.omnid.transport.bus_fixtures import SUBSCRIBER as STAMP_SUBSCRIBER
+from tests.waiting import wait_until
 
 SUBSCRIBER = """
 import json, sys, zenoh

@@ -13,7 +13,8 @@ import zenoh
 from omnid.client import Robot
 from omnid.transport import session as transport_session
 from omnid.transport.bus import Bus, BusConfig
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session
+from tests.waiting import wait_until
 
 
 def test_does_not_connect_to_a_peer_that_another_one_introduces() -> None:

@@ -10,7 +10,8 @@ from omnid.errors import OmnidError
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.client_session import open_client, robots_there
 from omnid.transport.session import Unreachable
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.waiting import wait_until
 
 
 def test_the_robots_that_are_reached_are_named() -> None:

@@ -16,7 +16,8 @@ from omnid.transport.codec import WARN
 from omnid.transport.intake import UNKNOWN, budget_of
 from omnid.transport.requests import Request
 from omnid.transport.topics import REQUEST_TOPICS, command_topics
-from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
+from tests.waiting import wait_until
 
 
 def test_a_query_for_several_keys_is_no_request() -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.codec import ERROR, OK
-from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, session, wait_until
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, session
+from tests.waiting import wait_until
 
 
 def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:

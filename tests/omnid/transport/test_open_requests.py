@@ -11,7 +11,8 @@ import zenoh
 from omnid.client import Answer
 from omnid.transport.open_requests import OpenRequests
 from omnid.transport.requests import MOST_OPEN, answer_of
-from tests.omnid.transport.bus_fixtures import robot, wait_until
+from tests.omnid.transport.bus_fixtures import robot
+from tests.waiting import wait_until
 
 
 @pytest.mark.parametrize("answer", [Answer(True, "driving"), Answer(False, "not armed: d\u00e9sarm\u00e9\n" * 50)])

@@ -15,8 +15,9 @@ from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.topics import PUBLISHED
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.transport.ros2_fixtures import COMMANDS, TOPICS, client, tokens
+from tests.waiting import wait_until
 
 
 def test_all_topics_are_announced_to_rmw_zenoh() -> None:

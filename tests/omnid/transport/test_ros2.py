@@ -20,8 +20,9 @@ from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.requests import Request
-from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script, wait_until
+from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
 from tests.omnid.transport.ros2_fixtures import COMMANDS, TOPICS, client
+from tests.waiting import wait_until
 
 ODOMETRY_KEY = (
     "0/omnid/odom/nav_msgs::msg::dds_::Odometry_/"

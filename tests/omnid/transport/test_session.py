@@ -11,7 +11,8 @@ from omnid.client import Robot
 from omnid.transport.bus import BusConfig
 from omnid.transport.session import open_session
 from omnid.transport.topics import SERVED
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.waiting import wait_until
 
 
 def test_queries_for_several_keys_at_once_are_all_answered() -> None:

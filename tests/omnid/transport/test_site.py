@@ -18,8 +18,9 @@ from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from omnid.transport.status_names import BUS
-from tests.omnid.transport.bus_fixtures import free_endpoint, script, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, script
 from tests.omnid.transport.test_access import asks_to_arm, authority, certificate, needs_openssl
+from tests.waiting import wait_until
 
 PAGE = (Path(__file__).parents[3] / "omnid" / "transport" / "SITE.md").read_text()
 USERS = ("one", "two", "ada", "bob")

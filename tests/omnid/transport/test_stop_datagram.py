@@ -10,7 +10,8 @@ import pytest
 
 from omnid.transport.bus import Bus, BusConfig
 from omnid.transport.stop_datagram import ASKED, STOPPED, StopSender, addresses
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.waiting import wait_until
 
 
 def test_a_stop_is_confirmed_only_where_the_robot_says_so() -> None:

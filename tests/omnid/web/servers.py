@@ -16,8 +16,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from websockets.sync.client import ClientConnection, connect
 
+from tests.waiting import PATIENCE_S, ended
+
 ROOT = Path(__file__).parents[3]
-PATIENCE_S = 30.0
 
 
 class HttpAnswer(NamedTuple):
@@ -91,9 +92,7 @@ class WebServer:
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
         """Send a signal; return the exit code and stderr."""
-        self.process.send_signal(number)
-        _, err = self.process.communicate(timeout=PATIENCE_S)
-        return self.process.returncode, err
+        return ended(self.process, number)
 
 
 @contextmanager

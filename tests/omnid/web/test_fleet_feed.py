@@ -28,7 +28,8 @@ from omnid.web.access import Access
 from omnid.web.fleet_feed import FleetFeed, robot_key
 from omnid.web.fleet_page import MOST_OPEN, FleetPage
 from omnid.web.site import Site
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.waiting import wait_until
 
 ARMED = DiagnosticStatus(WHEELS, 0, "armed", {"armed": "1"})
 STOPPED = DiagnosticStatus(WHEELS, 1, "stopped", {"armed": "0", "disarmed_by": DISARMED_BY_STOP})

@@ -19,8 +19,9 @@ from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
-from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer, served
+from tests.omnid.web.servers import Shown, WebServer, served
 from tests.replay.command import Command
+from tests.waiting import PATIENCE_S
 
 NAMES = ("hall/one", "two", "camera-only")
 HOSTILE = "<img src=x onerror=alert(1)>\x1b[2J"

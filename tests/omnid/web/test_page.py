@@ -28,11 +28,12 @@ from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import CALIBRATION
 from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
-from tests.omnid.web.servers import PATIENCE_S, WebServer, served
+from tests.omnid.web.servers import WebServer, served
 from tests.omnid.web.test_fleet_page import Robots
 from tests.omnid.web.test_routes import Navigator
-from tests.replay.live import robot, started, wait_until
+from tests.replay.live import robot, started
 from tests.replay.test_arming import MANUAL
+from tests.waiting import PATIENCE_S, wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytestmark = [pytest.mark.browser, pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")]

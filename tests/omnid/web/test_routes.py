@@ -23,7 +23,7 @@ from omnid.transport.status_names import NAVIGATION, WHEELS, Key
 from omnid.transport.topics import command_topics
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.omnid.web.servers import Shown, WebServer, served
-from tests.replay.live import wait_until
+from tests.waiting import wait_until
 
 
 class Navigator:

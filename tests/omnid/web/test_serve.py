@@ -22,9 +22,10 @@ from omnid.web import server
 from omnid.web.access import Access, new_token
 from omnid.web.guard import Guard
 from omnid.web.server import WebSettings, _address, _check_names, _listening, _print_addresses, _uvicorn_config, serve
-from tests.omnid.transport.bus_fixtures import wait_until
-from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer
-from tests.replay.live import answers, free_port
+from tests.omnid.web.servers import Shown, WebServer
+from tests.ports import free_port
+from tests.replay.live import answers
+from tests.waiting import PATIENCE_S, wait_until
 
 
 @pytest.fixture

@@ -34,10 +34,11 @@ from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import BUS, WHEELS
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.transport.test_access import authority
-from tests.omnid.web.servers import PATIENCE_S, Shown, WebServer, served
+from tests.omnid.web.servers import Shown, WebServer, served
 from tests.replay.command import Command
+from tests.waiting import PATIENCE_S, wait_until
 
 HOSTILE = "<img src=x onerror=alert(1)>\x1b[2J\u202e\x00\n"
 

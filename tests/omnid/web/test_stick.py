@@ -20,7 +20,8 @@ from omnid.web import snapshot
 from omnid.web.feed import RobotFeed
 from omnid.web.stick import StickCommands, StickRequest, stick_request
 from omnid.web.wheel_commands import WheelCommands
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.waiting import wait_until
 
 NOW_MS = 50_000
 

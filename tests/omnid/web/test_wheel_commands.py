@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import pytest
-from starlette.requests import Request as HttpRequest
 
 from omnid.client import Robot
 from omnid.core.control.velocity_limits import VelocityLimits
@@ -27,7 +26,9 @@ from omnid.web.robot_page import RobotPage
 from omnid.web.robot_requests import RobotRequests
 from omnid.web.stick import StickCommands
 from omnid.web.wheel_commands import WheelCommands, within
-from tests.omnid.transport.bus_fixtures import free_endpoint, wait_until
+from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.omnid.web.test_robot_requests import asked
+from tests.waiting import wait_until
 
 NOW_MS = 50_000
 
@@ -87,18 +88,9 @@ def clock_ms(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return now_ms
 
 
-def asked(text: str) -> HttpRequest:
-    """Return a request with a text."""
-
-    async def receive() -> dict[str, object]:
-        return {"type": "http.request", "body": text.encode(), "more_body": False}
-
-    return HttpRequest({"type": "http", "method": "POST", "path": "/", "headers": []}, receive)
-
-
 async def until(condition: Callable[[], bool]) -> None:
     """Wait for a condition without blocking the event loop."""
-    await asyncio.to_thread(wait_until, condition, 0.002)
+    await asyncio.to_thread(wait_until, condition, pause_s=0.002)
 
 
 def test_a_stop_ends_once_it_is_confirmed_and_one_asked_for_meanwhile_is_sent_again(

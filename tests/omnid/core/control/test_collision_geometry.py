@@ -7,11 +7,12 @@ import random
 
 import pytest
 
-from omnid.core.control.collision_geometry import Outline, contact_s
+from omnid.core.control.collision_geometry import MOST_MOTIONS, DrivenMotions, Outline, contact_s
 from omnid.core.control.heading_controller import Twist
 from tests.omnid.core.control import swept_outline
 
 OUTLINE = Outline(0.3, 0.2, 0.25)
+S = 1_000_000_000
 SLACK_M = 2e-3  # of the sweep's steps
 
 
@@ -104,3 +105,23 @@ def test_the_edge_the_gap_and_the_farthest_corner_are_those_of_the_rectangle() -
         assert (len(inside), len(outside)) == ((1, 0) if depth_m <= 0.0 else (0, 1))
         corner_m = max(abs(complex(x, outline.half_width_m)) for x in (outline.front_m, outline.rear_m))
         assert outline.radius_m == pytest.approx(corner_m)
+
+
+def test_a_way_begins_at_the_stamp_and_lasts_until_now() -> None:
+    motions = DrivenMotions()
+    motions.add(1 * S, Twist(1.0))
+    motions.add(3 * S, Twist(0.0, math.pi / 2))
+    motions.add(4 * S, Twist(2.0))
+    # One second straight on, a quarter of a turn to the left, half a second straight on.
+    pose = motions.since(2 * S, 4 * S + S // 2)
+    assert pose == pytest.approx((1.0, 1.0, math.pi / 2))
+
+
+def test_a_motion_that_is_forgotten_is_not_reached() -> None:
+    motions = DrivenMotions()
+    for tick in range(MOST_MOTIONS):
+        assert motions.reach_back_to(5)
+        motions.add(10 + tick, Twist(1.0))
+    assert motions.reach_back_to(10)
+    motions.add(10 + MOST_MOTIONS, Twist(1.0))
+    assert not motions.reach_back_to(10) and motions.reach_back_to(11)

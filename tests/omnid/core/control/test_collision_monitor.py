@@ -9,7 +9,7 @@ from dataclasses import replace
 import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
-from omnid.core.control.collision_geometry import Outline
+from omnid.core.control.collision_geometry import MOST_MOTIONS, Outline
 from omnid.core.control.collision_monitor import CollisionMonitor
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.controller_ring import ControllerRing, MovingPoint
@@ -302,7 +302,7 @@ def test_a_ring_is_moved_by_all_of_the_way_until_a_late_tick(late_s: float) -> N
 def test_a_ring_from_before_all_motions_that_are_remembered_is_stale() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, stale_s=10.0), 1.5)
     monitor.set_ring(ControllerRing(10 * S, FREE_RING))
-    for tick in range(monitor_module.MOST_MOTIONS + 1):
+    for tick in range(MOST_MOTIONS + 1):
         assert monitor.step(10 * S + tick * S // 200, Twist(0.2)) == Twist(0.2)
         monitor.follow(10 * S + tick * S // 200, Twist(0.2))
     assert monitor.step(12 * S + S // 100, Twist(0.2)) == Twist()

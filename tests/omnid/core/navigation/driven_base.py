@@ -26,6 +26,14 @@ LAG_S = 0.1
 AGE_S = 0.08  # of a pose when it is known
 
 
+def wheel_state(law: ControlLaw) -> WheelState:
+    """Return the state of the wheels, as the daemon reads it from the controller."""
+    arming, current = law.arming, law.commands.current
+    source = "" if law.reason or current is None else current.source
+    held_by = law.collision.reason if law.collision.share == 0.0 else ""
+    return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
+
+
 class Sample(NamedTuple):
     """The base at one pose."""
 
@@ -72,10 +80,7 @@ class DrivenBase:
 
     @property
     def wheels(self) -> WheelState:
-        arming, law = self.law.arming, self.law
-        source = "" if law.reason or law.commands.current is None else law.commands.current.source
-        held_by = law.collision.reason if law.collision.share == 0.0 else ""
-        return WheelState(arming.armed, arming.needs_request, arming.reason, law.reason, source, held_by)
+        return wheel_state(self.law)
 
     def seen(self) -> Situation:
         """Return the pose as it is estimated now."""
