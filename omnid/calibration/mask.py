@@ -19,6 +19,7 @@ from omnid.calibration.drive_observations import Topics, tracked_updates
 from omnid.calibration.drive_start import with_masks
 from omnid.calibration.image_pairs import open_log
 from omnid.config import Config
+from omnid.core.frames import of_base
 from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedParts
 from omnid.errors import OmnidError
 from omnid.stages.front_end import FrontEnd
@@ -68,7 +69,7 @@ def calibrate_mask(
     with closing(open_log(log, topics, rig)) as reader:
         for update in tracked_updates(reader, front_end, config, log):
             pair = update.depth.panoramas
-            parts.observe(update.T_odom_rig, pair.lower, pair.upper, pair.visible)
+            parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
             front_end.poses.after()
     if parts.headings < LEAST_HEADINGS:
         raise OmnidError(

@@ -61,7 +61,7 @@ class PairRings:
             # The grid stays: it holds again once odometry recognises its landmarks.
             self._tracker.clear()
             return unknown
-        self._leave_out_fixed_parts(odometry)
+        self._leave_out_fixed_parts(panoramas, T_odom_base)
         columns = self._columns_of(camera_floor, panoramas)
         if columns is None:
             return unknown
@@ -77,13 +77,10 @@ class PairRings:
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
 
-    def _leave_out_fixed_parts(self, odometry: OdometryUpdate) -> None:
+    def _leave_out_fixed_parts(self, panoramas: Panoramas, T_odom_base: Array) -> None:
         """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""
-        panoramas = odometry.depth.panoramas
         is_frozen = any(dead.any() for dead in panoramas.tiles.dead.values())
-        if is_frozen or not self.fixed.observe(
-            odometry.T_odom_rig, panoramas.lower, panoramas.upper, panoramas.visible
-        ):
+        if is_frozen or not self.fixed.observe(T_odom_base, panoramas.lower, panoramas.upper, panoramas.visible):
             return
         if self.fixed.pixels is not self._left_out:
             self._left_out, self._of_floor, self._is_misled = self.fixed.pixels, None, True

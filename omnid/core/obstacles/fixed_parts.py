@@ -46,7 +46,7 @@ SPECK: Final = np.ones((2, 3), np.uint8)  # smallest part, because noise is narr
 WITHIN: Final = np.ones((COARSE_ROWS, 9), np.uint8)
 MOST: Final = 0.3  # Share that may be fixed, because where more is, images do not follow the heading.
 LEAST_FALL: Final = math.tan(math.radians(20))  # Below the horizon: floor there is within 2.5 m of a base.
-ON_THE_SPOT_M: Final = 0.2  # A base that has moved by less in a turn knows the floor beside it as at its start.
+ON_THE_SPOT_M: Final = 0.2  # A base that moves by less as it turns knows the floor beside it as at its start.
 LEAST_NEW: Final = 0.01  # share of the panorama that must be new, because it costs what was known about the floor
 
 
@@ -83,19 +83,19 @@ class FixedParts:
         places_m = np.array(self._places_m)
         return len(places_m) == LEAST_HEADINGS and bool((np.ptp(places_m, axis=0) < ON_THE_SPOT_M).all())
 
-    def observe(self, T_odom_rig: Array, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> bool:
-        """Take a pair at a pose (4, 4); return True where it was judged what is fixed.
+    def observe(self, T_odom_base: Array, lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags) -> bool:
+        """Take a pair at a pose (4, 4) of the base; return True where it was judged what is fixed.
 
         visible (H, W): pixels that show the world as far as the rig knows, the same in all pairs.
         """
         # 1. One view of each heading, taken as the base turns to it.
-        heading = int(float(se3.yaw(T_odom_rig)) % math.tau / math.tau * HEADINGS) % HEADINGS
+        heading = int(float(se3.yaw(T_odom_base)) % math.tau / math.tau * HEADINGS) % HEADINGS
         if heading == self._heading:
             return False
         self._heading = heading
         shown = cv2.resize(visible.view(np.uint8), self._size, interpolation=cv2.INTER_AREA).astype(np.float32)
         self._views[heading] = np.stack([_texture(lower, shown), _texture(upper, shown)])
-        self._places_m.append(T_odom_rig[:2, 3].copy())
+        self._places_m.append(T_odom_base[:2, 3].copy())
         self._new += 1
         # 2. Judged by all headings once as many are new as the least.
         if self._new < LEAST_HEADINGS or self.headings < LEAST_HEADINGS:

@@ -38,8 +38,8 @@ PERIOD_NS = 100_000_000
 class Standing:
     """A base that does not move, with cameras so high over the floor."""
 
-    def __init__(self, height_m: float) -> None:
-        T_base_rig = se3.transform(np.eye(3), [0.0, 0.0, height_m])
+    def __init__(self, height_m: float, ahead_m: float = 0.0) -> None:
+        T_base_rig = se3.transform(np.eye(3), [ahead_m, 0.0, height_m])
         rig = replace(make_rig(baseline_m=BASELINE_M), T_base_rig=T_base_rig)
         self.rings, self._floor, self._seq = (
             PairRings(Geometry(rig, CYLINDER), RingSettings()),
@@ -54,11 +54,12 @@ class Standing:
         resets: int = 0,
         heading_rad: float = 0.0,
         x_m: float = 0.0,
+        y_m: float = 0.0,
     ) -> ObstacleRing:
         """Return the ring at the next pair."""
         self._seq += 1
         T_odom_rig = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading_rad]))
-        T_odom_rig[0, 3] = x_m
+        T_odom_rig[:2, 3] = x_m, y_m
         of_pose = T_odom_rig, np.eye(6), np.zeros(6), np.eye(6)
         return self.rings.add(
             OdometryUpdate(self._seq, self._seq * PERIOD_NS, *of_pose, state, resets, 100, 100, StereoDepth(pair)),
@@ -139,6 +140,17 @@ def test_a_base_that_learns_as_it_drives_takes_no_floor_for_free_until_it_turns_
         free_m.append(float(np.median(rings[-1].free_m)))
         assert (base.rings.fixed.share > 0.05) == (n >= 11)
     assert max(free_m[11:23]) < 0.8 and min(free_m[23:]) > 2.0
+
+
+def test_cameras_ahead_of_the_base_are_on_the_spot_as_it_turns() -> None:
+    """They move on a circle of 0.6 m about it."""
+    base = Standing(HEIGHT_M, ahead_m=0.3)
+    T_base_rig = se3.transform(np.eye(3), [0.3, 0.0, HEIGHT_M])
+    for heading in (np.arange(13) + 0.5) * math.tau / 16:
+        turn = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading]))
+        x_m, y_m = (se3.inverse(T_base_rig) @ turn @ T_base_rig)[:2, 3]
+        base.ring(_turned(heading, 60.0), heading_rad=heading, x_m=x_m, y_m=y_m)
+    assert base.rings.fixed.share and base.rings.fixed.is_on_the_spot
 
 
 def test_a_frozen_part_of_the_images_is_not_learned() -> None:
