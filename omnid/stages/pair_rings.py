@@ -91,7 +91,7 @@ class PairRings:
             self._is_misled = False
 
     def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
-        """Return the columns for the floor and what is left out, made anew where these change; None: no floor."""
+        """Return the columns for the floor and what is left out, None without a floor."""
         floor = camera_floor.floor
         if floor is not None and floor is not self._of_floor:
             geometry, settings = self._geometry, self._settings

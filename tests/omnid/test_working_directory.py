@@ -40,6 +40,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "calibrate check": (("none.mcap", "--rig", "none.toml"), NO_RIG),
     "calibrate drive": (("none.mcap", "--rig", "none.toml", "-o", "r.toml"), NO_RIG),
     "calibrate height": (("none.mcap", "--rig", "none.toml"), "none"),
+    "calibrate mask": (("none.mcap", "--rig", "none.toml"), "none"),
     "calibrate import": (("none.yaml", "-o", "r.toml"), "none.yaml"),
     "calibrate export": (("none.toml", "--format", "kalibr", "-o", "c.yaml"), NO_RIG),
     "cameras": (("--snapshot", "views", "--log", "none.mcap"), "none.mcap"),
