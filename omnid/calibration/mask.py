@@ -24,6 +24,7 @@ from omnid.core.obstacles.fixed_parts import HEADINGS, LEAST_HEADINGS, FixedPart
 from omnid.errors import OmnidError
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry, geometry
+from omnid.tracking_state import TrackingState
 
 Flags = NDArray[np.bool_]
 
@@ -69,7 +70,8 @@ def calibrate_mask(
     with closing(open_log(log, topics, rig)) as reader:
         for update in tracked_updates(reader, front_end, config, log):
             pair = update.depth.panoramas
-            parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
+            if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:
+                parts.observe(of_base(update, place.rig.T_base_rig)[0], pair.lower, pair.upper, pair.visible)
             front_end.poses.after()
     if parts.headings < LEAST_HEADINGS:
         raise OmnidError(

@@ -52,7 +52,7 @@ class PairRings:
         if odometry.reset_counter != self._resets:
             self._grid.begin_again()
             self._tracker.clear()
-            self._resets = odometry.reset_counter
+            self._resets, self._is_misled = odometry.reset_counter, False
         panoramas = odometry.depth.panoramas
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
@@ -79,8 +79,9 @@ class PairRings:
 
     def _leave_out_fixed_parts(self, panoramas: Panoramas, T_odom_base: Array) -> None:
         """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""
-        is_frozen = any(dead.any() for dead in panoramas.tiles.dead.values())
-        if is_frozen or not self.fixed.observe(T_odom_base, panoramas.lower, panoramas.upper, panoramas.visible):
+        if panoramas.tiles.is_frozen:
+            return
+        if not self.fixed.observe(T_odom_base, panoramas.lower, panoramas.upper, panoramas.visible):
             return
         if self.fixed.pixels is not self._left_out:
             self._left_out, self._of_floor, self._is_misled = self.fixed.pixels, None, True

@@ -78,6 +78,11 @@ class TileStates:
         """Return the columns of tiles (C,) in which the pair shows nothing to rely on."""
         return np.asarray(np.logical_or.reduce(list(self.columns.values()) or [np.zeros(TILE_COLUMNS, bool)]))
 
+    @property
+    def is_frozen(self) -> bool:
+        """Return whether a part of an image is dead."""
+        return any(tiles.any() for tiles in self.dead.values())
+
     def lost_pixels(self, shape: tuple[int, ...]) -> Flags | None:
         """Return the pixels (H, W) of directions that are unknown, and of single tiles that are dead or blind.
 

@@ -10,6 +10,7 @@ import pytest
 import omnid
 from calib.rig_file import read_rig
 from omnid.calibration.mask import MaskCalibration
+from omnid.core.stereo.tiles import TileStates
 from tests.omnid.commands.test_calibrate_files import omnid as command
 from tests.simulation.disturbances import REFLECTION_RADIUS
 from tests.simulation.logs import write_log
@@ -57,3 +58,10 @@ def test_the_command_writes_a_rig_that_needs_no_other_mask(
 def test_a_robot_that_hardly_turns_is_refused(scene: Path) -> None:
     with pytest.raises(omnid.OmnidError, match=r"shows \d of 16 headings of a turn, 12 are needed: record a log"):
         omnid.calibrate_mask(scene / "log.mcap", scene / "rig.toml")
+
+
+def test_a_part_that_is_frozen_is_no_fixed_one(spin: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its driver may write it again, and a mask would hide it for good; such pairs show no heading."""
+    monkeypatch.setattr(TileStates, "is_frozen", property(lambda _: True))
+    with pytest.raises(omnid.OmnidError, match="shows 0 of 16 headings"):
+        omnid.calibrate_mask(spin / "log.mcap", spin / "rig.toml")
