@@ -234,6 +234,10 @@ class LandmarkStore:
         misses[rows] = self._max_misses
         self.table = replace(self.table, misses=misses)
 
+    def keep(self, ids: Indices) -> None:
+        """Remove all landmarks but these."""
+        self._select(np.isin(self.table.id, ids))
+
     def from_anchors(self, T_rect_odom: Array, rows: Indices) -> Array:
         """Return the transforms (M, 4, 4) into a rectified frame from the anchors of landmarks (rows of the table)."""
         T_odom_anchor, keyframe = self._anchors(rows)

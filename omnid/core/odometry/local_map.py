@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.first_depths import FirstDepths
 from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
 from omnid.core.odometry.late_depths import LateDepths
 from omnid.core.odometry.patch_alignment import AlignedPatches, align
@@ -54,6 +55,7 @@ class LocalMap:
         self._near_klt = replace(self._coarse_klt, levels=0)
         self.store = LandmarkStore(model, max_keyframes, max_misses)
         self.late_depths = LateDepths(self.store)
+        self.first_depths: FirstDepths | None = None  # of the only keyframe; None: its depths are not in doubt
         self._last: PaddedPanorama | None = None
         self.lost: NDArray[np.bool_] | None = None  # (H, W) of the frame, in which no landmark is searched; None: none
 
@@ -64,7 +66,7 @@ class LocalMap:
         """Remove all landmarks and keyframes."""
         self.store.clear()
         self.late_depths.clear()
-        self._last = None
+        self.first_depths = self._last = None
 
     def add_keyframe(
         self, keyframe: Keyframe, views: Array, slopes: Array, noise: Array | None = None, pixels: Array | None = None
@@ -72,6 +74,13 @@ class LocalMap:
         """Add a keyframe at the last panorama with new landmarks: see LandmarkStore.add_keyframe."""
         self._last = keyframe.lower
         return self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
+
+    def decide_first_depths(self, lower: PaddedPanorama, dt_s: float, most_mps: float) -> None:
+        """Let a new panorama, dt_s after the last one, decide among the depths of the first keyframe."""
+        if self.first_depths is not None:
+            self.first_depths.decide(lower, self._coarse_klt, self.store, dt_s, most_mps)
+            if not self.first_depths.is_open:
+                self.first_depths = None
 
     def update_tracked(self, lower: PaddedPanorama, landmarks: Indices, pixels: Array) -> None:
         """Record the inliers (rows of the table) of an accepted panorama with their pixels (M, 2)."""

@@ -6,6 +6,7 @@ Equations and sections are those of Dang et al. 2012.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ class PoseSearch:
         self, frame: StereoFrame, usable: Flags, last: LastFrame, T_predicted: Array, dt_s: float
     ) -> PoseEstimate | None:
         """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
+        self._map.decide_first_depths(frame.lower, dt_s, self._limits.max_speed_mps)
         best: PoseEstimate | None = None
         exposure = self._exposures.predicted(frame, dt_s)
         for T_guess, is_near in self._guesses(frame, usable, last, T_predicted):
@@ -105,7 +107,11 @@ class PoseSearch:
             other = self._by_outliers(frame, estimate, exposure, last, dt_s)
             others += [other] if other is not None else []
         # 3. The likeliest one, and whether another one is nearly as likely.
-        return likeliest(estimate, others, T_predicted, max(reach_m, off_m))
+        chosen = likeliest(estimate, others, T_predicted, max(reach_m, off_m))
+        if chosen.runner_up is None and self._map.first_depths is not None:
+            step = se3.log(se3.inverse(last.T_odom_rect) @ chosen.T_odom_rect)
+            return replace(chosen, runner_up=self._map.first_depths.runner_up(step))
+        return chosen
 
     def _by_outliers(
         self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure, last: LastFrame, dt_s: float

@@ -26,6 +26,8 @@ SEARCH_SHARE = 0.2
 # By how much the correlation of the patch at its own disparity must exceed that at the neighbours': identical bricks
 # differ by less than 0.05, other textures by 0.3 and more.
 LEAST_LEAD = 0.15
+MOST_ALIKE = 10  # disparities of one landmark: courses of 6 cm fit within a baseline of 0.5 m so often
+APART_PX = 3.0  # least distance of two of them, more than the width of a peak
 
 
 def has_wrong_period(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array, rows: Array, known: Array) -> Flags:
@@ -45,12 +47,40 @@ def has_wrong_period(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array,
         if there[-1] > len(pair[1].image) - 1:  # a motion that the image does not show cannot be excluded
             found[n] = True
             continue
-        lower = _patches(pair[0], pixels[n, 0], pixels[n, 1:])
+        lower = _patches(pair[0], pixels[n : n + 1, 0], pixels[n, 1:])
         at_own, elsewhere = (
-            float(np.max(_patches(pair[1], pixels[n, 0], at) @ lower[0], initial=-1.0))
+            float(np.max(_patches(pair[1], np.full(len(at), pixels[n, 0]), at) @ lower[0], initial=-1.0))
             for at in (rows[n : n + 1], there)
         )
         found[n] = at_own - elsewhere < LEAST_LEAD
+    return found
+
+
+def disparities_alike(pair: tuple[PaddedPanorama, PaddedPanorama], views: Array, most_px: int) -> Array:
+    """Return disparities (N, K) [px] up to most_px at which views (N, 3) [px] match, their own ones first, then the best.
+
+    The others are peaks of the correlation within LEAST_LEAD of the own one; NaN: there are no more.
+    """
+    columns, rows, own = views[:, 0], views[:, 1], views[:, 2] - views[:, 1]
+    lower, found = _patches(pair[0], columns, rows), np.full((len(views), MOST_ALIKE), np.nan)
+    found[:, 0] = own
+    # 1. The correlation at all disparities; -1 where the panorama ends.
+    scores = np.full((len(views), most_px + 1), -1.0, np.float32)
+    for disparity in range(most_px + 1):
+        inside = np.flatnonzero(rows + disparity < len(pair[1].image))
+        upper = _patches(pair[1], columns[inside], rows[inside] + disparity)
+        scores[inside, disparity] = np.einsum("ns,ns->n", lower[inside], upper)
+    # 2. Its peaks, to fractions of a pixel by a parabola, away from the own disparity.
+    before, peak, after = scores[:, :-2], scores[:, 1:-1], scores[:, 2:]
+    shift = (before - after) / np.minimum(2 * (before - 2 * peak + after), -1e-6)
+    at = np.arange(1, most_px) + shift
+    nearest = np.clip(np.rint(own).astype(np.intp), 1, most_px - 1)
+    at_own = np.maximum.reduce([scores[np.arange(len(views)), nearest + step] for step in (-1, 0, 1)])
+    is_peak = (peak >= before) & (peak > after) & (peak > at_own[:, None] - LEAST_LEAD)
+    ranked = np.where(is_peak & (np.abs(at - own[:, None]) > APART_PX), peak, -np.inf)
+    order = np.argsort(-ranked, axis=1, kind="stable")[:, : MOST_ALIKE - 1]
+    kept = np.isfinite(np.take_along_axis(ranked, order, axis=1))
+    found[:, 1 : 1 + order.shape[1]] = np.where(kept, np.take_along_axis(at, order, axis=1), np.nan)
     return found
 
 
@@ -62,12 +92,13 @@ def _disparity_around(lower: PaddedPanorama, pixels: Array, known: Array) -> Arr
     return np.asarray(np.median((known[:, 2] - known[:, 1])[nearest], axis=1))
 
 
-def _patches(panorama: PaddedPanorama, column: float, rows: Array) -> Array:
-    """Return patches (R, SIDE_PX^2) of a column at rows (R,), of zero mean and unit length."""
+def _patches(panorama: PaddedPanorama, columns: Array, rows: Array) -> NDArray[np.float32]:
+    """Return patches (N, SIDE_PX^2) about pixels with columns and rows (N,), of zero mean and unit length."""
     side = np.arange(SIDE_PX) - SIDE_PX // 2
     image = panorama.image
-    columns = np.rint(panorama.padded(np.array([column]))).astype(np.intp) + side
-    at = np.rint(rows).astype(np.intp)[:, None] + side
-    patches = image[at.clip(0, len(image) - 1)[:, :, None], columns.clip(0, image.shape[1] - 1)].reshape(len(rows), -1)
-    patches = patches - patches.mean(axis=1, keepdims=True)
-    return np.asarray(patches / np.maximum(np.linalg.norm(patches, axis=1), 1e-9)[:, None])
+    across = np.rint(panorama.padded(columns)).astype(np.intp)[:, None] + side
+    down = np.rint(rows).astype(np.intp)[:, None] + side
+    at = down.clip(0, len(image) - 1)[:, :, None], across.clip(0, image.shape[1] - 1)[:, None, :]
+    patches = image[at].reshape(len(rows), -1).astype(np.float32)
+    patches -= patches.mean(axis=1, keepdims=True)
+    return np.asarray(patches / np.maximum(np.linalg.norm(patches, axis=1), 1e-9)[:, None], np.float32)

@@ -1,0 +1,210 @@
+"""Depths of the first keyframe where nearly everything repeats: the first motion decides among them.
+
+Courses of bricks of the height c fit the upper panorama at every disparity d (1 - k c / B), B the baseline, whatever
+their distance: a world that is larger by 1 / (1 - k c / B) explains the pair as well. Where a landmark repeats, dense
+stereo may have taken any of its disparities d_k, and landmarks of an earlier keyframe, which would decide, there are
+none. The lower panorama alone, followed from the keyframe on, decides:
+
+1. Motion without depths: of horizontal directions t and turns R the ones that most pairs of bearings (a_i, b_i) fit,
+
+       e_i = f (t x R a_i) b_i / |t x R a_i|.
+
+2. The distance |t|: the bearings of a landmark give its range r_i in units of |t|, and each of its disparities a
+   distance |t| = f B / (d_k r_i). Each landmark votes once,
+
+       S(|t|) = sum_i max_k exp(-(log |t| - log f B / (d_k r_i))^2 / (2 sigma_ik^2)).
+
+   The true distance has the votes of all landmarks, that of a larger world not those of landmarks that do not repeat.
+3. The distance that a vehicle can have made with most votes decides the depths. Another one with nearly as many is the
+   runner-up; it stays one, in each later step, until votes in one of the next frames decide.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from omnid.core.odometry.landmarks import LandmarkStore
+from omnid.core.odometry.tracking import KltSettings, track
+from omnid.core.odometry.wrong_periods import disparities_alike
+from omnid.core.odometry.view_kernels import MIN_RADIUS_M
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.stereo_model import StereoModel
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+# Landmarks that do not repeat, as a share of all, below which the others decide the scale of the map: rendered rooms
+# with a wall of bricks have 0.42 and more.
+LEAST_SURE = 0.4
+# Directions of the motion and turns that are tried, rad: a step moves an epipolar line at 45 degrees by TOLERANCE_PX of
+# a scale of 1, because the lines are compared with that tolerance. The last turn is as far as the tracker reaches.
+DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
+ROUNDS, FINER = 3, 3  # rounds of a search that is each so many times as fine: to a tenth of a degree
+TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicles roll and pitch by half a degree
+# Parallax from which a landmark votes: with errors of SIGMA_PX its range errs by an eighth, half of a course's share.
+PARALLAX_PX, SIGMA_PX = 6.0, 0.7
+DISPARITY_SIGMA_PX = 0.5  # because peaks of the correlation are found among whole pixels
+LOG_STEP = 0.01  # between two distances whose votes are counted, a fraction of the least sigma
+LEAST_SIGMA = 0.02  # of a vote, because the motion is only known to a tenth of a degree
+LEAST_VOTES = 30.0  # that decide: half of a hundred votes would be scattered
+DECIDING_SHARE = 0.5  # share of the landmarks with a vote that agree on the distance
+# Votes by which a runner-up has fewer: a million to one, with the cost of 1.1 of an outlier (runner_up_motions.py).
+LEAD_VOTES = math.log(1e6) / 1.1
+OTHER_RATIO = 1.1  # Distances whose ratio is less are one: the votes for one distance are spread so far.
+LEAST_SHARE = 0.1  # by which a motion may be larger where the depths that were taken are the farthest ones
+# Covariance [px^2] of a view whose upper row was moved to another peak of the correlation.
+VIEW_NOISE = np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2])
+VOTED_SIGMAS = 3.0  # within which a disparity is the voted one: three in a thousand of the right ones are farther
+
+
+class Votes(NamedTuple):
+    """Distances [m] with most votes."""
+
+    moved_m: float
+    runner_up_m: float | None  # another distance that has nearly as many
+
+
+class FirstDepths:
+    """Disparities that the landmarks of the first keyframe may have, until the motion has decided among them."""
+
+    def __init__(
+        self, pair: tuple[PaddedPanorama, PaddedPanorama], ids: Indices, views: Array, model: StereoModel
+    ) -> None:
+        """pair: lower and upper panorama of the keyframe; ids (N,) and views (N, 3) [px] of its landmarks."""
+        self._model, self._ids, self._views = model, ids, views
+        self._disparities = disparities_alike(pair, views, round(model.cylinder.focal_px))
+        self._last, self._pixels, self._since_s = pair[0], views[:, :2], 0.0
+        self._larger_share = self._largest_share()
+
+    @property
+    def is_open(self) -> bool:
+        """True while the motion may be larger or smaller than the depths of the map give it."""
+        return self._larger_share != 0.0
+
+    def runner_up(self, step: Array) -> Array | None:
+        """Return the displacement (6,) [t; r] from a pose to the runner-up after a step (6,) to it; None: no doubt."""
+        return self._larger_share * np.concatenate([step[:3], np.zeros(3)]) if self.is_open else None
+
+    def decide(
+        self, lower: PaddedPanorama, klt: KltSettings, store: LandmarkStore, dt_s: float, most_mps: float
+    ) -> None:
+        """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is."""
+        # 1. Follow them from the keyframe on.
+        self._since_s += dt_s
+        self._follow(lower, klt)
+        # 2. Vote for the distance.
+        ranges, parallax_px = self._ranges()
+        distances = self._model.cylinder.focal_px * self._model.baseline_m / (self._disparities * ranges[:, None])
+        sigmas = np.hypot(SIGMA_PX / parallax_px[:, None], DISPARITY_SIGMA_PX / self._disparities) + LEAST_SIGMA
+        votes = voted(np.log(distances), sigmas, math.log(max(most_mps * self._since_s, MIN_RADIUS_M)))
+        if votes is None:
+            return
+        self._larger_share = 0.0 if votes.runner_up_m is None else votes.runner_up_m / votes.moved_m - 1.0
+        # 3. Landmarks take the disparity of that distance; those without one, or without a vote, may be wrong.
+        off = np.abs(np.log(distances / votes.moved_m)) / sigmas
+        off[~np.isfinite(off)] = np.inf
+        chosen, each = off.argmin(axis=1), np.arange(len(off))
+        is_right = (off[each, chosen] < VOTED_SIGMAS) | (~self._repeats & ~np.isfinite(ranges))
+        moved = is_right & (chosen > 0)
+        views = self._views[moved]
+        views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
+        store.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
+        store.keep(self._ids[is_right])
+
+    @property
+    def _repeats(self) -> Flags:
+        return np.asarray(np.isfinite(self._disparities[:, 1:]).any(axis=1))
+
+    def _largest_share(self) -> float:
+        """Return by which share of a motion it may be larger; 0: enough landmarks do not repeat."""
+        if not len(self._ids) or 1.0 - self._repeats.mean() >= LEAST_SURE:
+            return 0.0
+        own, least = self._disparities[self._repeats, 0], np.nanmin(self._disparities[self._repeats], axis=1)
+        return max(float(np.median(own / least)) - 1.0, LEAST_SHARE)
+
+    def _follow(self, lower: PaddedPanorama, klt: KltSettings) -> None:
+        """Track the landmarks from the last panorama into the next one; others are no longer followed."""
+        pixels, found = track(self._last, lower, self._pixels, self._pixels, klt)
+        self._last, self._pixels = lower, pixels[found]
+        self._ids, self._views, self._disparities = self._ids[found], self._views[found], self._disparities[found]
+
+    def _ranges(self) -> tuple[Array, Array]:
+        """Return the ranges (N,) of the landmarks from the keyframe, in units of the distance, and parallaxes (N,) [px].
+
+        A landmark off its epipolar line, behind the camera, or with too little parallax has none: NaN.
+        """
+        cylinder = self._model.cylinder
+        before, now = cylinder.rays(self._views[:, :2]), cylinder.rays(self._pixels)
+        now /= np.linalg.norm(now, axis=1, keepdims=True)
+        direction, turn = most_likely_motion(before, now, cylinder.focal_px)
+        t, turned = (
+            np.array([math.cos(direction), math.sin(direction), 0.0]),
+            before @ se3.rotation_exp([0.0, 0.0, turn]).T,
+        )
+        error_px = cylinder.focal_px * epipolar_errors(turned, now, direction)
+        # r R a + t = q b in the least-squares sense; t points forwards or backwards, whichever leaves most in front.
+        a2, ab = (turned**2).sum(axis=1), (turned * now).sum(axis=1)
+        sine2 = a2 - ab**2
+        ranges = (ab * (now @ t) - turned @ t) / np.maximum(sine2, 1e-12)
+        ranges *= np.sign(np.median(ranges[sine2 > np.median(sine2)])) if len(ranges) else 1.0
+        parallax_px = cylinder.focal_px * np.sqrt(np.maximum(sine2, 1e-12) / a2)
+        known = (np.abs(error_px) < TOLERANCE_PX) & (parallax_px > PARALLAX_PX) & (ranges > 0)
+        return np.where(known, ranges, np.nan), parallax_px
+
+
+def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float]:
+    """Return direction and turn [rad] of the horizontal motion that most bearings (N, 3) fit, before and after it."""
+    direction, turn = np.arange(0.0, math.pi, DIRECTION_STEP), np.arange(-MOST_TURN, MOST_TURN + TURN_STEP, TURN_STEP)
+    steps = DIRECTION_STEP, TURN_STEP
+    for _ in range(ROUNDS):
+        scores = np.empty((len(turn), len(direction)))
+        for row, angle in zip(scores, turn, strict=True):
+            errors_px = focal_px * epipolar_errors(
+                before @ se3.rotation_exp([0.0, 0.0, angle]).T, now, direction[:, None]
+            )
+            row[:] = np.exp(-0.5 * (errors_px / TOLERANCE_PX) ** 2).sum(axis=1)
+        best = np.unravel_index(int(scores.argmax()), scores.shape)
+        at = float(direction[best[1]]), float(turn[best[0]])
+        steps = steps[0] / FINER, steps[1] / FINER
+        direction, turn = (middle + step * np.arange(-FINER, FINER + 1) for middle, step in zip(at, steps, strict=True))
+    return at
+
+
+def epipolar_errors(turned: Array, now: Array, direction: Array | float) -> Array:
+    """Return the angles (..., N) [rad] of bearings now (N, 3), of unit length, to the planes through turned (N, 3).
+
+    direction (...,) [rad]: that of the horizontal motion, which all planes contain.
+    """
+    c, s = np.cos(direction), np.sin(direction)
+    x, y, z = turned.T
+    across = c * y - s * x
+    return np.asarray((z * (s * now[:, 0] - c * now[:, 1]) + across * now[:, 2]) / np.hypot(z, across))
+
+
+def voted(distances: Array, sigmas: Array, most: float) -> Votes | None:
+    """Return the distance with most votes up to a largest one; None: too few agree.
+
+    distances (N, K): logarithms, NaN: no vote; sigmas (N, K) of them; most: a logarithm, too.
+    """
+    voting = np.isfinite(distances).any(axis=1)
+    distances, sigmas = distances[voting], sigmas[voting]
+    if len(distances) < LEAST_VOTES:
+        return None
+    grid = np.arange(float(np.nanmin(distances)), most, LOG_STEP)
+    if not len(grid):
+        return None
+    each = np.exp(-0.5 * ((grid[:, None, None] - distances) / sigmas) ** 2)
+    votes = np.nan_to_num(each).max(axis=2).sum(axis=1)
+    best = int(votes.argmax())
+    if votes[best] < max(LEAST_VOTES, DECIDING_SHARE * len(distances)):
+        return None
+    others = np.where(np.abs(grid - grid[best]) > math.log(OTHER_RATIO), votes, 0.0)
+    other = int(others.argmax())
+    is_near = others[other] > votes[best] - LEAD_VOTES
+    return Votes(math.exp(grid[best]), math.exp(grid[other]) if is_near else None)
