@@ -49,12 +49,18 @@ class PoseEstimate:
     runner_up: Array | None = None  # (6,) [t; r] of the step to a pose that explains the images nearly as well
     # (K,) rows of the local map whose landmarks support that pose instead
     contradicting: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
+    doubtful_depths: bool = False  # True while the landmarks may all have another depth: it is in the covariance
     upper_ratio: float = 1.0  # share of the inliers among the tracks that the upper panorama shows where they must be
 
     @property
     def spread(self) -> Array:
         """The covariance (6, 6) that covers the runner-up as well."""
         return self.covariance if self.runner_up is None else self.covariance + np.outer(self.runner_up, self.runner_up)
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether no other motion or depths explain the images nearly as well."""
+        return self.runner_up is None and not self.doubtful_depths
 
     @property
     def without_landmarks(self) -> PoseEstimate:

@@ -15,8 +15,8 @@ none. The lower panorama alone, followed from the keyframe on, decides:
        S(|t|) = sum_i max_k exp(-(log |t| - log f B / (d_k r_i))^2 / (2 sigma_ik^2)).
 
    The true distance has the votes of all landmarks, that of a larger world not those of landmarks that do not repeat.
-3. The distance that a vehicle can have made with most votes decides the depths. Another one with nearly as many is the
-   runner-up; it stays one, in each later step, until votes in one of the next frames decide.
+3. The distance that a vehicle can have made with most votes decides the depths. While another one has nearly as many, or
+   too few landmarks have moved far enough to vote, the pose is in doubt by the difference of both.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.landmarks import LandmarkStore
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.odometry.wrong_periods import disparities_alike
 from omnid.core.odometry.view_kernels import MIN_RADIUS_M
+from omnid.core.odometry.wrong_periods import disparities_alike
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
@@ -56,8 +56,8 @@ LEAST_VOTES = 30.0  # that decide: half of a hundred votes would be scattered
 DECIDING_SHARE = 0.5  # share of the landmarks with a vote that agree on the distance
 # Votes by which a runner-up has fewer: a million to one, with the cost of 1.1 of an outlier (runner_up_motions.py).
 LEAD_VOTES = math.log(1e6) / 1.1
+SAME_M = 0.02  # poses that differ less are one, as in runner_up_motions.py
 OTHER_RATIO = 1.1  # Distances whose ratio is less are one: the votes for one distance are spread so far.
-LEAST_SHARE = 0.1  # by which a motion may be larger where the depths that were taken are the farthest ones
 # Covariance [px^2] of a view whose upper row was moved to another peak of the correlation.
 VIEW_NOISE = np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2])
 VOTED_SIGMAS = 3.0  # within which a disparity is the voted one: three in a thousand of the right ones are farther
@@ -74,10 +74,15 @@ class FirstDepths:
     """Disparities that the landmarks of the first keyframe may have, until the motion has decided among them."""
 
     def __init__(
-        self, pair: tuple[PaddedPanorama, PaddedPanorama], ids: Indices, views: Array, model: StereoModel
+        self,
+        pair: tuple[PaddedPanorama, PaddedPanorama],
+        T_odom_rect: Array,
+        ids: Indices,
+        views: Array,
+        model: StereoModel,
     ) -> None:
         """pair: lower and upper panorama of the keyframe; ids (N,) and views (N, 3) [px] of its landmarks."""
-        self._model, self._ids, self._views = model, ids, views
+        self._model, self._T_odom_rect, self._ids, self._views = model, T_odom_rect, ids, views
         self._disparities = disparities_alike(pair, views, round(model.cylinder.focal_px))
         self._last, self._pixels, self._since_s = pair[0], views[:, :2], 0.0
         self._larger_share = self._largest_share()
@@ -87,9 +92,11 @@ class FirstDepths:
         """True while the motion may be larger or smaller than the depths of the map give it."""
         return self._larger_share != 0.0
 
-    def runner_up(self, step: Array) -> Array | None:
-        """Return the displacement (6,) [t; r] from a pose to the runner-up after a step (6,) to it; None: no doubt."""
-        return self._larger_share * np.concatenate([step[:3], np.zeros(3)]) if self.is_open else None
+    def runner_up(self, T_odom_rect: Array) -> Array | None:
+        """Return the displacement (6,) [t; r] from a pose to the runner-up; None: it is small, or there is none."""
+        moved = se3.log(se3.inverse(self._T_odom_rect) @ T_odom_rect)
+        displacement = self._larger_share * np.concatenate([moved[:3], np.zeros(3)])
+        return displacement if np.linalg.norm(displacement) > SAME_M else None
 
     def decide(
         self, lower: PaddedPanorama, klt: KltSettings, store: LandmarkStore, dt_s: float, most_mps: float
@@ -122,11 +129,12 @@ class FirstDepths:
         return np.asarray(np.isfinite(self._disparities[:, 1:]).any(axis=1))
 
     def _largest_share(self) -> float:
-        """Return by which share of a motion it may be larger; 0: enough landmarks do not repeat."""
+        """Return by which share of a motion it may be larger or smaller; 0: enough landmarks do not repeat."""
         if not len(self._ids) or 1.0 - self._repeats.mean() >= LEAST_SURE:
             return 0.0
-        own, least = self._disparities[self._repeats, 0], np.nanmin(self._disparities[self._repeats], axis=1)
-        return max(float(np.median(own / least)) - 1.0, LEAST_SHARE)
+        own, others = self._disparities[self._repeats, 0], self._disparities[self._repeats]
+        larger, smaller = (np.median(own / edge(others, axis=1)) - 1.0 for edge in (np.nanmin, np.nanmax))
+        return float(max(larger, smaller, key=abs))
 
     def _follow(self, lower: PaddedPanorama, klt: KltSettings) -> None:
         """Track the landmarks from the last panorama into the next one; others are no longer followed."""
@@ -135,7 +143,7 @@ class FirstDepths:
         self._ids, self._views, self._disparities = self._ids[found], self._views[found], self._disparities[found]
 
     def _ranges(self) -> tuple[Array, Array]:
-        """Return the ranges (N,) of the landmarks from the keyframe, in units of the distance, and parallaxes (N,) [px].
+        """Return ranges (N,) of the landmarks from the keyframe, in units of the distance, and parallaxes (N,) [px].
 
         A landmark off its epipolar line, behind the camera, or with too little parallax has none: NaN.
         """
@@ -165,15 +173,18 @@ def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[floa
     for _ in range(ROUNDS):
         scores = np.empty((len(turn), len(direction)))
         for row, angle in zip(scores, turn, strict=True):
-            errors_px = focal_px * epipolar_errors(
-                before @ se3.rotation_exp([0.0, 0.0, angle]).T, now, direction[:, None]
-            )
+            errors_px = focal_px * epipolar_errors(_turned(before, angle), now, direction[:, None])
             row[:] = np.exp(-0.5 * (errors_px / TOLERANCE_PX) ** 2).sum(axis=1)
         best = np.unravel_index(int(scores.argmax()), scores.shape)
         at = float(direction[best[1]]), float(turn[best[0]])
         steps = steps[0] / FINER, steps[1] / FINER
         direction, turn = (middle + step * np.arange(-FINER, FINER + 1) for middle, step in zip(at, steps, strict=True))
     return at
+
+
+def _turned(bearings: Array, angle: float) -> Array:
+    """Return bearings (N, 3) turned about the vertical by an angle [rad]."""
+    return np.asarray(bearings @ se3.rotation_exp([0.0, 0.0, angle]).T)
 
 
 def epipolar_errors(turned: Array, now: Array, direction: Array | float) -> Array:

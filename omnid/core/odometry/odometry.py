@@ -199,10 +199,9 @@ class VisualOdometry:
         at_previous: RigVelocity | None = None
         if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
-            at_previous = self._motion.accept(
-                T_prev_curr, estimate.spread, dt_s, exposed_at_once=frame.times.is_at_once
-            )
-            if estimate.inliers >= self._limits.good_inliers and estimate.runner_up is None:
+            is_at_once = frame.times.is_at_once
+            at_previous = self._motion.accept(T_prev_curr, estimate.spread, dt_s, exposed_at_once=is_at_once)
+            if estimate.inliers >= self._limits.good_inliers and estimate.is_sure:
                 self._step = T_prev_curr, estimate.covariance
         elif frame.sensed is None:
             self._motion.reset()
@@ -211,7 +210,8 @@ class VisualOdometry:
         self._covariance = estimate.covariance + (self._map.covariance_of(estimate) if len(estimate.landmarks) else 0.0)
         self._doubt = doubt_after(self._doubt, self._T_odom_rect, estimate, self._since_fix_s(dt_s))
         self._T_odom_rect, self._previous = estimate.T_odom_rect, frame.lower
-        facts = FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=self._in_doubt, turned=turned)
+        in_doubt = self._in_doubt or estimate.doubtful_depths
+        facts = FrameFacts(FrameOutcome.ACCEPTED, dt_s, estimate.inliers, runner_up=in_doubt, turned=turned)
         self._advance(replace(facts, lower_only=estimate.upper_ratio < self._limits.good_inlier_ratio))
         self._static_mask.observe(frame.lower.panorama, self._T_odom_rect)
 

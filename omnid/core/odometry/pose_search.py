@@ -76,7 +76,7 @@ class PoseSearch:
             best = with_more_inliers(best, estimate)
             if is_good_enough(best, self._limits, is_near=is_near):
                 break
-        return best
+        return None if best is None else self._with_doubtful_depths(best)
 
     def with_runner_up(
         self,
@@ -107,11 +107,15 @@ class PoseSearch:
             other = self._by_outliers(frame, estimate, exposure, last, dt_s)
             others += [other] if other is not None else []
         # 3. The likeliest one, and whether another one is nearly as likely.
-        chosen = likeliest(estimate, others, T_predicted, max(reach_m, off_m))
-        if chosen.runner_up is None and self._map.first_depths is not None:
-            step = se3.log(se3.inverse(last.T_odom_rect) @ chosen.T_odom_rect)
-            return replace(chosen, runner_up=self._map.first_depths.runner_up(step))
-        return chosen
+        return self._with_doubtful_depths(likeliest(estimate, others, T_predicted, max(reach_m, off_m)))
+
+    def _with_doubtful_depths(self, estimate: PoseEstimate) -> PoseEstimate:
+        """Return an estimate whose covariance covers other depths of the first keyframe: first_depths.py."""
+        first = self._map.first_depths
+        other = None if first is None or estimate.doubtful_depths else first.runner_up(estimate.T_odom_rect)
+        if other is None:
+            return estimate
+        return replace(estimate, covariance=estimate.covariance + np.outer(other, other), doubtful_depths=True)
 
     def _by_outliers(
         self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure, last: LastFrame, dt_s: float

@@ -57,7 +57,7 @@ def has_wrong_period(pair: tuple[PaddedPanorama, PaddedPanorama], pixels: Array,
 
 
 def disparities_alike(pair: tuple[PaddedPanorama, PaddedPanorama], views: Array, most_px: int) -> Array:
-    """Return disparities (N, K) [px] up to most_px at which views (N, 3) [px] match, their own ones first, then the best.
+    """Return disparities (N, K) [px] up to most_px at which views (N, 3) [px] match: their own first, then the best.
 
     The others are peaks of the correlation within LEAST_LEAD of the own one; NaN: there are no more.
     """
