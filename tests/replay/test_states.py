@@ -123,3 +123,12 @@ def test_bricks_of_several_sizes_do_not_mislead(tmp_path: Path) -> None:
     moved_m = np.linalg.norm(found.T_odom_rig[:, :3, 3] - found.T_odom_rig[0, :3, 3], axis=1)
     assert moved_m == pytest.approx(np.linalg.norm(run.poses[:pairs, :3, 3] - run.poses[0, :3, 3], axis=1), abs=0.01)
     assert {*found.states} == {TrackingState.TRACKING}
+
+
+def test_the_first_motion_decides_on_depths_that_repeat(tmp_path: Path) -> None:
+    """At 512 px most landmarks of the first pair are three courses off, and the wall is six times as far away."""
+    run, pairs = build("brick_corridor", 3, 512, 60), 4
+    write_log(tmp_path, run.rig, run.poses[:pairs], run.scene, seed=3)
+    found = replay(tmp_path / "log.mcap", tmp_path / "rig.toml")
+    moved_m = np.linalg.norm(found.T_odom_rig[:, :3, 3] - found.T_odom_rig[0, :3, 3], axis=1)
+    assert moved_m == pytest.approx(np.linalg.norm(run.poses[:pairs, :3, 3] - run.poses[0, :3, 3], axis=1), abs=0.01)

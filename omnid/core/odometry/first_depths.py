@@ -15,8 +15,8 @@ none. The lower panorama alone, followed from the keyframe on, decides:
        S(|t|) = sum_i max_k exp(-(log |t| - log f B / (d_k r_i))^2 / (2 sigma_ik^2)).
 
    The true distance has the votes of all landmarks, that of a larger world not those of landmarks that do not repeat.
-3. The distance that a vehicle can have made with most votes decides the depths. While another one has nearly as many, or
-   too few landmarks have moved far enough to vote, the pose is in doubt by the difference of both.
+3. Of the distances that a vehicle can have made, the one with most votes decides the depths. While another one has
+   nearly as many, or too few landmarks have moved far enough to vote, the pose is in doubt by the difference of both.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.landmarks import LandmarkStore
 from omnid.core.odometry.tracking import KltSettings, track
-from omnid.core.odometry.view_kernels import MIN_RADIUS_M
 from omnid.core.odometry.wrong_periods import disparities_alike
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
@@ -57,6 +56,8 @@ DECIDING_SHARE = 0.5  # share of the landmarks with a vote that agree on the dis
 # Votes by which a runner-up has fewer: a million to one, with the cost of 1.1 of an outlier (runner_up_motions.py).
 LEAD_VOTES = math.log(1e6) / 1.1
 SAME_M = 0.02  # poses that differ less are one, as in runner_up_motions.py
+# Of the distance that wheels report, because theirs errs by less also before its scale is learned, and periods by more.
+WHEELS_RATIO = 1.2
 OTHER_RATIO = 1.1  # Distances whose ratio is less are one: the votes for one distance are spread so far.
 # Covariance [px^2] of a view whose upper row was moved to another peak of the correlation.
 VIEW_NOISE = np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2])
@@ -84,7 +85,9 @@ class FirstDepths:
         """pair: lower and upper panorama of the keyframe; ids (N,) and views (N, 3) [px] of its landmarks."""
         self._model, self._T_odom_rect, self._ids, self._views = model, T_odom_rect, ids, views
         self._disparities = disparities_alike(pair, views, round(model.cylinder.focal_px))
-        self._last, self._pixels, self._since_s = pair[0], views[:, :2], 0.0
+        self._last, self._pixels = pair[0], views[:, :2]
+        # The largest distance from the keyframe that is possible, and the one by wheels; NaN: not known.
+        self._most_m, self._sensed_m = 0.0, 0.0
         self._larger_share = self._largest_share()
 
     @property
@@ -99,17 +102,20 @@ class FirstDepths:
         return displacement if np.linalg.norm(displacement) > SAME_M else None
 
     def decide(
-        self, lower: PaddedPanorama, klt: KltSettings, store: LandmarkStore, dt_s: float, most_mps: float
+        self, lower: PaddedPanorama, klt: KltSettings, store: LandmarkStore, step_m: tuple[float, float]
     ) -> None:
-        """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is."""
+        """Follow the landmarks into the next panorama, and correct their depths where it shows how far it is.
+
+        step_m: the most that a vehicle can move since the last panorama, and the step by wheels, NaN: not known.
+        """
         # 1. Follow them from the keyframe on.
-        self._since_s += dt_s
+        self._most_m, self._sensed_m = self._most_m + step_m[0], self._sensed_m + step_m[1]
         self._follow(lower, klt)
         # 2. Vote for the distance.
         ranges, parallax_px = self._ranges()
         distances = self._model.cylinder.focal_px * self._model.baseline_m / (self._disparities * ranges[:, None])
         sigmas = np.hypot(SIGMA_PX / parallax_px[:, None], DISPARITY_SIGMA_PX / self._disparities) + LEAST_SIGMA
-        votes = voted(np.log(distances), sigmas, math.log(max(most_mps * self._since_s, MIN_RADIUS_M)))
+        votes = voted(np.log(distances), sigmas, self._reach_m())
         if votes is None:
             return
         self._larger_share = 0.0 if votes.runner_up_m is None else votes.runner_up_m / votes.moved_m - 1.0
@@ -123,6 +129,12 @@ class FirstDepths:
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
         store.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
         store.keep(self._ids[is_right])
+
+    def _reach_m(self) -> tuple[float, float]:
+        """Return the least and the largest distance from the keyframe that are possible."""
+        if self._sensed_m > SAME_M:
+            return self._sensed_m / WHEELS_RATIO, self._sensed_m * WHEELS_RATIO
+        return 0.0, self._most_m
 
     @property
     def _repeats(self) -> Flags:
@@ -198,18 +210,19 @@ def epipolar_errors(turned: Array, now: Array, direction: Array | float) -> Arra
     return np.asarray((z * (s * now[:, 0] - c * now[:, 1]) + across * now[:, 2]) / np.hypot(z, across))
 
 
-def voted(distances: Array, sigmas: Array, most: float) -> Votes | None:
-    """Return the distance with most votes up to a largest one; None: too few agree.
+def voted(distances: Array, sigmas: Array, reach_m: tuple[float, float]) -> Votes | None:
+    """Return the distance within reach that has most votes; None: too few agree.
 
-    distances (N, K): logarithms, NaN: no vote; sigmas (N, K) of them; most: a logarithm, too.
+    distances (N, K): logarithms, NaN: no vote; sigmas (N, K) of them; reach_m: least and largest distance.
     """
     voting = np.isfinite(distances).any(axis=1)
     distances, sigmas = distances[voting], sigmas[voting]
     if len(distances) < LEAST_VOTES:
         return None
-    grid = np.arange(float(np.nanmin(distances)), most, LOG_STEP)
-    if not len(grid):
+    least, most = max(math.exp(np.nanmin(distances)), reach_m[0]), min(math.exp(np.nanmax(distances)), reach_m[1])
+    if least >= most:
         return None
+    grid = np.arange(math.log(least), math.log(most), LOG_STEP)
     each = np.exp(-0.5 * ((grid[:, None, None] - distances) / sigmas) ** 2)
     votes = np.nan_to_num(each).max(axis=2).sum(axis=1)
     best = int(votes.argmax())

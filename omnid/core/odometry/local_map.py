@@ -75,10 +75,10 @@ class LocalMap:
         self._last = keyframe.lower
         return self.store.add_keyframe(keyframe, views, slopes, noise, pixels)
 
-    def decide_first_depths(self, lower: PaddedPanorama, dt_s: float, most_mps: float) -> None:
-        """Let a new panorama, dt_s after the last one, decide among the depths of the first keyframe."""
+    def decide_first_depths(self, lower: PaddedPanorama, step_m: tuple[float, float]) -> None:
+        """Let a new panorama decide among the depths of the first keyframe; step_m: see FirstDepths.decide."""
         if self.first_depths is not None:
-            self.first_depths.decide(lower, self._coarse_klt, self.store, dt_s, most_mps)
+            self.first_depths.decide(lower, self._coarse_klt, self.store, step_m)
             if not self.first_depths.is_open:
                 self.first_depths = None
 

@@ -5,6 +5,7 @@ Equations and sections are those of Dang et al. 2012.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import NamedTuple
@@ -68,7 +69,10 @@ class PoseSearch:
         self, frame: StereoFrame, usable: Flags, last: LastFrame, T_predicted: Array, dt_s: float
     ) -> PoseEstimate | None:
         """Return the best estimate from the guesses, or the first good one; None: no landmarks were found."""
-        self._map.decide_first_depths(frame.lower, dt_s, self._limits.max_speed_mps)
+        sensed_m = math.nan
+        if frame.sensed is not None and frame.sensed.is_complete:
+            sensed_m = float(np.linalg.norm(T_predicted[:3, 3] - last.T_odom_rect[:3, 3]))
+        self._map.decide_first_depths(frame.lower, (self._limits.max_speed_mps * dt_s, sensed_m))
         best: PoseEstimate | None = None
         exposure = self._exposures.predicted(frame, dt_s)
         for T_guess, is_near in self._guesses(frame, usable, last, T_predicted):

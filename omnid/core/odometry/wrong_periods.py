@@ -99,6 +99,6 @@ def _patches(panorama: PaddedPanorama, columns: Array, rows: Array) -> NDArray[n
     across = np.rint(panorama.padded(columns)).astype(np.intp)[:, None] + side
     down = np.rint(rows).astype(np.intp)[:, None] + side
     at = down.clip(0, len(image) - 1)[:, :, None], across.clip(0, image.shape[1] - 1)[:, None, :]
-    patches = image[at].reshape(len(rows), -1).astype(np.float32)
+    patches = image[at].reshape(len(rows), SIDE_PX**2).astype(np.float32)
     patches -= patches.mean(axis=1, keepdims=True)
     return np.asarray(patches / np.maximum(np.linalg.norm(patches, axis=1), 1e-9)[:, None], np.float32)

@@ -103,7 +103,9 @@ def test_the_pose_by_outliers_is_sought_where_the_inliers_show_no_motion_of_a_ve
 ) -> None:
     monkeypatch.setattr(pose_search, "displacements", lambda *_: [])
     monkeypatch.setattr(pose_search.PoseSearch, "_by_outliers", lambda *_: pose(0.028, 0.5, inliers=91))
-    search = pose_search.PoseSearch(Mock(), alike.model, OdometryLimits(), frame_to_map=Mock(), exposures=Mock())
+    search = pose_search.PoseSearch(
+        Mock(first_depths=None), alike.model, OdometryLimits(), frame_to_map=Mock(), exposures=Mock()
+    )
     frame, T_predicted = alike.frame(0, np.eye(4)), pose(0.020, 0.0).T_odom_rect
     last = pose_search.LastFrame(np.eye(4), frame.lower)
     found = search.with_runner_up(frame, pose(0.0, 0.6, inliers=70), last, T_predicted, 0.1, reach_m=reach_m)

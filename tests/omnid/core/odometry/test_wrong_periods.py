@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.odometry.wrong_periods import NEIGHBOURS, has_wrong_period
+from omnid.core.odometry.wrong_periods import NEIGHBOURS, disparities_alike, has_wrong_period
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.scenery import texture, wrapped
 
@@ -40,3 +40,13 @@ def test_a_match_at_another_period_than_the_surroundings_is_wrong(
 ) -> None:
     found = has_wrong_period(pair(repeats), PIXEL, PIXEL[:, 1] + disparity_px, known)
     assert found.tolist() == [wrong]
+
+
+@pytest.mark.parametrize(("repeats", "others"), [(True, [16.0, 64.0, 88.0]), (False, [])])
+def test_disparities_at_which_a_pixel_matches_as_well(repeats: bool, others: list[float]) -> None:
+    views = np.array([[100.0, 50.0, 50.0 + DISPARITY_PX], [200.5, 80.0, 80.0 + DISPARITY_PX]])
+    found = disparities_alike(pair(repeats), views, 100)
+    assert np.allclose(found[:, 0], DISPARITY_PX)
+    for row in found:
+        alike = np.sort(row[1:][np.isfinite(row[1:])])
+        assert alike == pytest.approx(others, abs=0.1)
