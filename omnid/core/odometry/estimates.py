@@ -21,6 +21,7 @@ JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 # A smaller step keeps the view: landmarks are a metre away and farther, so that they move by 6 degrees at most besides
 # the turn.
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
+SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose that few landmarks support are as large.
 # Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
 MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # m, rad
 

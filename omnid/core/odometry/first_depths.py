@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.estimates import SAME_M
 from omnid.core.odometry.landmarks import LandmarkStore
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.odometry.wrong_periods import disparities_alike
@@ -55,7 +56,6 @@ LEAST_VOTES = 30.0  # that decide: half of a hundred votes would be scattered
 DECIDING_SHARE = 0.5  # share of the landmarks with a vote that agree on the distance
 # Votes by which a runner-up has fewer: a million to one, with the cost of 1.1 of an outlier (runner_up_motions.py).
 LEAD_VOTES = math.log(1e6) / 1.1
-SAME_M = 0.02  # poses that differ less are one, as in runner_up_motions.py
 # Of the distance that wheels report, because theirs errs by less also before its scale is learned, and periods by more.
 WHEELS_RATIO = 1.2
 OTHER_RATIO = 1.1  # Distances whose ratio is less are one: the votes for one distance are spread so far.

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.estimates import SAME_M, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import JERK_PSD, START_ACCELERATION_VARIANCE
 from omnid.core.stereo.triangulation import view
@@ -58,7 +58,6 @@ RUNNER_UP_ERROR = 0.02
 # Poses whose landmarks contradict each other: their shares of the landmarks in view differ by less than the chance of
 # which are in view, and fewer than half of the landmarks support both.
 EQUAL_SHARE, COMMON_SHARE = 2 / 3, 0.5
-SAME_M = 0.02  # poses that differ less are one: four sigmas of a pose that few landmarks support
 # Consecutive steps without a runner-up that end a doubt: in one of 29 the noise hid it.
 CLEAR_STEPS = 3
 # Sigmas of a predicted velocity, or of its change, within which a motion is to be expected: of the unknown velocity
