@@ -28,17 +28,19 @@ SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # wider than what is seen.
 SECTOR_STEPS = 96
 SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
-# A panorama is a sector if the cameras do not share an azimuth of at least this width: a strut or a mast hides less.
+# A panorama is a sector if the cameras do not share an azimuth of at least this width, because a strut or a mast hides
+# less.
 MIN_UNSEEN_RAD = math.radians(45)
-# Least elevations that both cameras see: 15 degrees have 60 rows at scale 1, four windows of the tracker.
+# Least elevations that both cameras see, because 15 degrees have 60 rows at scale 1, four windows of the tracker.
 MIN_SHARED_DEG = 15.0
 # Least length of the horizon, a full turn, of a camera that sees it. By judgement; not measured.
 MIN_HORIZON_PX = 64
-# Steps along the horizon are about as long as each other; a longer one leads from one end of the image to the other.
+# Steps along the horizon are about as long as each other, because a longer one leads from one end of the image to the
+# other.
 MAX_STEP_RATIO = 20
 # Columns: more than cv2.remap's 32767 with padding cannot be used. Pixels: tables and images must fit the memory.
 MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
-# Rows of a table that are computed at once: the projection takes some 200 bytes a pixel.
+# Rows of a table that are computed at once, because the projection takes some 200 bytes a pixel.
 BLOCK_ROWS = 64
 # Guards against division by zero on the cylinder's axis.
 MIN_RADIUS = 1e-9

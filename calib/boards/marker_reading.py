@@ -16,7 +16,7 @@ Markers = dict[int, Array]
 # OpenCV's defaults, because markers are small in a mirror image.
 MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
 # Markers whose middles are at most this many sides (of the larger one) apart must predict each other's position, within
-# this part of a side.
+# this part of a side. By judgement; not measured.
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One marker alone may be misread.
 MIN_MARKERS = 2

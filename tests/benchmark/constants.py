@@ -48,15 +48,22 @@ UNITS: Final = {
     "SIGMAS": "sigma",
     "SQUARED": "squared",
 }
-# Words by which a comment says why: a cause, a source, a measurement or a trial.
+# Words by which a comment says why. A colon, or "must", is none: what follows it may only describe.
+CAUSES: Final = (
+    r"because|since|so that|so (?:many|much|small|large|wide|few) that|, so (?!many|much)|therefore|otherwise",
+    r"never|cannot|hardly|enough|needs|needed|would|may not|covers|guards? against|for few|stays? below|exact",
+    r"too (?:many|few|small|large|long|short|near|far)|no (?:more|less|longer)|more than (?:the|any)|larger than any",
+    r"are not resolved|(?:say|tell)s? (?:nothing|the same)|misread|to the last digit|rounding|of a normal distribution",
+)
+MEASUREMENTS: Final = (
+    r"(?<!is )(?<!are )(?<!not )measured|by trial|fitted on|set (?:by|on|with|to)",
+)
+SOURCES: Final = (
+    r"sources?:|\(source|section [IVX\d]|eq\.|et al|the paper|the standard|IEEE|ISO|RFC|REP \d|OpenCV's|by OpenCV",
+    r"as in|as for|by default|'s default|the limit of",
+)
 REASON: Final = re.compile(
-    r"\b(because|so that|so many that|since|therefore|otherwise|enough|too (many|few|small|large|long|short|near|far)"
-    r"|never|cannot|hardly|no (more|less)|set by|set on|set with|set to|by trial|measured|source|section|eq\.|et al|"
-    r"default|the paper|the standard|IEEE|ROS|REP|ISO|RFC|OpenCV|covers|needed|needs|stay(s)? below|as in|as for|"
-    r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact|guards? against|larger than any"
-    r"|more than (the|any)|the limit of|are not resolved|(say|tell)s? (nothing|the same)|misread|to the last digit)\b"
-    r"|\([^()]* (19|20)\d\d\)|[:;] |, so (?!many|much)",
-    re.IGNORECASE,
+    rf"(?:(?<!\w)(?:{'|'.join((*CAUSES, *MEASUREMENTS, *SOURCES))}))(?!\w)|\([^()]* (?:19|20)\d\d\)", re.IGNORECASE
 )
 # What says plainly that there is no reason but somebody's judgement, whatever else the comment says.
 JUDGEMENT: Final = re.compile(r"\bby judgement\b", re.IGNORECASE)

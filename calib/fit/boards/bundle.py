@@ -25,7 +25,7 @@ ENDING = Ending(steps=60, gain=1e-9, damping=1e-7)
 # Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
 # these on the width.
 KERNEL_ROUNDS = 3
-# Width of Huber's kernel in standard deviations of one coordinate: 1 of 23 normal residuals (2-D) is longer.
+# Width of Huber's kernel in standard deviations of one coordinate, because 1 of 23 normal residuals (2-D) is longer.
 HUBER_WIDTH = 2.5
 # Least standard deviation assumed for a coordinate: exact corners would make the kernel's width 0.
 MIN_SIGMA_PX = 0.02

@@ -17,7 +17,7 @@ import numpy as np
 from calib.models.camera import Array
 
 # Grid of the fields: nodes along the diameter of the seen part of an image, and the width of each in parts of their
-# distance. Five nodes follow three waves over the azimuth and a turning point over the radius.
+# distance, because five nodes follow three waves over the azimuth and a turning point over the radius.
 NODES, WIDTH = 5, 1.0
 # Nodes farther from the centre, in parts of the largest radius, are left out, because no corner determines them.
 MAX_RADIUS = 1.3

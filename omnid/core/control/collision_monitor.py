@@ -41,8 +41,8 @@ MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a pers
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
 NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs; a third one makes it smaller.
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
-# Speed of a person who walks towards the base, and the time until it brakes: two pairs at 10 Hz show the person, and
-# images and commands are 0.2 s on their way.
+# Speed of a person who walks towards the base, and the time until it brakes, because two pairs at 10 Hz show the
+# person, and images and commands are 0.2 s on their way.
 WALK_MPS, TURN_S = 1.6, 0.4
 MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
 

@@ -31,8 +31,8 @@ LIMIT: Final = np.float32(6.0)  # Limit of all log-odds: a change is believed af
 FLOOR_LOW: Final = np.float32(
     -3.0
 )  # Least log-odds of the floor: what was hidden for long is free again after few pairs.
-# Least log-odds against an edge: it stays where it is. With -3, three pairs in which ribs beyond it fit as floor by
-# another period outweighed all those before.
+# Least log-odds against an edge, so that it stays where it is. With -3, by trial, three pairs in which ribs beyond it
+# fit as floor by another period outweighed all those before.
 EDGE_LOW: Final = np.float32(-12.0)
 TAKEN_ODDS: Final = np.float32(0.0)  # Log-odds of a surface from which a cell is occupied.
 # Of the floor, of a cell and a pair: the errors of pairs that follow each other are alike, so that a few count.

@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Indices = NDArray[np.intp]
 
-REACH_PX = 1  # Reach of patches whose pose and depth are known well: the least there is, as cells have whole pixels.
+# Reach of patches whose pose and depth are known well, the least there is, because cells have whole pixels.
+REACH_PX = 1
 # By which a patch may move sideways in the upper panorama from where it was tracked to. By judgement; not measured.
 CROSS_PX = 0.5
 

@@ -17,7 +17,8 @@ from omnid.core.places.place_features import PlaceFeatures
 
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
 CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds
-PATCH_BASELINES: Final = 2.0  # side of a feature, in baselines of the rig: disparity times this is its side in px
+# Side of a feature, in baselines of the rig: disparity times this is its side in px. By judgement; not measured.
+PATCH_BASELINES: Final = 2.0
 SIDES_PX: Final = (16.0, 240.0)  # smallest and largest side; one sample a pixel at 16; by trial on development seeds
 
 
