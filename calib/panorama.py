@@ -21,13 +21,14 @@ from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 # Grid on which the common field of view is measured, and the least share of the azimuths, of a full turn or of the
-# sector, at which a slope is visible.
+# sector, at which a slope is visible. By judgement; not measured.
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # A sector begins and ends at one of SECTOR_STEPS steps of a full turn, each of a whole number of columns. Steps of 3.75
 # degrees are five directions of the obstacles, so that both share their borders, and a sector is at most two of them
 # wider than what is seen.
 SECTOR_STEPS = 96
-SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
+# Azimuths at which a sector is measured, 0.375 degrees, so that no pole hides between them.
+SECTOR_GRID = 10 * SECTOR_STEPS
 # A panorama is a sector if the cameras do not share an azimuth of at least this width, because a strut or a mast hides
 # less.
 MIN_UNSEEN_RAD = math.radians(45)

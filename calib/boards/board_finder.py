@@ -49,13 +49,13 @@ MAX_IRREGULARITY = 0.2
 MAX_OUTLIER, MIN_OUTLIER = 4.0, 0.015
 # Least share of accepted corners in a detected board. By judgement; not measured.
 MIN_GOOD = 0.75
-# Number of boards without an outline that OpenCV is asked to confirm in one image.
+# Number of boards without an outline that OpenCV is asked to confirm in one image. By judgement; not measured.
 MAX_UNCONFIRMED = 2
-# Least share of the board's corners in a grid around which OpenCV searches once more.
+# Least share of the board's corners in a grid around which OpenCV searches once more. By judgement; not measured.
 PARTIAL = 0.6
 # Least share of corners accepted of a board without outline that one detector alone finds. By judgement; not measured.
 MIN_LONE_PART = 0.9
-# Larger grids are not grown: in parts of the board's corners, and at least.
+# Larger grids are not grown: in parts of the board's corners, and at least. By judgement; not measured.
 FLOOR_PART, MIN_FLOOR_CORNERS = 3, 200
 # A grid that shares more than this part of its corners with a floor belongs to it. By judgement; not measured.
 MAX_SHARED = 0.5

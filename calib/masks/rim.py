@@ -10,7 +10,8 @@ from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
 MIN_SIDE_PX = 64  # Shorter side of the smallest image. By judgement; not measured.
-# The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least.
+# The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least. By
+# judgement; not measured.
 CORNER_PART, MIN_CORNER_PX = 1 / 32, 4
 # Least difference of grey levels between the middle and the corners, and across the edge at one azimuth.
 # By judgement; not measured.

@@ -43,16 +43,18 @@ MOST_POINTS: Final = 2000  # more of a pair say the same
 # Enough: of 36 floors of test_floor.py 2000 iterations move 34 by 3 mm at most, and deny 2.
 ITERATIONS: Final = 40
 CONVERGED: Final = 1e-5  # m, rad; so that what is left is less than a 300th of RIG_SIGMAS
-# Fitted on rendered logs (the sample, rooms 601, two_walls 601): pairs scatter by 6 mm and 0.3 degrees.
+# Fitted on rendered logs (the sample, rooms 601, two_walls 601), where a line gives no other reason: pairs scatter by
+# 6 mm and 0.3 degrees.
 POINTS_ALIKE: Final = 20.0
 LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor, because it is odds of 150 to 1.
 LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
 # Sectors of ten degrees, and those of them in which the floor must be seen, because less than a third of a turn does
 # not determine its tilt.
 SECTORS: Final = 36
-LEAST_SECTORS: Final = 12  # of SECTORS
-# Of the rig and of stereo, which many pairs do not average out; the same logs: -12 to +8 mm.
-RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])  # m, rad, rad
+LEAST_SECTORS: Final = 12
+# Errors [m, rad, rad] of the rig and of stereo, which many pairs do not average out; measured on the same logs: -12 to
+# +8 mm.
+RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])
 # Pairs whose heights scatter more show no common floor, because those of one floor scatter by 6 mm.
 LARGEST_SCATTER_M: Final = 0.05
 # Pairs after which the floor stays as it is, so that it costs nothing any more. The number was chosen by judgement.

@@ -15,7 +15,8 @@ XI_SIGMA, FOCAL_SIGMA, CENTRE_SIGMA_PX, DISTORTION_SIGMA_PX, TANGENTIAL_SIGMA_PX
 TURN_SIGMA_RAD, DIRECTION_SIGMA_RAD = np.deg2rad(1.5), np.deg2rad(2.0)
 RULER_SIGMA_M = 0.5e-3
 # Powers of the polynomial that have this prior, because the largest one has 63; 0 for a paraboloid. By judgement.
-HIGHER_POWERS, POLYNOMIAL_SIGMA_PX = tuple(f"a{power}" for power in range(3, 64)), 0.5  # 0 for a paraboloid
+# 0 for a paraboloid. By judgement; not measured.
+HIGHER_POWERS, POLYNOMIAL_SIGMA_PX = tuple(f"a{power}" for power in range(3, 64)), 0.5
 WAVEFRONT_SIGMA_M = 1e-3  # because a ray of a mirror camera passes the viewpoint within about a millimetre
 # Cameras without a trigger, and lines of a rolling shutter. By judgement; not measured.
 DELAY_SIGMA_MS, LINE_TIME_SIGMA_US = 15.0, 30.0

@@ -25,7 +25,7 @@ _BATCHES = 8  # At most 1/8 of the table is placed at once: the load stays below
 _OLD_FRAMES = 30
 _VARIANCE_RANGE_M2 = (1e-8, 1e8)  # standard deviations of 0.1 mm to 10 km, so that sums of weights cannot overflow
 _BLOCK_POINTS = 4096  # Points of a snapshot that are computed at a time, so that it needs little extra memory.
-_HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: Knuth's multiplicative hash
+_HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio; source: Knuth's multiplicative hash
 
 
 @dataclass(frozen=True, slots=True)

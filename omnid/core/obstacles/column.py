@@ -51,15 +51,20 @@ DEEP_STEP_PX: Final = 0.375
 # Log-likelihood by which the best of those planes may fit better than the floor by noise, 1.5 in the mean of a plain
 # floor. With 3, by trial, bases stood on boards of 10 cm that are nearly alike.
 DEEP_NOISE: Final = 10.0
-EVEN_SHARE: Final = 0.33  # Share of the least height and fall by which a floor is uneven: two more planes are floor.
+# Share of the least height and fall by which a floor is uneven, so that two more planes are floor.
+EVEN_SHARE: Final = 0.33
 LEVEL_RATIO: Final = 1.5  # log-likelihood by a sigma: that of single directions by three that are no more alike
-ADJACENT_PX: Final = 4.0  # An object often hides the floor near itself: decay of the prior with the disparity ...
-DISTANT_SHARE: Final = 0.1  # ... and the share of the prior that is left far away.
-STRIP_ROWS, STRIP_OVERLAP = 4, 2  # Rows of a strip of a surface, and rows that two strips share.
-STRIP_BOUND: Final = 3.0  # Limit of the log-likelihood ratio of a strip.
-STRIP_PRIOR: Final = 0.5  # Log-odds by which a strip of a surface must exceed its other explanations.
-FLOOR_WEIGHT: Final = 10.0  # probability of the floor in rows that may show it, by that of one disparity
-LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations
+# An object often hides the floor near itself: decay of the prior with the disparity, and the share of it that is left
+# far away. By judgement; not measured.
+ADJACENT_PX, DISTANT_SHARE = 4.0, 0.1
+# Rows of a strip of a surface, and rows that two strips share. By judgement; not measured.
+STRIP_ROWS, STRIP_OVERLAP = 4, 2
+STRIP_BOUND: Final = 3.0  # Limit of the log-likelihood ratio of a strip. By judgement; not measured.
+# Log-odds by which a strip of a surface must exceed its other explanations. By judgement; not measured.
+STRIP_PRIOR: Final = 0.5
+# Probability of the floor in rows that may show it, by that of one disparity. By judgement; not measured.
+FLOOR_WEIGHT: Final = 10.0
+LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations. By judgement; not measured.
 
 
 class FloorPlane(NamedTuple):

@@ -41,8 +41,9 @@ MEAN_FLOOR: Final = 4  # Index in the evidence of cells, because 0 to 3 are thos
 
 # A thin thing shows a surface in half of the pairs, and floor in the others, which contradict it: its log-odds stay at
 # the prior. So a cell is free only where the mean surface of single pairs is low. Set on development seeds 1 and 2.
-SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean
-SHOWN_CELLS: Final = 5  # side of the patch of the mean, as errors of the range move what a pair shows by some cells
+SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean; by trial, too
+# Side of the patch of the mean, because errors of the range move what a pair shows by some cells.
+SHOWN_CELLS: Final = 5
 MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair; by trial, too
 
 APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.

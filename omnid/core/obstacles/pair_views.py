@@ -28,7 +28,8 @@ FINE_PX: Final = 0.8  # Sigma of the smoothing along columns, because views diff
 COARSE_ROWS: Final = 17
 # Difference between two views of a surface, by the local contrast; noise is added to it. By judgement; not measured.
 TEXTURE_SHARE: Final = 0.3
-CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
+# Rows over which the contrast is measured, with a column on either side. By judgement; not measured.
+CONTRAST_ROWS: Final = 15
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
 # of 960 px 0.36 to 0.53 (test_pair_views.py). With 0.35, by trial, bases stood before free floor in noisy images.
 BAND_NOISE: Final = 0.65
@@ -37,7 +38,7 @@ BAND_NOISE: Final = 0.65
 CODING_FREQUENCIES: Final = 3.0
 UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
 ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
-BOUNDED_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
+BOUNDED_ROWS: Final = COARSE_ROWS  # Rows with which a pixel of the floor is compared.
 # Most that one of them counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
 # texture of the floor around it. With 3 to 11 bases passed such a line; with no limit they stood before it.
 BOUNDED_SIGMAS: Final = 5.5

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 # Share of a pair that counts in full in the mean. With 0.5, by trial, the mean behind a plain pole was forgotten before
 # the base came to it, as F is about 0 there; it need not follow faster than F falls from 3.3 at 4 m to 1.5 at 1 m.
 LEARNED: Final = np.float32(0.2)
-HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden: two disparities in full
+HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden, because two disparities in full have them
 # Part of the log-odds without any evidence from which floor is hidden, because F is then below a quarter of the usual
 # in the mean.
 HIDDEN_SHARE: Final = 0.5

@@ -17,13 +17,14 @@ Flags = NDArray[np.bool_]
 CELL_PX = 48
 # More cells than a row of any panorama has, so that one index encodes row and column.
 MAX_CELLS = 4096
-BLOCK_PX = 5  # window over which the gradients of a corner are summed
+BLOCK_PX = 5  # window over which the gradients of a corner are summed. By judgement; not measured.
 # Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two
 # landmarks of one piece of texture.
 APART_PX = 9
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
-NOISE_RESPONSE = 2.5e-5  # Response that noise of one grey level reaches in 1 % of the pixels: it grows with its square.
-CROSS_PX = 0.7  # largest horizontal error of a vertical match: corner noise and error of the calibration
+# Measured response that noise of one grey level reaches in 1 % of the pixels; it grows with its square.
+NOISE_RESPONSE = 2.5e-5
+CROSS_PX = 0.7  # largest horizontal error of a vertical match, because corners and a right calibration err by less
 REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 
 

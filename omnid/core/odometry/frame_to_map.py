@@ -40,7 +40,7 @@ RECOGNISED_ROUNDS = 2
 # Landmarks tracked for each yaw hypothesis, because the share that is kept is then known to 4 %: sqrt(0.5^2 / 150).
 YAW_SAMPLE = 150
 LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
-ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search: section IV.F
+ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search; as in section IV.F
 # M and rad; a smaller step of the coarse pose is the last one, because it moves no track by 0.05 px.
 COARSE_CONVERGED = 1e-4
 # Standard deviation of a track whose patch was not yet warped to the new viewpoint. By judgement; not measured.

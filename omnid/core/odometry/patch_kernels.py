@@ -17,9 +17,10 @@ WINDOW_PX = 13  # Side of a patch, at most LANES. By judgement; not measured.
 PIXELS = WINDOW_PX * WINDOW_PX
 # Enough: 98 % of the patches of test_patch_fit.py end before; a last step is below the hundredths that noise leaves.
 ITERATIONS, CONVERGED_PX = 12, 0.004
-GAIN_SIGMA = 0.05  # Scatter of the gains of the patches of an image: vignetting, slanted light.
+# Scatter of the gains of the patches of an image, by vignetting and slanted light. By judgement; not measured.
+GAIN_SIGMA = 0.05
 LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before. By judgement; not measured.
-MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window: less is no texture
+MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window, because less is no texture
 # Determinant of the gradients' matrix by its squared trace, because less is an edge, along which a patch slides.
 MIN_DETERMINANT = 1e-3
 # Interpolation makes the noise of neighbouring pixels alike, so that a sum over a window of a panorama varies by this

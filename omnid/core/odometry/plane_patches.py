@@ -27,7 +27,8 @@ Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Indices = NDArray[np.intp]
 
-SLOPE_REACH_PX = 8  # half the side of the window in which the slope of the dense disparity is measured
+# Half the side of the window in which the slope of the dense disparity is taken. By judgement; not measured.
+SLOPE_REACH_PX = 8
 SAME_SURFACE_PX = 2.0  # disparities that differ more belong to another surface. By judgement; not measured.
 # px^2, weight of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936
 # px^2, so that the slope is 0.7 % too flat.

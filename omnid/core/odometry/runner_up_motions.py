@@ -47,7 +47,8 @@ PEAKS = 3  # that are estimated from. By judgement; not measured.
 # Share of the mean correlation at the pose that another peak must reach to be estimated from: textures that do not
 # repeat stay below 0.37 of it on rendered logs, identical bricks reach 0.62 and more.
 PEAK_SHARE = 0.5
-MIN_PATCH_GREY = 1.0  # standard deviation of a patch's grey levels, below which it has no texture
+# Standard deviation of a patch's grey levels, because with less, that of noise, it has no texture.
+MIN_PATCH_GREY = 1.0
 # Difference of the costs of two poses, the logarithm of the ratio of their likelihoods, up to which the less likely one
 # is a runner-up, so that none is left out but at a million to one.
 RUNNER_UP_COST = math.log(1e6)

@@ -23,7 +23,8 @@ from omnid.core.rig.column_matches import Matches, PanoramaPair, is_motion_unkno
 
 Array = NDArray[np.float64]
 
-# Views that are kept, and new views after which the rig is checked again: at the default period, after 80 s of driving.
+# Views that are kept, and new views after which the rig is checked again, because at the default period they take 80 s
+# of driving.
 VIEWS: Final = 16
 # Different places for a check, because walls in fewer directions may all bias it to the same side.
 MIN_PLACES: Final = 6

@@ -25,8 +25,8 @@ LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
 # Brightness of one panorama by the other's, above which nothing is changed: at 0.88 poses are as exact as at 1, at 0.85
 # they were degraded, at 0.8 lost.
 SAME_BRIGHTNESS = 0.87
-SECTORS = 24  # of azimuth; three quarters of them must differ, as a hand before one camera does not cover so many
-MAX_GAIN = 8.0  # Largest gain of 8 bit images: more only magnifies their steps.
+SECTORS = 24  # of azimuth; three quarters of them must differ, because a hand before one camera does not cover so many
+MAX_GAIN = 8.0  # Largest gain of 8 bit images, because more only magnifies their steps.
 # Noise is the difference of two Gaussian blurs in the smoothest blocks, because texture is stronger than noise
 # elsewhere.
 FINE_PX, COARSE_PX = 0.8, 1.6

@@ -48,21 +48,23 @@ NOISE_CHANGE: Final = 1.128
 # images: in the sample log live tiles change by a fifth of it at least.
 NOISE_SHARE: Final = 0.1
 MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, and says nothing about a tile
-# Cameras that remove noise repeat plain tiles while the base is at rest: a tile without texture is dead only if it has
-# changed in nearly all pairs before, by the mean of the newest 1 / LIVELY_GAIN.
+# Cameras that remove noise repeat plain tiles while the base is at rest, so that a tile without texture is dead only if
+# it has changed in nearly all pairs before, by the mean of the newest 1 / LIVELY_GAIN.
 TEXTURE_GREY: Final = 4.0  # standard deviation, because it is more than what such a camera leaves of the noise
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (source: ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
+# Grey level from which a pixel is saturated, and share of such pixels in a tile. By judgement; not measured.
 SATURATED_GREY, SATURATED_SHARE = np.uint8(250), 0.8
 # A column is blurred if its energy by the other camera's is below this share of the usual, in BLURRED_COLUMNS columns,
 # because a poster that only one camera sees is all the texture of a column: 0.15 was left in rendered corridors. A drop
 # leaves less.
 BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
-LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise: with less texture no blur is seen.
-COMPARED_COLUMNS: Final = 15  # Columns that must have this energy: else a single poster decides what is usual.
-BLIND_SHARE: Final = 0.5  # A column's direction is unknown if a larger share of its judged tiles is blind.
+LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise, because with less texture no blur is seen.
+COMPARED_COLUMNS: Final = 15  # Columns that must have this energy, because else a single poster decides what is usual.
+# A column's direction is unknown if a larger share of its judged tiles is blind. By judgement; not measured.
+BLIND_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
