@@ -1,10 +1,11 @@
 """Table of the numeric constants of omnid/core and calib: `python -m tests.benchmark.constants [--write] [--missing]`.
 
 A constant is a module-level name in capitals whose value contains a number, or a knob of a settings class. Its comment
-is behind it, or above it, where it holds for all lines up to the next comment or empty line. A comment that only says
-what the constant is describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives
-its reason. Words decide that: a person judges whether the reason is a good one. One that says "by judgement" gives none
-and says so: it is counted apart. `--write` makes docs/constants.md, `--missing` lists what says neither.
+is behind it, or above it, where it holds up to the next comment or empty line: for lines without a comment behind them,
+and for the others if it says so ("where a line gives no other reason"). A comment that only says what the constant is
+describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives its reason. Words
+decide that: a person judges whether the reason is a good one. One that says "by judgement" gives none and says so: it
+is counted apart. `--write` makes docs/constants.md, `--missing` lists what says neither.
 """
 
 from __future__ import annotations
