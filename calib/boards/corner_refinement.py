@@ -34,8 +34,8 @@ CONVERGED_PX = 2e-3
 # A corner that moves farther than this part of a square, plus some pixels, is reset, because it has reached another
 # edge.
 MAX_MOVE, MAX_MOVE_PX = 0.3, 0.3
-# Step of the difference quotient by which the size of a square is measured [squares], because the quotient is exact to
-# its square.
+# Step of the difference quotient by which the size of a square is measured [squares], a hundredth because a mapping
+# bends within a square.
 SIZE_STEP = 0.01
 
 

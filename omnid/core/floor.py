@@ -48,8 +48,8 @@ CONVERGED: Final = 1e-5  # m, rad; so that what is left is less than a 300th of 
 POINTS_ALIKE: Final = 20.0
 LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor, because it is odds of 150 to 1.
 LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
-# Sectors of ten degrees, and those of them in which the floor must be seen, because less than a third of a turn does
-# not determine its tilt.
+# Sectors of ten degrees, and those of them in which the floor must be seen, because a smaller part of a turn determines
+# its tilt badly.
 SECTORS: Final = 36
 LEAST_SECTORS: Final = 12
 # Errors [m, rad, rad] of the rig and of stereo, which many pairs do not average out; measured on the same logs: -12 to

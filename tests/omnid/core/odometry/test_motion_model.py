@@ -29,7 +29,7 @@ NOISE = np.diag(np.repeat([5e-4, 2e-4], 3) ** 2)
 SYSTEMATIC = np.diag([1e-3, 0, 0, 0, 0, 1e-4]) ** 2
 AHEAD = SensedMotion(np.array([0.05, 0, 0, 0, 0, 0]), NOISE, SYSTEMATIC, is_complete=True)
 STANDS = replace(AHEAD, twist=np.zeros(6), systematic=np.zeros((6, 6)))
-SOON = OdometryLimits(restart_s=0.35)  # four frames: each one of another place costs a search through all turns
+SOON = OdometryLimits(restart_s=0.25)  # four frames: each one of another place costs a search through all turns
 DEGRADED, LOST, TRACKING = TrackingState.DEGRADED, TrackingState.LOST, TrackingState.TRACKING
 
 

@@ -241,7 +241,7 @@ def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
     frames: list[StereoFrame], cameras: RenderedCameras
 ) -> None:
     """The robot is carried into another corridor: no pose is accepted there, and then the reset counter rises."""
-    limits = OdometryLimits(restart_s=0.55)  # six frames
+    limits = OdometryLimits(restart_s=0.45)  # six frames
     odometry = visual_odometry(cameras.model, limits)
     before = run(odometry, frames[:4])[-1]
     elsewhere = replace(cameras, scene=corridor(7))
