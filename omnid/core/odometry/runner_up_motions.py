@@ -56,8 +56,8 @@ RUNNER_UP_COST = math.log(1e6)
 LEAST_SHARE = 0.5
 # Error of a runner-up pose as a share of its displacement, because it is few millimetres of some decimetres.
 RUNNER_UP_ERROR = 0.02
-# Two poses contradict each other if their shares of the landmarks in view differ by less than the chance of which are in
-# view, and fewer than half of the landmarks support both, because one of them is then wrong.
+# Two poses contradict each other if their shares of the landmarks in view differ by less than the chance of which are
+# in view, and fewer than half of the landmarks support both, because one of them is then wrong.
 EQUAL_SHARE, COMMON_SHARE = 2 / 3, 0.5
 SAME_M = 0.02  # poses that differ less are one, because it is four sigmas of a pose that few landmarks support
 # Consecutive steps without a runner-up that end a doubt, because in one of 29 the noise hid it.
