@@ -56,7 +56,9 @@ NOISE_GAIN, RATIO_LIMIT = 0.02, 16.0
 # A larger difference from the cameras' step means that a sensor slips or is wrong, because noise makes one of a million
 # so large.
 OUTLIER_SIGMA = 5.0
-SLIPPING = 2  # Consecutive outliers of wheels that mean slip, because a single one may be a bump.
+# Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
+# because each step is another measurement.
+SLIPPING = 2
 MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not calibrated. By judgement.
 SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales, because beyond them their settings are wrong.
 # Sigma of a motion that no sensor measures in a step, so large that it has no weight, because nothing is known.

@@ -35,7 +35,8 @@ RETRY_S: Final = 1.0
 # Pairs whose motion is not known, before such pairs are used as if the rig stood, because with a rig that is wrong by
 # degrees, no odometry starts that could find the motion.
 PATIENT_PAIRS: Final = 5
-# Scatter of the columns: right rigs stay below 0.45 px, other mirrors have 0.3 to 7 px.
+# Scatter of the columns, because right rigs stay below 0.45 px, other mirrors have 0.3 to 7 px. At all scales, because
+# most of the scatter of a right rig is of the matches, which err by parts of a pixel at each.
 SCATTERED_PX: Final = 0.6
 # Matches with the cameras exchanged, per match, because right rigs have up to 0.41, exchanged ones 2.0 or more.
 EXCHANGED_RATIO: Final = 1.2
