@@ -29,7 +29,7 @@ def describe(frame: StereoFrame) -> PlaceFeatures:
     disparity = nearby_disparity(frame.disparity, pixels)
     located = np.flatnonzero(np.isfinite(disparity))[:FEATURES]
     pixels, disparity = pixels[located], disparity[located]
-    sides = np.clip(PATCH_BASELINES * disparity, LEAST_SIDE_PX, frame.lower.scale * LARGEST_SIDE_PX)
-    descriptors = describe_patches(frame.lower, pixels, sides)
+    sides = np.minimum(PATCH_BASELINES * disparity, frame.lower.scale * LARGEST_SIDE_PX)
+    descriptors = describe_patches(frame.lower, pixels, np.maximum(sides, LEAST_SIDE_PX))
     views = np.column_stack([frame.lower.in_turn(pixels[:, 0]), pixels[:, 1], pixels[:, 1] + disparity])
     return PlaceFeatures(descriptors, views.astype(np.float32))
