@@ -64,6 +64,6 @@ class OdometryLimits:
         """Raise OmnidError unless a keyframe may have more landmarks than a pose needs."""
         if self.min_inliers >= self.features:
             raise OmnidError(
-                f"odometry.min_inliers is {self.min_inliers}: expected less than odometry.features, {self.features}, "
-                "as no pose has more inliers than a keyframe has landmarks"
+                f"odometry.limits.min_inliers is {self.min_inliers}: expected less than odometry.limits.features, "
+                f"{self.features}, as no pose has more inliers than a keyframe has landmarks"
             )

@@ -31,7 +31,7 @@ Flags = NDArray[np.bool_]
 
 TRACKERS = ("improved", "klt")
 REFERENCES = ("previous", "keyframe")
-FEATURES = 500  # As the default of odometry.features, so that the methods are compared with as many.
+FEATURES = 500  # As the default of odometry.limits.features, so that the methods are compared with as many.
 # Share of the features that makes a yaw hypothesis good enough ("N is more than needed", section IV.F). Beyond the
 # ample share the search ends; between the two the next larger turn is tried as long as it finds more.
 ENOUGH_RATIO = 0.5
