@@ -72,7 +72,6 @@ class TrackingStatus:
 
 def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits) -> TrackingStatus:
     """Return the status after a frame."""
-    time_since_fix_s = status.time_since_fix_s + facts.dt_s
     unknown_motion = status.unknown_motion or (status.has_begun and not facts.carried)
 
     if facts.outcome is FrameOutcome.STARTED:
@@ -87,33 +86,41 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
         state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
         return TrackingStatus(state, has_begun=True, resets=status.resets + facts.turned)
 
-    state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST
-    if facts.outcome is FrameOutcome.NOT_STARTED:
-        return TrackingStatus(
-            state,
-            time_since_fix_s=time_since_fix_s,
-            has_begun=status.has_begun,
-            unknown_motion=unknown_motion,
-            resets=status.resets,
-        )
+    if facts.outcome is FrameOutcome.REFUSED:
+        return _after_refusal(status, facts, limits, unknown_motion=unknown_motion)
 
-    # What is in view is not seen in a time without frames: no more of it counts than goes without a doubt.
-    step_s = min(facts.dt_s, limits.max_gap_s)
-    refused_s = 0.0 if status.refused_s is None else status.refused_s + step_s
-    unmatched_s, restart = status.unmatched_s, False
-    if refused_s < limits.lost_s:
-        state = TrackingState.DEGRADED
-    else:
-        if facts.textured:
-            unmatched_s = 0.0 if unmatched_s is None else unmatched_s + step_s
-        restart = facts.elsewhere or (unmatched_s is not None and unmatched_s >= limits.restart_s)
     return TrackingStatus(
-        state,
+        TrackingState.DEGRADED if facts.carried else TrackingState.LOST,
+        time_since_fix_s=status.time_since_fix_s + facts.dt_s,
+        has_begun=status.has_begun,
+        unknown_motion=unknown_motion,
+        resets=status.resets,
+    )
+
+
+def _after_refusal(
+    status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits, *, unknown_motion: bool
+) -> TrackingStatus:
+    """Return the status after a frame that was refused; unknown_motion: before it is known that it stayed."""
+    # Nothing is seen in a time without frames: no more of it counts than goes without a doubt.
+    step_s = min(facts.dt_s, limits.max_gap_s)
+    refused_s, unmatched_s = _longer(status.refused_s, step_s), status.unmatched_s
+    is_lost = refused_s >= limits.lost_s
+    if is_lost and facts.textured:
+        unmatched_s = _longer(unmatched_s, step_s)
+    restart = is_lost and (facts.elsewhere or (unmatched_s is not None and unmatched_s >= limits.restart_s))
+    return TrackingStatus(
+        TrackingState.LOST if is_lost and not facts.carried else TrackingState.DEGRADED,
         refused_s,
         unmatched_s,
-        time_since_fix_s,
+        status.time_since_fix_s + facts.dt_s,
         restart,
         has_begun=True,
         unknown_motion=unknown_motion or (restart and facts.stayed),
         resets=status.resets,
     )
+
+
+def _longer(since_s: float | None, step_s: float) -> float:
+    """Return the time since a first frame after one more; None: this is the first one."""
+    return 0.0 if since_s is None else since_s + step_s
