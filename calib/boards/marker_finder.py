@@ -40,7 +40,8 @@ MIN_QUALITY = 0.4
 # Largest distance of a corner from the mapping of the others: in squares, and in pixels added to it. By judgement; not
 # measured.
 MAX_IRREGULARITY, MAX_IRREGULARITY_PX = 0.03, 0.4
-# Fewer corners determine no pose well; they must not lie on one line (ratio of the standard deviations).
+# Least number of corners, and how far they lie off one line (ratio of the standard deviations), because fewer, or those
+# of a line, determine no pose well.
 MIN_CORNERS, MIN_SPREAD = 8, 0.1
 
 

@@ -22,7 +22,7 @@ NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 MIN_MARKERS = 2
 # The largest dictionary of every family that users print.
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
-# A hint about another dictionary needs this many of its markers.
+# Least markers of another dictionary of which a hint tells. By judgement; not measured.
 MIN_HINT_MARKERS = 4
 
 
