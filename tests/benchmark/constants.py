@@ -58,8 +58,8 @@ CAUSES: Final = (
 )
 MEASUREMENTS: Final = (r"(?<!is )(?<!are )(?<!not )measured|by trial|fitted on|set (?:by|on|with|to)",)
 SOURCES: Final = (
-    r"sources?:|\(source|section [IVX\d]|eq\.|et al|the paper|the standard(?! deviation)|IEEE|ISO|RFC|REP \d|OpenCV's|by OpenCV",
-    r"as in|as for|by default|'s default|the limit of",
+    r"sources?:|\(source|section [IVX\d]|eq\.|et al|the paper|the standard(?! deviation)|IEEE|ISO|RFC|REP \d",
+    r"OpenCV's|by OpenCV|as in|as for|by default|'s default|the limit of",
 )
 REASON: Final = re.compile(
     rf"(?:(?<!\w)(?:{'|'.join((*CAUSES, *MEASUREMENTS, *SOURCES))}))(?!\w)|\([^()]* (?:19|20)\d\d\)", re.IGNORECASE
