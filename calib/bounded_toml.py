@@ -14,7 +14,7 @@ MAX_BYTES: Final = 1 << 19
 MAX_LINES: Final = 10_000
 # Characters of a bare key or a number, more than any needs: the largest double written out has 309 digits.
 MAX_WORD: Final = 400
-# Dots of a key: the deepest key of a rig or a configuration has 2.
+# Dots of a key, because the deepest key of a rig or a configuration has 2.
 MAX_DOTS: Final = 8
 
 # Strings and comments (TOML 1.0); possessive, so that the time is linear. A quotation mark alone opens no string.

@@ -8,7 +8,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent, NodeEvent, ScalarEvent
 
 MAX_BYTES: Final = 1 << 15  # enough for MAX_NODES of 16 characters
-# Values and lists; a camera has about 60.
+# Values and lists, because a camera has about 60.
 MAX_NODES: Final = 2000
 MAX_DEPTH: Final = 16  # Lists and mappings within each other: enough, as those of a camera are four deep.
 MAX_SCALAR: Final = 1000  # Characters of a value: enough for names of topics and paths.

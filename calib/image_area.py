@@ -17,7 +17,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 
-# A side of an area: a smaller one holds no view that could be calibrated.
+# A side of an area, because a smaller one holds no view that could be calibrated.
 MIN_SIDE_PX = 32
 
 

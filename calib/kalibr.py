@@ -32,7 +32,7 @@ MAX_DISAGREEMENT_M = 1e-3
 MAX_DISAGREEMENT_RAD = np.deg2rad(0.1)
 # Least difference in height by which the lower camera is identified: less may be rounding, as above.
 MIN_HEIGHT_M = 1e-3
-# Largest angle of the baseline from z of the rig: no rig leans so far, but the axes of an IMU may be others.
+# Largest angle of the baseline from z of the rig, because no rig leans so far, but the axes of an IMU may be others.
 MAX_LEAN_RAD = np.deg2rad(30)
 MIN_DELAY_S = 0.5e-3  # between two cameras: less is no different from none, as for `omnid calibrate drive`
 LOWER_WORDS, UPPER_WORDS = {"lower", "bottom"}, {"upper", "top"}

@@ -18,7 +18,8 @@ from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, rea
 
 # More than any file needs: one of the toolbox has about 2 kB.
 MAX_BYTES = 1 << 16
-# The degree of the inverse polynomial is raised until it reaches this error: the toolbox's own goal and bound.
+# The degree of the inverse polynomial is raised until it reaches this error, because that is the toolbox's own goal and
+# bound.
 INVERSE_GOAL_PX = 0.01
 INVERSE_DEGREES = range(4, 26)
 

@@ -9,7 +9,7 @@ row = row0 - focal * z / r, r the distance from the axis, so row_upper - row_low
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +21,27 @@ from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 # Grid on which the common field of view is measured, and the least share of the azimuths, of a full turn or of the
-# sector, at which a slope is visible.
+# sector, at which a slope is visible. By judgement; not measured.
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # A sector begins and ends at one of SECTOR_STEPS steps of a full turn, each of a whole number of columns. Steps of 3.75
 # degrees are five directions of the obstacles, so that both share their borders, and a sector is at most two of them
 # wider than what is seen.
 SECTOR_STEPS = 96
-SECTOR_GRID = 10 * SECTOR_STEPS  # azimuths at which a sector is measured, 0.375 degrees: no pole hides between them
-# A panorama is a sector if the cameras do not share an azimuth of at least this width: a strut or a mast hides less.
+# Azimuths at which a sector is measured, 0.375 degrees, so that no pole hides between them.
+SECTOR_GRID = 10 * SECTOR_STEPS
+# A panorama is a sector if the cameras do not share an azimuth of at least this width, because a strut or a mast hides
+# less.
 MIN_UNSEEN_RAD = math.radians(45)
-# Least elevations that both cameras see: 15 degrees have 60 rows at scale 1, four windows of the tracker.
+# Least elevations that both cameras see, because 15 degrees have 60 rows at scale 1, four windows of the tracker.
 MIN_SHARED_DEG = 15.0
 # Least length of the horizon, a full turn, of a camera that sees it. By judgement; not measured.
 MIN_HORIZON_PX = 64
-# Steps along the horizon are about as long as each other; a longer one leads from one end of the image to the other.
+# Steps along the horizon are about as long as each other, because a longer one leads from one end of the image to the
+# other.
 MAX_STEP_RATIO = 20
 # Columns: more than cv2.remap's 32767 with padding cannot be used. Pixels: tables and images must fit the memory.
 MAX_WIDTH_PX, MAX_PIXELS = 16384, 16 * 2**20
-# Rows of a table that are computed at once: the projection takes some 200 bytes a pixel.
+# Rows of a table that are computed at once, because the projection takes some 200 bytes a pixel.
 BLOCK_ROWS = 64
 # Guards against division by zero on the cylinder's axis.
 MIN_RADIUS = 1e-9
@@ -53,6 +56,7 @@ class Cylinder:
     row0: float
     turn_px: int = 0  # columns of a full turn, of which the panorama has `width`; 0: all of them
     first: int = 0  # column of the full turn that is column 0
+    scale: float = field(default=1.0, compare=False)  # columns by those of the images' own resolution
 
     def __post_init__(self) -> None:
         if not self.turn_px:
@@ -77,12 +81,13 @@ class Cylinder:
         """Return the panorama of about the same view in other columns."""
         scale = width / self.width
         turn_px, first = round(self.turn_px * scale), round(self.first * scale)
-        return Cylinder(width, max(1, round(self.height * scale)), self.row0 * scale, turn_px, first)
+        height = max(1, round(self.height * scale))
+        return Cylinder(width, height, self.row0 * scale, turn_px, first, self.scale * scale)
 
     @property
     def full_turn(self) -> Cylinder:
         """Return the panorama of the full turn of which this is a sector."""
-        return Cylinder(self.turn_px, self.height, self.row0)
+        return Cylinder(self.turn_px, self.height, self.row0, scale=self.scale)
 
     def azimuth(self, columns: Array) -> Array:
         """Return the azimuths (N,) of columns (N,)."""
@@ -135,10 +140,13 @@ def fit_cylinder(
     # 1. The sector of azimuth, and the slopes, that both cameras see.
     sector, slopes = _shared_view(rig, elevation_deg)
     # 2. Columns.
-    turn = width_px
-    if not turn:
-        per_turn = scale * _turn_px(rig, sector, float(np.clip(0.0, slopes.min(), slopes.max())))
-        turn = 8 * round(per_turn / 8)
+    own_px, turn = _turn_px(rig, sector, float(np.clip(0.0, slopes.min(), slopes.max()))), width_px
+    if turn:
+        scale = turn / own_px if math.isfinite(own_px) else 1.0
+    elif math.isfinite(own_px):
+        turn = 8 * round(scale * own_px / 8)
+    else:
+        raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
     width, first = turn, 0
     if not sector.is_full:
         step = max(1, round(turn / SECTOR_STEPS))
@@ -154,7 +162,12 @@ def fit_cylinder(
     height = math.ceil(row0 - focal * slopes.min()) + 1
     if width * height > MAX_PIXELS:
         raise _too_large(f"{width} x {height} pixels")
-    return Cylinder(width, height, row0, turn, first)
+    return Cylinder(width, height, row0, turn, first, scale)
+
+
+def at_scale(px: float, scale: float) -> int:
+    """Return an angle in pixels of a panorama of a scale, at least one; px: in one of the images' own resolution."""
+    return max(1, round(px * scale))
 
 
 def _too_large(found: str) -> CalibError:
@@ -237,7 +250,7 @@ def _seen(rig: Rig, mounted: MountedCamera, slopes: Array, azimuth: Array) -> ND
 def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
     """Return the length [px] of a full turn in the images, from that of the sector at a slope, in the coarser camera.
 
-    That of a full circle is the length of the horizon.
+    That of a full circle is the length of the horizon; NaN where a camera does not see it.
     """
     azimuth = (
         np.linspace(0, 2 * math.pi, 361)
@@ -254,9 +267,8 @@ def _turn_px(rig: Rig, sector: _Sector, slope: float) -> float:
         np.where(steps < MAX_STEP_RATIO * step, steps, step).sum() * 2 * math.pi / sector.span_rad
         for steps, step in zip(around, usual, strict=True)
     ]
-    if not np.isfinite(lengths).all() or min(lengths) < MIN_HORIZON_PX:
-        raise CalibError("rig: a camera does not see the horizon; set panorama.width_px and check the transforms")
-    return float(min(lengths))
+    sees_all = np.isfinite(lengths).all() and min(lengths) >= MIN_HORIZON_PX
+    return float(min(lengths)) if sees_all else math.nan
 
 
 def _project(rig: Rig, mounted: MountedCamera, rays: Array) -> Array:

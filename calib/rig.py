@@ -13,7 +13,7 @@ from calib.models.names import visible_part
 from calib.rig_covariance import RigCovariance
 
 MIN_BASELINE_M = 1e-3  # because viewpoints that are closer would show no depth
-MAX_BASELINE_M = 5.0  # of two cameras on one robot: a number beyond it has another unit
+MAX_BASELINE_M = 5.0  # of two cameras on one robot, because a number beyond it has another unit
 # A T_base_rig with the cameras on the floor states no height: as the identity, which it is where none was measured.
 LEAST_HEIGHT_M = 0.1
 MAX_HEIGHT_M = 10.0  # Of cameras on a robot: a number beyond it is refused, because it has another unit.

@@ -17,7 +17,8 @@ from calib.models.camera import Array
 
 # Rotation [rad] and direction of the baseline [rad], in the rectified frame; length of the baseline [m].
 TRANSFORM_NAMES = ("r_x", "r_y", "r_z", "e_x", "e_y", "baseline")
-# No rig has more: two ocam cameras with the largest polynomials, of 77 parameters each, and the transform of 6.
+# No rig has more, because the largest has two ocam cameras with the largest polynomials, of 77 parameters each, and the
+# transform of 6.
 MAX_PARAMETERS = 160
 # Larger sigmas say nothing of any parameter, and their products overflow.
 MAX_SIGMA = 1e6

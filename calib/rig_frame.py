@@ -10,9 +10,9 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.names import sees_directly
 from calib.rig import MIN_BASELINE_M, MountedCamera, Rig
 
-# Half the distance in pixels over which the image's axis is measured: inside any mirror or lens.
+# Half the distance in pixels over which the image's axis is measured, because it stays inside any mirror or lens.
 STEP_PX = 1.0
-# From the baseline to what is below in an image: half-way to a camera that lies on its side.
+# From the baseline to what is below in an image, because that is half-way to a camera that lies on its side.
 MAX_LEAN_DEG = 45.0
 
 

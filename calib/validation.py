@@ -21,7 +21,7 @@ MAX_SIDE_PX = 32767  # because OpenCV's remap takes no larger images
 MAX_PIXELS = 64 * 2**20  # because a mask of one byte a pixel must fit the memory
 # Larger numbers would overflow in products.
 MAX_NUMBER = 1e300
-# A rotation typed with few digits is made orthonormal; one that a program wrote is not changed.
+# A rotation typed with few digits is made orthonormal, so that one that a program wrote is not changed.
 ORTHONORMAL_TOLERANCE = 1e-9
 
 

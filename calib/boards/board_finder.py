@@ -39,22 +39,23 @@ from calib.boards.opencv_boards import are_same, confirmed, grids_nearby, opencv
 from calib.image_area import MIN_SIDE_PX
 from calib.models.camera import Array
 
-# Number of grids per image that are grown and checked: those closest to the board's corner count.
+# Number of grids per image that are grown and checked, those closest to the board's corner count. By judgement; not
+# measured.
 TRIED_GRIDS = 5
 # Largest distance of a corner from where its neighbours predict it, in parts of a square. By judgement; not measured.
 MAX_IRREGULARITY = 0.2
-# A corner that is farther off than its board's others is one that a shadow or a cover moves: in parts of the median,
-# where the prediction's own spread is taken out, and least distance in parts of a square.
+# A corner that is farther off than its board's others is one that a shadow or a cover moves, by judgement: in parts of
+# the median, where the prediction's own spread is taken out, and least distance in parts of a square.
 MAX_OUTLIER, MIN_OUTLIER = 4.0, 0.015
 # Least share of accepted corners in a detected board. By judgement; not measured.
 MIN_GOOD = 0.75
-# Number of boards without an outline that OpenCV is asked to confirm in one image.
+# Number of boards without an outline that OpenCV is asked to confirm in one image. By judgement; not measured.
 MAX_UNCONFIRMED = 2
-# Least share of the board's corners in a grid around which OpenCV searches once more.
+# Least share of the board's corners in a grid around which OpenCV searches once more. By judgement; not measured.
 PARTIAL = 0.6
 # Least share of corners accepted of a board without outline that one detector alone finds. By judgement; not measured.
 MIN_LONE_PART = 0.9
-# Larger grids are not grown: in parts of the board's corners, and at least.
+# Larger grids are not grown: in parts of the board's corners, and at least. By judgement; not measured.
 FLOOR_PART, MIN_FLOOR_CORNERS = 3, 200
 # A grid that shares more than this part of its corners with a floor belongs to it. By judgement; not measured.
 MAX_SHARED = 0.5

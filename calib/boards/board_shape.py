@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 from calib.boards.corner_candidates import Grey, sample
 from calib.models.camera import Array
 
-# Half side of the square of neighbours that determine the mapping. It has six terms; some neighbours may be missing.
+# Half side of the square of neighbours that determine the mapping, so many because it has six terms, and some
+# neighbours may be missing.
 NEIGHBOURS = 2
 MIN_NEIGHBOURS = 6
 # Variance of the Gaussian weight of neighbours [squares^2], times two, so that the farthest ones have 7 %.
 WEIGHT_WIDTH = 3
-# Sampling positions within a square: a pixel away from the edges of the smallest squares (MIN_SPACING_PX).
+# Sampling positions within a square, so that they are a pixel away from the edges of the smallest squares
+# (MIN_SPACING_PX).
 MIDDLE = np.linspace(0.3, 0.7, 5)
 # The squares of a print are uniform. A grey step between neighbouring squares counts if it has the right sign and at
 # least MIN_STEP of the median step. MIN_STEPS is the least share of such steps (the edge of a shadow spoils some), and
@@ -27,8 +29,8 @@ MAX_SPREAD, MIN_STEPS = 0.22, 0.6
 FEW_CORNERS, FEW_MAX_SPREAD, FEW_MIN_STEPS = 20, 0.08, 0.9
 # Least share of right steps in the outermost ring of squares. By judgement; not measured.
 MIN_AROUND = 0.85
-# Largest share, on any side, of steps beyond the board of at least BEYOND_STEP of the median step. A light margin next
-# to the squares yields about a quarter, a pattern that continues 1: the limit is near the middle.
+# Largest share, on any side, of steps beyond the board of at least BEYOND_STEP of the median step, because a light
+# margin next to the squares yields about a quarter, a pattern that continues 1: the limit is near the middle.
 MAX_BEYOND, BEYOND_STEP = 0.65, 0.4
 
 

@@ -12,13 +12,14 @@ from scipy.spatial import cKDTree
 from calib.models.camera import Array
 
 Grey = NDArray[np.float32]
-# Samples on the ring about a corner: about one a pixel on the largest one, which is 29 px around.
+# Samples on the ring about a corner, about one a pixel because the largest one is 29 px around.
 RING = 32
 # Standard deviation of the Gaussian blur before grey levels of a ring are sampled. By judgement; not measured.
 BLUR_PX = 0.7
 # Least contrast of a ring [grey levels]. By judgement; not measured.
 MIN_CONTRAST = 6.0
-# Opposite sides of a corner are alike: largest ratio of the ring's odd part to its even part (standard deviations).
+# Largest ratio of the ring's odd part to its even part (standard deviations), because opposite sides of a corner are
+# alike.
 MAX_ODD = 0.6
 # Least angle between the two edges of a corner. By judgement; not measured.
 MIN_CROSSING_RAD = np.deg2rad(18)
@@ -35,7 +36,7 @@ MAX_PER_LEVEL = 4000  # Most candidates of a level, so that the largest board fi
 # 3 px apart at least (MIN_SPACING_PX), and farther than the radius of their rings.
 SAME_PX = 2.0
 SAME_RING_PART = 0.35
-# cv2.remap expects images, not lists: samples are folded into rows of this length.
+# cv2.remap expects images, not lists, so that samples are folded into rows of this length.
 REMAP_COLUMNS = 1024
 
 

@@ -19,10 +19,10 @@ Cell = tuple[int, int]
 Grid = dict[Cell, Array]
 # To the neighbours along columns and rows: exact.
 STEPS: tuple[Cell, ...] = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# Bounds of the growth: no board has more corners, and every round adds a row at least.
+# Bounds of the growth, because no board has more corners, and every round adds a row at least.
 MAX_CELLS = 61 * 61
 MAX_ROUNDS = 64
-# Least corners of a grid: one square.
+# Least corners of a grid, because a square has them.
 MIN_GRID_CORNERS = 4
 # Radius, in parts of the corner spacing, in which a predicted corner is searched, and radius of its ring: less than a
 # half, otherwise they would reach the next corner's. A smaller ring than MIN_RING_PX has too few pixels, twelve.
@@ -35,10 +35,11 @@ MIN_SPACING_PX = 3
 MIN_QUALITY = 0.15
 # Least contrast of a predicted corner, in parts of the grid's median contrast. By judgement; not measured.
 MIN_CONTRAST_PART = 0.25
-# Corners of which that median is taken: measuring all of them takes long on a wall full of corners.
+# Corners of which that median is taken, because measuring all of them takes long on a wall full of corners.
 CONTRAST_CELLS = 64
-# cv2.cornerSubPix: half window in parts of the corner spacing and its limits, iterations, convergence.
+# cv2.cornerSubPix: half window in parts of the corner spacing, and its limits. By judgement; not measured.
 WINDOW_PART, MIN_WINDOW_PX, MAX_WINDOW_PX = 0.3, 2, 15
+# Its iterations and convergence, as in OpenCV's tutorial of it.
 SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX = 40, 1e-3
 
 

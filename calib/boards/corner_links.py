@@ -12,15 +12,17 @@ from scipy.spatial import cKDTree
 from calib.boards.corner_candidates import CornerCandidates, Grey, sample
 from calib.models.camera import Array
 
-# Number of nearest candidates among which an arm's neighbour is chosen: those of a board within three squares.
+# Number of nearest candidates among which an arm's neighbour is chosen, because a grid has so many within three
+# squares.
 NEAREST = 28
-# Largest angle between an arm and the line to its neighbour: edges in a mirror image are curved.
+# Largest angle between an arm and the line to its neighbour, because edges in a mirror image are curved.
 MAX_TURN_RAD = np.deg2rad(22)
 # The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it. Its
-# two sides must differ by MIN_EDGE of the corners' contrast.
+# two sides must differ by MIN_EDGE of the corners' contrast. By judgement; not measured.
 ASIDE = 0.17
 ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
 MIN_EDGE = 0.3
+# No index, because the least one is 0.
 NO_NEIGHBOUR = -1
 
 

@@ -22,7 +22,7 @@ from calib.models.ocam import project_near
 # Mapping of board offsets (..., 2) from a corner [squares] to pixels (..., 2).
 ToImage = Callable[[Array], Array]
 
-# Largest half side of the window in pixels: farther grey levels do not depend on the corner's position.
+# Largest half side of the window in pixels, because farther grey levels do not depend on the corner's position.
 REACH_PX = 8
 # Least samples along a side of the window: 25 for the six terms of the surface, since 9 would be too few.
 MIN_WINDOW_SAMPLES = 5
@@ -31,9 +31,11 @@ WEIGHT_PART = 0.6
 # Enough: 8 of 11 boards of test_board_finder.py end before; a last step is a fifth of the accuracy.
 MAX_ITERATIONS = 4
 CONVERGED_PX = 2e-3
-# A corner that moves farther than this part of a square, plus some pixels, is reset: it has reached another edge.
+# A corner that moves farther than this part of a square, plus some pixels, is reset, because it has reached another
+# edge.
 MAX_MOVE, MAX_MOVE_PX = 0.3, 0.3
-# Step of the difference quotient by which the size of a square is measured [squares].
+# Step of the difference quotient by which the size of a square is measured [squares], a hundredth because a mapping
+# bends within a square.
 SIZE_STEP = 0.01
 
 

@@ -22,11 +22,11 @@ Dictionary = cv2.aruco.Dictionary
 DICTIONARIES = {
     name.removeprefix("DICT_"): int(getattr(cv2.aruco, name)) for name in dir(cv2.aruco) if name.startswith("DICT_")
 }
-# Least part of a square that a marker fills, and largest: a light margin must remain.
+# Least part of a square that a marker fills, and largest, because a light margin has to remain.
 MIN_MARKER_PART, MAX_MARKER_PART = 0.3, 0.95
 # Least and largest space between two tags, in parts of a tag. By judgement; not measured.
 MIN_SPACING, MAX_SPACING = 0.05, 1.0
-# Kalibr's tags: family, width of the border [bits], bits along a side within the border.
+# Tags as in Kalibr: family, width of the border [bits], bits along a side within the border.
 TAG_FAMILY, TAG_BORDER_BITS, TAG_BITS = "APRILTAG_36h11", 2, 6
 # Tag 0 of the family 36h11 (Olson 2011): row by row, the most significant bit at the upper left, 1 is light.
 TAG_0 = 0xD5D628584

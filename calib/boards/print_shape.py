@@ -16,7 +16,8 @@ from calib.models.camera import Array
 MODE_NAMES = ("bend_x", "bend_y", "twist", "stretch")
 # The modes that move points out of the plane come first, because bends are kept or left out together.
 BENDS = 3
-# One step of a mode: a millimetre of height, and a hundredth of the sides' ratio, about a pixel of a near board.
+# One step of a mode, a millimetre of height and a hundredth of the sides' ratio, because each is about a pixel of a
+# near board.
 MODE_UNITS = np.array([1e-3, 1e-3, 1e-3, 1e-2])
 
 

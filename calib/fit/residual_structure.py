@@ -9,12 +9,12 @@ import numpy as np
 from calib.boards.board_shape import quadratic_terms
 from calib.models.camera import Array
 
-# Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
+# Bins of the image: rings with equal numbers of corners, and sectors of azimuth. By judgement; not measured.
 RINGS, SECTORS = 6, 12
-# Least number of corners in a bin that is used: the mean of fewer errs by more than half the noise.
+# Least number of corners in a bin that is used, because the mean of fewer errs by more than half the noise.
 MIN_CORNERS = 4
-# A misfit is reported if the systematic part exceeds this part of the noise, and this error: smaller ones do not change
-# the motion estimate by a measurable amount.
+# A misfit is reported if the systematic part exceeds this part of the noise, and this error, because smaller ones do
+# not change the motion estimate by a measurable amount.
 MAX_SYSTEMATIC_PART, MAX_SYSTEMATIC_PX = 0.5, 0.03
 # Residuals longer than this many times their median length are outliers: 3 of 100 million of a
 # normal distribution.

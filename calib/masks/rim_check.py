@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 
-# Tolerance for a mask that reaches beyond the rim: a rim is found to a pixel or two, and masks are also drawn by hand.
+# Tolerance for a mask that reaches beyond the rim, because a rim is found to a pixel or two, and masks are also drawn
+# by hand.
 MAX_BEYOND_PX, MAX_BEYOND_PART = 3.0, 0.005
 
 

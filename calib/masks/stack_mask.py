@@ -19,10 +19,10 @@ MAX_FRAMES = 64  # Most images, so that the memory is bounded: 128 MB of images 
 # median change. By judgement; not measured.
 DARK_PART = 0.35
 STILL_PART = 0.35
-# Percentiles that stand for the light and the dark level of a pixel over time: single glints must not count.
+# Percentiles that stand for the light and the dark level of a pixel over time, so that single glints do not count.
 LIGHT_PERCENTILE, DARK_PERCENTILE = 95, 5
 # Morphology: opening removes specks, closing fills gaps; components smaller than this part of the ring are dropped; the
-# rest is dilated by the blur at its edges.
+# rest is dilated by the blur at its edges. By judgement; not measured.
 OPEN_PX, CLOSE_PX = 3, 7
 MIN_SPECK_PART = 5e-4
 EDGE_PX = 2

@@ -33,16 +33,19 @@ TANGENTIAL_NAMES, ASTIGMATISM_NAMES = ("p1", "p2"), ("s1", "s2")
 
 # The limit of the toolbox's own C reader.
 MAX_COEFFICIENTS = 64
-# Size of the table of radii in which the inversion starts; each solution stays within one interval.
+# Size of the table of radii in which the inversion starts, so that each solution stays within one interval.
 TABLE_SIZE = 1025
-# Newton steps on one table interval: 3 reach the last bit, the others are for the model's end, where the slope is 0.
+# Newton steps on one table interval, because 3 reach the last bit, the others are for the model's end, where the slope
+# is 0.
 SOLVE_STEPS = 8
-# A Newton step that is shorter ends the search: the error left is of the order of its square, below the last bit.
+# A Newton step that is shorter ends the search, because the error left is of the order of its square, below the last
+# bit.
 SOLVED_PX = 1e-9
 # A camera with a wavefront is exact for points at this distance; half of it and twice as far have the same error.
 DISTANCE_M, MIN_DISTANCE_M, MAX_DISTANCE_M = 1.5, 0.05, 1e4
 NO_WAVEFRONT = (0.0,) * wavefronts.TERMS
-# Newton steps that invert the tangential and astigmatic terms; pixels without convergence have no ray.
+# Newton steps that invert the tangential and astigmatic terms; measured: terms of 3, 30 and 60 px at a rim of 460 px
+# take 2, 4 and 6. Pixels without convergence, within a millionth of what a corner errs by, have no ray.
 TANGENTIAL_STEPS, TANGENTIAL_TOLERANCE_PX = 8, 1e-8
 # Least determinant of the affine: less would squeeze the image to a line.
 MIN_DETERMINANT = 1e-6

@@ -17,7 +17,8 @@ from calib.models.camera import Array
 
 # The parameters, as files and results name them.
 OMNI_NAMES = ("xi", "fu", "fv", "pu", "pv", "k1", "k2", "p1", "p2")
-# Newton steps that invert the lens distortion; a mild one converges in 3 to 5, and pixels without convergence are NaN.
+# Newton steps that invert the lens distortion, because a mild one converges in 3 to 5, and pixels without convergence
+# are NaN.
 UNDISTORT_STEPS = 12
 UNDISTORT_TOLERANCE = 1e-9
 # Smallest denominator of the projection: guards against division by zero.

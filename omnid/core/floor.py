@@ -27,30 +27,40 @@ from omnid.core.floor_kernels import densities, level_floors
 Array = NDArray[np.float64]
 
 TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base on its wheels
-# Searched heights; their step is finer than the noise that the prior's tilt adds.
+# Heights that are searched, because cameras of robots are between them; the step is finer than the noise that the
+# prior's tilt adds, so that none is missed.
 HEIGHTS_M: Final = np.arange(0.1, 3.0, 0.02)
-SPAN_M: Final = 0.3  # Points within this distance of the floor are compared with it: 3 sigma of the noisiest ones.
-FALSE: Final = 0.05  # Share of the points that lie on no surface: false matches.
-FIRST_PART: Final = 0.1  # Share of the points on the floor at the start of the search: that of a narrow corridor.
-STEEP: Final = math.tan(math.radians(15))  # Slope below the horizon; flatter rays measure the floor's height badly.
+SPAN_M: Final = 0.3  # Points so near to the floor are compared with it, because that is 3 sigma of the noisiest ones.
+FALSE: Final = 0.05  # Share of the points that lie on no surface, false matches. By judgement; not measured.
+# Share of the points on the floor at the start of the search, because a narrow corridor shows so much.
+FIRST_PART: Final = 0.1
+# Slope below the horizon, because flatter rays measure the floor's height badly.
+STEEP: Final = math.tan(math.radians(15))
 LARGEST_SIGMA_M: Final = 0.1  # Noisier points are left out: by UNEVEN_M they would weigh a 400th of the best.
 UNEVEN_M: Final = 0.005  # Standard deviation of an uneven floor. By judgement; not measured.
-NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise; on floors it was 0.3 to 0.9
+NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise, because it was 0.3 to 0.9 on floors
 MOST_POINTS: Final = 2000  # more of a pair say the same
 # Enough: of 36 floors of test_floor.py 2000 iterations move 34 by 3 mm at most, and deny 2.
 ITERATIONS: Final = 40
 CONVERGED: Final = 1e-5  # m, rad; so that what is left is less than a 300th of RIG_SIGMAS
-# Fitted on rendered logs (the sample, rooms 601, two_walls 601): pairs scatter by 6 mm and 0.3 degrees.
+# Fitted on rendered logs (the sample, rooms 601, two_walls 601), where a line gives no other reason: pairs scatter by
+# 6 mm and 0.3 degrees.
 POINTS_ALIKE: Final = 20.0
-LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor: 150 to 1.
+LEAST_EVIDENCE: Final = 5.0  # Log-likelihood ratio from which a run has a floor, because it is odds of 150 to 1.
 LEAST_OF_PAIR: Final = 0.5  # a pair with less shows no floor
+# Sectors of ten degrees, and those of them in which the floor must be seen, because a smaller part of a turn determines
+# its tilt badly.
 SECTORS: Final = 36
-LEAST_SECTORS: Final = 12  # Sectors in which the floor must be seen.
-# Of the rig and of stereo, which many pairs do not average out; the same logs: -12 to +8 mm.
-RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])  # m, rad, rad
-LARGEST_SCATTER_M: Final = 0.05  # Pairs whose heights scatter more show no common floor: they contradict one another.
-MOST_PAIRS: Final = 12  # then the floor stays as it is, and costs nothing any more
-RENEWED_AT: Final = (3, 6, MOST_PAIRS)  # pairs; what depends on the floor is computed again then
+LEAST_SECTORS: Final = 12
+# Errors [m, rad, rad] of the rig and of stereo, which many pairs do not average out; measured on the same logs: -12 to
+# +8 mm.
+RIG_SIGMAS: Final = np.array([0.01, math.radians(0.2), math.radians(0.2)])
+# Pairs whose heights scatter more show no common floor, because those of one floor scatter by 6 mm.
+LARGEST_SCATTER_M: Final = 0.05
+# Pairs after which the floor stays as it is, so that it costs nothing any more. The number was chosen by judgement.
+MOST_PAIRS: Final = 12
+# Pairs; what depends on the floor is computed again then, seldom because the median hardly changes.
+RENEWED_AT: Final = (3, 6, MOST_PAIRS)
 
 
 class Floor(NamedTuple):

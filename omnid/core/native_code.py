@@ -30,12 +30,12 @@ from omnid.core.kernel_arguments import Argument
 OPTIONS: Final = {"nogil": True, "error_model": "numpy", "fastmath": False, "parallel": False}
 # Entries of numba for Python and C, which nothing calls, take a tenth of all compilation.
 UNWRAPPED: Final = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-# Bytes from the start of an array's struct, and of its type's: numpy/core/include/numpy/ndarraytypes.h.
+# Bytes from the start of an array's struct, and of its type's; source: numpy/core/include/numpy/ndarraytypes.h.
 TYPE_AT, DATA_AT, AXES_AT, SHAPE_AT, STRIDES_AT, DTYPE_AT, FLAGS_AT = 8, 16, 24, 32, 40, 56, 64
 BYTE_ORDER_AT, NUMBER_AT = 26, 28
 CONTIGUOUS, ALIGNED, WRITABLE = 0x1, 0x100, 0x400
-# Memory of numba's arrays (numba/core/runtime/nrt.h): a count of references first, the address of the data fourth; the
-# rest is not used where arrays are made and freed by compiled functions only.
+# Memory of numba's arrays (source: numba/core/runtime/nrt.h): a count of references first, the address of the data
+# fourth; the rest is not used where arrays are made and freed by compiled functions only.
 HEADER_BYTES, DATA_FIELD = 64, 3
 
 # So many bits because the fields of numpy's structs have them.

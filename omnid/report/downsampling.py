@@ -47,11 +47,6 @@ class Downsampled:
         """Return at most two points for each bin, in the order of time."""
         return sorted({point for bin_ in self._bins.values() for point in bin_})
 
-    @property
-    def highest(self) -> float:
-        """Highest of all values; NaN without any."""
-        return max((bin_.high[1] for bin_ in self._bins.values()), default=math.nan)
-
     def _put(self, key: int, new: _Bin) -> None:
         old = self._bins.get(key, new)
         self._bins[key] = _Bin(min(old.low, new.low, key=itemgetter(1)), max(old.high, new.high, key=itemgetter(1)))

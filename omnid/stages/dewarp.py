@@ -36,7 +36,7 @@ class Dewarp:
         self._pad_px = config.pad_px
         timing = timing or TimingConfig()
         rig, cylinder = geometry.rig, geometry.cylinder
-        self._sector = cylinder.turn_px, cylinder.first
+        self._sector, self._scale = (cylinder.turn_px, cylinder.first), cylinder.scale
         self._lower, self._upper, self._blur_px, self._visible = _tables(geometry, config)
         self._tiles = TileMonitor(self._visible, tile_columns(cylinder))
         self.upper_delay_s = timing.upper_delay_ms * 1e-3 or rig.times.upper_delay_s
@@ -97,7 +97,8 @@ class Dewarp:
     def _padded(self, remapped: NDArray[np.uint8], gain: float, camera: Side, steps: Steps) -> PaddedPanorama:
         """Return a panorama multiplied by a gain; steps: of the quantisation of its JPEG."""
         noise_grey = gain * self._noise_grey[camera]
-        return PaddedPanorama(brightened(remapped, gain), self._pad_px, noise_grey, gain, *self._sector, steps)
+        image, of_turn = brightened(remapped, gain), (*self._sector, steps, self._scale)
+        return PaddedPanorama(image, self._pad_px, noise_grey, gain, *of_turn)
 
 
 class _Tables(NamedTuple):

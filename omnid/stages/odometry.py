@@ -98,8 +98,12 @@ class OdometryStage:
             self._agreement.add_step(last_ns, pair.stamp_ns, *map(float, seen[[0, 5, 1]]))
             if self.witness.is_fault:
                 self.last_fault = self.witness
+        # 4. The message, in the frame of the rig, with the uncertainty by what wheels and gyro contradict.
         covariance_rect = estimate.covariance + self._contradicted(estimate.T_odom_rect, pair.stamp_ns)
-        # 4. The message, in the frame of the rig.
+        return self._update(pair, estimate, covariance_rect)
+
+    def _update(self, pair: Panoramas, estimate: OdometryEstimate, covariance_rect: Array) -> OdometryUpdate:
+        """Return the message of an estimate at a pair; covariance_rect (6, 6): that of its pose."""
         earlier = self._earlier(pair, estimate)
         T_odom_rig = self._T_rig_rect @ estimate.T_odom_rect @ se3.inverse(self._T_rig_rect)
         return OdometryUpdate(

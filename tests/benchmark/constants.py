@@ -1,10 +1,11 @@
 """Table of the numeric constants of omnid/core and calib: `python -m tests.benchmark.constants [--write] [--missing]`.
 
 A constant is a module-level name in capitals whose value contains a number, or a knob of a settings class. Its comment
-is behind it, or above it, where it holds for all lines up to the next comment or empty line. A comment that only says
-what the constant is describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives
-its reason. Words decide that: a person judges whether the reason is a good one. One that says "by judgement" gives none
-and says so: it is counted apart. `--write` makes docs/constants.md, `--missing` lists what says neither.
+is behind it, or above it, where it holds up to the next comment or empty line: for lines without a comment behind them,
+and for the others if it says so ("where a line gives no other reason"). A comment that only says what the constant is
+describes it; one that says why it has this value (a cause, a source, a measurement, a trial) gives its reason. Words
+decide that: a person judges whether the reason is a good one. One that says "by judgement" gives none and says so: it
+is counted apart. `--write` makes docs/constants.md, `--missing` lists what says neither.
 """
 
 from __future__ import annotations
@@ -48,18 +49,25 @@ UNITS: Final = {
     "SIGMAS": "sigma",
     "SQUARED": "squared",
 }
-# Words by which a comment says why: a cause, a source, a measurement or a trial.
+# Words by which a comment says why. A colon, or "must", is none: what follows it may only describe.
+CAUSES: Final = (
+    r"because|since|so that|so (?:many|much|small|large|wide|few) that|(?<=, )so(?! many| much)|therefore|otherwise",
+    r"never|cannot|hardly|enough|needs|needed|would|may not|covers|guards? against|for few|stays? below|exact",
+    r"too (?:many|few|small|large|long|short|near|far)|no (?:more|less|longer)|more than (?:the|any)|larger than any",
+    r"are not resolved|(?:say|tell)s? (?:nothing|the same)|misread|to the last digit|rounding|of a normal distribution",
+)
+MEASUREMENTS: Final = (r"(?<!is )(?<!are )(?<!not )measured|by trial|fitted on|set (?:by|on|with|to)",)
+SOURCES: Final = (
+    r"sources?:|\(source|section [IVX\d]|eq\.|et al|the paper|the standard(?! deviation)|IEEE|ISO|RFC|REP \d",
+    r"OpenCV's|by OpenCV|as in|as for|by default|'s default|the limit of",
+)
 REASON: Final = re.compile(
-    r"\b(because|so that|so many that|since|therefore|otherwise|enough|too (many|few|small|large|long|short|near|far)"
-    r"|never|cannot|hardly|no (more|less)|set by|set on|set with|set to|by trial|measured|source|section|eq\.|et al|"
-    r"default|the paper|the standard|IEEE|ROS|REP|ISO|RFC|OpenCV|covers|needed|needs|stay(s)? below|as in|as for|"
-    r"rounding|would|must|may not|of a normal distribution|no longer|for few|exact|guards? against|larger than any"
-    r"|more than (the|any)|the limit of|are not resolved|(say|tell)s? (nothing|the same)|misread|to the last digit)\b"
-    r"|\([^()]* (19|20)\d\d\)|[:;] |, so (?!many|much)",
-    re.IGNORECASE,
+    rf"(?:(?<!\w)(?:{'|'.join((*CAUSES, *MEASUREMENTS, *SOURCES))}))(?!\w)|\([^()]* (?:19|20)\d\d\)", re.IGNORECASE
 )
 # What says plainly that there is no reason but somebody's judgement, whatever else the comment says.
 JUDGEMENT: Final = re.compile(r"\bby judgement\b", re.IGNORECASE)
+# A comment above lines that gives the reason of those whose own comment gives none.
+GROUP: Final = re.compile(r"\bwhere a line gives no other reason\b")
 SOURCE: Final = re.compile(
     r"\([A-Z][\w .&-]* (?:et al\.,? )?(?:19|20)\d\d[^)]*\)|Dang et al[^:;]*|(?:section|eq\.) [IVX()\d.A-Z]+"
     r"|Keys(?: 1981)?|OpenCV's? \w+|the paper's? [\w ]+|REP \d+|Source: [^.;]+"
@@ -142,13 +150,16 @@ class Comments:
         return " ".join(b" ".join(rows).decode().split())
 
     def at(self, first: int, last: int) -> str:
-        """Return the comments of an assignment: that behind it, and that above it unless the former gives the reason
-        or says that there is none.
+        """Return the comments of an assignment: that behind it, else that above it, or both.
 
-        A comment above holds up to the next one, or to the next empty line.
+        A comment above holds up to the next one, or to the next empty line, for the lines without one behind them; for
+        the others where it says so (GROUP), unless theirs gives a reason or says that there is none.
         """
         behind = self._joined(line for line in range(first, last + 1) if line in self._of)
-        return behind if REASON.search(behind) or JUDGEMENT.search(behind) else f"{self._above(first)} {behind}".strip()
+        above = self._above(first)
+        if behind and (REASON.search(behind) or JUDGEMENT.search(behind) or not GROUP.search(above)):
+            return behind
+        return f"{above} {behind}".strip()
 
     def _above(self, line: int) -> str:
         """Return the comment above a line that holds for it, empty where there is none."""
@@ -197,7 +208,11 @@ def _assigned(node: ast.stmt, comments: Comments, path: str) -> Iterator[Constan
 
 def has_number(value: ast.expr) -> bool:
     """True if a number, which is no index and no part of a text, occurs in an expression."""
-    return any(isinstance(part, ast.Constant) and type(part.value) in (int, float) for part in ast.walk(value))
+    if isinstance(value, ast.Subscript):
+        return has_number(value.value)
+    if isinstance(value, ast.Constant):
+        return type(value.value) in (int, float)
+    return any(isinstance(part, ast.expr) and has_number(part) for part in ast.iter_child_nodes(value))
 
 
 def is_structure(names: Sequence[ast.expr], parts: Sequence[ast.expr]) -> bool:

@@ -214,9 +214,8 @@ def table(folders: Sequence[str], kept: dict[str, Outcome]) -> ResultTable:
 
 
 REMARKS: Final = (
-    "Short logs (10 to 24 pairs for odometry and rig, 128 for places). The noise of a ratio was not measured; one "
-    "above 2 is a defect. A ratio of exactly 1 with nothing else changed shows that the constant decided nothing on "
-    "these logs, not that it is safe elsewhere.",
+    "Short logs (10 to 24 pairs for odometry and rig, 128 for places). A ratio above 2 is a defect. A ratio of exactly "
+    "1 with nothing else changed shows that the constant decided nothing on these logs, not that it is safe elsewhere.",
     "Empty: not run at that size, as are factors without a row. Constants of compiled files (*_kernels.py) are not in "
     "the list.",
 )

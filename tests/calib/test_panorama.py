@@ -11,7 +11,7 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.models.camera import Mask
-from calib.panorama import Cylinder, fit_cylinder, remap_tables, visible
+from calib.panorama import Cylinder, at_scale, fit_cylinder, remap_tables, visible
 from calib.rig import MountedCamera, Rig
 from tests.simulation import make_rig
 from tests.simulation.rigs import R_RIG_AHEAD, lens, lens_rig
@@ -53,6 +53,16 @@ def test_a_sector_has_the_columns_of_what_both_cameras_see(
     missing = both.any(axis=0)
     missing[(cylinder.first + np.arange(cylinder.width)) % cylinder.turn_px] = False
     assert missing.mean() < 0.002
+
+
+@pytest.mark.parametrize("rig", [make_rig(size=256), lens_rig(lens("pinhole", 100, (640, 480)))])
+def test_a_panorama_knows_its_scale(rig: Rig) -> None:
+    whole = fit_cylinder(rig)
+    half = fit_cylinder(rig, scale=0.5)
+    assert (whole.scale, half.scale) == (1.0, 0.5) and half.full_turn.scale == 0.5
+    assert fit_cylinder(rig, whole.turn_px // 2).scale == pytest.approx(0.5, abs=0.01)
+    assert whole.resized(whole.width // 2).scale == pytest.approx(0.5, abs=0.01)
+    assert [at_scale(48, half.scale), at_scale(1, half.scale), at_scale(0.3, 0.25)] == [24, 1, 1]
 
 
 def test_pixels_and_rays_of_a_sector_agree_with_those_of_the_full_turn() -> None:

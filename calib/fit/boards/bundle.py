@@ -25,7 +25,7 @@ ENDING = Ending(steps=60, gain=1e-9, damping=1e-7)
 # Number of optimisations, each with the kernel's width estimated again, because the width depends on the residuals and
 # these on the width.
 KERNEL_ROUNDS = 3
-# Width of Huber's kernel in standard deviations of one coordinate: 1 of 23 normal residuals (2-D) is longer.
+# Width of Huber's kernel in standard deviations of one coordinate, because 1 of 23 normal residuals (2-D) is longer.
 HUBER_WIDTH = 2.5
 # Least standard deviation assumed for a coordinate: exact corners would make the kernel's width 0.
 MIN_SIGMA_PX = 0.02
@@ -93,7 +93,6 @@ class BundleResult:
     residuals: Array  # (K, N, 2)
     covariance: Array  # (P, P), with the misfit of the model
     cost: float = 0.0  # of the robust residuals and the prior [px^2]
-    misfit_px: float = 0.0  # size of the smooth error of the model, most of which the parameters absorb
     board_steps: Array = field(default_factory=lambda: np.zeros(0))  # (S,) of the modes of the board's shape
     board_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (S, S), with the misfit of the model
 
@@ -260,14 +259,13 @@ def _bundle_result(problem: _BoardProblem, state: _State) -> BundleResult:
         return BundleResult(state.parameters, state.poses, state.residuals, np.zeros((0, 0)))
     fields = smooth_fields(problem.observed.pixels, problem.observed.cameras)
     system = problem.normal_equations(state, problem.kernel_px, fields).reduced()
-    covariance, misfit_px = covariance_with_misfit(*system, count, variance)
+    covariance = covariance_with_misfit(*system, count, variance)
     return BundleResult(
         state.parameters,
         state.poses,
         state.residuals,
         covariance[:P, :P],
         problem.cost(state, problem.kernel_px),
-        misfit_px,
         state.board_steps,
         covariance[P:, P:],
     )

@@ -16,10 +16,13 @@ from calib.fit.boards.bundle import Observations
 from calib.models.camera import Array
 from calib.models.ocam import View
 
-# Grid search for the centre: start half width in parts of the image, points per axis, factor per round, end width.
+# Grid search for the centre: start half width in parts of the image. By judgement; not measured.
 SEARCH_PART = 0.16
+# Points per axis, and factor of the width per round, so that a round goes as far as to the neighbours of the best point
+# of the last one: half of its width, and a tenth.
 SEARCH_SIDE = 5
 SEARCH_SHRINK = 0.55
+# Width at which the search ends, because the fit that follows refines the centre.
 SEARCH_END_PX = 0.5
 # Errors are capped, so that one bad image does not determine the centre.
 CAP_RAD = 0.05

@@ -14,8 +14,8 @@ from calib.errors import CalibError
 from calib.fit.boards.bundle import CameraFactory, Observations, Prior, adjust_bundle
 from calib.models.camera import Array
 
-# Least squared Mahalanobis distance from the drawing: a board as drawn exceeds it once in ten thousand calibrations
-# (chi-square of three bends, and of the stretch).
+# Least squared Mahalanobis distance from the drawing, because a board as drawn exceeds it once in ten thousand
+# calibrations (chi-square of three bends, and of the stretch).
 MIN_CHI2_BENDS, MIN_CHI2_STRETCH = 21.1, 15.1
 
 

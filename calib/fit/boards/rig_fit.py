@@ -29,11 +29,12 @@ from calib.fit.boards.telecentric_mirror import TelecentricMirror
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.camera import Array, OmniCamera
 
-# One pair determines the transform; with four the consensus of most shows which pair is wrong.
+# One pair determines the transform, but four are expected, because with them the consensus of most shows which pair is
+# wrong.
 MIN_PAIRS = 4
 # A bound for the loop. Each round rejects at most a third of the views, so it ends earlier for lack of pairs.
 MAX_REJECTIONS = 10
-# Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong:
+# Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong, because
 # corners of right ones err by 0.05 to 0.15 px (docs/notes/calibration.md).
 MAX_MEAN_PX = 3.0
 MOTION_NAMES = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")

@@ -19,8 +19,8 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, has_wavefront, project_near
 from calib.models.wavefront import WAVEFRONT_NAMES
 
-# Prior of the terms of real mirrors: secondary astigmatism by about a pixel, wavefronts by a millimetre, or by what a
-# TelecentricMirror says.
+# Prior of the terms of real mirrors, because they are about one step: secondary astigmatism by about a pixel,
+# wavefronts by a millimetre, or by what a TelecentricMirror says.
 MIRROR_NAMES, MIRROR_SIGMA_STEPS = (*ASTIGMATISM_NAMES, *WAVEFRONT_NAMES, RADIUS_NAME), 1.0
 # The lower and the upper camera.
 Sides = tuple[OmniCamera, OmniCamera]

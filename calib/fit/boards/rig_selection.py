@@ -22,13 +22,14 @@ from calib.models.ocam import OcamCamera
 POWERS = (0, 2, 4)
 # Number of radii at which polynomials are compared: enough for three coefficients.
 RADII = 60
-# Start values of terms that are fitted: a wavefront [m], tangential terms [1/px].
+# Start values of terms that are fitted: a wavefront [m], tangential terms [1/px], so small that no pixel changes,
+# because 0 stands for a term that is not fitted.
 START_M, START_TANGENTIAL = 1e-9, (1e-12, 1e-12)
 # The more general rig is selected if its held-out error is lower by this part. By judgement; not measured.
 MIN_IMPROVEMENT = 0.01
-# Mirrors below telecentric lenses are selected if their cost is larger by less, in variances of a coordinate: the sum
-# of squares of ten normal values, of the five terms of both wavefronts, is larger once in twenty times. Ray-traced
-# paraboloids had 5, hyperboloids of xi = 0.97 had 23 with twelve pairs.
+# Mirrors below telecentric lenses are selected if their cost is larger by less, in variances of a coordinate, because
+# the sum of squares of ten normal values, of the five terms of both wavefronts, is larger once in twenty times.
+# Ray-traced paraboloids had 5, hyperboloids of xi = 0.97 had 23 with twelve pairs.
 MAX_MORE_VARIANCES = 18.3
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from calib.models.camera import Array
 
 # Grid of the fields: nodes along the diameter of the seen part of an image, and the width of each in parts of their
-# distance. Five nodes follow three waves over the azimuth and a turning point over the radius.
+# distance, because five nodes follow three waves over the azimuth and a turning point over the radius.
 NODES, WIDTH = 5, 1.0
 # Nodes farther from the centre, in parts of the largest radius, are left out, because no corner determines them.
 MAX_RADIUS = 1.3
@@ -53,8 +53,8 @@ def smooth_fields(pixels: Array, cameras: int) -> Array:
     return fields
 
 
-def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, variance: float) -> tuple[Array, float]:
-    """Return the covariance (P, P) of the parameters, and tau [px].
+def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, variance: float) -> Array:
+    """Return the covariance (P, P) of the parameters.
 
     normal (P + F, P + F), gradient (P + F,): of the weighted residuals by parameters and fields, poses eliminated, at
     the fit's minimum; variance: sigma^2 of a coordinate [px^2].
@@ -69,8 +69,7 @@ def covariance_with_misfit(normal: Array, gradient: Array, parameters: int, vari
     d, y = d[known], (axes.T @ (gradient[P:] - by_field @ gradient[:P]))[known]
     ratio2 = _mean_ratio2(d, y**2, variance) if len(d) else 0.0
     # The fit does not know the fields: each shifts the parameters by its row of by_field, which has the prior tau.
-    covariance = variance * (inverse + ratio2 * by_field.T @ by_field)
-    return np.asarray(covariance), float(np.sqrt(ratio2 * variance))
+    return np.asarray(variance * (inverse + ratio2 * by_field.T @ by_field))
 
 
 def _mean_ratio2(d: Array, squares: Array, variance: float) -> float:

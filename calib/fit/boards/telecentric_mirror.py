@@ -25,12 +25,12 @@ from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import OcamCamera
 from calib.models.wavefront import TERMS, WAVEFRONT_NAMES
 
-# Prior of h: two of three mirrors between 14 and 46 mm, which are 5 to 20 cm wide. With 15 or 50 mm as its median the
-# lengths of ten rigs change by less than 0.01 %.
+# Prior of h: two of three mirrors are between 14 and 46 mm, because mirrors are 5 to 20 cm wide. With 15 or 50 mm as
+# its median the lengths of ten rigs change by less than 0.01 %.
 RADIUS_NAME, RADIUS_M, RADIUS_LOG_SIGMA = "mirror_radius", 0.025, 0.6
-# Prior of what the wavefront differs from the mirror's, in parts of h: pixels that are not square by a thousandth (w_a,
-# w_b), a mirror whose own coma is that of a tilt by 0.06 degree (w_x, w_y), a lens that distorts its rim by a
-# thousandth (w_s).
+# Prior of what the wavefront differs from the mirror's, in parts of h, because there are pixels that are not square by
+# a thousandth (w_a, w_b), a mirror whose own coma is that of a tilt by 0.06 degree (w_x, w_y), a lens that distorts its
+# rim by a thousandth (w_s).
 DEVIATIONS = np.array([5e-4, 5e-4, 1e-3, 1e-3, 3.5e-4])
 # Step of the derivatives [units], because the plain values are nearly linear over it, and 1e9 times their rounding.
 STEP = 1e-4

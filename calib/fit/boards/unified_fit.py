@@ -12,9 +12,9 @@ from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
 from calib.models.unified import OMNI_NAMES, UnifiedCamera
 
-# Numbers of distortion coefficients that may be solved for: none, k1 and k2, all.
+# Numbers of distortion coefficients that may be solved for, because a lens has none, k1 and k2, or all.
 DISTORTION_TERMS = (0, 2, 4)
-# Start values of xi: pinhole (0), hyperbolic mirrors, parabolic mirrors (1), fisheye lenses.
+# Start values of xi, so that pinholes (0), hyperbolic mirrors, parabolic mirrors (1) and fisheye lenses are near one.
 START_XI = np.linspace(0.0, 3.0, 31)
 # Least cos(angle) + xi at which the projection is well defined: less would be 100 focal lengths from the centre.
 MIN_DENOMINATOR = 1e-2

@@ -21,7 +21,8 @@ from calib.fit.least_squares import Ending, minimise
 from calib.models.camera import Array
 from calib.rig import Rig
 
-# Patches are matched to a tenth of a pixel: observations that fit no better than to a pixel show no rigid world.
+# Patches are matched to a tenth of a pixel, so that observations that fit no better than to a pixel show no rigid
+# world.
 MAX_SIGMA_PX = 1.0
 # A landmark is not one point of one surface if the RMS of its errors exceeds the first number of sigmas. An
 # observation is a wrong match if its error exceeds the second. The robust kernel alone would leave them some weight.

@@ -19,7 +19,7 @@ from calib.models.camera import Array
 # Step of numeric derivatives, in steps of a parameter (about a pixel each) or in parts of a point's distance: a model
 # is linear over a ten-thousandth of a pixel, and rounding is 1e-9 of it.
 STEP = 1e-4
-# Cauchy's function counts errors of more sigmas less; at 3 sigmas its weight is one half.
+# Cauchy's function counts errors of more sigmas less, so that one of 3 sigmas has half of the weight.
 KERNEL = 3.0
 # Error of an observation whose point the model does not project: far outside of Cauchy's kernel, because observations
 # whose sigma exceeds a pixel are refused.

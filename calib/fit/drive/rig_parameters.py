@@ -15,12 +15,13 @@ from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import TRANSFORM_NAMES as RIG_TRANSFORM_NAMES
 
-ANGLE_UNIT_RAD = 1.0 / 250.0  # one step of the transform between the cameras: about a pixel
+ANGLE_UNIT_RAD = 1.0 / 250.0  # one step of the transform between the cameras, because it is about a pixel
 # The length of the baseline is no parameter: images of a drive do not determine the scale.
 TRANSFORM_NAMES = RIG_TRANSFORM_NAMES[:-1]
-# Times of exposure, and one step of each: some tenths of a pixel at walking speed.
+# Times of exposure, and one step of each, because some tenths of a pixel at walking speed.
 UPPER_DELAY, LINE_TIME = "upper delay [ms]", "line time [us]"
 TIME_UNITS = {UPPER_DELAY: 5.0, LINE_TIME: 5.0}
+# exact, by the definition of the prefixes
 S_PER_MS, S_PER_US = 1e-3, 1e-6
 WAVE_NAMES = tuple(f"{side} {name}" for side in ("lower", "upper") for name in WAVEFRONT_NAMES)
 

@@ -19,7 +19,7 @@ from omnid.core.nanoseconds import S_PER_NS
 STRAIGHT_RADPS: Final = 1e-3
 SPARE_M: Final = 0.1  # Added to a reach beyond which nothing can lie, so that rounding does not count.
 TINY: Final = 1e-9  # Added to divisors, so that no division is by zero.
-MOST_MOTIONS: Final = 400  # remembered between a ring's images and now: 2 s at the highest rate of ticks
+MOST_MOTIONS: Final = 400  # remembered between a ring's images and now, because 2 s at the highest rate of ticks
 
 
 class Outline(NamedTuple):

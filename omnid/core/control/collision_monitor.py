@@ -36,13 +36,14 @@ ALONG_SLOPE: Final = 0.05
 # free ranges change by a cell of 5 cm from ring to ring: at time_s of 1.5 s it is the speed for 9 cm.
 RESUME_MPS: Final = 0.06
 BRAKING_SHARE: Final = 0.8  # Share of the deceleration that is relied on, because the rest is for lag.
-BESIDE_M: Final = 0.05  # Room beyond the sides' clearance: corrections of the heading swing no corner farther.
-MOVING_STEP_S: Final = 0.1  # Step of the prediction of moving obstacles: a person at 1.5 m/s moves 0.15 m in it.
+BESIDE_M: Final = 0.05  # Room beyond the sides' clearance, because corrections of the heading swing no corner farther.
+# Step of the prediction of moving obstacles, short because a person at 1.5 m/s moves 0.15 m in it.
+MOVING_STEP_S: Final = 0.1
 MOVING_S: Final = 2.0  # the base slows down where it would meet a moving obstacle sooner: a person walks 3 m in it
-NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs; a third one makes it smaller.
+NEW_MPS: Final = 0.4  # Sigma of a velocity by two pairs, large because a third one makes it smaller.
 MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; by trial on development seeds
-# Speed of a person who walks towards the base, and the time until it brakes: two pairs at 10 Hz show the person, and
-# images and commands are 0.2 s on their way.
+# Speed of a person who walks towards the base, and the time until it brakes, because two pairs at 10 Hz show the
+# person, and images and commands are 0.2 s on their way.
 WALK_MPS, TURN_S = 1.6, 0.4
 MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
 

@@ -34,7 +34,9 @@ from omnid.core.nanoseconds import S_PER_NS
 from omnid.settings import knob
 
 TO_STAND: Final = Setpoint(0.0)
-JUMP_RAD: Final = 0.3  # A larger change of the heading than the base can turn: odometry was corrected, or is wrong.
+# Change of the heading beyond what the base can turn, from which odometry was corrected or is wrong. By judgement, far
+# above the noise of a heading.
+JUMP_RAD: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,9 @@ from omnid.settings import knob
 
 LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step; by trial on development seeds
 HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
-BRAKING_SHARE: Final = 0.8  # Share of the yaw acceleration that is planned for braking; the rest is for lag.
+# Share of the yaw acceleration that is planned for braking; the rest is left for the lag of the base. Chosen by
+# judgement.
+BRAKING_SHARE: Final = 0.8
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ from omnid.core.control.velocity_limits import VelocityLimits
 # Between the heading that the motor controller reported and its turn to the next goal; by trial with simulated
 # controllers.
 REACTION_S: Final = 0.15
-OVERSPEED: Final = 1.1  # times the yaw rate's limit, reported: the goal is the present heading until it is slower
+# Times the yaw rate's limit, reported: the goal is the present heading until it is slower. By judgement; not measured.
+OVERSPEED: Final = 1.1
 
 
 def longest_lead_rad(heading: HeadingLimits, velocity: VelocityLimits) -> float:

@@ -24,7 +24,7 @@ from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.settings import knob
 
-MOST_ACCOUNTS: Final = 2048  # kept of each kind: 10 s at the highest rate of commands
+MOST_ACCOUNTS: Final = 2048  # kept of each kind, because 10 s at the highest rate of commands have so many
 SIGMAS: Final = 3.0  # Of right differences 0.3 % exceed this, so that false alarms are rare.
 # Of the motion that stops, per second in which nothing is unexplained; by trial on development seeds.
 RECOVERY: Final = 0.5

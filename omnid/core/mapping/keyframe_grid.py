@@ -17,7 +17,8 @@ Array = NDArray[np.float64]
 
 MAX_CELLS: Final = 1_000_000  # 50 m by 50 m at cells of 0.05 m, so that a message has 1 MB.
 MARGIN_M: Final = 5.0  # around the area of the scans, so that it need not grow with each of them
-# The grid is drawn again when a keyframe has moved farther than this: half a cell, which 0.3 degrees are at 5 m.
+# The grid is drawn again when a keyframe has moved farther than this, because less than half a cell changes no cell;
+# 0.3 degrees are half a cell at 5 m.
 MOVED_CELLS, MOVED_RAD = 0.5, math.radians(0.3)
 
 

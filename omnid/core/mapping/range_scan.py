@@ -16,7 +16,8 @@ Array = NDArray[np.float64]
 SECTORS: Final = 360
 # Points of a keyframe that are farther away do not enter its scan; by trial on development seeds.
 MAX_RANGE_M: Final = 12.0
-# Longest gap that is filled between two sectors of one surface. It is 0.2 m wide at 3 m: too narrow for a person.
+# Longest gap that is filled between two sectors of one surface, because it is 0.2 m wide at 3 m, too narrow for a
+# person.
 FILLED_SECTORS: Final = 4
 # The ranges on both sides of a gap belong to one surface if their ratio is at most this; by trial on development seeds.
 SURFACE_RATIO: Final = 1.15

@@ -38,7 +38,8 @@ FREE_UNTIL: Final = -8
 # From this far on a cell is free only where a view has seen through the whole of it, so that what is narrower than a
 # cell and shows no range, as a plain pole, is unknown; nearer is the base itself. By trial on a development seed.
 WHOLE_M: Final = 0.5
-# Factor [1/m] of the squared range: the free space ends by this much before the obstacle, as the noise of stereo grows.
+# Factor [1/m] of the squared range: the free space ends by this much before the obstacle, because the noise of stereo
+# grows like that.
 SHORTER: Final = 0.02
 # Sectors to each side whose nearest range ends the free space, because an edge may be measured that far off.
 EDGE_SECTORS: Final = 2

@@ -22,10 +22,11 @@ _MAX_LOAD = 0.7
 _LOAD_AFTER_EVICTION = 0.5  # A fifth of the table is filled between two evictions, so that they are rare.
 _BATCHES = 8  # At most 1/8 of the table is placed at once: the load stays below 0.7 + 0.125, so probing ends.
 # A voxel seen once and not again for this number of frames is most likely a false match; by trial on development seeds.
+# A count and no time, as the age of a point, because each frame is another look.
 _OLD_FRAMES = 30
 _VARIANCE_RANGE_M2 = (1e-8, 1e8)  # standard deviations of 0.1 mm to 10 km, so that sums of weights cannot overflow
 _BLOCK_POINTS = 4096  # Points of a snapshot that are computed at a time, so that it needs little extra memory.
-_HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: Knuth's multiplicative hash
+_HASH = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio; source: Knuth's multiplicative hash
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,17 +21,20 @@ from omnid.core.navigation.settings import NavigationSettings
 
 Array = NDArray[np.float64]
 
-SPACING_M: Final = 0.1  # Spacing of the kept places: the least spacing of a path.
+SPACING_M: Final = 0.1  # Spacing of the kept places, because a path has no nearer points.
 SHORTEST_M: Final = 0.3  # Least length of a way back, because a shorter one makes no room for anybody.
 CLEAR_M: Final = 1.0  # Least way back to a wider place: nearer to the block the base would still be in the way.
-BACK_MPS: Final = 0.2  # slower than forwards: people do not expect a robot to back up
-LOOK_M: Final = 1.0  # Length of the way back that must be free now: the distance to stop, and a person's two steps.
-PASS_M: Final = 0.8  # Room next to the outline in which a person passes: shoulders of 0.6 m, and a margin.
+BACK_MPS: Final = 0.2  # slower than forwards, because people do not expect a robot to back up
+# Length of the way back that is free now, enough for the distance to stop and a person's two steps.
+LOOK_M: Final = 1.0
+# Room next to the outline in which a person passes, because shoulders have 0.6 m; the rest is a margin.
+PASS_M: Final = 0.8
 REST_S: Final = 3.0  # Least time before the base returns: a person needs it to go past a base.
-SPREAD_S: Final = 4  # Added to it, by the stamp of the pose: two robots that met then move at different times.
-RETRY_S: Final = 10.0  # The base returns after this time in any case, to search a way; then after twice the time.
+SPREAD_S: Final = 4  # Added to it, by the stamp of the pose, so that two robots that met move at different times.
+# The base returns after this time in any case, to search a way; then after twice the time. By judgement; not measured.
+RETRY_S: Final = 10.0
 LONGEST_RETRY_S: Final = 300.0  # Twelve attempts an hour, so that a way that becomes free is found.
-FREE_S: Final = 1.0  # The way ahead must be free for this time: rings vote for half a second.
+FREE_S: Final = 1.0  # The way ahead has been free for this time, because rings vote for half a second.
 ARRIVED_M: Final = 0.1  # The way ends this far from its last point; enough: it is one spacing.
 FAR_M: Final = 1e3  # Distance in directions without an obstacle: larger than any measured one.
 NARROWER_M: Final = 0.005  # Least change of width between two places of the way: more than rounding.

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 STOPS: Final = 5  # A stop is sent at so many poses after the end of a drive, because one might be lost.
 BESIDE_M: Final = 0.3  # The path counts as left this far beyond the corridor; by trial on development seeds.
-PLANNED_M: Final = 4.0  # Length of the path that the local planner is given: its grid ends at 3.2 m.
+PLANNED_M: Final = 4.0  # Length of the path that the local planner is given, because its grid ends at 3.2 m.
 LONGEST_STEP_S: Final = 1.0  # A longer time between two poses counts as this, because a gap is no wait.
 RESUME: Final = "`omnid goto --resume` (it arms, too)"  # the one command after a fault or a pause
 AROUND: Final = "it looks for a way around an obstacle"

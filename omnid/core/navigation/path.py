@@ -18,9 +18,9 @@ from omnid.errors import OmnidError
 Array = NDArray[np.float64]
 
 STEP_M: Final = 0.05  # Spacing of the points; fine enough: a cell of the local planner.
-SHORTEST_M: Final = 0.1  # Nearer points of a given path are dropped: they are noise of the position.
+SHORTEST_M: Final = 0.1  # Nearer points of a given path are dropped, because they are noise of the position.
 CORNER_RAD: Final = math.radians(40)  # At sharper corners the base turns on the spot; by trial on development seeds.
-BACK_M, AHEAD_M = 0.5, 2.0  # of the path, in which the nearest point is searched: so a path may cross itself
+BACK_M, AHEAD_M = 0.5, 2.0  # of the path, in which the nearest point is searched, so that a path may cross itself
 MAX_POINTS: Final = 20_000  # Most points of a given path, so that a message has at most 320 kB of coordinates.
 MAX_LENGTH_M: Final = 5_000.0  # so that memory is bounded: 100,000 points
 FARTHEST_M: Final = 1e6  # Largest coordinate, so that nonsense is refused: larger than any site.

@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 # The base turns on the spot towards a point at a larger angle; by trial on development seeds.
 TURN_RAD: Final = math.radians(45)
 TURNED_RAD: Final = math.radians(4)  # The turn ends below this angle; by trial on development seeds.
-BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned: the base follows with a lag.
-APPROACH_HZ: Final = 1.2  # speed per distance to the end: the last centimetres are slow
+BRAKE_SHARE: Final = 0.7  # Share of the deceleration that is planned, because the base follows with a lag.
+APPROACH_HZ: Final = 1.2  # speed per distance to the end, so that the last centimetres are slow
 LAST_MPS: Final = 0.02  # least speed before the end; by trial on development seeds
 
 

@@ -17,7 +17,8 @@ from omnid.tracking_state import MapState, TrackingState
 Array = NDArray[np.float64]
 
 NOWHERE: Final = np.zeros((0, 2))
-UNKNOWN_M: Final = 100.0  # A larger sigma says that the pose in the map is not known at all: it is a kilometre then.
+# A larger sigma says that the pose in the map is not known at all, because it is a kilometre then.
+UNKNOWN_M: Final = 100.0
 
 
 class WheelState(NamedTuple):

@@ -27,12 +27,11 @@ NOTHING, ONE, TWO, INFINITE = np.float32(0.0), np.float32(1.0), np.float32(2.0),
 
 # Log-odds where nothing was seen: floor that was not seen is not free, so that pairs must show it.
 FLOOR_PRIOR, SURFACE_PRIOR, VISIBLE_PRIOR = np.float32(-1.0), np.float32(-6.0), np.float32(3.0)
-LIMIT: Final = np.float32(6.0)  # Limit of all log-odds: a change is believed after a few pairs.
-FLOOR_LOW: Final = np.float32(
-    -3.0
-)  # Least log-odds of the floor: what was hidden for long is free again after few pairs.
-# Least log-odds against an edge: it stays where it is. With -3, three pairs in which ribs beyond it fit as floor by
-# another period outweighed all those before.
+LIMIT: Final = np.float32(6.0)  # Limit of all log-odds, so that a change is believed after a few pairs.
+# Least log-odds of the floor, so that what was hidden for long is free again after few pairs.
+FLOOR_LOW: Final = np.float32(-3.0)
+# Least log-odds against an edge, so that it stays where it is. With -3, by trial, three pairs in which ribs beyond it
+# fit as floor by another period outweighed all those before.
 EDGE_LOW: Final = np.float32(-12.0)
 TAKEN_ODDS: Final = np.float32(0.0)  # Log-odds of a surface from which a cell is occupied.
 # Of the floor, of a cell and a pair: the errors of pairs that follow each other are alike, so that a few count.
@@ -45,7 +44,8 @@ MOST_SURFACE: Final = np.float32(1.0)
 # Mean evidence of a surface where there is none, as the best of many runs is never negative: below 0.13 in 95 % of the
 # cells of bare floor. It would add up as the robot moves: two of three false surfaces before plain walls came of it.
 NOISE_SURFACE: Final = np.float32(0.15)
-UNSEEN_SURFACE: Final = np.float32(0.4)  # The same where no floor is in view, as nothing contradicts a surface there.
+# The same where no floor is in view, because nothing contradicts a surface there.
+UNSEEN_SURFACE: Final = np.float32(0.4)
 # Log-odds of a surface where floor is seen and no surface; by trial on development seeds.
 CONTRADICTION: Final = np.float32(-1.5)
 # Pairs from one place are no more than so many, as to a surface: 6 / 18 parts the evidence of bare floor (0.13 a pair

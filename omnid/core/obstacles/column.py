@@ -28,34 +28,43 @@ Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 Tables = NDArray[np.int32]
 
-# Directions without floor in view side by side, 15 degrees, in which nothing is assumed about it: struts and masts are
-# narrower, and the robot sees past them as it moves.
+# Directions without floor in view side by side, 15 degrees, in which nothing is assumed about it, because struts and
+# masts are narrower, and the robot sees past them as it moves.
 UNSEEN_RUN: Final = 20
-NEAREST_M: Final = 0.5  # Least range at which surfaces are searched.
-FLOOR_FOCAL_PX: Final = 100.0  # rows of panoramas in a radian: with 104 all of 4 goals were reached, with 87 not
+
+NEAREST_M: Final = 0.5  # Least range at which surfaces are searched. By judgement; not measured.
+# Rows of panoramas in a radian; by trial: with 104 all of 4 goals were reached, with 87 not.
+FLOOR_FOCAL_PX: Final = 100.0
 LEAST_SEEN: Final = 0.5  # Share of the rows of a patch that must be in view. By judgement; not measured.
-OUTLIER: Final = np.uint8(48)  # Most units by which a pixel differs; a larger difference counts as this one.
+OUTLIER: Final = np.uint8(48)  # Most units by which a pixel differs, because more than four sigmas are no noise.
 DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 would be that of independent pixels
 THIN_M: Final = 0.035  # Width of the thinnest obstacle. With 0.03, by trial, more bases stood on polished floors.
-BIN_ROWS: Final = 2  # Rows on either side of those in which the floor has a disparity.
-FLOOR_PX: Final = 1.3  # least difference of disparity by which something is not the floor
-OTHERS_PX: Final = (12, 25)  # lower and higher disparities than the floor's that may explain its rows
-EDGE_M: Final = 0.05  # least fall of the floor that is an edge; lower ones the base's wheels pass
-LEVEL_STEP_PX: Final = 0.75  # Step between planes next to the floor: matching resolves half of it.
+BIN_ROWS: Final = 2  # Rows on either side of those in which the floor has a disparity. By judgement; not measured.
+FLOOR_PX: Final = 1.3  # Least difference of disparity by which something is not the floor. By judgement; not measured.
+# Lower and higher disparities than the floor's that may explain its rows. By judgement; not measured.
+OTHERS_PX: Final = (12, 25)
+EDGE_M: Final = 0.05  # least fall of the floor that is an edge, because the base's wheels pass lower ones
+LEVEL_STEP_PX: Final = 0.75  # Step between planes next to the floor, because matching resolves half of it.
 LEVEL_STEPS: Final = 3  # enough at all disparities to where others are compared
-DEEP_STEP_PX: Final = 0.375  # Step between planes deep below the floor: one that is missed is no evidence against it.
+# Step between planes deep below the floor; narrow, because a plane that is missed is no evidence against it.
+DEEP_STEP_PX: Final = 0.375
 # Log-likelihood by which the best of those planes may fit better than the floor by noise, 1.5 in the mean of a plain
 # floor. With 3, by trial, bases stood on boards of 10 cm that are nearly alike.
 DEEP_NOISE: Final = 10.0
-EVEN_SHARE: Final = 0.33  # Share of the least height and fall by which a floor is uneven: two more planes are floor.
+# Share of the least height and fall by which a floor is uneven, so that two more planes are floor.
+EVEN_SHARE: Final = 0.33
 LEVEL_RATIO: Final = 1.5  # log-likelihood by a sigma: that of single directions by three that are no more alike
-ADJACENT_PX: Final = 4.0  # An object often hides the floor near itself: decay of the prior with the disparity ...
-DISTANT_SHARE: Final = 0.1  # ... and the share of the prior that is left far away.
-STRIP_ROWS, STRIP_OVERLAP = 4, 2  # Rows of a strip of a surface, and rows that two strips share.
-STRIP_BOUND: Final = 3.0  # Limit of the log-likelihood ratio of a strip.
-STRIP_PRIOR: Final = 0.5  # Log-odds by which a strip of a surface must exceed its other explanations.
-FLOOR_WEIGHT: Final = 10.0  # probability of the floor in rows that may show it, by that of one disparity
-LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations
+# An object often hides the floor near itself: decay of the prior with the disparity, and the share of it that is left
+# far away. By judgement; not measured.
+ADJACENT_PX, DISTANT_SHARE = 4.0, 0.1
+# Rows of a strip of a surface, and rows that two strips share. By judgement; not measured.
+STRIP_ROWS, STRIP_OVERLAP = 4, 2
+STRIP_BOUND: Final = 3.0  # Limit of the log-likelihood ratio of a strip. By judgement; not measured.
+# Log-odds by which a strip of a surface must exceed its other explanations. By judgement; not measured.
+STRIP_PRIOR: Final = 0.5
+# Probability of the floor in rows that may show it, by that of one disparity. By judgement; not measured.
+FLOOR_WEIGHT: Final = 10.0
+LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations. By judgement; not measured.
 
 
 class FloorPlane(NamedTuple):

@@ -34,7 +34,9 @@ Flags = NDArray[np.bool_]
 Texture = NDArray[np.int8]
 
 HEADINGS: Final = 16  # of a full turn, 22 degrees apart, so that their textures have nothing in common
-LEAST_HEADINGS: Final = 12  # three quarters of a turn; as many new views are taken before the next judgement
+# Three quarters of a turn, because after fewer headings more of a cluttered place seems to be fixed (LEAST_RATIO). As
+# many new views are taken before the next judgement.
+LEAST_HEADINGS: Final = 12
 # Least ratio of the mean and its standard error, because in a drive through clutter (872) 0.02 % of the pixels are
 # above it after 12 headings, 0.08 % after 8, and borders of a lens have 10 to 60.
 LEAST_RATIO: Final = 6.0
@@ -42,11 +44,12 @@ LEAST_MEAN: Final = 1.5  # sigmas of the noise, because weaker parts are no evid
 LEAST_SIGMA: Final = 0.25  # of textures, because a black lens has none, by which no mean could be judged
 UNITS: Final = 12.0  # levels of a texture in one sigma, because 8 bits hold ten sigmas either way
 SPECK: Final = np.ones((2, 3), np.uint8)  # smallest part, because noise is narrower
-# The band-pass shows the border of a part; what is between two of them belongs to it.
+# The band-pass shows the border of a part, so that what is between two of them belongs to it.
 WITHIN: Final = np.ones((COARSE_ROWS, 9), np.uint8)
 MOST: Final = 0.3  # Share that may be fixed, because where more is, images do not follow the heading.
-LEAST_FALL: Final = math.tan(math.radians(20))  # Below the horizon: floor there is within 2.5 m of a base.
-ON_THE_SPOT_M: Final = 0.2  # A base that moves by less as it turns knows the floor beside it as at its start.
+LEAST_FALL: Final = math.tan(math.radians(20))  # Below the horizon, because floor there is within 2.5 m of a base.
+# A base that moves by less turns on the spot, because it knows the floor beside it as at its start.
+ON_THE_SPOT_M: Final = 0.2
 LEAST_NEW: Final = 0.01  # share of the panorama that must be new, because it costs what was known about the floor
 
 

@@ -33,21 +33,23 @@ Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
 CELL_M: Final = 0.05  # Side of a cell. By judgement; not measured.
-CELLS: Final = 256  # Cells of a side: twice the largest range, and the way until the square is moved.
+CELLS: Final = 256  # Cells of a side, because they hold twice the largest range, and the way until the square is moved.
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
-VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes: it must be less than the margin.
+VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes, because they are within the margin.
 
-MEAN_FLOOR: Final = 4  # Index in the evidence of cells; the others are those of the layers.
+MEAN_FLOOR: Final = 4  # Index in the evidence of cells, because 0 to 3 are those of the layers.
 
 # A thin thing shows a surface in half of the pairs, and floor in the others, which contradict it: its log-odds stay at
 # the prior. So a cell is free only where the mean surface of single pairs is low. Set on development seeds 1 and 2.
-SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean
-SHOWN_CELLS: Final = 5  # side of the patch of the mean, as errors of the range move what a pair shows by some cells
+SHOWN_RATE: Final = np.float32(0.1)  # part of a pair in the mean; by trial, too
+# Side of the patch of the mean, because errors of the range move what a pair shows by some cells.
+SHOWN_CELLS: Final = 5
 MOST_SHOWN: Final = np.float32(1.5)  # limit of one pair; by trial, too
 
 APART_M: Final = 0.05  # Least distance of places so that the errors of their pairs are independent: a cell.
 APART_S: Final = 0.2  # A pair from the same place counts in full after it, so that a base that stands sees what comes.
-END_BINS: Final = 2  # A cell takes the evidence of patches so much farther: at the foot of an object they show both.
+# A cell takes the evidence of patches so much farther, because at the foot of an object they show both.
+END_BINS: Final = 2
 
 
 class ObstacleGrid:

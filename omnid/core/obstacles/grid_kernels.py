@@ -15,7 +15,8 @@ Bytes = NDArray[np.uint8]
 
 
 LANES = 64  # Cells of a row that are computed at once, because the compiler makes vector instructions of a known count.
-# Where the numbers of those cells begin in `found` of `places`: one kind after the other, LANES of each.
+# Where the numbers of those cells begin in `found` of `places`: multiples of LANES, because it holds so many of each
+# kind.
 X, Y, RANGE, AT, HALF, NEAR, FAR, LAST_SURFACE, FIRST_SURFACE = 0, 64, 128, 192, 256, 320, 384, 448, 512
 PLACES = 576
 # Directions by which a cell is off a border of one, so that `azimuth` is enough: its 2e-8 rad are 2e-6 directions.

@@ -14,7 +14,8 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-END_M: Final = 0.1  # Distance kept before the end of the free floor: at the foot of an object patches show both.
+# Distance kept before the end of the free floor, because at the foot of an object patches show both.
+END_M: Final = 0.1
 # Share of the longest range from which on a direction is open, because few pairs show the last cells.
 OPEN_SHARE: Final = 0.9
 

@@ -19,12 +19,14 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-PAST_SECTORS: Final = 3  # Sectors on either side that must see past a place too near to be seen.
-# Cells beyond the nearest floor in view, one of which must show floor or a surface: at the foot of a wall some show
-# neither. Before a viewpoint 0.9 m high, what stands 0.5 m away and is higher than 0.6 m hides all of them.
+# Sectors on either side that see past a place which is not in view itself. By judgement; not measured.
+PAST_SECTORS: Final = 3
+# Cells beyond the nearest floor in view, one of which must show floor or a surface, because at the foot of a wall some
+# show neither. Before a viewpoint 0.9 m high, what stands 0.5 m away and is higher than 0.6 m hides all of them.
 BEHIND_CELLS: Final = 7
-# Evidence of a pair by which a surface is surely in view: a box of 1.5 m has 15 and more 0.55 to 0.8 m away, one of
-# 0.35 m 4.5 at most (by hand, in a rendered room of 512 px, development seed 1); bare floor has 0.15 in the mean.
+# Evidence of a pair by which a surface is surely in view; measured: a box of 1.5 m has 15 and more 0.55 to 0.8 m away,
+# one of 0.35 m 4.5 at most (by hand, in a rendered room of 512 px, development seed 1); bare floor has 0.15 in the
+# mean.
 SEEN_SURFACE: Final = np.float32(5.0)
 
 

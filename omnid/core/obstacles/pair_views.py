@@ -21,21 +21,24 @@ from omnid.core.types.panorama import PaddedPanorama
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]
 
-DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees: a pole of 3 cm at 2 m
-FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian: that of images of 512 px
+DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees, because a pole of 3 cm is as wide at 2 m
+FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian, because images of 512 px have that resolution
 FINE_PX: Final = 0.8  # Sigma of the smoothing along columns, because views differ by parts of a row.
-COARSE_ROWS: Final = 17  # Rows of the coarse mean, which is taken twice: like a sigma of 7 rows.
-TEXTURE_SHARE: Final = 0.3  # Difference between two views of a surface, by the local contrast; noise is added to it.
-CONTRAST_ROWS: Final = 15  # Rows over which the contrast is measured, with a column on either side.
+# Rows of the coarse mean, which is taken twice, like a Gaussian with a sigma of 7 rows. By judgement; not measured.
+COARSE_ROWS: Final = 17
+# Difference between two views of a surface, by the local contrast; noise is added to it. By judgement; not measured.
+TEXTURE_SHARE: Final = 0.3
+# Rows over which the contrast is measured, with a column on either side. By judgement; not measured.
+CONTRAST_ROWS: Final = 15
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
 # of 960 px 0.36 to 0.53 (test_pair_views.py). With 0.35, by trial, bases stood before free floor in noisy images.
 BAND_NOISE: Final = 0.65
-# Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows: the
+# Frequencies of a JPEG's blocks, of 8, whose errors a working panorama of the image's own resolution shows, because the
 # smoothing halves those above. A coarser panorama shows fewer.
 CODING_FREQUENCIES: Final = 3.0
 UNITS: Final = 12.0  # Units of a normalised image in one sigma, because it has 8 bits and ten sigmas either way.
 ZERO: Final = 128.5  # Its level without texture, and half a level, because kernels cut what they round.
-BOUNDED_ROWS: Final = 17  # Rows with which a pixel of the floor is compared: as many as those of the coarse mean.
+BOUNDED_ROWS: Final = COARSE_ROWS  # Rows with which a pixel of the floor is compared.
 # Most that one of them counts, in sigmas of the noise, because the edge of a painted line has a hundred and hid the
 # texture of the floor around it. With 3 to 11 bases passed such a line; with no limit they stood before it.
 BOUNDED_SIGMAS: Final = 5.5

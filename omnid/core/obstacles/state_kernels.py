@@ -15,15 +15,16 @@ from omnid.core.obstacles.cell_kernels import FLOOR, NOTHING, SURFACE, TAKEN_ODD
 
 Numbers = NDArray[np.int64]
 
-NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)  # of flags, and of cells: unknown, free, taken
+# Labels of flags, and of cells (unknown, free, taken), so that they fit a byte.
+NO, YES, TAKEN = np.uint8(0), np.uint8(1), np.uint8(2)
 
 # Log-odds of the floor from which a cell is free, so that it takes three pairs of the usual evidence, 1 each, from -1.
 FREE_ODDS: Final = np.float32(1.5)
 VISIBLE_ODDS: Final = np.float32(0.0)  # Log-odds of visible floor above which a cell is free.
-# Most log-odds of a surface in a free cell: 3 %. With -4.5 a base stopped in a free corridor.
+# Most log-odds of a surface in a free cell: 3 %. With -4.5, by trial, a base stopped in a free corridor.
 CLEAR_ODDS: Final = np.float32(-3.5)
-FREE_SHOWN: Final = np.float32(0.1)  # largest mean in a free cell
-# Unknown cells that are so few, with floor around: what is tall hides floor behind it, and a low box is larger.
+FREE_SHOWN: Final = np.float32(0.1)  # largest mean in a free cell. By judgement; not measured.
+# Unknown cells that are so few, with floor around, because what is tall hides floor behind it, and a low box is larger.
 SPECK_CELLS: Final = 4
 
 

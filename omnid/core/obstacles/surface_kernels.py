@@ -26,7 +26,7 @@ from omnid.core.obstacles.column_kernels import (
     lower_to,
 )
 
-PART = 96  # Directions of a part, a divisor of column.DIRECTIONS: the next part follows when all of it is computed.
+PART = 96  # Directions of a part, a divisor of column.DIRECTIONS, so that all parts have as many.
 # Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
 LEAST_LIKELIHOOD = np.float32(1e-3)
 STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR = 0, 1, 2, 3, 4

@@ -16,9 +16,9 @@ from omnid.core.stereo.tiles import tile_columns
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# A direction of the cameras is one of the base only far away: the viewpoint may lie off the base's origin.
+# A direction of the cameras is one of the base only far away, because the viewpoint may lie off the base's origin.
 RANGES_M: Final = (0.3, 0.6, 1.2, 2.5, 5.0)
-SAMPLES: Final = 13  # across a tile of 6 degrees: two in each sector
+SAMPLES: Final = 13  # across a tile of 6 degrees, so that each sector has two
 
 
 class Unwatched:

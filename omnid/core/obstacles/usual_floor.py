@@ -22,12 +22,16 @@ Array = NDArray[np.float64]
 # Share of a pair that counts in full in the mean. With 0.5, by trial, the mean behind a plain pole was forgotten before
 # the base came to it, as F is about 0 there; it need not follow faster than F falls from 3.3 at 4 m to 1.5 at 1 m.
 LEARNED: Final = np.float32(0.2)
-HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden: two disparities in full
-# Part of the log-odds without any evidence from which floor is hidden: F below a quarter of the usual in the mean.
+HIDDEN_SUM: Final = 6.0  # log-odds of a direction, by which floor is hidden, because two disparities in full have them
+# Part of the log-odds without any evidence from which floor is hidden, because F is then below a quarter of the usual
+# in the mean.
 HIDDEN_SHARE: Final = 0.5
-BIN_SIGMA: Final = 0.3  # sigma of the range at which hidden floor begins, in disparities: within one
-NEAR_SIGMA: Final = 0.3  # the same where nearer floor is not in view, as a share of the range: anywhere before it
-GAP_M: Final = 0.1  # Length of floor that was not free lately and ends a free way: the base of an object.
+# Sigma of the range at which hidden floor begins, in disparities, because it is anywhere in one: 1 / sqrt(12).
+BIN_SIGMA: Final = 0.3
+# The same where nearer floor is not in view, as a share of the range, because it is anywhere before it: 1 / sqrt(12).
+NEAR_SIGMA: Final = 0.3
+# Length of floor that was not free lately and ends a free way, because it may be the base of an object.
+GAP_M: Final = 0.1
 
 
 class Arrivals(NamedTuple):

@@ -16,10 +16,12 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
 NEVER: Final = np.iinfo(np.int64).min
-FRESH_NS: Final = 500_000_000  # time constant of the mean by which a cell is watched: no motion on older evidence
-MOST_FRESH: Final = 1.2  # Most evidence of a pair in the mean: an object that leaves is noticed in half a second.
-LEAST_FRESH: Final = 0.4  # Mean evidence from which a cell is watched; that of noise is 0.2.
-FLOOD_MPS: Final = 1.6  # Speed at which an object may enter hidden cells: that of a person who walks fast.
+# Time constant of the mean by which a cell is watched, because older evidence shows no motion.
+FRESH_NS: Final = 500_000_000
+# Most evidence of a pair in the mean, because an object that leaves is noticed in half a second.
+MOST_FRESH: Final = 1.2
+LEAST_FRESH: Final = 0.4  # Mean evidence from which a cell is watched, because that of noise is 0.2.
+FLOOD_MPS: Final = 1.6  # Speed at which an object may enter hidden cells, because a person who walks fast has it.
 NARROW_CELLS: Final = 5  # Width from which an object may enter, because that of a person is 25 cm and more.
 CROSS: Final = np.array(
     [[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8

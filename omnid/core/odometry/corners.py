@@ -6,24 +6,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import at_scale
 from omnid.core.odometry.tracking import KltSettings, flow, track
 from omnid.core.types.panorama import PaddedPanorama
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Side of the cells among which the corners are shared out evenly: in a panorama of 1300 x 380 px there are about 200
-# cells, so that each has two or three of the 500 landmarks wanted.
+# Side, at scale 1, of the cells among which the corners are shared out evenly: in a panorama of 1300 x 380 px there are
+# about 200 cells, so that each has two or three of the 500 landmarks wanted.
 CELL_PX = 48
 # More cells than a row of any panorama has, so that one index encodes row and column.
 MAX_CELLS = 4096
-BLOCK_PX = 5  # window over which the gradients of a corner are summed
+BLOCK_PX = 5  # window over which the gradients of a corner are summed. By judgement; not measured.
 # Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two
-# landmarks of one piece of texture.
+# landmarks of one piece of texture. At all scales, because patches have as many pixels at each.
 APART_PX = 9
 MIN_RESPONSE = 2e-4  # smallest eigenvalue of a corner, in OpenCV's scale for 8 bit images
-NOISE_RESPONSE = 2.5e-5  # Response that noise of one grey level reaches in 1 % of the pixels: it grows with its square.
-CROSS_PX = 0.7  # largest horizontal error of a vertical match: corner noise and error of the calibration
+# Measured response that noise of one grey level reaches in 1 % of the pixels; it grows with its square.
+NOISE_RESPONSE = 2.5e-5
+# Largest horizontal error of a vertical match, at all scales, because matches err by parts of a pixel at each; a right
+# calibration errs by 0.1 degrees, 0.4 px of 1300 columns.
+CROSS_PX = 0.7
 REACH_PX = 3  # eq. (8): largest distance, in column and in row, of a located pixel from a feature
 
 
@@ -41,7 +45,8 @@ def corners(lower: PaddedPanorama, usable: Flags, most: int) -> Array:
     rows, columns = np.nonzero(is_peak)
     strongest = np.lexsort((columns, rows, -response[rows, columns + lower.pad_px]))
     rows, columns = rows[strongest], columns[strongest]
-    rank = _rank_within((rows // CELL_PX) * MAX_CELLS + columns // CELL_PX)
+    cell_px = at_scale(CELL_PX, lower.scale)
+    rank = _rank_within((rows // cell_px) * MAX_CELLS + columns // cell_px)
     chosen = np.argsort(rank, kind="stable")[: max(0, most)]
     return np.column_stack([columns[chosen], rows[chosen]]).astype(float)
 

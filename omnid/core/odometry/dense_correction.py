@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import at_scale
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.stereo.semiglobal import ColumnShift
 
@@ -21,10 +22,10 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Indices = NDArray[np.intp]
 
-# Spacing of the points at which the correction is computed exactly. The fields follow the azimuth and the row smoothly,
-# so that interpolation over 16 px, 5 degrees of a panorama of 1300 columns, loses little.
+# Spacing, at scale 1, of the points at which the correction is computed exactly. The fields follow the azimuth and the
+# row smoothly, so that interpolation over 16 px, 5 degrees of a panorama of 1300 columns, loses little.
 GRID_PX = 16
-DISPARITIES_PX = (8.0, 40.0)  # Disparities at which the exact correction is computed.
+DISPARITIES_PX = (8.0, 40.0)  # At scale 1: disparities at which the correction is exact. By judgement; not measured.
 
 
 class CorrectedPixels(NamedTuple):
@@ -46,13 +47,15 @@ class DenseCorrection:
     @staticmethod
     def of(exposure: Exposure, shape: tuple[int, int]) -> DenseCorrection:
         """Return the correction of panoramas (H, W)."""
-        rows, columns = (GRID_PX * (np.arange(-(-size // GRID_PX)) + 0.5) - 0.5 for size in shape)
+        scale = exposure.model.cylinder.scale
+        grid_px, near = at_scale(GRID_PX, scale), [scale * disparity for disparity in DISPARITIES_PX]
+        rows, columns = (grid_px * (np.arange(-(-size // grid_px)) + 0.5) - 0.5 for size in shape)
         grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-        found = [_exact(exposure, grid, disparity) for disparity in DISPARITIES_PX]
-        slope = (found[1] - found[0]) / (DISPARITIES_PX[1] - DISPARITIES_PX[0])
-        both = np.stack([found[0] - slope * DISPARITIES_PX[0], slope], axis=-1)  # (N, 5, 2)
+        found = [_exact(exposure, grid, disparity) for disparity in near]
+        slope = (found[1] - found[0]) / (near[1] - near[0])
+        both = np.stack([found[0] - slope * near[0], slope], axis=-1)  # (N, 5, 2)
         coarse = np.nan_to_num(both).astype(np.float32).reshape(len(rows), len(columns), 5, 2)
-        whole = (len(columns) * GRID_PX, len(rows) * GRID_PX)
+        whole = (len(columns) * grid_px, len(rows) * grid_px)
         fields = [_resized(coarse[:, :, k], whole)[: shape[0], : shape[1]] for k in range(5)]
         return DenseCorrection(
             (fields[0], fields[1], fields[2]),

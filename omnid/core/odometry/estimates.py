@@ -23,7 +23,9 @@ JUMP_M, JUMP_RAD = 0.5, math.radians(30)
 SAME_VIEW_M, SAME_VIEW_RAD = 0.1, math.radians(10)
 SAME_M = 0.02  # Poses that differ less are one, because four sigmas of a pose that few landmarks support are as large.
 # Sigmas of a pose of which nothing is known any more; larger ones would leave no digits to differences of covariances.
-MOST_SIGMA = np.repeat([1000.0, math.pi], 3)  # m, rad
+# Sigmas of a pose of which nothing is known any more, m and rad, because larger ones would leave no digits to
+# differences of covariances.
+MOST_SIGMA = np.repeat([1000.0, math.pi], 3)
 
 
 @dataclass(frozen=True, slots=True)

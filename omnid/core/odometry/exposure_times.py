@@ -20,7 +20,7 @@ from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-# Rounds of triangulation and correction: each reduces the error by the ratio of motion to distance.
+# Rounds of triangulation and correction, few because each reduces the error by the ratio of motion to distance.
 ROUNDS = 3
 # Standard deviation, m/s and rad/s, below which a velocity is known well enough to check a rig: in 15 ms between two
 # exposures that is an error of 3 mm and 0.2 degrees of the motion.

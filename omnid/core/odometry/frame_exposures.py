@@ -27,7 +27,8 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # The depths of the first frame are measured as if the rig were at rest, so the motion is wrong by a few per cent of
-# what happens between two exposures: each round of starting the map again reduces the error by this ratio.
+# what happens between two exposures, and two are enough because each round of starting the map again reduces the error
+# by this ratio.
 START_ROUNDS = 2
 
 

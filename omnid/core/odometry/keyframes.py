@@ -17,15 +17,16 @@ from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.new_landmarks import located
+from omnid.core.odometry.patch_fit import WINDOW_PX
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-# Smallest distance of a new landmark from a known one: nearer ones would share most of their patches of 13 px, and so
-# their errors.
-LANDMARK_SPACING_PX = 9
+# Smallest distance of a new landmark from a known one, two thirds of a patch: nearer ones would share most of their
+# patches, which have as many pixels at all scales, and so their errors.
+LANDMARK_SPACING_PX = -(-2 * WINDOW_PX // 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,16 +60,19 @@ class Keyframes:
         """
         self._map, self._model, self._klt, self._limits = local_map, model, klt, limits
         self._relocaliser, self._features = relocaliser, features
-        self._most_inliers = self._frames = 0  # since the last keyframe
+        self._most_inliers, self._tracked_s = 0, 0.0  # since the last keyframe
 
-    def is_due(self, inliers: int) -> bool:
-        """True if the local map needs a keyframe at the next accepted frame; inliers: their number there."""
+    def is_due(self, inliers: int, dt_s: float) -> bool:
+        """True if the local map needs a keyframe at the next accepted frame; inliers: their number there.
+
+        dt_s: since the frame before.
+        """
         limits = self._limits
         if limits.keyframes == 1:  # frame to frame: all landmarks are new, the old ones leave with their keyframe
             return True
         self._most_inliers = max(self._most_inliers, inliers)
-        self._frames += 1
-        sparse = inliers < limits.refresh * self._wanted() and self._frames >= limits.sparse_every
+        self._tracked_s += dt_s
+        sparse = inliers < limits.refresh * self._wanted() and self._tracked_s >= limits.sparse_s
         return sparse or inliers < limits.refresh * self._most_inliers or inliers < limits.good_inliers
 
     def add(self, request: KeyframeRequest) -> Array:
@@ -86,7 +90,7 @@ class Keyframes:
             self._map.first_depths = first if first.is_open else None
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
-        self._most_inliers = self._frames = 0
+        self._most_inliers, self._tracked_s = 0, 0.0
         self._map.store.add_observations(frame.seq, request.ids, request.views)
         return new.pixels
 

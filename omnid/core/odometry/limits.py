@@ -16,8 +16,9 @@ class OdometryLimits:
     refresh: float = knob(
         0.9, "a keyframe is added when less than this share of the last one's landmarks is left", low=0, high=1
     )
-    sparse_every: int = knob(
-        5, "frames after which a keyframe is added where the features wanted are not reached", low=1, high=1000
+    # Defaults of times lie in the middle between two pairs at 10 Hz, so that the jitter of stamps changes nothing.
+    sparse_s: float = knob(
+        0.45, "time after which a keyframe is added where the features wanted are not reached, s", low=0, high=100
     )
     keyframes: int = knob(8, "keyframes in the local map; 1: frame to frame", low=1, high=50)
     min_inliers: int = knob(20, "inliers below which a pose is refused", low=4, high=10_000)
@@ -37,12 +38,15 @@ class OdometryLimits:
         high=1,
     )
     max_speed_mps: float = knob(5.0, "poses that imply a higher speed are refused, m/s", low=0.1, high=100)
-    lost_after: int = knob(3, "consecutive refused frames after which the state is lost", low=1, high=1000)
-    restart_after: int = knob(
-        10,
-        "frames with enough corners that match no landmark, after which the map is started again",
-        low=1,
-        high=10_000,
+    lost_s: float = knob(
+        0.15, "time from the first of consecutive refused frames after which the state is lost, s", low=0, high=100
+    )
+    restart_s: float = knob(
+        0.85,
+        "time from the first frame with enough corners that matches no landmark while lost, after which the map is "
+        "started again, s",
+        low=0,
+        high=1000,
     )
     max_gap_s: float = knob(0.5, "a pose after a longer time without frames is degraded, s", low=0.01, high=60)
     bridge_s: float = knob(
@@ -60,6 +64,6 @@ class OdometryLimits:
         """Raise OmnidError unless a keyframe may have more landmarks than a pose needs."""
         if self.min_inliers >= self.features:
             raise OmnidError(
-                f"odometry.min_inliers is {self.min_inliers}: expected less than odometry.features, {self.features}, "
-                "as no pose has more inliers than a keyframe has landmarks"
+                f"odometry.limits.min_inliers is {self.min_inliers}: expected less than odometry.limits.features, "
+                f"{self.features}, as no pose has more inliers than a keyframe has landmarks"
             )

@@ -23,9 +23,11 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level: the patches are aligned afterwards.
-REACH_PX = 2  # Reach of the alignment: a new landmark, whose depth is uncertain, may be off by more than a pixel.
-EDGE_ROWS = 3  # px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked
+COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because the patches are aligned afterwards.
+# Reach of the alignment, because a new landmark, whose depth is uncertain, may be off by more than a pixel.
+REACH_PX = 2
+# Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked. By judgement; not measured.
+EDGE_ROWS = 3
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,8 @@ from omnid.core.nanoseconds import SecondsSinceFirst
 
 Array = NDArray[np.float64]
 
-# A delay of 0.3 s is 0.15 m at 0.5 m/s, what the collision monitor keeps as distance; 10 % of 3 m is twice that.
+# So much because a delay of 0.3 s is 0.15 m at 0.5 m/s, what the collision monitor keeps as distance; 10 % of 3 m is
+# twice that.
 WINDOW_S, WINDOW_M, SCALE_SHARE, ALLOWED_LAG_S = 10.0, 3.0, 0.1, 0.3
 # Lags that are compared: buffers of cameras hold up to a second or so, because drivers keep a handful of images.
 LEAST_LAG_S, MOST_LAG_S, LAG_STEP_S = -0.5, 1.5, 0.05
@@ -51,14 +52,17 @@ LEAST_LAG_S, MOST_LAG_S, LAG_STEP_S = -0.5, 1.5, 0.05
 # a motion so much before the other.
 LAG_SIGMA_S: Final = 0.1
 DOUBT_SHARE: Final = 0.5  # Share of a limit from which on the base drives slowly; by trial on development seeds.
-# The same of the newest second alone: 0.1 m, and a third of the way, as of images that play at half of the speed.
+# The same of the newest second alone: 0.1 m, and a third of the way, because images that play at half of the speed show
+# half of it.
 SOON_S, SOON_M, SOON_SHARE = 1.0, 0.1, 1 / 3
-# Motion to the side as a share of the way: 0.15 m a metre ahead, as much as the collision monitor keeps as distance.
+# Motion to the side as a share of the way: 0.15 m a metre ahead, because the collision monitor keeps as much as
+# distance.
 ASIDE_SHARE: Final = 0.15
 STRAIGHT_RADPM: Final = 0.1  # Most turn of a straight way, because in a curve an offset of the rig moves to the side.
 LEAST_M: Final = 0.05  # Least motion that counts, because an allowed delay moves a base of 0.2 m/s so far.
 TURN_RAD: Final = np.radians(5.0)  # because a gyro's bias is estimated to less than half a degree a second
-# Wheels whose diameters differ by 0.7 %, as those of the simulation, turn by 4 degrees over 3 m: that is no doubt yet.
+# More than 4 degrees, because wheels whose diameters differ by 0.7 %, as those of the simulation, turn by so much over
+# 3 m, which is no doubt yet.
 WHEEL_TURN_RAD: Final = np.radians(15.0)
 # Sigmas of a step that are added to those of its residuals: roughness of floor and images; by trial on development
 # seeds.

@@ -24,15 +24,21 @@ Array = NDArray[np.float64]
 
 # States: scales of the wheels' distance and turn, offsets [s] that are added to the stamps of wheels and gyro, and bias
 # (3,) [rad/s] of the gyro; their start, its standard deviations, and those of their random walks over one second.
+# States: scales of the wheels' distance and turn, offsets [s] that are added to the stamps of wheels and gyro, and bias
+# (3,) [rad/s] of the gyro, in the order of a vector so that each has an index.
 DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
 START: Final = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+# Standard deviations of the start, and those of the states' random walks over one second. By judgement; not measured.
 START_SIGMA: Final = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
 WALK_SIGMA: Final = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
-LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])  # The same after many steps that do not agree.
+# The same after many steps that do not agree, so large that all is learned again. By judgement.
+LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])
 # Errors of a step that are independent of those of other steps, by sigma.
-DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02  # Shares of the wheels' distance and turn: roughness, slack.
-WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # Least errors of the wheels: steps of the encoders.
-SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4  # Lateral and vertical errors: wheels roll forwards on a plane.
+# Shares of the wheels' distance and turn, for roughness and slack. By judgement; not measured.
+DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02
+WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # Least errors of the wheels, for the steps of encoders. By judgement; not measured.
+# Lateral and vertical errors; wheels roll forwards on a plane. By judgement; not measured.
+SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4
 GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not measured.
 TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
 CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
@@ -44,13 +50,19 @@ NOT_YET_MPS2, NOT_YET_RADPS2 = 1.0, 2.0
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
 STILL_BEFORE_S = 0.2  # The sensors must have been at rest this long before the step, so that none swings on.
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
-# mean of the squared differences by their expected values. Ratios beyond the limit do not count: slip is no noise.
+# mean of the squared differences by their expected values, over 50 steps because a floor is the same for some seconds.
+# Ratios beyond the limit, 4 sigmas, do not count, because slip is no noise.
 NOISE_GAIN, RATIO_LIMIT = 0.02, 16.0
-OUTLIER_SIGMA = 5.0  # A larger difference from the cameras' step means that a sensor slips or is wrong.
-SLIPPING = 2  # Consecutive outliers of wheels that mean slip: a single one may be a bump.
-MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not calibrated.
-SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales: beyond them their settings are wrong.
-UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2  # Sigma of a motion that no sensor measures in a step.
+# A larger difference from the cameras' step means that a sensor slips or is wrong, because noise makes one of a million
+# so large.
+OUTLIER_SIGMA = 5.0
+# Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
+# because each step is another measurement.
+SLIPPING = 2
+MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not calibrated. By judgement.
+SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales, because beyond them their settings are wrong.
+# Sigma of a motion that no sensor measures in a step, so large that it has no weight, because nothing is known.
+UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2
 
 
 class MotionSensors:

@@ -18,7 +18,8 @@ from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-SLOPE_STEP_PX = 4.0  # half the distance over which the correction of a slope for the motion is measured
+# Half the distance over which the correction of a slope for the motion is taken. By judgement; not measured.
+SLOPE_STEP_PX = 4.0
 
 
 @dataclass(frozen=True, slots=True)

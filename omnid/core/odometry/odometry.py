@@ -100,7 +100,7 @@ class VisualOdometry:
 
         # 2. to 4. Track, estimate and refine: pose_search.py. Once a frame was refused, those without corners
         #    (darkness, a blank wall) are left out to save time.
-        after_refusal = self._status.refused_frames > 0
+        after_refusal = self._status.is_refused
         searched = not after_refusal or self._is_textured(frame, usable)
         tracked = estimate = self._find(frame, usable, T_predicted, dt_s) if searched else None
 
@@ -126,7 +126,7 @@ class VisualOdometry:
         new = estimate.pixels[self._map.store.table.anchor[estimate.landmarks] == self._added]
         self._added = None
         exposure = self._exposures.predicted(frame, dt_s)
-        self._requested = self._update_map(frame, usable, estimate, exposure)
+        self._requested = self._update_map(frame, usable, estimate, exposure, dt_s)
         features, is_keyframe = Features(estimate.pixels, estimate.rejected, new), self._requested is not None
         exposure = exposure if is_keyframe else self._exposures.now(frame)
         result = self._result(estimate.tracked, estimate.inliers, features, exposure)
@@ -137,7 +137,7 @@ class VisualOdometry:
         assert self._previous is not None
         last = LastFrame(self._T_odom_rect, self._previous)
         estimate = self._search.find(frame, usable, last, T_predicted, dt_s)
-        if estimate is None or self._status.refused_frames:
+        if estimate is None or self._status.is_refused:
             return estimate  # displacements from an unknown place lead anywhere: relocalisation decides
         # How far the vehicle may be from where it was predicted, by the velocity's covariance, for which the errors of
         # steps are independent. Those of runners-up are not: wheels, which measure each step, are better evidence.
@@ -197,7 +197,7 @@ class VisualOdometry:
     def _accept(self, frame: StereoFrame, estimate: PoseEstimate, dt_s: float, *, turned: bool) -> None:
         """Update the filter, from standstill after a break, and set the pose; turned: its heading is a jump of odom."""
         at_previous: RigVelocity | None = None
-        if not self._status.refused_frames and 0 < dt_s <= self._limits.max_gap_s:
+        if not self._status.is_refused and 0 < dt_s <= self._limits.max_gap_s:
             T_prev_curr = se3.inverse(self._T_odom_rect) @ estimate.T_odom_rect
             is_at_once = frame.times.is_at_once
             at_previous = self._motion.accept(T_prev_curr, estimate.spread, dt_s, exposed_at_once=is_at_once)
@@ -293,7 +293,7 @@ class VisualOdometry:
             self._untracked_mps, self._T_at_fix = UNTRACKED_SPEED_SIGMA, self._T_odom_rect
 
     def _update_map(
-        self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure
+        self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure, dt_s: float
     ) -> KeyframeRequest | None:
         """Remove lost landmarks; return the keyframe that is to be added, where too few are left."""
         store = self._map.store
@@ -301,7 +301,7 @@ class VisualOdometry:
         self._map.late_depths.seen(ids, estimate)
         self._map.store.give_up(estimate.contradicting)
         self._map.update_tracked(frame.lower, estimate.landmarks, estimate.pixels)
-        if not self._keyframes.is_due(len(estimate.landmarks)):
+        if not self._keyframes.is_due(len(estimate.landmarks), dt_s):
             return None
         request = self._request(frame, usable, exposure)
         if self._limits.keyframes == 1:

@@ -17,9 +17,10 @@ Indices = NDArray[np.intp]
 Places = NDArray[np.int32]
 Bytes = NDArray[np.uint8]
 
-TEMPLATE_PX = WINDOW_PX + 2  # the window and the gradient's border: a pixel on each side
-MAX_REACH_PX = 2.0 * TEMPLATE_PX  # twice as large as it should be: what reaches farther is no patch of this plane
-MAX_SLOPE = 0.7  # Largest slope of a disparity: a steeper plane is seen so obliquely that it has no patch.
+TEMPLATE_PX = WINDOW_PX + 2  # the window and the gradient's border, because that has a pixel on each side
+# Twice as large as it should be, because what reaches farther is no patch of this plane.
+MAX_REACH_PX = 2.0 * TEMPLATE_PX
+MAX_SLOPE = 0.7  # Largest slope of a disparity, because a steeper plane is seen so obliquely that it has no patch.
 AROUND_PX = int(2 * MAX_REACH_PX) + 8  # side of a template's source: the reach, and the support of the cubic kernel
 # Bits of the second to the fourth grey, because a number of 32 bits holds four of 8.
 BYTE, FIRST, SECOND, THIRD = np.int32(255), np.int32(8), np.int32(16), np.int32(24)

@@ -19,7 +19,7 @@ Flags = NDArray[np.bool_]
 # as large (docs/results/accuracy.md).
 RANSAC_THRESHOLD_PX = 2.0
 GAUSS_NEWTON_STEPS = 6  # enough: 305 of 306 fits of test_pose_estimation.py converge in 5
-CONVERGED = 1e-5  # m and rad: a smaller step is the last one
+CONVERGED = 1e-5  # m and rad: a smaller step is the last one, because it moves no view by a hundredth of a pixel
 # Noise of no views: the compiled function would not take None.
 NO_NOISE = np.zeros((0, 3, 3))
 

@@ -34,31 +34,32 @@ from omnid.core.types.stereo_model import StereoModel
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-LANDMARKS = 120  # whose patches are compared, evenly chosen: the mean of 120 correlations errs by less than 0.1
-# Side of a patch in samples, and their distance, px: as wide as the tracker's window, and blurred by as much as a step
-# of the grid moves it.
+LANDMARKS = 120  # whose patches are compared, evenly chosen, because the mean of 120 correlations errs by less than 0.1
+# Side of a patch in samples, and their distance, px, so that it is as wide as the tracker's window, and blurred by as
+# much as a step of the grid moves it.
 SAMPLES, SAMPLE_PX = 7, 2
 BLUR_PX = 2.0
-# Displacement between two candidates at the median distance, px: a tracker's window without a pyramid finds its place
-# from half as far.
+# Displacement between two candidates at the median distance, px, because a tracker's window without a pyramid finds its
+# place from half as far.
 STEP_PX = 5.0
-MOST_STEPS = 12  # Most steps to each side: a wider reach is searched in wider steps.
-PEAKS = 3  # that are estimated from
+MOST_STEPS = 12  # Most steps to each side, so that the time is bounded: a wider reach is searched in wider steps.
+PEAKS = 3  # that are estimated from. By judgement; not measured.
 # Share of the mean correlation at the pose that another peak must reach to be estimated from: textures that do not
 # repeat stay below 0.37 of it on rendered logs, identical bricks reach 0.62 and more.
 PEAK_SHARE = 0.5
-MIN_PATCH_GREY = 1.0  # standard deviation of a patch's grey levels, below which it has no texture
+# Standard deviation of a patch's grey levels, because with less, that of noise, it has no texture.
+MIN_PATCH_GREY = 1.0
 # Difference of the costs of two poses, the logarithm of the ratio of their likelihoods, up to which the less likely one
-# is a runner-up: a million to one.
+# is a runner-up, so that none is left out but at a million to one.
 RUNNER_UP_COST = math.log(1e6)
-# Share of the landmarks in view: without repetition no two poses explain more than half of them each.
+# Share of the landmarks in view, because without repetition no two poses explain more than half of them each.
 LEAST_SHARE = 0.5
-# Error of a runner-up pose as a share of its displacement: few millimetres of a period of some decimetres.
+# Error of a runner-up pose as a share of its displacement, because it is few millimetres of some decimetres.
 RUNNER_UP_ERROR = 0.02
-# Poses whose landmarks contradict each other: their shares of the landmarks in view differ by less than the chance of
-# which are in view, and fewer than half of the landmarks support both.
+# Two poses contradict each other if their shares of the landmarks in view differ by less than the chance of which are
+# in view, and fewer than half of the landmarks support both, because one of them is then wrong.
 EQUAL_SHARE, COMMON_SHARE = 2 / 3, 0.5
-# Consecutive steps without a runner-up that end a doubt: in one of 29 the noise hid it.
+# Consecutive steps without a runner-up that end a doubt, because in one of 29 the noise hid it.
 CLEAR_STEPS = 3
 # Sigmas of a predicted velocity, or of its change, within which a motion is to be expected: of the unknown velocity
 # after a start they are 5 m/s, the limit of the speed, so that no motion of a vehicle is left out.

@@ -22,11 +22,12 @@ HALF_PX = 10
 SIDE_PX = 2 * HALF_PX + 1
 PIXELS = SIDE_PX * SIDE_PX
 UNKNOWNS = 5  # exact: shift along column and row, slopes along column and row, gain
-SLOPE_SIGMA = 0.1  # px/px, of the start: those of dense stereo are a third too flat, its windows being upright
+# Px/px, of the start, because those of dense stereo are a third too flat, its windows being upright.
+SLOPE_SIGMA = 0.1
 # Enough: 59 fits of test_plane_patches.py take 3 to 5. A last step is below the errors: of slopes about 0.008.
 ITERATIONS, CONVERGED_PX, CONVERGED_SLOPE = 10, 0.005, 5e-4
 MAX_SHIFT_PX = 1.5  # Most distance from where the patch was found before. By judgement; not measured.
-DAMPING = 1e-3  # grey^2, of the shifts: keeps patches without texture from being singular
+DAMPING = 1e-3  # grey^2, of the shifts, so that patches without texture are not singular
 
 
 @compiled(

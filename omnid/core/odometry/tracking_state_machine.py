@@ -6,9 +6,9 @@ STARTED again after an unknown motion --------------------> DEGRADED, and the re
 ACCEPTED with few inliers, after a gap or a refused frame -> DEGRADED
 ACCEPTED with a runner-up that is nearly as likely -----------> DEGRADED
 ACCEPTED with few inliers that the upper camera shows ------> DEGRADED
-REFUSED, up to lost_after - 1 consecutive frames ---------> DEGRADED
+REFUSED, less than lost_s after the first such frame -----> DEGRADED
 REFUSED from then on -------------------------------------> LOST, and the map is started again when
-                                                            restart_after textured frames matched nothing,
+                                                            textured frames matched nothing for restart_s,
                                                             or one was recognised elsewhere
 REFUSED, carried on by wheels and gyro -------------------> DEGRADED, and the map is started again likewise
 
@@ -56,18 +56,22 @@ class TrackingStatus:
     """Tracking state after a frame, with the counters that lead to the next one."""
 
     state: TrackingState = TrackingState.LOST
-    refused_frames: int = 0  # consecutive
-    unmatched_frames: int = 0  # textured frames refused after lost_after others, since the last accepted one
+    refused_s: float | None = None  # from the first of consecutive refused frames to this one; None: it was not refused
+    unmatched_s: float | None = None  # the same of textured ones after lost_s; None: there was none
     time_since_fix_s: float = 0.0  # since the last accepted frame
     restart: bool = False  # the map is to be started again at this frame
     has_begun: bool = False  # a map was started once
     unknown_motion: bool = False  # nothing measured the whole motion since the last fix
     resets: int = 0  # times that odom has lost its relation to what was published
 
+    @property
+    def is_refused(self) -> bool:
+        """True if the frame was refused."""
+        return self.refused_s is not None
+
 
 def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits) -> TrackingStatus:
     """Return the status after a frame."""
-    time_since_fix_s = status.time_since_fix_s + facts.dt_s
     unknown_motion = status.unknown_motion or (status.has_begun and not facts.carried)
 
     if facts.outcome is FrameOutcome.STARTED:
@@ -77,34 +81,46 @@ def next_status(status: TrackingStatus, facts: FrameFacts, limits: OdometryLimit
 
     if facts.outcome is FrameOutcome.ACCEPTED:
         few_inliers = facts.inliers < limits.good_inliers
-        after_gap = status.refused_frames > 0 or facts.dt_s > limits.max_gap_s
+        after_gap = status.is_refused or facts.dt_s > limits.max_gap_s
         is_doubtful = few_inliers or after_gap or facts.lower_only or facts.runner_up
         state = TrackingState.DEGRADED if is_doubtful else TrackingState.TRACKING
         return TrackingStatus(state, has_begun=True, resets=status.resets + facts.turned)
 
-    state = TrackingState.DEGRADED if facts.carried else TrackingState.LOST
-    if facts.outcome is FrameOutcome.NOT_STARTED:
-        return TrackingStatus(
-            state,
-            time_since_fix_s=time_since_fix_s,
-            has_begun=status.has_begun,
-            unknown_motion=unknown_motion,
-            resets=status.resets,
-        )
+    if facts.outcome is FrameOutcome.REFUSED:
+        return _after_refusal(status, facts, limits, unknown_motion=unknown_motion)
 
-    refused_frames, unmatched_frames, restart = status.refused_frames + 1, status.unmatched_frames, False
-    if refused_frames < limits.lost_after:
-        state = TrackingState.DEGRADED
-    else:
-        unmatched_frames += int(facts.textured)
-        restart = facts.elsewhere or unmatched_frames >= limits.restart_after
     return TrackingStatus(
-        state,
-        refused_frames,
-        unmatched_frames,
-        time_since_fix_s,
+        TrackingState.DEGRADED if facts.carried else TrackingState.LOST,
+        time_since_fix_s=status.time_since_fix_s + facts.dt_s,
+        has_begun=status.has_begun,
+        unknown_motion=unknown_motion,
+        resets=status.resets,
+    )
+
+
+def _after_refusal(
+    status: TrackingStatus, facts: FrameFacts, limits: OdometryLimits, *, unknown_motion: bool
+) -> TrackingStatus:
+    """Return the status after a frame that was refused; unknown_motion: before it is known that it stayed."""
+    # Nothing is seen in a time without frames: no more of it counts than goes without a doubt.
+    step_s = min(facts.dt_s, limits.max_gap_s)
+    refused_s, unmatched_s = _longer(status.refused_s, step_s), status.unmatched_s
+    is_lost = refused_s >= limits.lost_s
+    if is_lost and facts.textured:
+        unmatched_s = _longer(unmatched_s, step_s)
+    restart = is_lost and (facts.elsewhere or (unmatched_s is not None and unmatched_s >= limits.restart_s))
+    return TrackingStatus(
+        TrackingState.LOST if is_lost and not facts.carried else TrackingState.DEGRADED,
+        refused_s,
+        unmatched_s,
+        status.time_since_fix_s + facts.dt_s,
         restart,
         has_begun=True,
         unknown_motion=unknown_motion or (restart and facts.stayed),
         resets=status.resets,
     )
+
+
+def _longer(since_s: float | None, step_s: float) -> float:
+    """Return the time since a first frame after one more; None: this is the first one."""
+    return 0.0 if since_s is None else since_s + step_s

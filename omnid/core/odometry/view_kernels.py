@@ -15,7 +15,7 @@ from omnid.core.compiled import inner
 Array = NDArray[np.float64]
 CameraNumbers = tuple[float, float, float, float, float]
 
-MIN_RADIUS_M = 1e-9  # Distance from the axis below which a point has no disparity: it lies on the axis.
+MIN_RADIUS_M = 1e-9  # Distance from the axis below which a point has no disparity, because it lies on the axis.
 
 
 @inner

@@ -17,14 +17,15 @@ from omnid.core.types.panorama import PaddedPanorama
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-NEIGHBOURS = 5  # known landmarks whose median disparity counts: two of them may be of another surface
-# Two disparities whose ratio is larger are of two surfaces: the slope of one surface changes them by 0.15 px/px.
+NEIGHBOURS = 5  # known landmarks whose median disparity counts, because two of them may be of another surface
+# Two disparities whose ratio is larger are of two surfaces, because the slope of one surface changes them by 0.15
+# px/px.
 OTHER_RATIO = 1.25
-SIDE_PX = 15  # Side of a patch, as the tracker's window.
+SIDE_PX = 15  # Side of a patch, because the tracker's window has as many.
 # The patch is searched within this share of the neighbours' disparity, because slopes change it by less.
 SEARCH_SHARE = 0.2
-# By how much the correlation of the patch at its own disparity must exceed that at the neighbours': identical bricks
-# differ by less than 0.05, other textures by 0.3 and more.
+# By how much the correlation of the patch at its own disparity must exceed that at the neighbours', because identical
+# bricks differ by less than 0.05, other textures by 0.3 and more.
 LEAST_LEAD = 0.15
 MOST_ALIKE = 10  # disparities of one landmark: courses of 6 cm fit within a baseline of 0.5 m so often
 APART_PX = 3.0  # least distance of two of them, more than the width of a peak

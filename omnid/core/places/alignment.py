@@ -19,8 +19,9 @@ Array = NDArray[np.float64]
 # At which an error of 1 degree of a facing weighs as much as one of 1 cm of a position; by trial on development seeds.
 AHEAD_M: Final = 0.5
 FACING: Final = 0.7  # least horizontal part of a normal: that of a tag on the floor says nothing of the heading
-# Least horizontal spread of the points of a fit: root of the sum of their squared distances from their middle. There,
-# errors of 1 cm at each landmark, in map and plan, turn the map by 4 degrees; two landmarks are then 0.28 m apart.
+# Least horizontal spread of the points of a fit: root of the sum of their squared distances from their middle. Less is
+# refused, because there errors of 1 cm at each landmark, in map and plan, turn the map by 4 degrees; two landmarks are
+# then 0.28 m apart.
 MIN_SPREAD_M: Final = 0.2
 
 

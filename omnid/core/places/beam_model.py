@@ -20,7 +20,8 @@ COARSE_SIGMA_M: Final = 0.35  # the same for poses drawn at random, of which non
 # Likelihood of a range that has nothing to do with the map, relative to that of a right one; by trial on development
 # seeds.
 RANDOM: Final = 0.1
-INDEPENDENT: Final = 0.2  # Share of independent beams: neighbours see the same wall, and the same error of the map.
+# Share of independent beams, because neighbours see the same wall, and the same error of the map.
+INDEPENDENT: Final = 0.2
 # Distance from an obstacle of the map, up to which a beam fits; 2.5 SIGMA_M; by trial on development seeds.
 HIT_M: Final = 0.3
 NOT_FREE: Final = -3.0  # log likelihood of a pose where the map has no free space; by trial on development seeds

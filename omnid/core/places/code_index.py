@@ -18,7 +18,7 @@ from omnid.core.places.place_features import DESCRIPTOR, PlaceFeatures
 CODE_BITS: Final = 64  # Bits of a code, so that it is one number.
 INDEXED: Final = 100  # Features of a keyframe that have codes; by trial on development seeds.
 # The first step: features of the frame, features of each keyframe, and keyframes that go to the second step, in which
-# VOTERS features of the frame vote for all codes. Of 20,000 the right one was among 211 on development seeds.
+# VOTERS features of the frame vote for all codes, because of 20,000 the right one was among 211 on development seeds.
 FEW_VOTERS, FEW_INDEXED, KEPT = 24, 64, 1000
 VOTERS: Final = 64  # Features of the frame in the second step, as in place_comparison.py.
 

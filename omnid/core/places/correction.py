@@ -21,7 +21,7 @@ FITS_M, FITS_RAD = 0.01, 0.003  # A loop that the map fits within this needs no 
 LOOPS_THAT_FIT: Final = 3  # wait for the next optimisation, more of them in a large map; by trial on development seeds
 KEYFRAMES_PER_LOOP: Final = 50  # one more loop waits per this number of keyframes; by trial on development seeds
 ACCEPTED: Final = 0.5  # least weight of a loop that counts; the middle is enough, because weights end at 0 or 1
-RECENT: Final = 8  # Newest loops, which show the present drift; a refused loop may be accepted while among them.
+RECENT: Final = 8  # Newest loops, because they show the present drift; a refused loop may be accepted while among them.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ LARGEST = np.float32(0.2)  # Limit of a histogram's entries, of one of length 1 
 SCALE = np.float32(512.0)  # Factor on the square roots of a descriptor's shares, so that they fill a byte.
 LEAST_LENGTH = np.float32(1e-3)  # grey levels: guards against division by zero where a patch has no contrast
 BINS_PER_RAD = np.float32(BINS / (2 * np.pi))  # exact: the directions make a full turn
-# Polynomial of the arc tangent of 0 to 1, with an error of 1e-5 rad: Abramowitz and Stegun 1964, 4.4.49.
+# Polynomial of the arc tangent of 0 to 1, with an error of 1e-5 rad (4.4.49 of Abramowitz and Stegun 1964).
 ATAN = (
     np.float32(0.9998660),
     np.float32(-0.3302995),

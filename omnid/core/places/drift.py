@@ -11,9 +11,10 @@ from calib import se3
 
 Array = NDArray[np.float64]
 
-QUANTILE: Final = 0.75  # Share of the squared distances that the factor explains: the others may be wrong loops.
+# Share of the squared distances that the factor explains, because the others may be wrong loops.
+QUANTILE: Final = 0.75
 EXPECTED: Final = 7.841  # that quantile of the chi-squared distribution of six dimensions; exact
-LARGEST: Final = 1e6  # factor on the covariance: a thousand times the standard deviation
+LARGEST: Final = 1e6  # factor on the covariance, so that sigmas grow a thousandfold at most
 ROUNDS: Final = 40  # Rounds of bisection, so that the factor is exact to 2^-40 of its range.
 
 

@@ -17,8 +17,10 @@ from omnid.core.places.place_features import PlaceFeatures
 
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
 CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds
-PATCH_BASELINES: Final = 2.0  # side of a feature, in baselines of the rig: disparity times this is its side in px
-SIDES_PX: Final = (16.0, 240.0)  # smallest and largest side; one sample a pixel at 16; by trial on development seeds
+# Side of a feature, in baselines of the rig: disparity times this is its side in px. By judgement; not measured.
+PATCH_BASELINES: Final = 2.0
+LEAST_SIDE_PX: Final = 16.0  # at all scales, because it has one sample a pixel
+LARGEST_SIDE_PX: Final = 240.0  # at scale 1; by trial on development seeds
 
 
 def describe(frame: StereoFrame) -> PlaceFeatures:
@@ -27,6 +29,7 @@ def describe(frame: StereoFrame) -> PlaceFeatures:
     disparity = nearby_disparity(frame.disparity, pixels)
     located = np.flatnonzero(np.isfinite(disparity))[:FEATURES]
     pixels, disparity = pixels[located], disparity[located]
-    descriptors = describe_patches(frame.lower, pixels, np.clip(PATCH_BASELINES * disparity, *SIDES_PX))
+    sides = np.minimum(PATCH_BASELINES * disparity, frame.lower.scale * LARGEST_SIDE_PX)
+    descriptors = describe_patches(frame.lower, pixels, np.maximum(sides, LEAST_SIDE_PX))
     views = np.column_stack([frame.lower.in_turn(pixels[:, 0]), pixels[:, 1], pixels[:, 1] + disparity])
     return PlaceFeatures(descriptors, views.astype(np.float32))

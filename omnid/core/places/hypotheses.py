@@ -23,9 +23,10 @@ KEPT: Final = 6  # recognitions that are remembered
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
 SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
 SURE_INLIERS: Final = 24  # Inliers of recognitions that count without motion: a robot may be at rest.
-# Largest difference of poses by a tag: its direction is less certain than that of a view.
+# Largest difference of poses by a tag, because its direction is less certain than that of a view.
 TAG_SAME_M, TAG_SAME_RAD = 0.5, math.radians(12)
-TAG_SQUARED: Final = 16.8  # Limit of their squared Mahalanobis distance: 99 % of chi-squared, 6 degrees of freedom.
+# Limit of their squared Mahalanobis distance, because 99 % are below it (chi-squared, 6 dimensions).
+TAG_SQUARED: Final = 16.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)

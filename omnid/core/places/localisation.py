@@ -43,10 +43,11 @@ TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is
 # Largest error of odometry, and its growth with the path; by trial on development seeds.
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
-TAG_SIGMAS: Final = 3.0  # Accepted error of a pose by a tag; 0.3 % of right poses exceed it.
+TAG_SIGMAS: Final = 3.0  # Accepted error of a pose by a tag, because 0.3 % of right poses exceed it.
 # After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
-RECENT_M: Final = 15.0  # A pose counts as localised up to this length of path after the last recognition.
+# A pose counts as localised up to this length of path after the last recognition. By judgement; not measured.
+RECENT_M: Final = 15.0
 
 
 class MapLocaliser:

@@ -14,7 +14,8 @@ from omnid.tracking_state import MapState
 
 Array = NDArray[np.float64]
 
-# Covariance in a map of which nothing has been recognised, m^2 and rad^2: a kilometre, and any direction.
+# Covariance in a map of which nothing has been recognised, m^2 and rad^2, because it may be a kilometre away in any
+# direction.
 UNKNOWN_PLACE: Final[Array] = np.diag([1e6] * 3 + [np.pi**2] * 3)
 
 

@@ -14,8 +14,8 @@ from omnid.core.places.tags import TagEstimate, fused
 
 Array = NDArray[np.float64]
 
-MAX_VIEWS: Final = 24  # Most views of a tag that are kept: the most certain ones.
-MOST_REJECTED: Final = 0.25  # share of the views of a tag that may contradict the others: it hangs in one place
+MAX_VIEWS: Final = 24  # Most views of a tag that are kept, the most certain ones. By judgement; not measured.
+MOST_REJECTED: Final = 0.25  # share of the views of a tag that may contradict the others, because it hangs in one place
 
 
 @dataclass(frozen=True, slots=True)

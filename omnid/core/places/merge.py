@@ -22,12 +22,15 @@ Array = NDArray[np.float64]
 # Difference up to which two recognised keyframes agree about where the maps lie; by trial on development seeds.
 SAME_M: Final = 0.5
 SAME_RAD: Final = math.radians(5)  # The same of their headings; by trial on development seeds.
-MIN_CONSISTENT: Final = 3  # keyframes that must agree
-MIN_SHARE: Final = 0.6  # Share of the recognised keyframes that must agree.
+MIN_CONSISTENT: Final = 3  # keyframes that agree, because one or two may be mistaken
+# Share of the recognised keyframes that agree, because most are right where the maps have a place in common.
+MIN_SHARE: Final = 0.6
 # Keyframes, spread over the other map, that agree before the rest are searched near their places only, which costs a
-# tenth of a search among all: where 0.35 of the map lies there, so many agree with the share above in 1 % of the maps.
+# tenth of a search among all, because where 0.35 of the map lies there, so many agree with the share above in 1 % of
+# the maps.
 ENOUGH_CONSISTENT: Final = 16
-GOLDEN_RATIO: Final = (math.sqrt(5) - 1) / 2  # steps of this part of a turn leave no large gap, however many there are
+# So that steps of this part of a turn leave no large gap, however many there are.
+GOLDEN_RATIO: Final = (math.sqrt(5) - 1) / 2
 NO_COMMON_PLACE: Final = "shares no place"  # words of the error, by which programs that join many maps know it
 
 

@@ -20,15 +20,17 @@ Array = NDArray[np.float64]
 
 # Least inliers, and sectors of azimuth that hold them, where odometry agrees; by trial on development seeds.
 NEAR_INLIERS, NEAR_SECTORS = 20, 4
-# The same where it gives no pose; other worlds gave 10 inliers in 600 queries: docs/notes/places.md.
+# The same where it gives no pose, because other worlds gave 10 inliers in 600 queries: docs/notes/places.md.
 FAR_INLIERS, FAR_SECTORS = 24, 5
 # At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other; by trial on development seeds.
 PER_PLACE, SAME_PLACE_M = 3, 1.5
 # Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
 RUNNER_UP: Final = 0.6
-RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)  # poses farther apart are different places
-VOTERS: Final = 64  # features of a frame that vote; they are evenly spread, the strongest ones first
-BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
+# Poses farther apart are different places. By judgement; not measured.
+RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)
+# Features of a frame that vote, evenly spread, the strongest ones first. By judgement; not measured.
+VOTERS: Final = 64
+BINS: Final = 24  # Bins of the yaw angle; three neighbours count together. By judgement; not measured.
 
 
 def compare(

@@ -18,8 +18,10 @@ from omnid.core.places.place_features import FeatureStore, PlaceFeatures, Stored
 
 Array = NDArray[np.float64]
 
-MOST_LOOPS = 4  # Most loops that a dropped keyframe leaves to its neighbour: the most certain ones.
-OVERHEAD_BYTES = 1500  # Bytes of a keyframe without its large arrays: poses, covariance, links.
+# Most loops that a dropped keyframe leaves to its neighbour, the most certain ones. By judgement; not measured.
+MOST_LOOPS = 4
+# Bytes of a keyframe without its large arrays, because poses, covariance and links take about so many.
+OVERHEAD_BYTES = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)

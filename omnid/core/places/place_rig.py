@@ -15,7 +15,7 @@ from omnid.core.places.place_map import PlaceMap
 
 Array = NDArray[np.float64]
 
-BASELINE_RATIO: Final = 0.01  # Relative difference of the baselines of one rig: it may be calibrated again.
+BASELINE_RATIO: Final = 0.01  # Relative difference of the baselines of one rig, because it may be calibrated again.
 # By which the rectified frame may be turned in the rig, for the same reason; by trial on development seeds.
 TURN_RAD: Final = 0.02
 SHIFT_M: Final = 0.01  # Shift of the rectified frame in the rig, for the same reason; by trial on development seeds.

@@ -24,13 +24,13 @@ YAW_WINDOW_RAD: Final = 1.2
 SIGMA_PX: Final = 0.7  # Standard deviation of corners and their disparities; by trial on development seeds.
 THRESHOLD_PX: Final = 4.0  # largest error of a view in the consensus set; by trial on development seeds
 MIN_MATCHES: Final = 8  # matches, and inliers among them, below which there is no pose; by trial on development seeds
-REACH_PX: Final = 3.0  # Reach of the second search about the predicted views: the next brick is not far.
+REACH_PX: Final = 3.0  # Reach of the second search about the predicted views, because the next brick is not far.
 # Distance of descriptors that may match in the second search; by trial on development seeds.
 LARGEST_SQUARED: Final = 0.35 * 512**2
 # Squared Mahalanobis distance (4 sigma) from which a view is an outlier; so that 0.1 % of right ones are lost.
 OUTLIER_SQUARED: Final = 16.0
 CORRELATED: Final = 4.0  # features that count as one in the covariance; by trial on development seeds
-# m, rad: least standard deviations, however many features there are.
+# m, rad: least standard deviations, however many features there are. By judgement; not measured.
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
 SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted; of 45 degrees; by trial on development seeds.
 

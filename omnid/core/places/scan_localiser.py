@@ -21,8 +21,9 @@ Array = NDArray[np.float64]
 CELL_M: Final = 0.05  # Side of a cell, as in the grids.
 UPDATE_M: Final = 0.2  # motion after which a scan is compared; four cells; by trial on development seeds
 UPDATE_RAD: Final = math.radians(15)  # The same of the heading; by trial on development seeds.
-FLOOR_SIGMA: Final = (0.02, math.radians(0.5))  # m, rad: of height, roll and pitch, which a scan does not measure
-LEAST_SIGMA: Final = (0.03, math.radians(0.5))  # m, rad: of the others, as cells and scans are no finer
+# M, rad: of height, roll and pitch, because a scan does not measure them.
+FLOOR_SIGMA: Final = (0.02, math.radians(0.5))
+LEAST_SIGMA: Final = (0.03, math.radians(0.5))  # m, rad: of the others, because cells and scans are no finer
 
 
 @dataclass(frozen=True, slots=True, eq=False)

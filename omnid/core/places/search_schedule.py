@@ -22,7 +22,8 @@ WAIT_FACTOR: Final = 2.0
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)
 SEARCH_NS: Final = 200_000_000  # At most five searches a second, so that most of the time is left to other stages.
 JITTER_NS: Final = 5_000_000  # Stamps vary, so a rate that divides that of the cameras is reached with this tolerance.
-SEARCHES: Final = 10  # After this number of searches without success only new keyframes are searched for.
+# After this number of searches without success only new keyframes are searched for. By judgement; not measured.
+SEARCHES: Final = 10
 # After this number of searches without success range scans are compared, if the settings allow it; by trial on
 # development seeds.
 SEARCHES_BEFORE_SCANS: Final = 3

@@ -31,8 +31,9 @@ SIGMA_PX: Final = 0.35
 # Mean squared error of the corners, in SIGMA_PX, of what is a tag of the known size; because it is three standard
 # deviations.
 LARGEST_SQUARED: Final = 9.0
-CORRELATED_VIEWS: Final = 4.0  # views of a tag that count as one: errors of the rig are common to them
-# Corners of a tag of edge 1, as the detector orders them, seen from the front: x to the right, y up, z out of the face.
+CORRELATED_VIEWS: Final = 4.0  # views of a tag that count as one, because errors of the rig are common to them
+# Corners of a tag of edge 1, in the order of the detector so that they are its pixels' points, seen from the front: x
+# to the right, y up, z out of the face.
 CORNERS: Final = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
 
 

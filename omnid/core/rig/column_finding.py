@@ -18,23 +18,24 @@ Array = NDArray[np.float64]
 
 # Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be distinguished.
 MIN_MATCHES: Final = 120
-# Rotation of the upper camera: rigs as calibrated, rendered and real, are measured below 0.1 deg.
+# Rotation of the upper camera, because rigs as calibrated, rendered and real, are measured below 0.1 deg.
 DRIFTED_DEG: Final = 0.2
-# Two degrees are seven columns of a panorama of 1300: stereo, which searches one column, then matches by chance.
+# So many because two degrees are seven columns of a panorama of 1300, where stereo, which searches one column, matches
+# by chance.
 BROKEN_DEG: Final = 2.0
-# Weight of the shift's angle against the rotation's: a shifted viewpoint affects near points only.
+# Weight of the shift's angle against the rotation's, because a shifted viewpoint affects near points only.
 SHIFT_WEIGHT: Final = 0.2
-# Standard deviations subtracted from rotation and shift: an uncertain finding accuses no rig.
+# Standard deviations subtracted from rotation and shift, so that an uncertain finding accuses no rig.
 SIGMAS: Final = 4.0
 # With a rig that is wrong by many degrees, points match by chance only. Corners in noise match nowhere either, so only
-# points with contrast are counted: a smaller part of them that match means a broken rig.
+# points with contrast are counted, because a smaller part of them that match means a broken rig.
 MIN_MATCHED_PART: Final = 0.08
 MIN_CONTRAST_POINTS: Final = 400
-SECTORS: Final = 12  # Sectors of azimuth, 30 deg each: about the width of a wall in a room.
+SECTORS: Final = 12  # Sectors of azimuth, 30 deg each, because that is about the width of a wall in a room.
 # Matches for the median of a sector, so that it is known to 1.25 / sqrt(20), about a quarter of the spread.
 MIN_IN_SECTOR: Final = 20
-# Median residual of the sectors. A camera whose intrinsics have changed bends the columns all around; the matches of
-# one wall alone may be misled.
+# Median residual of the sectors, because a camera whose intrinsics have changed bends the columns all around; the
+# matches of one wall alone may be misled.
 DRIFTED_PX: Final = 0.3
 
 

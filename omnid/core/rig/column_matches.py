@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.panorama import at_scale
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.tracking import KltSettings, track
@@ -24,27 +25,31 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-# Corners per pair: a round of two pairs has the matches of a finding (120) where four corners in ten are found.
+# Corners per pair, so that a round of two pairs has the matches of a finding (120) where four corners in ten are found.
 POINTS: Final = 160
-# The coarse search works on images reduced by this factor: its cost falls with the fourth power, and the tracker that
-# follows converges from two reduced pixels away (MAX_STEP_PX).
+# The coarse search works on images reduced by this factor, because its cost falls with the fourth power, and the
+# tracker that follows converges from two reduced pixels away (MAX_STEP_PX).
 COARSE: Final = 4
-# Half the side of a patch, in the reduced image: 36 px of the panorama, some ten degrees at 1300 columns.
+# Half the side of a patch, in the reduced image: 36 px of the panorama, some ten degrees at 1300 columns. At all
+# scales, because fewer pixels match by chance.
 PATCH_PX: Final = 4
-# Search range to either side, in the reduced image: five degrees of a panorama of 1300 columns. A rig that is wrong by
-# more finds chance matches only, which `column_finding` recognises by their number.
+# Search range to either side, in the reduced image at scale 1: five degrees of a panorama of 1300 columns, because a
+# rig that is wrong by more finds chance matches only, which `column_finding` recognises by their number.
 ASIDE_PX: Final = 5
-# Search range downwards, in the reduced image: a point at a distance of one and a half baselines.
+# Search range downwards, in the reduced image at scale 1, because a point at one and a half baselines is so far below.
 DOWN_PX: Final = 30
-# Least correlation of a coarse match; the search is wide, and a lower one lets more chance matches pass.
+# Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
 MIN_CORRELATION: Final = 0.8
-# Largest step from the coarse match to the tracked point, px: two reduced pixels, the error of the coarse search.
+# Largest step from the coarse match to the tracked point, px, because two reduced pixels are the error of the coarse
+# search.
 MAX_STEP_PX: Final = 2 * COARSE
-# Points at infinity have no disparity; noise makes it negative for some of them, as exchanged cameras do for all.
+# Points at infinity have no disparity, and so less than this, because noise makes it negative for some of them, as
+# exchanged cameras do for all.
 MIN_DISPARITY_PX: Final = 0.5
 # Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than MAX_STEP_PX.
 KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
-# Standard deviation of a coarse patch with contrast, grey levels: noise alone, averaged over COARSE^2 pixels, has less.
+# Standard deviation of a coarse patch with contrast, grey levels, because noise alone, averaged over COARSE^2 pixels,
+# has less.
 CONTRAST_GREY: Final = 6.0
 
 
@@ -132,13 +137,14 @@ def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tupl
     Also the number of points with contrast.
     """
     small_lower, small_upper = (_reduced(wrapped.image) for wrapped in (lower, upper))
-    height, width = small_upper.shape
+    (height, width), scale = small_upper.shape, lower.scale
+    aside, down_most = at_scale(ASIDE_PX, scale), at_scale(DOWN_PX, scale)
     guess, likely, clear = points.copy(), np.zeros(len(points), bool), 0
     padded = points + np.array([lower.pad_px, 0])
     for index, (column, row) in enumerate((padded / COARSE).round().astype(int).tolist()):
         left, right, top = column - PATCH_PX, column + PATCH_PX + 1, row - PATCH_PX
-        low, high = max(0, left - ASIDE_PX), min(width, right + ASIDE_PX)
-        strip = small_upper[max(0, top) : min(height, row + PATCH_PX + 1 + DOWN_PX), low:high]
+        low, high = max(0, left - aside), min(width, right + aside)
+        strip = small_upper[max(0, top) : min(height, row + PATCH_PX + 1 + down_most), low:high]
         patch = small_lower[max(0, top) : row + PATCH_PX + 1, max(0, left) : right]
         if left < 0 or top < 0 or right > width or patch.shape[0] != 2 * PATCH_PX + 1 or strip.shape[0] < len(patch):
             continue

@@ -28,9 +28,11 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-# Landmarks in view of a keyframe: the time of the adjustment grows with them, the sigmas fall with their root.
+# Landmarks in view of a keyframe, no more because the time of the adjustment grows with them, the sigmas fall with
+# their root.
 LANDMARKS: Final = 500
-# Most keyframes that see one landmark: from farther away its patch has another appearance, and images are kept so long.
+# Most keyframes that see one landmark, because from farther away its patch has another appearance, and images are kept
+# so long.
 MAX_KEYFRAMES: Final = 25
 # Two keyframes and the landmark's own three coordinates leave almost nothing that the rig could contradict, so that
 # there must be a third.

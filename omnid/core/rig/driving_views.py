@@ -23,13 +23,15 @@ from omnid.core.rig.column_matches import Matches, PanoramaPair, is_motion_unkno
 
 Array = NDArray[np.float64]
 
-# Views that are kept, and new views after which the rig is checked again: at the default period, after 80 s of driving.
+# Views that are kept, and new views after which the rig is checked again, because at the default period they take 80 s
+# of driving.
 VIEWS: Final = 16
-# Different places for a check: walls in fewer directions may all bias it to the same side.
+# Different places for a check, because walls in fewer directions may all bias it to the same side.
 MIN_PLACES: Final = 6
-# Newest views that show alone that the rig is broken: a mirror was knocked, and the wheels must not wait for VIEWS.
+# Newest views that show alone that the rig is broken, because a mirror was knocked, and the wheels must not wait for
+# VIEWS.
 RECENT_VIEWS: Final = 3
-# Least correlation of the thumbnails of two views of one place: some 15 cm of a corridor.
+# Least correlation of the thumbnails of two views of one place, because those 15 cm apart in a corridor are so alike.
 SAME_VIEW_CORRELATION: Final = 0.8
 # Columns and rows of a thumbnail: three degrees a column, so that noise and small parts do not make a place new.
 THUMBNAIL: Final = (128, 24)

@@ -22,21 +22,23 @@ from omnid.core.rig.column_finding import BROKEN_DEG, DRIFTED_DEG, MIN_MATCHES, 
 from omnid.core.rig.column_matches import Matches, PanoramaPair, is_motion_unknown, match, together
 from omnid.core.rig.rig_state import RigState
 
-# Pairs of a round, and the most where matches are few: a start is checked within a second.
+# Pairs of a round, and the most where matches are few, so that a start is checked within a second.
 ROUND_PAIRS: Final = 2
 MOST_ROUND_PAIRS: Final = 8
-# Rounds that must agree before the rig counts as contradicted: a hand before a mirror passes.
+# Rounds that must agree before the rig counts as contradicted, because a hand before a mirror passes.
 CONTRADICTIONS: Final = 2
-# Rounds without a decision, after which the check ends: at RETRY_S between two of them, the first minute of a run.
+# Rounds without a decision, after which the check ends, because at RETRY_S between two of them the first minute of a
+# run is over.
 MOST_ROUNDS: Final = 40
-# Between two rounds while the images show too little, s: light changes slower than that.
+# Between two rounds while the images show too little, s, because light changes slower than that.
 RETRY_S: Final = 1.0
-# Pairs whose motion is not known, before such pairs are used as if the rig stood: with a rig that is wrong by degrees,
-# no odometry starts that could find the motion.
+# Pairs whose motion is not known, before such pairs are used as if the rig stood, because with a rig that is wrong by
+# degrees, no odometry starts that could find the motion.
 PATIENT_PAIRS: Final = 5
-# Scatter of the columns: right rigs stay below 0.45 px, other mirrors have 0.3 to 7 px.
+# Scatter of the columns, because right rigs stay below 0.45 px, other mirrors have 0.3 to 7 px. At all scales, because
+# most of the scatter of a right rig is of the matches, which err by parts of a pixel at each.
 SCATTERED_PX: Final = 0.6
-# Matches with the cameras exchanged, per match: right rigs have up to 0.41, exchanged ones 2.0 or more.
+# Matches with the cameras exchanged, per match, because right rigs have up to 0.41, exchanged ones 2.0 or more.
 EXCHANGED_RATIO: Final = 1.2
 
 

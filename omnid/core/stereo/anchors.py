@@ -24,8 +24,9 @@ Array = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-CELL_PX = 32  # side of a cell: longer than the courses of most brick walls are high
-MAX_ROUNDS = 64  # Rounds of propagation: cells that anchors can cross.
+CELL_PX = 32  # side of a cell, because the courses of most brick walls are lower
+# Rounds of propagation, because an anchor crosses a cell in each, and a panorama of 1300 columns has 41.
+MAX_ROUNDS = 64
 # Samples on the line to the anchor of a neighbouring cell; enough: every fourth pixel of two cells.
 LONG_LINE_SAMPLES = 16
 SHORT_LINE_SAMPLES = 8  # Samples on the line to the nearest anchor; enough: every fourth pixel of a cell.

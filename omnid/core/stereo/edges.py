@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 
-RESPONSE_SCALE = 0.5  # a 3x3 Sobel of 8-bit images reaches 1020; half of it and less is kept in 8 bits
+RESPONSE_SCALE = 0.5  # because a 3x3 Sobel of 8-bit images reaches 1020: half of it and less is kept in 8 bits
 
 
 def smooth(image: Image, sigma_px: float) -> Image:

@@ -18,25 +18,27 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
-TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought
+TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought. By judgement; not measured.
 LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene
-NOTHING_BUT_NOISE = 0.5  # contrast to noise: corners and patches are then those of noise
+NOTHING_BUT_NOISE = 0.5  # contrast to noise, because corners and patches are then those of noise
 LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
 # Brightness of one panorama by the other's, above which nothing is changed: at 0.88 poses are as exact as at 1, at 0.85
 # they were degraded, at 0.8 lost.
 SAME_BRIGHTNESS = 0.87
-SECTORS = 24  # of azimuth; three quarters of them must differ, as a hand before one camera does not cover so many
-MAX_GAIN = 8.0  # Largest gain of 8 bit images: more only magnifies their steps.
-# Noise is the difference of two Gaussian blurs in the smoothest blocks: texture is stronger than noise elsewhere.
+SECTORS = 24  # of azimuth; three quarters of them must differ, because a hand before one camera does not cover so many
+MAX_GAIN = 8.0  # Largest gain of 8 bit images, because more only magnifies their steps.
+# Noise is the difference of two Gaussian blurs in the smoothest blocks, because texture is stronger than noise
+# elsewhere.
 FINE_PX, COARSE_PX = 0.8, 1.6
 BLOCK_PX = 8
-LIGHT_EVERY_PX = 3  # Spacing of the rows and columns: a ninth of the pixels gives mean and contrast as well.
+LIGHT_EVERY_PX = 3  # Spacing of the rows and columns, because a ninth of the pixels gives mean and contrast as well.
 SMOOTHEST_PERCENT = 5.0
-# Noise of a panorama by that measure: simulated with white noise of 1.5 to 13 grey levels, JPEG, remapped bilinearly.
+# Noise of a panorama by that measure; measured with simulated white noise of 1.5 to 13 grey levels, JPEG, remapped
+# bilinearly.
 NOISE_SCALE = 6.1
 BANDS, BAND_ROWS = 4, 24  # rows in which noise is measured: all would take milliseconds
-MIN_BLOCKS = 20  # With fewer visible blocks the noise is not known: the smoothest of few have texture.
-UNKNOWN_NOISE = 1.0  # grey levels
+MIN_BLOCKS = 20  # With fewer visible blocks the noise is not known, because the smoothest of few have texture.
+UNKNOWN_NOISE = 1.0  # grey levels. By judgement; not measured.
 
 
 @dataclass(frozen=True, slots=True)

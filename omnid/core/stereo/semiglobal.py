@@ -19,14 +19,14 @@ Image = NDArray[np.uint8]
 Floats = NDArray[np.float32]
 
 BLOCK_PX = 3  # side of StereoSGBM's matching window at the prior's resolution; the least of OpenCV's range of 3 to 11
-SMALL_STEP_PENALTY = 100  # Penalty of a change of disparity by one: walls are smooth.
-LARGE_STEP_PENALTY = 3200  # Penalty of a larger change: depth edges are rare.
+SMALL_STEP_PENALTY = 100  # Penalty of a change of disparity by one, because walls are smooth.
+LARGE_STEP_PENALTY = 3200  # Penalty of a larger change, because depth edges are rare.
 LEFT_RIGHT_PX = 1  # largest disagreement of the disparities of both panoramas; as in OpenCV's samples
 PREFILTER_CAP = 31  # StereoSGBM limits the gradients that it compares to this; by trial on development seeds.
 SUBPIXEL = 16  # StereoSGBM returns sixteenths of a pixel; exact, by OpenCV
 STEP_ROWS = 16  # StereoSGBM searches a multiple of this number of disparities; exact, by OpenCV
-SCALE = 2  # the prior is computed at half the resolution: at a quarter the courses of a brick wall are one grey
-FILL_PX = 5  # Unknown pixels of the prior take the largest disparity within this distance: no holes.
+SCALE = 2  # the prior is computed at half the resolution, because at a quarter the courses of a brick wall are one grey
+FILL_PX = 5  # Unknown pixels of the prior take the largest disparity within this distance, so that none is a hole.
 REACH_PX = 2  # The search reaches this far from the prior, because a pixel of the prior is two pixels here.
 
 

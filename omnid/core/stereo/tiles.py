@@ -31,37 +31,40 @@ Flags = NDArray[np.bool_]
 Side = Literal["lower", "upper"]
 SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 
-# Of a full turn; a sector has fewer. 6 degrees: 15 columns of a panorama at scale 1 (512 px images), less than the
-# narrowest part that matters.
+# Of a full turn; a sector has fewer. So many because 6 degrees, 15 columns of a panorama at scale 1 (512 px images),
+# are less than the narrowest part that matters.
 TILE_COLUMNS: Final = 60
-TILE_ROWS: Final = 4  # 63 rows at scale 1
+TILE_ROWS: Final = 4  # 63 rows at scale 1. By judgement; not measured.
 SPACING_PX: Final = 2  # of the pixels that are judged, because a quarter of them is enough in a quarter of the time ...
-LEAST_SAMPLES: Final = 100  # ... where a tile has so many: a few may keep their greys by chance, as at 160 px
-JUDGED_SHARE: Final = 0.5  # Share of a tile that must show the world; tiles that show less are not judged.
-IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts; one may be a glitch of a driver
-# Share of the judged tiles that must change before others are dead: else the whole image is still.
+LEAST_SAMPLES: Final = 100  # ... where a tile has so many, because a few may keep their greys by chance, as at 160 px
+# Share of a tile that shows the world; tiles that show less are not judged. By judgement; not measured.
+JUDGED_SHARE: Final = 0.5
+IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts, because one may be a glitch of a driver
+# Share of the judged tiles that must change before others are dead, because else the whole image is still.
 LEAST_ALIVE: Final = 0.1
 # Mean change between two images with independent normal noise of sigma: 2 sigma / sqrt(pi), exact to 0.03 %.
 NOISE_CHANGE: Final = 1.128
-# Of it. The noise is that of the smoothest blocks, and pixels of a panorama are interpolated from compressed images:
-# in the sample log live tiles change by a fifth of it at least.
+# Of it, because the noise is that of the smoothest blocks, and pixels of a panorama are interpolated from compressed
+# images: in the sample log live tiles change by a fifth of it at least.
 NOISE_SHARE: Final = 0.1
 MEASURED_NOISE_GREY: Final = 1.0  # less is that of rounding and compression, and says nothing about a tile
-# Cameras that remove noise repeat plain tiles while the base is at rest: a tile without texture is dead only if it has
-# changed in nearly all pairs before, by the mean of the newest 1 / LIVELY_GAIN.
-TEXTURE_GREY: Final = 4.0  # standard deviation, more than what such a camera leaves of the noise
+# Cameras that remove noise repeat plain tiles while the base is at rest, so that a tile without texture is dead only if
+# it has changed in nearly all pairs before, by the mean of the newest 1 / LIVELY_GAIN.
+TEXTURE_GREY: Final = 4.0  # standard deviation, because it is more than what such a camera leaves of the noise
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
-BLACK_GREY: Final = 16.0  # black of limited-range video (ITU-R BT.601)
+BLACK_GREY: Final = 16.0  # black of limited-range video (source: ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
+# Grey level from which a pixel is saturated, and share of such pixels in a tile. By judgement; not measured.
 SATURATED_GREY, SATURATED_SHARE = np.uint8(250), 0.8
 # A column is blurred if its energy by the other camera's is below this share of the usual, in BLURRED_COLUMNS columns,
 # because a poster that only one camera sees is all the texture of a column: 0.15 was left in rendered corridors. A drop
 # leaves less.
 BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
-LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise: with less texture no blur is seen.
-COMPARED_COLUMNS: Final = 15  # Columns that must have this energy: else a single poster decides what is usual.
-BLIND_SHARE: Final = 0.5  # A column's direction is unknown if a larger share of its judged tiles is blind.
+LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise, because with less texture no blur is seen.
+COMPARED_COLUMNS: Final = 15  # Columns that must have this energy, because else a single poster decides what is usual.
+# A column's direction is unknown if a larger share of its judged tiles is blind. By judgement; not measured.
+BLIND_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 # Squared length of the cross product of two rays below which they count as parallel; rounding of 1e-7, squared.
 PARALLEL_CROSS2 = 1e-14
 MIN_DISPARITY_RAD = 1e-7  # the same for the rays of a view, which have r = 1; rounding: a point 1,000 km away
-MIN_RADIUS_M = 1e-9  # Distance from the axis below which a point has no disparity: it lies on the axis.
+MIN_RADIUS_M = 1e-9  # Distance from the axis below which a point has no disparity, because it lies on the axis.
 MIN_RADIUS2_M2 = 1e-12  # the same, squared, in derivatives; so that no division is by zero
 
 

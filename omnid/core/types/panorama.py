@@ -28,6 +28,7 @@ class PaddedPanorama:
     turn_px: int = 0  # columns of the full turn of which this is a sector; 0: this is a full turn
     first: int = 0  # column of the full turn that is column 0
     jpeg_steps: Steps = ()  # of the quantisation of the image's JPEG, (): none
+    scale: float = 1.0  # columns by those of the images' own resolution
 
     @property
     def width(self) -> int:

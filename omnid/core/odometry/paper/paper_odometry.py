@@ -31,19 +31,22 @@ Flags = NDArray[np.bool_]
 
 TRACKERS = ("improved", "klt")
 REFERENCES = ("previous", "keyframe")
-FEATURES = 500  # As the default of odometry.features, so that the methods are compared with as many.
+FEATURES = 500  # As the default of odometry.limits.features, so that the methods are compared with as many.
 # Share of the features that makes a yaw hypothesis good enough ("N is more than needed", section IV.F). Beyond the
 # ample share the search ends; between the two the next larger turn is tried as long as it finds more.
 ENOUGH_RATIO = 0.5
 AMPLE_RATIO = 0.85
 EPSILON_PX = 3  # eq. (8): largest distance of a located point from the feature that it locates
-THRESHOLD_M = 0.05  # section IV.B: largest 3-D error of a point of the consensus set
-MIN_INLIERS = 6  # points of the consensus set, below which the motion is refused
-KEYFRAME_RATIO = 0.5  # share of a keyframe's largest consensus set, below which the current frame replaces it
+THRESHOLD_M = 0.05  # largest 3-D error of a point of the consensus set, as in section IV.B
+# Points of the consensus set, below which the motion is refused, because three determine it and as many confirm it.
+MIN_INLIERS = 6
+# Share of a keyframe's largest consensus set, below which the current frame replaces it. By judgement; not measured.
+KEYFRAME_RATIO = 0.5
 # Spectral density of the jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz. The turns of section IV.F change the yaw rate by
 # radians per second within 0.1 s; a filter that takes this for impossible would shorten the turn and overshoot.
 JERK_PSD = (10.0, 4000.0)
-UNTRACKED_SPEED_SIGMA = 0.5  # standard deviation of the velocity while nothing is tracked, m/s and rad/s
+# Standard deviation of the velocity while nothing is tracked, m/s and rad/s. By judgement; not measured.
+UNTRACKED_SPEED_SIGMA = 0.5
 
 
 @dataclass(frozen=True, slots=True)

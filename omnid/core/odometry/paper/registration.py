@@ -13,9 +13,9 @@ from omnid.core.odometry.pose_estimation import rigid_fit
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-HYPOTHESES = 200  # RANSAC: if half of the points are wrong, (1 - 0.5^3)^200 = 3e-12 of the searches fail.
+HYPOTHESES = 200  # of RANSAC, because if half of the points are wrong, (1 - 0.5^3)^200 = 3e-12 of the searches fail.
 STEPS = 10  # Gauss-Newton steps; enough: 351 motions of test_paper_odometry.py took 2 to 5.
-CONVERGED = 1e-9  # rad and m: a smaller step is the last one
+CONVERGED = 1e-9  # rad and m: a smaller step is the last one, because what is left is far below any noise
 MIN_POINTS = 3  # because fewer leave a rotation about their line open
 
 X, Y, Z = np.eye(3)

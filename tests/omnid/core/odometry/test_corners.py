@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,6 +32,16 @@ def test_within_a_cell_the_strongest_come_first() -> None:
         image[row : row + 6, column : column + 6] = 255
     first = corners(wrapped(image), np.arange(120)[:, None] * np.ones((1, 480)) < 48, 10)
     assert all(np.min(np.hypot(*(first - (c + 2.5, r + 2.5)).T)) < 6 for c, r in strong)
+
+
+def test_cells_are_angles() -> None:
+    """In a panorama of half the images' resolution a cell has half as many columns: faint halves of cells are cells."""
+    is_faint = np.arange(480) % 48 >= 24
+    image = np.where(is_faint, texture(3) // 5 + 100, texture(3)).astype(np.uint8)
+    usable = ALL & (np.arange(120)[:, None] < 24)
+    found = [corners(replace(wrapped(image), scale=scale), usable, 20) for scale in (1.0, 0.5)]
+    of_faint = [int(is_faint[points[:, 0].astype(int)].sum()) for points in found]
+    assert of_faint[0] == 0 and of_faint[1] >= 9
 
 
 def test_corners_are_apart_and_within_the_usable_pixels() -> None:

@@ -29,7 +29,7 @@ NOISE = np.diag(np.repeat([5e-4, 2e-4], 3) ** 2)
 SYSTEMATIC = np.diag([1e-3, 0, 0, 0, 0, 1e-4]) ** 2
 AHEAD = SensedMotion(np.array([0.05, 0, 0, 0, 0, 0]), NOISE, SYSTEMATIC, is_complete=True)
 STANDS = replace(AHEAD, twist=np.zeros(6), systematic=np.zeros((6, 6)))
-SOON = OdometryLimits(restart_after=4)  # each frame of another place costs a search through all turns
+SOON = OdometryLimits(restart_s=0.25)  # four frames: each one of another place costs a search through all turns
 DEGRADED, LOST, TRACKING = TrackingState.DEGRADED, TrackingState.LOST, TrackingState.TRACKING
 
 
@@ -91,11 +91,7 @@ def test_another_view_after_the_dark_starts_a_new_map_and_odom_goes_on(cameras: 
     odometry = started(cameras, OdometryLimits())
     dark(odometry, cameras, 6)
     elsewhere = replace(cameras, scene=corridor(7))
-    limits = OdometryLimits()
-    there = [
-        odometry.process(sensed(elsewhere.frame(200 + k, PATH[10 + k]), AHEAD), PERIOD_S)
-        for k in range(limits.restart_after + 2)
-    ]
+    there = [odometry.process(sensed(elsewhere.frame(200 + k, PATH[10 + k]), AHEAD), PERIOD_S) for k in range(12)]
     assert there[-1].state == TRACKING and there[-1].resets == 0
     assert LOST not in {estimate.state for estimate in there}
     assert motion_errors(there[-1].T_odom_rect, along(21))[0] < 0.02
@@ -105,7 +101,7 @@ def test_another_view_after_the_dark_starts_a_new_map_and_odom_goes_on(cameras: 
 def elsewhere(odometry: VisualOdometry, cameras: RenderedCameras, motion: SensedMotion) -> list[OdometryEstimate]:
     """Return the estimates at frames of another place, until a new map was started and followed."""
     there = replace(cameras, scene=corridor(7))
-    steps = range(SOON.restart_after + 2)
+    steps = range(6)
     return [odometry.process(sensed(there.frame(200 + k, PATH[10]), motion), PERIOD_S) for k in steps]
 
 

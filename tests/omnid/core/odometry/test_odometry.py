@@ -90,7 +90,7 @@ def test_a_keyframe_is_made_when_it_is_asked_for_or_before_the_next_frame(
     found = []
     for early in (False, True):
         made.clear()
-        odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(sparse_every=1), Kept(cameras.model))
+        odometry = VisualOdometry(cameras.model, KltSettings(), OdometryLimits(sparse_s=0), Kept(cameras.model))
         for k, frame in enumerate(frames[:4]):
             estimate = odometry.process(frame, PERIOD_S * (k > 0))
             assert estimate.is_keyframe and (made[-1] == frame.seq) == (k == 0), "only the first comes with its pose"
@@ -241,14 +241,14 @@ def test_frames_that_match_nothing_are_refused_and_then_restart_the_map(
     frames: list[StereoFrame], cameras: RenderedCameras
 ) -> None:
     """The robot is carried into another corridor: no pose is accepted there, and then the reset counter rises."""
-    limits = OdometryLimits(restart_after=6)
+    limits = OdometryLimits(restart_s=0.45)  # six frames
     odometry = visual_odometry(cameras.model, limits)
     before = run(odometry, frames[:4])[-1]
     elsewhere = replace(cameras, scene=corridor(7))
     there = run(odometry, [elsewhere.frame(50 + k, PATH[k % 4]) for k in range(12)], first=False)
-    restarted = limits.lost_after + limits.restart_after - 2
+    restarted = 3 + 6 - 2
     assert all(estimate.inliers == 0 and estimate.state != TrackingState.TRACKING for estimate in there[:restarted])
-    assert there[limits.lost_after].state == TrackingState.LOST
+    assert there[3].state == TrackingState.LOST
     assert [estimate.resets for estimate in there[restarted:]] == [1] * (12 - restarted)
     assert all(estimate.state == TrackingState.TRACKING for estimate in there[restarted + 1 :])
     # Standing at a corner of that corridor, it moves there as it does here; the gap stays in the covariance.

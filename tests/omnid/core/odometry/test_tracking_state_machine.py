@@ -10,8 +10,9 @@ from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
 from omnid.tracking_state import TrackingState
 
-LIMITS = OdometryLimits(good_inliers=50, lost_after=3, restart_after=2, max_gap_s=0.5)
 DT_S = 0.125
+# Lost from the third refused frame on, and started again at the second unmatched one.
+LIMITS = OdometryLimits(good_inliers=50, lost_s=0.2, restart_s=0.1, max_gap_s=0.5)
 
 TRACKING, DEGRADED, LOST = TrackingState.TRACKING, TrackingState.DEGRADED, TrackingState.LOST
 STARTED, NOT_STARTED, ACCEPTED, REFUSED = FrameOutcome
@@ -23,7 +24,8 @@ ROUGH = replace(FIX, state=DEGRADED)
 
 def refused(state: TrackingState, frames: int, unmatched: int = 0, **facts: bool) -> TrackingStatus:
     """Return the status after frames that were refused, over which nothing measured the motion where facts say so."""
-    status = TrackingStatus(state, frames, unmatched, frames * DT_S, has_begun=True, unknown_motion=True)
+    unmatched_s = (unmatched - 1) * DT_S if unmatched else None
+    status = TrackingStatus(state, (frames - 1) * DT_S, unmatched_s, frames * DT_S, has_begun=True, unknown_motion=True)
     return replace(status, **facts)
 
 
@@ -39,9 +41,13 @@ ONE_RESET = replace(FIX, resets=1)
 TRANSITIONS = [
     # before, frame, after
     (FIRST, FrameFacts(STARTED, 0.0), FIX),
-    (FIRST, FrameFacts(NOT_STARTED, DT_S), TrackingStatus(LOST, 0, 0, DT_S)),
-    (TrackingStatus(LOST, 0, 0, DT_S), FrameFacts(NOT_STARTED, DT_S), TrackingStatus(LOST, 0, 0, 2 * DT_S)),
-    (TrackingStatus(LOST, 0, 0, DT_S), FrameFacts(STARTED, DT_S), FIX),
+    (FIRST, FrameFacts(NOT_STARTED, DT_S), TrackingStatus(LOST, time_since_fix_s=DT_S)),
+    (
+        TrackingStatus(LOST, time_since_fix_s=DT_S),
+        FrameFacts(NOT_STARTED, DT_S),
+        TrackingStatus(LOST, time_since_fix_s=2 * DT_S),
+    ),
+    (TrackingStatus(LOST, time_since_fix_s=DT_S), FrameFacts(STARTED, DT_S), FIX),
     (FIX, FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
     (FIX, FrameFacts(ACCEPTED, DT_S, inliers=49), ROUGH),
     (ROUGH, FrameFacts(ACCEPTED, DT_S, inliers=50), FIX),
@@ -92,6 +98,27 @@ def test_transition(before: TrackingStatus, facts: FrameFacts, after: TrackingSt
 
 
 def test_the_first_refused_frame_is_lost_where_one_is_enough() -> None:
-    limits = OdometryLimits(lost_after=1, restart_after=1)
+    limits = OdometryLimits(lost_s=0, restart_s=0)
     assert next_status(FIX, FrameFacts(REFUSED, DT_S, textured=False), limits) == refused(LOST, 1)
     assert next_status(FIX, FrameFacts(REFUSED, DT_S), limits).restart
+
+
+@pytest.mark.parametrize(("dt_s", "lost", "started_again"), [(0.25, 2, 4), (0.125, 3, 7), (0.0625, 5, 13)])
+def test_times_and_not_frames_decide(dt_s: float, lost: int, started_again: int) -> None:
+    limits, status, seen = replace(LIMITS, restart_s=0.5), FIX, []
+    for _ in range(started_again):
+        status = next_status(status, FrameFacts(REFUSED, dt_s), limits)
+        seen.append(status)
+    assert [status.state for status in seen] == [DEGRADED] * (lost - 1) + [LOST] * (started_again - lost + 1)
+    assert [status.restart for status in seen] == [False] * (started_again - 1) + [True]
+
+
+def test_a_time_without_frames_is_no_evidence_against_the_map() -> None:
+    limits = replace(LIMITS, lost_s=0.6, restart_s=0.6)
+    first = next_status(FIX, FrameFacts(REFUSED, 60.0), limits)
+    second = next_status(first, FrameFacts(REFUSED, 60.0), limits)
+    assert (first.state, second.state, second.time_since_fix_s) == (DEGRADED, DEGRADED, 120.0)
+    third = next_status(second, FrameFacts(REFUSED, 60.0), limits)
+    fourth = next_status(third, FrameFacts(REFUSED, 60.0), limits)
+    assert (third.state, third.restart, fourth.restart) == (LOST, False, False)
+    assert next_status(fourth, FrameFacts(REFUSED, 60.0), limits).restart
