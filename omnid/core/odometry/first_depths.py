@@ -40,28 +40,31 @@ Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 # Landmarks that do not repeat, as a share of all, below which the others decide the scale of the map: rendered rooms
-# with a wall of bricks have 0.42 and more.
+# with a wall of bricks have 0.42 and more, so that only worlds which repeat nearly everywhere are in doubt.
 LEAST_SURE = 0.4
-# Directions of the motion and turns that are tried, rad: a step moves an epipolar line at 45 degrees by TOLERANCE_PX of
-# a scale of 1, because the lines are compared with that tolerance. The last turn is as far as the tracker reaches.
+# Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by about TOLERANCE_PX,
+# so that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
-ROUNDS, FINER = 3, 3  # rounds of a search that is each so many times as fine: to a tenth of a degree
+ROUNDS, FINER = 3, 3  # rounds, each so many times as fine, because a tenth of a degree then remains
 TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicles roll and pitch by half a degree
-# Parallax from which a landmark votes: with errors of SIGMA_PX its range errs by an eighth, half of a course's share.
+# Parallax from which a landmark votes: with errors of SIGMA_PX, as measured for tracks without warped patches, its range
+# errs by an eighth, so that neighbouring courses differ by two sigmas.
 PARALLAX_PX, SIGMA_PX = 6.0, 0.7
 DISPARITY_SIGMA_PX = 0.5  # because peaks of the correlation are found among whole pixels
-LOG_STEP = 0.01  # between two distances whose votes are counted, a fraction of the least sigma
+LOG_STEP = 0.01  # between two distances whose votes are counted, so that it is half of the least sigma
 LEAST_SIGMA = 0.02  # of a vote, because the motion is only known to a tenth of a degree
-LEAST_VOTES = 30.0  # that decide: half of a hundred votes would be scattered
-DECIDING_SHARE = 0.5  # share of the landmarks with a vote that agree on the distance
-# Votes by which a runner-up has fewer: a million to one, with the cost of 1.1 of an outlier (runner_up_motions.py).
+LEAST_VOTES = 30.0  # that decide, because fewer are as many as scattered votes of a hundred landmarks give
+# Share of the landmarks with a vote that must agree, because without repetition no two distances can have so many.
+DECIDING_SHARE = 0.5
+# Votes by which a runner-up has fewer, so that it is less likely by a million to one: an outlier costs 1.1, see `_cost`
+# in `frame_to_map.py`.
 LEAD_VOTES = math.log(1e6) / 1.1
 # Of the distance that wheels report, because theirs errs by less also before its scale is learned, and periods by more.
 WHEELS_RATIO = 1.2
-OTHER_RATIO = 1.1  # Distances whose ratio is less are one: the votes for one distance are spread so far.
-# Covariance [px^2] of a view whose upper row was moved to another peak of the correlation.
+OTHER_RATIO = 1.1  # Distances whose ratio is less are one, because the votes for one distance are spread so far.
+# Covariance [px^2] of a view whose upper row was moved to another peak, because only that is known less well.
 VIEW_NOISE = np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2])
-VOTED_SIGMAS = 3.0  # within which a disparity is the voted one: three in a thousand of the right ones are farther
+VOTED_SIGMAS = 3.0  # within which a disparity is the voted one, because three in a thousand of the right ones are not
 
 
 class Votes(NamedTuple):

@@ -27,7 +27,7 @@ SEARCH_SHARE = 0.2
 # By how much the correlation of the patch at its own disparity must exceed that at the neighbours', because identical
 # bricks differ by less than 0.05, other textures by 0.3 and more.
 LEAST_LEAD = 0.15
-MOST_ALIKE = 10  # disparities of one landmark: courses of 6 cm fit within a baseline of 0.5 m so often
+MOST_ALIKE = 10  # disparities of one landmark, because courses of 6 cm fit into a baseline of 0.5 m less often
 APART_PX = 3.0  # least distance of two of them, more than the width of a peak
 
 
