@@ -38,7 +38,7 @@ from tests.simulation.boards import BoardRenderer, board_pose, board_poses_aroun
 from tests.simulation.rigs import lens, lens_rig
 
 STEP_M: Final = 0.05
-STITCHED, ONE_IMAGE = "equirectangular", "one_image"
+STITCHED, ONE_IMAGE = FULL_TURNS = ("equirectangular", "one_image")
 # Boards before cameras that see the full turn: distances, azimuths and elevations of stitched images without their
 # seam, which is behind, and angles from the axis of two mirrors of which one is seen around the other.
 DISTANCE_M, AZIMUTH_DEG, ELEVATION_DEG, AXIS_DEG = (0.5, 1.0), 140.0, (-35.0, 40.0), (75.0, 120.0)
@@ -81,6 +81,9 @@ REMARKS: Final = (
     "degrees tells a turn from a step aside by its perspective only: where the pose is lost near the wall, the state "
     "says so. On seed 600 (development) half of the first landmarks lie one course of bricks too far away; the first "
     "steps are `degraded`, because two motions are supported by as many landmarks each.",
+)
+
+FULL_TURN_REMARKS: Final = (
     "`equirectangular_360`: stitched images of 1280x640 px. `one_image_360`: two mirrors on one axis in images of "
     "1280x1280 px, the lower one a disc of 0.4 of the width, the upper one the ring around it. `by boards`: the same "
     "drive with the rig that `omnid calibrate rig` makes, with all defaults, of 24 positions of a 9x6 board of 50 mm "
@@ -103,7 +106,7 @@ def measure(case: Case, seed: int, pairs: int, table: ResultTable) -> None:
         folder = Path(name)
         (one_image.write_log if is_one else write_log)(folder, rig, poses, scene, seed=seed)
         add_row(f"{case.name}, seed {seed}", folder, read_rig(folder / "rig.toml"), seed, table)
-        if is_one or case.model == STITCHED:
+        if case.model in FULL_TURNS:
             found = by_boards(rig, folder / "boards", seed)
             add_row(f"{case.name} by boards, seed {seed}", folder, found, seed, table)
 
@@ -181,10 +184,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Column("largest", "", 1),
         Column("states"),
     )
-    table = ResultTable("sectors", "accuracy", "Sectors and full turns", columns, REMARKS)
+    sectors = ResultTable("sectors", "accuracy", "Lenses that see a sector", columns, REMARKS)
+    title = "Stitched images, and two mirrors in one image"
+    full_turns = ResultTable("sectors_full_turns", "accuracy", title, columns, FULL_TURN_REMARKS)
     for case in CASES:
         for seed in args.seeds if args.only is None or case.name in args.only else []:
-            measure(case, seed, args.pairs, table)
+            measure(case, seed, args.pairs, full_turns if case.model in FULL_TURNS else sectors)
 
 
 if __name__ == "__main__":
