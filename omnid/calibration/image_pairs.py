@@ -66,15 +66,16 @@ def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str 
     if areas[0] == areas[1]:
         raise OmnidError(
             "calibrate rig: --lower-area and --upper-area are the same, so the board would be found at one place for "
-            "both: give the rectangle of each view; views one around the other are not told apart by rectangles"
+            "both: give the rectangle of each view; of views one around the other the inner one's is that of its circle"
         )
     if is_log(source):
         topic = image_topic(source, topic)
     images = read_images([str(source)], topic)
     height, width = next(iter(images.values())).shape
-    lower, upper = ({name: area.crop(image) for name, image in images.items()} for area in areas)
+    views = TwoViews(areas, (width, height))
+    lower, upper = ({name: views.view(image, side) for name, image in images.items()} for side in (0, 1))
     topics = (topic, topic) if topic else ("", "")
-    return _each_once(PairedImages((lower, upper), topics, TwoViews(areas, (width, height))))
+    return _each_once(PairedImages((lower, upper), topics, views))
 
 
 def _each_once(pairs: PairedImages) -> PairedImages:

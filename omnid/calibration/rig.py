@@ -130,7 +130,8 @@ def calibrate_rig(
     views = _find_views(images, board, progress)
     # 3. Fit each camera to all its views, unless the cameras are known.
     if cameras is None:
-        direction, shown = view_of_images(view, _by_camera(images, views), board, progress)
+        chosen = _of_one_lens(view, images, progress)
+        direction, shown = view_of_images(chosen, _by_camera(images, views), board, progress)
         single = fit_cameras(views, images, board, model, direction, AS_DRAWN, progress)
     else:
         single, shown = FittedCameras.known(cameras, views), []
@@ -192,6 +193,14 @@ def _read(
     if len(named) > 1:
         raise OmnidError(f"calibrate rig: expected one topic with both views, found {' and '.join(named)}")
     return read_two_views(source, areas, named[0] if named else None)
+
+
+def _of_one_lens(choice: ViewChoice, images: PairedImages, progress: Progress) -> ViewChoice:
+    """Return the view, mirror where one view lies around the other: one lens alone sees a board at one place only."""
+    if choice != "auto" or images.one_image is None or images.one_image.inner is None:
+        return choice
+    progress("view: mirror, as one view lies around the other")
+    return "mirror"
 
 
 def _fit_rig(

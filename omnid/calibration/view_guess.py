@@ -4,9 +4,11 @@ A flat checkerboard appears the same either way: its poses are then mirror image
 
 - markers, which a mirror reflects;
 - the rim of a mirror with the dark hub in its middle, where the camera sees itself;
-- straight lines of the board that stay straight off the axis, which no convex mirror leaves so.
+- straight lines of the board that stay straight off the axis, which no convex mirror leaves so;
+- boards that grow towards the rim, more than a right angle from the axis, as in paraboloids and hyperboloids: lenses
+  that see so far keep them as large or make them smaller there.
 
-A circle without a hub may be a mirror or a fisheye lens, and so may an image without a rim whose lines are bent: the
+Other circles without a hub may be a mirror or a fisheye lens, and so may images without a rim whose lines are bent: the
 part of a mirror inside its rim looks like that.
 """
 
@@ -21,6 +23,10 @@ from numpy.typing import NDArray
 
 from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import MarkerBoard
+from calib.errors import CalibError
+from calib.fit.boards.camera_fit import BAD_LINEAR_RAD, consistent_views, observations
+from calib.fit.boards.ocam_fit import DEGREE
+from calib.fit.boards.ocam_linear import powers, solve_linear
 from calib.masks.rim import find_rim
 from calib.models.camera import Array
 from calib.models.ocam import VIEWS, View
@@ -32,7 +38,8 @@ ViewChoice = Literal["auto", "mirror", "direct"]
 VIEW_CHOICES: Final[tuple[ViewChoice, ...]] = ("auto", *VIEWS)
 VIEW_HELP: Final = (
     "the world is seen in a mirror or directly through a lens; auto (default): what markers, or rim and hub of a "
-    "mirror, or lines that a lens leaves straight show; else it must be given, as a checkerboard looks the same"
+    "mirror, or lines that a lens leaves straight, or boards that a mirror's rim enlarges show; else it must be given, "
+    "as a checkerboard looks the same"
 )
 # Share of the views whose markers must agree: a single view may be misread.
 AGREED: Final = 0.8
@@ -43,6 +50,10 @@ MAX_ANGLE_RAD: Final = np.deg2rad(50)  # from the axis; beyond it the one coeffi
 # Corners are found to 0.1 to 0.3 px; in a part of a mirror beside its middle the fit fails by 0.5 to 5 px.
 MAX_RMS_PX: Final = 0.5
 MIN_VIEWS, MIN_CORNERS = 3, 8  # for a fit of focal length and bend
+# At 95 degrees from the axis the radius grows with this power of the angle: 1.7 in a paraboloid and more in
+# hyperboloids, 1 and less in lenses of more than half a sphere and in balls. The limit is half way.
+FAR_RAD: Final = np.deg2rad(95)
+MIN_POWER: Final = 1.33
 FIXED: Final = (
     cv2.CALIB_USE_INTRINSIC_GUESS
     | cv2.CALIB_FIX_PRINCIPAL_POINT
@@ -74,7 +85,7 @@ def view_of_images(
         )
         return choice, [] if shown <= {choice} else [warning]
     if len(shown) != 1:
-        found = "no markers, no mirror's rim with a hub, no lines that are straight as only a lens shows them"
+        found = "no markers, no mirror's rim with a hub, no straight lines of a lens, no boards that a rim enlarges"
         if shown:
             found = "a mirror in one and a lens in the other camera"
         raise OmnidError(
@@ -97,7 +108,12 @@ def _views_shown(
 def _view_of_camera(image: Image, views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:
     """Return the view of one camera by the maximum of its images and its views of the board; None: undecided."""
     size = (image.shape[1], image.shape[0])
-    return _view_of_markers(views, board) or _view_of_image(image) or _view_of_lines(size, views, board)
+    return (
+        _view_of_markers(views, board)
+        or _view_of_image(image)
+        or _view_of_lines(size, views, board)
+        or _view_of_profile(size, views, board)
+    )
 
 
 def _view_of_markers(views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:
@@ -156,3 +172,28 @@ def _view_of_lines(size: tuple[int, int], views: Sequence[BoardView], board: Boa
     r = np.linspace(0, np.tan(MAX_ANGLE_RAD), 1000)
     r = r[r * (1 + k * r**2) <= farthest][-1]
     return "direct" if -k * r**2 < BENT_PART * np.tan(np.arctan(r) / 2) ** 2 else None
+
+
+def _view_of_profile(size: tuple[int, int], views: Sequence[BoardView], board: Board | MarkerBoard) -> View | None:
+    """Return "mirror" where boards FAR_RAD from the axis are as large as only a mirror shows them; size (w, h).
+
+    The profile is the same for both views: the poses of a flat board are mirror images of each other.
+    """
+    # 1. The profile f of the rays (x, y, f(rho)), by boards that agree.
+    try:
+        good, _ = consistent_views(views, board, size, "mirror")
+    except CalibError:
+        return None
+    observed = observations(good, board)
+    solved = solve_linear(observed, size, DEGREE, "mirror")
+    if float(np.median(solved.errors_rad)) > BAD_LINEAR_RAD or solved.coefficients[0] >= 0:
+        return None
+    # 2. The power n of rho ~ angle^n, n = angle / (rho d angle / d rho), at the first radius that far from the axis.
+    seen = np.linalg.norm(observed.pixels[..., ::-1] - solved.center, axis=-1)
+    rho = np.linspace(0, float(np.nanmax(seen)) / solved.scale_px, 1000)[1:]
+    f = rho[:, None] ** powers(DEGREE) @ solved.coefficients / solved.scale_px
+    angle = np.arctan2(rho, -f)
+    if angle[-1] < FAR_RAD:
+        return None
+    power = angle / (rho * np.gradient(angle, rho))
+    return "mirror" if power[np.argmax(angle >= FAR_RAD)] >= MIN_POWER else None

@@ -46,7 +46,8 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
             f"--{side}-area",
             type=_area,
             metavar="X,Y,W,H",
-            help=f"where each image holds both views: left, top, width and height of the {side} view [px]",
+            help=f"where each image holds both views: left, top, width and height of the {side} view [px]; an area "
+            "within the other one is a disc, and the other view is what lies around it",
         )
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
     parser.add_argument("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP)

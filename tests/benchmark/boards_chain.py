@@ -106,8 +106,6 @@ def calibrate(folder: Path, output: Path, options: Sequence[str] = ()) -> str:
                 f"{BOARD.columns}x{BOARD.rows}",
                 "--square-mm",
                 f"{1e3 * BOARD.square_m:g}",
-                "--view",
-                "mirror",  # these have no hub
                 "-o",
                 str(output),
                 *options,
@@ -132,7 +130,9 @@ def in_true_frame(found: Rig, truth: Rig) -> Rig:
     azimuth, part = rng.uniform(0, 2 * np.pi, 2000), np.sqrt(rng.uniform(0.05, 0.9, 2000))
     radius = truth.lower.visible.outer_px * part
     pixels = np.column_stack([u + radius * np.cos(azimuth), v + radius * np.sin(azimuth)])
-    left, _, right = np.linalg.svd(found.lower.camera.lift(pixels).T @ truth.lower.camera.lift(pixels))
+    rays, true_rays = found.lower.camera.lift(pixels), truth.lower.camera.lift(pixels)
+    seen = np.isfinite(rays + true_rays).all(axis=1)
+    left, _, right = np.linalg.svd(rays[seen].T @ true_rays[seen])
     T_found_true = se3.transform(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right, np.zeros(3))
     T_lower_rig = T_found_true @ truth.lower.T_cam_rig
     T_upper_lower = found.upper.T_cam_rig @ se3.inverse(found.lower.T_cam_rig)

@@ -64,3 +64,34 @@ def test_lenses_of_other_models_are_refused_in_words() -> None:
 
     with pytest.raises(CalibError, match="expected an omni or ocam camera, found Other"):
         VIEWS.of_whole_image(replace(rig(None), upper=MountedCamera(Other(), T_UPPER)))  # type: ignore[arg-type]
+
+
+AROUND = TwoViews((ImageArea(150, 110, 100, 80), ImageArea(0, 0, 400, 300)), (400, 300))
+MIDDLE = (199.5, 149.5)  # of the inner view's ellipse, 100 px wide and 80 high
+BESIDE_MIDDLE = np.array([[199.0 + 46, 149.0], [199.0 + 50, 149.0], [199.0 + 55, 149.0], [199.0, 149.0 + 45]])
+
+
+@pytest.mark.parametrize("views", [AROUND, TwoViews(AROUND.areas[::-1], AROUND.size)])
+def test_of_views_one_around_the_other_each_is_seen_without_the_other(views: TwoViews) -> None:
+    image = np.full((300, 400), 200, np.uint8)
+    image[110:190, 150:250] = 90
+    before, inner = image.copy(), 0 if views == AROUND else 1
+    assert views.inner == inner
+    shown, around = views.view(image, inner), views.view(image, 1 - inner)
+    assert shown.shape == (80, 100) and shown[40, 50] == 90 and shown[2, 2] == 0, "black as around a mirror"
+    assert around.shape == (300, 400) and np.ptp(around[120:180, 170:230]) == 0 and 190 < around[150, 200] <= 200
+    assert around[112, 152] == 90, "the area's corners belong to the outer view"
+    assert (image == before).all()
+    assert not (views.shown(0) & views.shown(1)).any()
+
+
+def test_masks_of_views_one_around_the_other_tell_them_apart() -> None:
+    inner = replace(OCAM, center_row_column=(39.5, 49.5), size=(100, 80))
+    outer = replace(OMNI, center=MIDDLE, size=(400, 300))
+    rig = Rig(MountedCamera(inner, np.eye(4), None), MountedCamera(outer, T_UPPER, Mask(MIDDLE, 0.0, 148.0)))
+    whole = AROUND.of_whole_image(rig)
+    assert whole.lower.mask is not None and whole.upper.mask is not None
+    assert whole.lower.mask.contains(BESIDE_MIDDLE).tolist() == [True, False, False, False]
+    assert whole.upper.mask.contains(BESIDE_MIDDLE).tolist() == [False, False, True, True]
+    assert not whole.upper.mask.contains(np.array([[199.0 + 150, 149.0]])).any(), "the rim stays one"
+    assert VIEWS.inner is None and VIEWS.shown(0)[10:410, 20:420].all()

@@ -1,4 +1,4 @@
-"""One camera whose images hold both views: two mirrors side by side in one image, divided by the rig's masks."""
+"""One camera whose images hold both views: two mirrors side by side or one around the other, divided by masks."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.boards.board import Board
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
@@ -22,13 +23,13 @@ from omnid.config import load_config
 from omnid.report.report_data import collect_report_data
 from omnid.runs.live import LiveRun
 from omnid.runs.live_robot import ConnectedRobot, LiveCamera
-from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import MountedSensor, Sensor
-from tests.drivers.logs.mcap_logs import COMPRESSED, Entry, compressed, write_log
 from tests.replay.command import Command
-from tests.simulation import corridor, make_rig, paths, tum
+from tests.simulation import corridor, make_rig, one_image, paths
+from tests.simulation.boards import board_poses_around_rig
+from tests.simulation.one_image import TOPIC
 
-PAIRS, SIZE, SEED, START_NS, PERIOD_NS, TOPIC = 14, 384, 4, 10**18, 10**8, "/camera/image/compressed"
+PAIRS, SIZE, SEED, BOARD = 14, 384, 4, Board(5, 4, 0.07)
+EVERY_PIXEL = np.stack(np.meshgrid(np.arange(640.0), np.arange(640.0)), axis=-1).reshape(-1, 2)
 
 
 def beside(mounted: MountedCamera, shift_px: float) -> MountedCamera:
@@ -43,19 +44,8 @@ def beside(mounted: MountedCamera, shift_px: float) -> MountedCamera:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a log with one topic, whose images show the lower mirror on the left and the upper one on the right."""
     folder, apart = tmp_path_factory.mktemp("one"), make_rig(size=SIZE, misaligned_deg=(0.5, -0.4, 0.6))
-    poses, scene, rng = paths.spline_path(SEED, PAIRS, 0.05), corridor(SEED), np.random.default_rng(SEED)
-    stamps = START_NS + PERIOD_NS * np.arange(PAIRS, dtype=np.int64)
-    sensors = [MountedSensor.of(Sensor(), m.visible, m.camera.size) for m in (apart.lower, apart.upper)]
-    entries = []
-    for stamp, T in zip(stamps.tolist(), poses, strict=True):
-        views = [
-            sensor.expose(render_grey(scene, m, T, 2), rng)
-            for sensor, m in zip(sensors, (apart.lower, apart.upper), strict=True)
-        ]
-        entries.append(Entry(TOPIC, COMPRESSED, compressed(stamp, sensors[0].jpeg(np.hstack(views))), stamp))
-    write_log(folder / "log.mcap", entries)
-    (folder / "truth.txt").write_text(tum(stamps, poses))
-    write_rig(folder / "rig.toml", Rig(beside(apart.lower, 0), beside(apart.upper, SIZE), topics=(TOPIC, TOPIC)))
+    rig = Rig(beside(apart.lower, 0), beside(apart.upper, SIZE), topics=(TOPIC, TOPIC))
+    one_image.write_log(folder, rig, paths.spline_path(SEED, PAIRS, 0.05), corridor(SEED), SEED)
     write_rig(folder / "apart.toml", apart)
     return folder
 
@@ -66,6 +56,32 @@ def test_one_topic_gives_both_cameras(recording: Path, tmp_path: Path, omnid: Co
     assert done.code == 0 and f"{PAIRS} of {PAIRS} pairs" in done.out and "tracking 100.0%" in done.out, done
     errors = json.loads(omnid("eval", found, recording / "truth.txt", "--json").out)
     assert abs(errors["length_error_ratio"]) < 0.002 and errors["ate_rmse_m"] < 0.003, errors
+
+
+@pytest.mark.slow
+def test_two_mirrors_on_one_axis_are_calibrated_by_boards_and_replayed(tmp_path: Path, omnid: Command) -> None:
+    """The lower view is a disc, the upper one the ring around it; each image shows the board twice."""
+    truth, log, out = one_image.coaxial_rig(640), tmp_path / "log.mcap", tmp_path / "out.txt"
+    one_image.write_log(tmp_path, truth, paths.spline_path(SEED, PAIRS, 0.05), corridor(SEED), SEED)
+    poses = board_poses_around_rig(truth, BOARD, 8, distance_m=(0.45, 1.0), elevation_deg=(70.0, 125.0))
+    one_image.write_boards(tmp_path / "boards", truth, BOARD, poses, noise=1.0)
+    lower, upper = one_image.areas(truth)
+    words = ("--corners", "5x4", "--square-mm", 70, "--lower-area", lower, "--upper-area", upper, "--model", "omni")
+    done = omnid("calibrate", "rig", tmp_path / "boards", *words, "-o", tmp_path / "found.toml")
+    assert done.code == 0 and ", 8 pairs" in done.out, done
+    assert "view: mirror, as one view lies around the other" in done.err
+    found = read_rig(tmp_path / "found.toml")
+    assert found.baseline_m == pytest.approx(truth.baseline_m, abs=1e-3)
+    for side, true in ((found.lower, truth.lower), (found.upper, truth.upper)):
+        assert side.camera.center == pytest.approx(true.camera.center, abs=0.2) and side.mask is not None
+        wrong = side.mask.contains(EVERY_PIXEL) != true.visible.contains(EVERY_PIXEL)
+        assert wrong.mean() < 0.02, "the masks are those of the views"
+    lengths = []
+    for rig in (tmp_path / "rig.toml", tmp_path / "found.toml"):
+        done = omnid("replay", log, "--rig", rig, "--lower", TOPIC, "--upper", TOPIC, "--quiet", "--tum", out)
+        assert done.code == 0 and "tracking 100.0%" in done.out, done
+        lengths.append(json.loads(omnid("eval", out, tmp_path / "truth.txt", "--json").out)["length_error_ratio"])
+    assert abs(lengths[0]) < 0.002 and abs(lengths[1] - lengths[0]) < 0.002, lengths
 
 
 def test_one_device_of_both_views_needs_masks_and_is_opened_once(

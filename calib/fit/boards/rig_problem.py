@@ -14,7 +14,7 @@ from calib.boards.print_shape import PrintShape
 from calib.fit.boards.bundle import Observations, Prior
 from calib.fit.boards.relative_pose import ViewPair
 from calib.fit.boards.telecentric_mirror import RADIUS_NAME, TelecentricMirror
-from calib.fit.parameterisation import CameraParameterisation, parameterise
+from calib.fit.parameterisation import CameraParameterisation, fixed_camera, parameterise
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, has_wavefront, project_near
 from calib.models.wavefront import WAVEFRONT_NAMES
@@ -56,10 +56,9 @@ class PairCamera:
 
 @dataclass(frozen=True, slots=True)
 class RigParameterisation:
-    """Parameterisation of a rig: steps of both cameras, if they are refined, and of the transform between them."""
+    """Parameterisation of a rig: steps of both cameras, none of fixed ones, and of the transform between them."""
 
     parameterisations: tuple[SideParameterisation, SideParameterisation]
-    refined: bool
     T_upper_lower: Array
     units: Array  # (6,) one step of the transform [m, rad]
     corners: int
@@ -67,14 +66,14 @@ class RigParameterisation:
     @property
     def ends(self) -> tuple[int, int, int]:
         """Return the end indices of the lower camera's, the upper camera's and the transform's steps."""
-        lower, upper = (len(side.names) if self.refined else 0 for side in self.parameterisations)
+        lower, upper = (len(side.names) for side in self.parameterisations)
         return lower, lower + upper, lower + upper + 6
 
     @property
     def prior(self) -> Prior:
         """Return the prior of the terms of real mirrors, about 0."""
         center, sigma = np.zeros(self.ends[-1]), np.full(self.ends[-1], np.inf)
-        for side, first in zip(self.parameterisations if self.refined else (), (0, self.ends[0]), strict=False):
+        for side, first in zip(self.parameterisations, (0, self.ends[0]), strict=True):
             for k, name in enumerate(side.names):
                 if name in MIRROR_NAMES:
                     center[first + k], sigma[first + k] = -side.start[k] / side.units[k], MIRROR_SIGMA_STEPS
@@ -85,8 +84,6 @@ class RigParameterisation:
         lower_end, upper_end, _ = self.ends
         lower, upper = self.parameterisations
         T_upper_lower = se3.exp(steps[upper_end:] * self.units) @ self.T_upper_lower
-        if not self.refined:
-            return PairCamera(lower.base, upper.base, T_upper_lower, self.corners)
         return PairCamera(
             lower.camera_at(steps[:lower_end]), upper.camera_at(steps[lower_end:upper_end]), T_upper_lower, self.corners
         )
@@ -94,18 +91,17 @@ class RigParameterisation:
     def plain_values(self, steps: Array) -> list[tuple[tuple[str, float], ...]]:
         """Return names and values of the parameters of the lower and the upper camera at the steps; none if fixed."""
         lower_end, upper_end, _ = self.ends
-        parts = (steps[:lower_end], steps[lower_end:upper_end]) if self.refined else ()
-        found = [
+        parts = (steps[:lower_end], steps[lower_end:upper_end])
+        return [
             tuple(zip(side.names, side.plain_values(part).tolist(), strict=False))
-            for side, part in zip(self.parameterisations, parts, strict=False)
+            for side, part in zip(self.parameterisations, parts, strict=True)
         ]
-        return found or [(), ()]
 
     def plain_by_steps(self, steps: Array) -> Array:
         """Return the derivatives of the plain values and of the transform's twist [m, rad] by the steps."""
         lower_end, upper_end, _ = self.ends
-        parts = (steps[:lower_end], steps[lower_end:upper_end]) if self.refined else ()
-        sides = [side.plain_by_steps(part) for side, part in zip(self.parameterisations, parts, strict=False)]
+        parts = (steps[:lower_end], steps[lower_end:upper_end])
+        sides = [side.plain_by_steps(part) for side, part in zip(self.parameterisations, parts, strict=True)]
         return np.asarray(scipy.linalg.block_diag(*sides, np.diag(self.units)))
 
 
@@ -120,18 +116,19 @@ def rig_unknowns(
 ) -> RigParameterisation:
     """Return the parameterisation about cameras, which stay as they are unless refined, and T_upper_lower.
 
-    telecentric: they are refined as mirrors below telecentric lenses. T_lower_board (K, 4, 4): poses of the board,
-    whose median distance gives the size of a step.
+    Cameras that stay may be of any model. telecentric: they are refined as mirrors below telecentric lenses.
+    T_lower_board (K, 4, 4): poses of the board, whose median distance gives the size of a step.
     """
-    lower, upper = cameras
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
     # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
-    units = np.repeat([reach, 1.0], 3) / (min(lower.size) / 4)
-    sides = [
-        TelecentricMirror.about(camera) if telecentric else parameterise(camera, wavefront=has_wavefront(camera))
-        for camera in (lower, upper)
-    ]
-    return RigParameterisation((sides[0], sides[1]), refined, T_upper_lower, units, len(board.points))
+    units = np.repeat([reach, 1.0], 3) / (min(cameras[0].size) / 4)
+    sides: list[SideParameterisation] = [fixed_camera(camera) for camera in cameras]
+    if refined:
+        sides = [
+            TelecentricMirror.about(camera) if telecentric else parameterise(camera, wavefront=has_wavefront(camera))
+            for camera in cameras
+        ]
+    return RigParameterisation((sides[0], sides[1]), T_upper_lower, units, len(board.points))
 
 
 def rig_observations(good: Sequence[PairView], printed: Printed, *, fixed: bool = False) -> Observations:

@@ -1,4 +1,4 @@
-"""The view, mirror or lens, by markers, rim and hub, or straight lines; asked for where nothing shows it."""
+"""The view, mirror or lens, by markers, rim and hub, lines, or boards near the rim; else it is asked for."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from calib import se3
 from calib.boards.board import Board, BoardView
 from calib.boards.marker_board import AprilGrid, CharucoBoard, MarkerBoard
 from calib.boards.marker_finder import find_marker_board
+from calib.models.camera import Mask, OmniCamera
+from calib.models.lens import EquidistantCamera
+from calib.models.unified import UnifiedCamera
 from omnid.calibration.progress import silent
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
-from tests.simulation.boards import board_pose
+from tests.simulation.boards import board_pose, board_poses_around_camera
 from tests.simulation.marker_boards import print_of
 
 CHECKERBOARD = Board(6, 5, 0.03)
@@ -48,6 +51,22 @@ def seen_boards(focal_px: float, xi: float, k: float = 0.0, *, sigma_px: float =
     return [np.full((480, 640), 150, np.uint8)], views
 
 
+def boards_around(camera: OmniCamera, farthest_deg: float = 105.0) -> Camera:
+    """Return a camera of a rim without a hub, and its views of boards whose middles are so far from the axis."""
+    rng, board, mask = np.random.default_rng(5), CHECKERBOARD, Mask(camera.center, 0.0, 300.0)
+    around = board_poses_around_camera(camera, board, mask, 8, distance_m=(0.2, 0.4), elevation_deg=(30, farthest_deg))
+    seen = [camera.project(se3.apply(T, board.points)) for T in around]
+    return rim(0.0, 640)[0], [BoardView("", pixels + 0.15 * rng.standard_normal(pixels.shape)) for pixels in seen]
+
+
+def mirror(xi: float, focal_px: float) -> UnifiedCamera:
+    """Return a mirror by the unified model: xi of 1 a paraboloid, below it a hyperboloid; a ball is like one of 3."""
+    return UnifiedCamera(xi, (-focal_px, focal_px), (321.0, 317.0), (640, 640))
+
+
+FISHEYE = EquidistantCamera((0.02, 0.0, 0.0, 0.0), (120.0, 120.0), (321.0, 317.0), (640, 640))
+
+
 def guess(*cameras: Camera) -> str:
     return view_of_images("auto", cameras, CHECKERBOARD, silent)[0]
 
@@ -75,10 +94,20 @@ def test_lines_that_stay_straight_are_seen_by_a_lens(focal_px: float, k: float) 
     assert guess(rim(0.0), seen_boards(focal_px, 0.0, k)) == "direct"
 
 
+@pytest.mark.parametrize("camera", [mirror(1.0, 160.0), mirror(0.9, 150.0)])
+def test_boards_that_grow_towards_the_rim_are_seen_in_a_mirror(camera: OmniCamera) -> None:
+    """A fisheye of 250 degrees and a ball keep them smaller; nearer to the axis nothing decides it."""
+    assert guess(boards_around(camera)) == "mirror"
+    assert guess(boards_around(FISHEYE), boards_around(camera)) == "mirror"
+
+
 @pytest.mark.parametrize(
     ("cameras", "found"),
     [
         ([rim(0.0)], "no markers"),  # a mirror without a hub, or a fisheye
+        ([boards_around(FISHEYE)], "no markers"),
+        ([boards_around(mirror(3.0, 200.0))], "no markers"),  # a ball
+        ([boards_around(mirror(1.0, 160.0), 60.0)], "no markers"),  # boards near the axis only
         ([seen_boards(1000, 0.8)], "no markers"),  # inside the rim of a mirror: 19 degrees about its axis,
         ([seen_boards(500, 0.9)], "no markers"),  # 36 degrees,
         ([seen_boards(300, 1.0)], "no markers"),  # and 55 degrees
