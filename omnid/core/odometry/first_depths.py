@@ -42,13 +42,13 @@ Indices = NDArray[np.intp]
 # Landmarks that do not repeat, as a share of all, below which the others decide the scale of the map: rendered rooms
 # with a wall of bricks have 0.42 and more, so that only worlds which repeat nearly everywhere are in doubt.
 LEAST_SURE = 0.4
-# Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by about TOLERANCE_PX,
-# so that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
+# Directions of the motion and turns that are tried first, rad: such a step moves an epipolar line by TOLERANCE_PX, so
+# that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
 ROUNDS, FINER = 3, 3  # rounds, each so many times as fine, because a tenth of a degree then remains
 TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicles roll and pitch by half a degree
-# Parallax from which a landmark votes: with errors of SIGMA_PX, as measured for tracks without warped patches, its range
-# errs by an eighth, so that neighbouring courses differ by two sigmas.
+# Parallax from which a landmark votes: with errors of SIGMA_PX, as measured for tracks without warped patches, its
+# range errs by an eighth, so that neighbouring courses differ by two sigmas.
 PARALLAX_PX, SIGMA_PX = 6.0, 0.7
 DISPARITY_SIGMA_PX = 0.5  # because peaks of the correlation are found among whole pixels
 LOG_STEP = 0.01  # between two distances whose votes are counted, so that it is half of the least sigma
