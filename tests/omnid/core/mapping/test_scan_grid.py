@@ -93,6 +93,24 @@ def test_a_pole_thinner_than_a_cell_that_shows_no_range_is_not_free() -> None:
         assert at(grid, 0.2, 0.5) == at(grid, 0.2, 0.0) == FREE
 
 
+def test_views_that_something_narrow_ends_outvote_those_that_have_missed_it() -> None:
+    """A pole at (0.2, 1): three of ten views miss it, and one sees something narrow where nothing stands."""
+    path, scans, free_m = np.array([pose(x, 0, 0) for x in np.arange(-1.3, 1.7, 0.3)]), [], []
+    for n, T in enumerate(path):
+        free = OPEN.copy()
+        if n % 4:
+            range_m = np.hypot(1.0, 0.2 - T[0, 3])
+            hidden = np.abs(np.arctan2(1.0, 0.2 - T[0, 3]) - azimuths()) < 0.02 / range_m + np.deg2rad(0.5)
+            free[hidden] = -(range_m - 0.1)
+        scans.append(scan_of(ROOM, T))
+        free_m.append(free)
+    free_m[5][90] = -1.2  # to the right
+    grid = scan_grid(scans, free_m, path, 0.05).grid()
+    assert {at(grid, 0.2 + dx, 1.0 + dy) for dx in (-0.02, 0.02) for dy in (-0.02, 0.02)} == {UNKNOWN}
+    assert {at(grid, 0.2 + dx, 1.0) for dx in (-0.3, 0.3)} | {at(grid, 0.2, y) for y in (0.7, 1.5)} == {FREE}
+    assert {at(grid, path[5, 0, 3], y) for y in np.arange(-1.6, -0.5, 0.05)} == {FREE}
+
+
 def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:
     scan, T = scan_of(ROOM, pose(0, 0, 0)), np.tile(np.eye(4), (4, 1, 1))
     scan[180 + 45] = 10.0  # a false match far behind the wall, at 45.5 degrees
