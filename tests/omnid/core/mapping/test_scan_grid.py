@@ -111,6 +111,18 @@ def test_views_that_something_narrow_ends_outvote_those_that_have_missed_it() ->
     assert {at(grid, path[5, 0, 3], y) for y in np.arange(-1.6, -0.5, 0.05)} == {FREE}
 
 
+def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_ones() -> None:
+    near_view, far_view = pose(0.2, 0, 0), pose(2.4, -0.9, 0)  # 1 m and 2.9 m from a pole at (0.2, 1)
+    ended = OPEN.copy()
+    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -0.95  # to the left
+    seen = [(near_view, ended)] * 2 + [(far_view, OPEN)] * 9
+    for more, expected in ((0, UNKNOWN), (1, FREE)):
+        views = seen + [(near_view, OPEN)] * more
+        path = np.array([T for T, _ in views])
+        grid = scan_grid([scan_of(ROOM, T) for T in path], [free for _, free in views], path, 0.05).grid()
+        assert at(grid, 0.2, 1.0) == expected and at(grid, 0.2, 0.8) == FREE
+
+
 def test_a_direction_that_sees_through_a_wall_beside_others_that_do_not_makes_it_free_nowhere() -> None:
     scan, T = scan_of(ROOM, pose(0, 0, 0)), np.tile(np.eye(4), (4, 1, 1))
     scan[180 + 45] = 10.0  # a false match far behind the wall, at 45.5 degrees
