@@ -20,8 +20,8 @@ Floats = NDArray[np.float32]
 
 # Directions on either side whose floor is compared: from beside a thing of 10 cm at 1 m, to as many as are even.
 BESIDE: Final = range(5, 13)
-# Log-odds of a direction from which something narrow stands there. With 4, by trial on development seeds, as many
-# cells of poles were free in maps, and less floor; with 6 twice as many.
+# Log-odds of a direction from which something narrow stands there. By trial on development seeds: with 4 less floor of
+# maps is free, with 6 twice as many cells of poles are.
 NARROW_SUM: Final = 5.0
 # Part of the log-odds without any evidence: a little less evidence than beside it is not hidden floor.
 NARROW_SHARE: Final = 0.5
