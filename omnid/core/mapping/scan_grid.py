@@ -104,7 +104,8 @@ class ScanGrid:
         # 4. What is narrow stands in one of the cells where the floor ends, and in none that is passed near by.
         odds, passed_m = self._narrow_odds[part], np.minimum(floor_m, TOLD_M)
         passed = _free(odds.shape, middle, middle + passed_m[:, None] * direction, near)
-        change = MISS * (_narrow(odds.shape, middle, free_m, angle, self._cell_m) - passed.astype(np.int8))
+        ended = _narrow(odds.shape, middle, free_m, angle, self._cell_m)
+        change = MISS * np.where(ended > 0, ended, -passed.astype(np.int8))
         np.clip(odds + change, *NARROW_LIMITS, out=odds)
 
     def grid(self) -> Grid:

@@ -124,7 +124,7 @@ def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_one
 
 
 def test_what_is_narrow_and_hides_the_nearest_floor_in_view_may_stand_anywhere_before_it() -> None:
-    ended, path = OPEN.copy(), np.array([pose(0.2, 0, 0)] * 4)
+    ended, path = OPEN.copy(), np.array([pose(0.225, 0, 0)] * 4)  # in the middle of a cell
     ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -0.9  # to the left
     passed = np.array([pose(-0.4, 0, 0)] * 2)
     views = np.concatenate([passed, path])
