@@ -112,15 +112,15 @@ def test_views_that_something_narrow_ends_outvote_those_that_have_missed_it() ->
 
 
 def test_what_is_narrow_is_cleared_by_near_views_that_pass_it_and_not_by_far_ones() -> None:
-    near_view, far_view = pose(0.2, 0, 0), pose(2.4, -0.9, 0)  # 1 m and 2.9 m from a pole at (0.2, 1)
+    near_view, far_view = pose(0.2, 0, 0), pose(2.4, -0.9, 0)  # 1.2 m and 3 m from a pole at (0.2, 1.2)
     ended = OPEN.copy()
-    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -0.95  # to the left
+    ended[SECTORS * 3 // 4 - 2 : SECTORS * 3 // 4 + 2] = -1.1  # to the left
     seen = [(near_view, ended)] * 2 + [(far_view, OPEN)] * 9
     for more, expected in ((0, UNKNOWN), (1, FREE)):
         views = seen + [(near_view, OPEN)] * more
         path = np.array([T for T, _ in views])
         grid = scan_grid([scan_of(ROOM, T) for T in path], [free for _, free in views], path, 0.05).grid()
-        assert at(grid, 0.2, 1.0) == expected and at(grid, 0.2, 0.8) == FREE
+        assert at(grid, 0.2, 1.2) == expected and at(grid, 0.2, 0.8) == FREE
 
 
 def test_what_is_narrow_and_hides_the_nearest_floor_in_view_may_stand_anywhere_before_it() -> None:
