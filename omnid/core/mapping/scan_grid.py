@@ -48,9 +48,9 @@ NARROW: Final = 0.14
 # What is narrow and ends the floor nearer than this may stand anywhere before it: nearer floor may be out of view, as
 # it is up to 0.8 to 1 m with the usual rig. By judgement, as cells of poles passed at 0.4 m stayed free.
 TOO_NEAR_M: Final = 1.0
-# From farther away a view through a cell does not tell that nothing narrow stands there: one view shows 64 % of plain
+# From farther away a view through a cell is not sure that nothing narrow stands there: one view shows 64 % of plain
 # poles of 3 to 4.5 cm from 1.3 to 1.7 m, 21 % from 1.7 to 2.6 m (development seed 1).
-TOLD_M: Final = 1.5
+SURE_M: Final = 1.5
 # Limits of its log odds in tenths: after two near views through a cell, three that end there make it unknown.
 NARROW_LIMITS: Final = (-2 * MISS, 3 * MISS)
 # Fractional bits of the polygons' corners: a sixteenth of a cell is enough.
@@ -102,7 +102,7 @@ class ScanGrid:
             change = np.where(hit > 0, HIT, -MISS * free.astype(np.int8)).astype(np.int8)
             np.clip(odds + change, *LIMITS, out=odds)
         # 4. What is narrow stands in one of the cells where the floor ends, and in none that is passed near by.
-        odds, passed_m = self._narrow_odds[part], np.minimum(floor_m, TOLD_M)
+        odds, passed_m = self._narrow_odds[part], np.minimum(floor_m, SURE_M)
         passed = _free(odds.shape, middle, middle + passed_m[:, None] * direction, near)
         ended = _narrow(odds.shape, middle, free_m, angle, self._cell_m)
         change = MISS * np.where(ended > 0, ended, -passed.astype(np.int8))
