@@ -192,7 +192,7 @@ def read_keyframes(rows: Sequence[Row]) -> list[KeyframeRow]:
         [row[column] for row in rows] for column in range(INDEX_COLUMNS)
     )
     ranges, free_m = (arrays_of(of, "<f2", (SECTORS,)) for of in (scan, free))
-    for known, may_be in ((ranges, np.isnan(ranges)), (free_m, False)):
+    for known, may_be in ((ranges, np.isnan(ranges)), (np.abs(free_m), False)):
         if not (may_be | ((known >= 0) & (known <= MAX_RANGE_M))).all():
             raise BadRowError(f"a range of a keyframe is outside 0 to {MAX_RANGE_M:g} m")
     return [

@@ -11,11 +11,12 @@ from calib import se3
 from calib.se2_arrays import planar, transform
 from omnid.core.floor import Floor
 from omnid.core.frames import of_base
-from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.column import NEAREST_M, Columns, floor_plane
+from omnid.core.mapping.range_scan import SECTORS, FreeRanges
+from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.fixed_parts import FixedParts
 from omnid.core.obstacles.grid import ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
 from omnid.core.obstacles.pair_views import FOCAL_PX
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.obstacles.unwatched import Unwatched, without
@@ -41,6 +42,7 @@ class PairRings:
         self._left_out = self.fixed.pixels  # those of the columns
         self._is_misled = False  # whether the grid holds what fixed parts have shown
         self._columns: Columns | None = None
+        self._evidence: ColumnEvidence | None = None  # of the newest pair
         self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, settings)
         self._tracker = MovingTracker()
         self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
@@ -53,7 +55,7 @@ class PairRings:
             self._grid.begin_again()
             self._tracker.clear()
             self._resets, self._is_misled = odometry.reset_counter, False
-        panoramas = odometry.depth.panoramas
+        panoramas, self._evidence = odometry.depth.panoramas, None
         T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
         unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
         unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
@@ -67,7 +69,7 @@ class PairRings:
             return unknown
         # 2. The evidence of the images, without their dead and blind parts.
         lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
-        evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
+        evidence = self._evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
         # 3. The grid, its ring, and the moving obstacles.
         pose = transform(planar(T_odom_base))
         unseen = self._unwatched.directions(panoramas.tiles.unknown)
@@ -76,6 +78,16 @@ class PairRings:
         return ObstacleRing(
             odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
         )
+
+    @property
+    def narrow_m(self) -> FreeRanges:
+        """Least range (SECTORS,) [m] at which something narrow hides floor by the newest pair, inf: nothing does.
+
+        Sectors are those of the rectified frame.
+        """
+        if self._evidence is None or self._columns is None:
+            return nothing_narrow()
+        return narrow_m(self._evidence.floor, self._columns.at_1m)
 
     def _leave_out_fixed_parts(self, panoramas: Panoramas, T_odom_base: Array) -> None:
         """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.config import Config
-from omnid.core.mapping.range_scan import RangeScan
+from omnid.core.mapping.range_scan import FreeRanges, RangeScan
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.localisation import MapLocaliser
 from omnid.core.places.map_pose import OdometryFrame
@@ -160,8 +160,13 @@ class Places:
             odometry.reset_counter,
             odometry.is_keyframe,
             lambda: self._scan(depth),
-            lambda: keyframe_free(self._rings.add(odometry, self.floor), self.floor, self._T_rig_rect),
+            lambda: self._free(odometry),
         )
+
+    def _free(self, odometry: OdometryUpdate) -> FreeRanges:
+        """Return the free ranges of a pair."""
+        ring = self._rings.add(odometry, self.floor)
+        return keyframe_free(ring, self._rings.narrow_m, self.floor, self._T_rig_rect)
 
     def _scan(self, depth: StereoDepth) -> RangeScan:
         """Return the range scan of a pair."""

@@ -27,7 +27,7 @@ class KeyframeScans:
     """Range scans of keyframes by their ids in the order of addition, and the poses (K, 4, 4) of their frames."""
 
     scans: Mapping[int, NDArray[np.float16]]  # (360,) each, see range_scan.py
-    free_m: Mapping[int, NDArray[np.float16]]  # (360,) each, up to which floor was seen
+    free_m: Mapping[int, NDArray[np.float16]]  # (360,) each, up to which floor was seen, see FreeRanges
     T_map_rect: Array
     loops: tuple[tuple[int, int], ...] = ()  # ids of the keyframes between which places were recognised
 

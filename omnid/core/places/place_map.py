@@ -35,7 +35,7 @@ class PlaceKeyframe:
     covariance: Array  # (6, 6) of it, [t; r] in the rectified frame
     thumbnail: NDArray[np.int8]  # (16, 128) the panorama's contrast, see signature.py
     scan: NDArray[np.float16]  # (360,) m, nearest obstacle by azimuth from -pi on, NaN unknown
-    free_m: NDArray[np.float16]  # (360,) in the same order, up to which floor was seen, 0: nowhere
+    free_m: NDArray[np.float16]  # (360,) in the same order, up to which floor was seen, see FreeRanges
     features: PlaceFeatures | StoredFeatures
 
     @property

@@ -27,7 +27,7 @@ def some_places(count: int, features: int = 256, seed: int = 1) -> PlaceMap:
         T = se3.exp([0.3 * id, 0, 0, 0, 0, 0.01 * id])
         scan = rng.uniform(0, 12, 360).astype(np.float16)
         scan[::7] = np.nan
-        free_m = rng.uniform(0, 4, 360).astype(np.float16)
+        free_m = rng.uniform(-4, 4, 360).astype(np.float16)
         views = rng.uniform([0, 0, 0], [1304, 300, 0], (features, 3)).astype(np.float32)
         views[:, 2] = views[:, 1] + rng.uniform(1, 50, features)
         seen = PlaceFeatures(rng.integers(0, 256, (features, 128), dtype=np.uint8), views)

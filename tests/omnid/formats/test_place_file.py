@@ -281,6 +281,7 @@ def test_a_view_in_the_place_of_a_table_is_not_asked(tmp_path: Path) -> None:
         ({"covariance": np.full((6, 6), np.inf)}, "a covariance is not finite"),
         ({"scan": np.full(360, 1000, np.float16)}, "a range of a keyframe"),
         ({"free_m": np.full(360, np.nan, np.float16)}, "a range of a keyframe"),
+        ({"free_m": np.full(360, -1000, np.float16)}, "a range of a keyframe"),
         ({"thumbnail": np.zeros((16, 64), np.int8)}, "an array has another size"),
         ({"session": -1}, "outside its range"),
     ],

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.mapping.range_scan import azimuths
+from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.settings import RingSettings
-from omnid.messages import DensePoints
+from omnid.messages import DensePoints, ObstacleRing
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.floor import CameraFloor
-from omnid.stages.keyframe_scan import keyframe_scan
+from omnid.stages.keyframe_scan import keyframe_free, keyframe_scan
 from tests.omnid.core.test_floor import HEIGHT_M, plane, walls
 
 BOX_M, WALL_M = 1.4, 2.4
@@ -46,6 +46,18 @@ def test_a_low_box_before_a_wall_is_the_nearest_obstacle(height_m: float, tilt_d
     np.testing.assert_allclose(scan[AHEAD], BOX_M, atol=0.08)
     np.testing.assert_allclose(scan[np.abs(azimuths()) > 0.5], WALL_M, atol=0.15)
     assert bool(camera_floor.summary()) != bool(height_m)
+
+
+@pytest.mark.parametrize("height_m", [HEIGHT_M, 0.0])
+def test_free_floor_ends_at_what_is_narrow_and_is_negative_there(height_m: float) -> None:
+    stated = se3.transform(np.eye(3), [0.0, 0.0, height_m])
+    unknown = np.full(SECTORS, np.nan, np.float32)
+    free_m, narrow_m = np.full(SECTORS, 2.0, np.float32), np.full(SECTORS, np.inf, np.float32)
+    narrow_m[[1, 3]] = 1.5, 3.0
+    ring = ObstacleRing(0, 0, unknown, unknown, free_m, np.eye(4), (), unwatched=())
+    found = keyframe_free(ring, narrow_m, CameraFloor(replace(make_rig(), T_base_rig=stated), 0.0), np.eye(4))
+    expected = [2.0, -1.5, 2.0, -2.0, 2.0] if height_m else [0.0] * 5
+    np.testing.assert_allclose(found[:5], expected, atol=1e-3)
 
 
 def test_without_a_floor_nothing_is_known_and_the_summary_names_it() -> None:
