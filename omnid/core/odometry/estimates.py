@@ -50,6 +50,7 @@ class PoseEstimate:
     cost: float = 0.0
     in_view: int = 0  # landmarks by which it is meant
     runner_up: Array | None = None  # (6,) [t; r] of the step to a pose that explains the images nearly as well
+    through_gap: bool = False  # True if that is a motion through refused poses, on which no later step decides
     # (K,) rows of the local map whose landmarks support that pose instead
     contradicting: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
     doubtful_depths: bool = False  # True while the landmarks may all have another depth: it is in the covariance

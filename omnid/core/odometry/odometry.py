@@ -28,15 +28,13 @@ from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
+from omnid.core.odometry.untracked_motion import UntrackedMotion
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-# Sigma of the velocity while poses are refused [m/s, rad/s]. If a pose is refused for its speed only, its speed is the
-# sigma, because it may be right.
-UNTRACKED_SPEED_SIGMA = 0.5
 SHORTEST_STEP_S = 0.05  # the speed limit counts at least this time, so that two close stamps refuse no pose
 # Corners per landmark of the smallest map: two make a frame textured, since not all will be located; four are sought.
 TEXTURED_CORNERS, COUNTED_CORNERS = 2, 4
@@ -64,10 +62,9 @@ class VisualOdometry:
         self._motion = MotionModel(limits)
         self._static_mask = StaticMask(model.cylinder.edges_rad)
         self._T_odom_rect, self._covariance = np.eye(4), np.zeros((6, 6))
-        self._T_at_fix = self._T_odom_rect  # the pose when the map was in view last
+        self._untracked = UntrackedMotion(self._T_odom_rect)  # since the map was in view last
         self._previous: PaddedPanorama | None = None  # the last accepted lower panorama; None: there is no map
         self._status = TrackingStatus()
-        self._untracked_mps = UNTRACKED_SPEED_SIGMA
         self._doubt: Doubt | None = None  # other motions that may have been made in place of the chosen ones
         self._step: tuple[Array, Array] | None = None  # last step by the cameras, and its covariance
         self._requested: KeyframeRequest | None = None  # keyframe that the last frame asked for, see complete
@@ -112,14 +109,16 @@ class VisualOdometry:
         # Predicted poses were published: one in a place far from them does not close the gap, as odom would jump.
         gap = GapStep.between(T_predicted, estimate.T_odom_rect) if estimate and after_refusal else GapStep()
         if estimate is None or gap.is_far or not self._is_plausible(estimate, dt_s):
-            self._untracked_mps = max(self._untracked_mps, too_fast_mps)
+            if tracked is not None and too_fast_mps:
+                self._untracked = self._untracked.refused(tracked.T_odom_rect, self._since_fix_s(dt_s))
             known = estimate is not None and gap.is_far and estimate.inliers >= self._limits.good_inliers
-            stayed = GapStep.between(self._T_at_fix, T_predicted).keeps_view and not supports(tracked, T_predicted)
+            stayed = self._untracked.keeps_view(T_predicted) and not supports(tracked, T_predicted)
             refused = self._refuse(frame, usable, T_predicted, dt_s, stayed=stayed, gap=gap if known else None)
             return replace(refused, refused_mps=too_fast_mps)
         estimate = self._exposures.start_again(
             frame, usable, estimate, dt_s, request=self._request, tracked=self._search.tracked
         )
+        estimate = self._untracked.in_doubt(estimate, self._since_fix_s(dt_s))
 
         # 6. Update the filter (eq. 11), the pose, the mask of what is fixed to the rig, and the map.
         self._accept(frame, estimate, dt_s, turned=gap.is_turned)
@@ -287,10 +286,11 @@ class VisualOdometry:
         elif facts.carried:
             before_s = after_s
         if after_s > before_s:
-            sigma = np.repeat([self._untracked_mps, UNTRACKED_SPEED_SIGMA], 3)
-            self._covariance = bounded(self._covariance + np.diag(sigma**2) * (after_s**2 - before_s**2))
+            self._covariance = bounded(
+                self._covariance + np.diag(self._untracked.sigma**2) * (after_s**2 - before_s**2)
+            )
         if after_s == 0:
-            self._untracked_mps, self._T_at_fix = UNTRACKED_SPEED_SIGMA, self._T_odom_rect
+            self._untracked = UntrackedMotion(self._T_odom_rect)
 
     def _update_map(
         self, frame: StereoFrame, usable: Flags, estimate: PoseEstimate, exposure: Exposure, dt_s: float

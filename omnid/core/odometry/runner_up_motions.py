@@ -127,12 +127,14 @@ def doubt_after(before: Doubt | None, T_odom_prev: Array, estimate: PoseEstimate
     velocity = (estimate.T_odom_rect[:3, 3] - T_odom_prev[:3, 3]) / dt_s
     if estimate.runner_up is None:
         return None if before is None else before.after_clear_step(velocity, dt_s)
-    displacement, is_right = estimate.runner_up, True
+    displacement, is_right = estimate.runner_up, not estimate.through_gap
     if before is not None:
         # The same mistake in each step adds up.
         earlier = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ before.T_odom_rect) @ before.displacement
         displacement = earlier + displacement * (1.0 if earlier[:3] @ displacement[:3] >= 0 else -1.0)
-        is_right = before.is_right and bool(np.linalg.norm(velocity - before.chosen_mps) <= most_change_mps(dt_s))
+        is_right = (
+            is_right and before.is_right and bool(np.linalg.norm(velocity - before.chosen_mps) <= most_change_mps(dt_s))
+        )
     runner_up_mps = velocity + estimate.T_odom_rect[:3, :3] @ estimate.runner_up[:3] / dt_s
     return Doubt(estimate.T_odom_rect, displacement, velocity, runner_up_mps, is_right)
 

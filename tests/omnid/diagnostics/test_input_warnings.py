@@ -74,7 +74,7 @@ def test_after_poses_that_were_refused_a_few_landmarks_are_no_pose(tmp_path: Pat
     found, T = replay(tmp_path / "log.mcap", tmp_path / "rig.toml"), read_tum(tmp_path / "truth.txt").T
     wrong = (se3.inverse(T[0]) @ T)[1:, :3, 3] - found.T_odom_rig[1:, :3, 3]
     sigma_m = np.sqrt(np.trace(found.covariances[1:, :3, :3], axis1=1, axis2=2))
-    assert (np.linalg.norm(wrong, axis=1) < 30 * sigma_m).all()
+    assert (np.linalg.norm(wrong, axis=1) < 13 * sigma_m).all()
 
 
 def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene: Path) -> None:
