@@ -18,15 +18,16 @@ from omnid.core.obstacles.column import THIN_M
 
 Floats = NDArray[np.float32]
 
-# Directions on either side whose floor is compared: from beside a thing of 10 cm at 1 m, to as many as are even.
+# Directions on either side whose floor is compared, because nearer ones may show a thing of 10 cm at 1 m, and farther
+# ones another floor.
 BESIDE: Final = range(5, 13)
 # Log-odds of a direction from which something narrow stands there. By trial on development seeds: with 4 less floor of
 # maps is free, with 6 twice as many cells of poles are.
 NARROW_SUM: Final = 5.0
-# Part of the log-odds without any evidence: a little less evidence than beside it is not hidden floor.
+# Part of the log-odds without any evidence, because a little less evidence than beside it is not hidden floor.
 NARROW_SHARE: Final = 0.5
-# Disparities before the first one that is hidden at which its foot may be, as patches there show the floor before it:
-# 1.3 to 5.3 of them in 90 % of the views of poles, development seed 1.
+# Disparities before the first one that is hidden at which its foot may be, because patches there show the floor before
+# it: 1.3 to 5.3 of them in 90 % of the views of poles, development seed 1.
 FOOT_BINS: Final = 5
 STEPS: Final = 4  # Of a direction, so that all sectors that it covers are found.
 
