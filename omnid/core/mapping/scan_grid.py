@@ -46,8 +46,8 @@ EDGE_SECTORS: Final = 2
 # Factor [1/m] of the squared range: so much farther may stand what is narrow and ends the free floor. It is four
 # disparities of the usual rig; with 0.12 and 0.18, by trial on development seeds, as many cells of poles were free.
 NARROW: Final = 0.14
-# What is narrow and ends the floor nearer than this may stand anywhere before it, because nearer floor may be out of view:
-# up to 0.8 to 1 m with the usual rig. Without, 4 of 89 cells of poles were free on development seeds, with it 2.
+# What is narrow and ends the floor nearer than this may stand anywhere before it, because nearer floor may be out of
+# view, up to 0.8 to 1 m with the usual rig. Without, 4 of 89 cells of poles were free on development seeds, with it 2.
 TOO_NEAR_M: Final = 1.0
 # From farther away a view through a cell is not sure that nothing narrow stands there, because one view shows 64 % of
 # plain poles of 3 to 4.5 cm from 1.3 to 1.7 m, 21 % from 1.7 to 2.6 m (development seed 1).
