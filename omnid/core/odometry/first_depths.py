@@ -46,6 +46,9 @@ LEAST_SURE = 0.4
 # that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
 ROUNDS, FINER = 3, 3  # rounds, each so many times as fine, because a tenth of a degree then remains
+# Share of the bearings that fit the best turn from which another turn fits as well, and how far apart both are, rad:
+# with a view of 30 degrees on a wall all of 10 degrees do, with a full turn those of 1.5 degrees, as measured.
+ALIKE_SHARE, ALIKE_TURN = 0.9, math.radians(2.5)
 TOLERANCE_PX = 1.5  # distance of a track from its epipolar line, because vehicles roll and pitch by half a degree
 # Parallax from which a landmark votes: with errors of SIGMA_PX, as measured for tracks without warped patches, its
 # range errs by an eighth, so that neighbouring courses differ by two sigmas.
@@ -165,7 +168,10 @@ class FirstDepths:
         cylinder = self._model.cylinder
         before, now = cylinder.rays(self._views[:, :2]), cylinder.rays(self._pixels)
         now /= np.linalg.norm(now, axis=1, keepdims=True)
-        direction, turn = most_likely_motion(before, now, cylinder.focal_px)
+        motion = most_likely_motion(before, now, cylinder.focal_px)
+        if motion is None:
+            return np.full(len(now), np.nan), np.ones(len(now))
+        direction, turn = motion
         t, turned = (
             np.array([math.cos(direction), math.sin(direction), 0.0]),
             before @ se3.rotation_exp([0.0, 0.0, turn]).T,
@@ -181,8 +187,11 @@ class FirstDepths:
         return np.where(known, ranges, np.nan), parallax_px
 
 
-def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float]:
-    """Return direction and turn [rad] of the horizontal motion that most bearings (N, 3) fit, before and after it."""
+def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float] | None:
+    """Return direction and turn [rad] of the horizontal motion that most bearings (N, 3) fit, before and after it.
+
+    None: other turns fit as well, because what fills a narrow view turns as it moves aside.
+    """
     direction, turn = np.arange(0.0, math.pi, DIRECTION_STEP), np.arange(-MOST_TURN, MOST_TURN + TURN_STEP, TURN_STEP)
     steps = DIRECTION_STEP, TURN_STEP
     for _ in range(ROUNDS):
@@ -192,6 +201,9 @@ def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[floa
             row[:] = np.exp(-0.5 * (errors_px / TOLERANCE_PX) ** 2).sum(axis=1)
         best = np.unravel_index(int(scores.argmax()), scores.shape)
         at = float(direction[best[1]]), float(turn[best[0]])
+        as_good = scores.max(axis=1) > ALIKE_SHARE * scores.max()
+        if np.abs(turn[as_good] - at[1]).max() > ALIKE_TURN:
+            return None
         steps = steps[0] / FINER, steps[1] / FINER
         direction, turn = (middle + step * np.arange(-FINER, FINER + 1) for middle, step in zip(at, steps, strict=True))
     return at

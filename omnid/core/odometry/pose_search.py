@@ -121,7 +121,9 @@ class PoseSearch:
         other = None if first is None or estimate.doubtful_depths else first.runner_up(estimate.T_odom_rect)
         if other is None:
             return estimate
-        return replace(estimate, covariance=estimate.covariance + np.outer(other, other), doubtful_depths=True)
+        # Of landmarks with several depths a pose may also err to the side.
+        covariance = estimate.covariance + np.diag(np.repeat([float(other[:3] @ other[:3]), 0.0], 3))
+        return replace(estimate, covariance=covariance, doubtful_depths=True)
 
     def _by_outliers(
         self, frame: StereoFrame, estimate: PoseEstimate, exposure: Exposure, last: LastFrame, dt_s: float

@@ -75,3 +75,10 @@ def test_few_or_scattered_votes_decide_nothing() -> None:
     distances, sigmas = votes_of(0, 100)
     distances[:, 0] = np.linspace(math.log(0.01), math.log(10.0), 100)
     assert voted(distances, sigmas, ANYWHERE) is None
+
+
+def test_in_a_narrow_view_of_a_wall_no_motion_is_the_likeliest() -> None:
+    """A step aside before a wall 3 m away looks like a turn where the view is 20 degrees wide."""
+    rng = np.random.default_rng(9)
+    wall = np.column_stack([np.full(200, 3.0), rng.uniform(-0.5, 0.5, 200), rng.uniform(-0.4, 0.4, 200)])
+    assert most_likely_motion(bearings(wall), bearings(wall - (0.0, 0.1, 0.0)), FOCAL_PX) is None
