@@ -67,6 +67,9 @@ WHEELS_RATIO = 1.2
 OTHER_RATIO = 1.1  # Distances whose ratio is less are one, because the votes for one distance are spread so far.
 # Covariance [px^2] of a view whose upper row was moved to another peak, because only that is known less well.
 VIEW_NOISE = np.diag([0.0, 0.0, DISPARITY_SIGMA_PX**2])
+# Share of the disparities decided on that were those of dense stereo, above which the others are kept as well, because
+# RANSAC leaves out so few wrong ones.
+RIGHT_SHARE = 0.9
 VOTED_SIGMAS = 3.0  # within which a disparity is the voted one, because three in a thousand of the right ones are not
 
 
@@ -125,12 +128,15 @@ class FirstDepths:
         if votes is None:
             return
         self._larger_share = 0.0 if votes.runner_up_m is None else votes.runner_up_m / votes.moved_m - 1.0
-        # 3. Landmarks take the disparity of that distance; those without one, or without a vote, may be wrong.
+        # 3. Landmarks take the disparity of that distance. Those without one are wrong, and so may be those without a
+        #    vote, unless nearly all that were decided on had been right.
         off = np.abs(np.log(distances / votes.moved_m)) / sigmas
         off[~np.isfinite(off)] = np.inf
         chosen, each = off.argmin(axis=1), np.arange(len(off))
-        is_right = (off[each, chosen] < VOTED_SIGMAS) | (~self._repeats & ~np.isfinite(ranges))
-        moved = is_right & (chosen > 0)
+        is_decided = off[each, chosen] < VOTED_SIGMAS
+        were_right = bool(np.mean(chosen[is_decided & self._repeats] == 0) > RIGHT_SHARE)
+        is_right = is_decided | (~np.isfinite(ranges) & (~self._repeats | were_right))
+        moved = is_decided & (chosen > 0)
         views = self._views[moved]
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
         store.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))

@@ -26,7 +26,7 @@ def test_the_fastest_refused_pose_is_the_sigma_of_the_speed() -> None:
 
 
 def test_a_pose_found_again_may_have_gone_on_at_the_refused_speed() -> None:
-    """After 0.5 s at 8 m/s the vehicle is 4 m ahead of the fix, and to the right of a pose that is turned to the left."""
+    """After 0.5 s at 8 m/s the vehicle is 4 m ahead of the fix, to the right of a pose that is turned to the left."""
     found = PoseEstimate(at(0, 0, 0, 0, 0, np.pi / 2), np.zeros((6, 6)), 100, 100, 100)
     assert UntrackedMotion(FIX).in_doubt(found, 0.5) is found
     doubtful = UntrackedMotion(FIX).refused(at(0.8, 0, 0, 0, 0, 0), 0.1).in_doubt(found, 0.5)
