@@ -63,7 +63,7 @@ class PoseEstimate:
 
     @property
     def is_sure(self) -> bool:
-        """Whether no other motion or depths explain the images nearly as well."""
+        """True if no other motion or depths explain the images nearly as well."""
         return self.runner_up is None and not self.doubtful_depths
 
     @property

@@ -1,4 +1,4 @@
-"""What is known of the motion since the last accepted pose, while poses are refused.
+"""Motion since the last accepted pose, while poses are refused: how fast it may be, and what else explains a pose.
 
 The speed is unknown, and the position's sigma grows with it. A pose that is refused for its speed alone may be right,
 because the vehicle may be faster than its limit says. Where the map is found again after that, two motions explain it:
@@ -34,7 +34,7 @@ class UntrackedMotion:
         return np.repeat([max(UNTRACKED_SPEED_SIGMA, float(np.linalg.norm(self.too_fast))), UNTRACKED_SPEED_SIGMA], 3)
 
     def keeps_view(self, T_odom_rect: Array) -> bool:
-        """Whether a pose (4, 4) has the same landmarks in view as the last accepted one."""
+        """Return whether a pose (4, 4) has the same landmarks in view as the last accepted one."""
         return GapStep.between(self.T_at_fix, T_odom_rect).keeps_view
 
     def refused(self, T_odom_rect: Array, since_s: float) -> UntrackedMotion:
