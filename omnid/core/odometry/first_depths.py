@@ -5,7 +5,8 @@ their distance: a world that is larger by 1 / (1 - k c / B) explains the pair as
 stereo may have taken any of its disparities d_k, and landmarks of an earlier keyframe, which would decide, there are
 none. The lower panorama alone, followed from the keyframe on, decides:
 
-1. Motion without depths: of horizontal directions t and turns R the ones that most pairs of bearings (a_i, b_i) fit,
+1. Motion without depths: of directions t at right angles to the baseline and turns R about it, those that most pairs
+   of bearings (a_i, b_i) fit,
 
        e_i = f (t x R a_i) b_i / |t x R a_i|.
 
@@ -120,6 +121,8 @@ class FirstDepths:
         # 1. Follow them from the keyframe on.
         self._most_m, self._sensed_m = self._most_m + step_m[0], self._sensed_m + step_m[1]
         self._follow(lower, klt)
+        if len(self._ids) < LEAST_VOTES:
+            return
         # 2. Vote for the distance.
         ranges, parallax_px = self._ranges()
         distances = self._model.cylinder.focal_px * self._model.baseline_m / (self._disparities * ranges[:, None])
@@ -134,7 +137,8 @@ class FirstDepths:
         off[~np.isfinite(off)] = np.inf
         chosen, each = off.argmin(axis=1), np.arange(len(off))
         is_decided = off[each, chosen] < VOTED_SIGMAS
-        were_right = bool(np.mean(chosen[is_decided & self._repeats] == 0) > RIGHT_SHARE)
+        own = chosen[is_decided & self._repeats] == 0
+        were_right = own.sum() > RIGHT_SHARE * len(own)
         is_right = is_decided | (~np.isfinite(ranges) & (~self._repeats | were_right))
         moved = is_decided & (chosen > 0)
         views = self._views[moved]
@@ -187,7 +191,7 @@ class FirstDepths:
         a2, ab = (turned**2).sum(axis=1), (turned * now).sum(axis=1)
         sine2 = a2 - ab**2
         ranges = (ab * (now @ t) - turned @ t) / np.maximum(sine2, 1e-12)
-        ranges *= np.sign(np.median(ranges[sine2 > np.median(sine2)])) if len(ranges) else 1.0
+        ranges *= np.sign(np.median(ranges[sine2 >= np.median(sine2)]))
         parallax_px = cylinder.focal_px * np.sqrt(np.maximum(sine2, 1e-12) / a2)
         known = (np.abs(error_px) < TOLERANCE_PX) & (parallax_px > PARALLAX_PX) & (ranges > 0)
         return np.where(known, ranges, np.nan), parallax_px
@@ -207,7 +211,7 @@ def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[floa
             row[:] = np.exp(-0.5 * (errors_px / TOLERANCE_PX) ** 2).sum(axis=1)
         best = np.unravel_index(int(scores.argmax()), scores.shape)
         at = float(direction[best[1]]), float(turn[best[0]])
-        as_good = scores.max(axis=1) > ALIKE_SHARE * scores.max()
+        as_good = scores.max(axis=1) >= ALIKE_SHARE * scores.max()
         if np.abs(turn[as_good] - at[1]).max() > ALIKE_TURN:
             return None
         steps = steps[0] / FINER, steps[1] / FINER
@@ -228,7 +232,9 @@ def epipolar_errors(turned: Array, now: Array, direction: Array | float) -> Arra
     c, s = np.cos(direction), np.sin(direction)
     x, y, z = turned.T
     across = c * y - s * x
-    return np.asarray((z * (s * now[:, 0] - c * now[:, 1]) + across * now[:, 2]) / np.hypot(z, across))
+    return np.asarray(
+        (z * (s * now[:, 0] - c * now[:, 1]) + across * now[:, 2]) / np.maximum(np.hypot(z, across), 1e-12)
+    )
 
 
 def voted(distances: Array, sigmas: Array, reach_m: tuple[float, float]) -> Votes | None:
