@@ -13,8 +13,8 @@ from calib.models.ocam import ASTIGMATISM_NAMES, TANGENTIAL_NAMES, OcamCamera
 from calib.models.unified import OMNI_NAMES, UnifiedCamera
 from calib.models.wavefront import WAVEFRONT_NAMES
 
-# One step of a wavefront's coefficient [m], because about half a pixel of a board at half a metre, as of the other
-# parameters.
+# One step of a wavefront's coefficient [m], so that it moves a board at half a metre by about half a pixel, as steps of
+# the other parameters do.
 WAVEFRONT_UNIT_M = 1e-3
 # A parameter: its name, its value, and one step in its own unit.
 _Row = tuple[str, float, float]
