@@ -86,8 +86,8 @@ class Keyframes:
         ids = self._map.add_keyframe(keyframe, new.views, new.slopes, new.whole_noise, new.pixels)
         self._map.late_depths.added(ids, new)
         if is_first and frame.times.is_at_once:
-            first = FirstDepths((frame.lower, frame.upper), request.T_odom_rect, ids, new.views, self._model)
-            self._map.first_depths = first if first.is_open else None
+            pair = frame.lower, frame.upper
+            self._map.first_depths = FirstDepths.of(pair, keyframe, ids, new.views, self._model)
         if len(self._map) >= self._limits.min_inliers:
             self._relocaliser.add(replace(frame, exposure=request.exposure), keyframe)
         self._most_inliers, self._tracked_s = 0, 0.0
