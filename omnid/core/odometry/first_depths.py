@@ -133,7 +133,7 @@ class FirstDepths:
         ranges, parallax_px = self._ranges()
         distances = self._model.cylinder.focal_px * self._model.baseline_m / (self._disparities * ranges[:, None])
         sigmas = np.hypot(SIGMA_PX / parallax_px[:, None], DISPARITY_SIGMA_PX / self._disparities) + LEAST_SIGMA
-        votes = voted(np.log(distances), sigmas, self._reach_m())
+        votes = voted(np.log(distances), sigmas, reach_m(self._most_m, self._sensed_m))
         if votes is None:
             return
         self._larger_share = 0.0 if votes.runner_up_m is None else votes.runner_up_m / votes.moved_m - 1.0
@@ -152,12 +152,6 @@ class FirstDepths:
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
         store.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
         store.keep(self._ids[is_right])
-
-    def _reach_m(self) -> tuple[float, float]:
-        """Return the least and the largest distance from the keyframe that are possible."""
-        if self._sensed_m > SAME_M:
-            return self._sensed_m / WHEELS_RATIO, self._sensed_m * WHEELS_RATIO
-        return 0.0, self._most_m
 
     def _largest_share(self) -> float:
         """Return by which share of a motion it may be larger or smaller; 0: enough landmarks do not repeat."""
@@ -199,6 +193,14 @@ class FirstDepths:
         parallax_px = cylinder.focal_px * np.sqrt(np.maximum(sine2, 1e-12) / a2)
         known = (np.abs(error_px) < TOLERANCE_PX) & (parallax_px > PARALLAX_PX) & (ranges > 0)
         return np.where(known, ranges, np.nan), parallax_px
+
+
+def reach_m(most_m: float, sensed_m: float) -> tuple[float, float]:
+    """Return the least and the largest distance that are possible, by the speed limit and by wheels; NaN: there are none.
+
+    Wheels that report hardly any motion may not have begun to turn.
+    """
+    return (sensed_m / WHEELS_RATIO, sensed_m * WHEELS_RATIO) if sensed_m > SAME_M else (0.0, most_m)
 
 
 def _disparities(pair: Pair, views: Array, model: StereoModel) -> Array:

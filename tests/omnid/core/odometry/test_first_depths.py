@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.first_depths import LEAD_VOTES, most_likely_motion, voted
+from omnid.core.odometry.first_depths import LEAD_VOTES, WHEELS_RATIO, most_likely_motion, reach_m, voted
 
 Array = NDArray[np.float64]
 
@@ -67,6 +67,14 @@ def test_a_distance_with_nearly_as_many_votes_is_the_runner_up() -> None:
 def test_a_distance_out_of_reach_is_no_runner_up(reach_m: tuple[float, float]) -> None:
     found = voted(*votes_of(100, 0), reach_m)
     assert found is not None and found.moved_m == pytest.approx(MOVED_M, rel=0.05) and found.runner_up_m is None
+
+
+@pytest.mark.parametrize(
+    ("sensed_m", "reach"),
+    [(math.nan, (0.0, 0.5)), (0.01, (0.0, 0.5)), (0.3, (0.3 / WHEELS_RATIO, 0.3 * WHEELS_RATIO))],
+)
+def test_wheels_bound_the_distance_once_they_turn(sensed_m: float, reach: tuple[float, float]) -> None:
+    assert reach_m(0.5, sensed_m) == pytest.approx(reach)
 
 
 def test_few_or_scattered_votes_decide_nothing() -> None:
