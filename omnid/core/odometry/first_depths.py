@@ -196,7 +196,7 @@ class FirstDepths:
 
 
 def reach_m(most_m: float, sensed_m: float) -> tuple[float, float]:
-    """Return the least and the largest distance that are possible, by the speed limit and by wheels; NaN: there are none.
+    """Return the least and the largest distance that are possible, by the speed limit and by wheels (NaN: none).
 
     Wheels that report hardly any motion may not have begun to turn.
     """
