@@ -92,6 +92,7 @@ class FirstDepths:
         """pair: lower and upper panorama of the keyframe; ids (N,) and views (N, 3) [px] of its landmarks."""
         self._model, self._T_odom_rect, self._ids, self._views = model, keyframe.T_odom_rect, ids, views
         self._disparities = _disparities(pair, views, model)
+        self._taken = np.zeros(len(ids), np.intp)  # which of its disparities a landmark has
         self._last, self._pixels = pair[0], views[:, :2]
         # The largest distance from the keyframe that is possible, and the one by wheels; NaN: not known.
         self._most_m, self._sensed_m = 0.0, 0.0
@@ -147,7 +148,8 @@ class FirstDepths:
         own = chosen[is_decided & repeats] == 0
         were_right = own.sum() > RIGHT_SHARE * len(own)
         is_right = is_decided | (~np.isfinite(ranges) & (~repeats | were_right))
-        moved = is_decided & (chosen > 0)
+        moved = is_decided & (chosen != self._taken)
+        self._taken = np.where(is_decided, chosen, self._taken)
         views = self._views[moved]
         views[:, 2] = views[:, 1] + self._disparities[each, chosen][moved]
         store.replace_views(self._ids[moved], views, np.tile(VIEW_NOISE, (len(views), 1, 1)))
@@ -167,6 +169,7 @@ class FirstDepths:
         pixels, found = track(self._last, lower, self._pixels, self._pixels, klt)
         self._last, self._pixels = lower, pixels[found]
         self._ids, self._views, self._disparities = self._ids[found], self._views[found], self._disparities[found]
+        self._taken = self._taken[found]
 
     def _ranges(self) -> tuple[Array, Array]:
         """Return ranges (N,) of the landmarks from the keyframe, in units of the distance, and parallaxes (N,) [px].
