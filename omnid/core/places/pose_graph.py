@@ -58,8 +58,8 @@ class PoseGraphResult:
     poses: Array  # (N, 4, 4)
     weights: Array  # (M,) 1 for odometry, 0 to 1 for loops
     squared: Array  # (M,) squared Mahalanobis distances of the edges from the result
-    # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite if odometry and accepted loops join
-    # it to none.
+    # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite if neither odometry nor accepted
+    # loops join it to one of them.
     covariance: Array
     steps: int  # steps of Gauss-Newton
     converged: bool
