@@ -165,13 +165,17 @@ class Odometry:
     def _process(
         self, stamp_ns: int, lower: InputImage, upper: InputImage, upper_stamp_ns: int | None
     ) -> OdometryUpdate:
+        # 1. Refuse what is no pair of this rig; it changes nothing.
         stamp_ns = self._later_stamp_ns(stamp_ns)
         images = (self._checked("lower", lower), self._checked("upper", upper))
         skew_ns = self._checked_skew_ns(stamp_ns, upper_stamp_ns)
+        # 2. Refuse an image that repeats an earlier one; it counts as an earlier one all the same.
         self._refuse_repeated(images)
+        # 3. Follow the time between the exposures, which the stamps give with jitter.
         if skew_ns is not None:
             self._skew.add(skew_ns)
         skew_s = 0.0 if skew_ns is None else self._skew.exposure_ns * 1e-9
+        # 4. Estimate the motion.
         pair = FramePair(self._pairs, stamp_ns, *images, skew_s)
         self._pairs, self._stamp_ns = self._pairs + 1, stamp_ns
         return self._front_end.process(pair)

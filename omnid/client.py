@@ -157,7 +157,26 @@ def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
-class Robot:
+class _Connection:
+    """A session that is ended once; zenoh undeclares what is declared on it when nothing refers to it any longer."""
+
+    def __init__(self, settings: BusConfig, timeout_s: float) -> None:
+        self._session = open_client(settings, timeout_s)
+        self._declared: list[object] = []
+
+    def close(self) -> None:
+        """End the connection; a second call does nothing."""
+        with suppress(zenoh.ZError):
+            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Robot(_Connection):
     """A connection to a robot, direct or through a router.
 
     settings: for TLS, user and password; the same as section [bus] of omnid's configuration.
@@ -174,8 +193,7 @@ class Robot:
         endpoints = (connect,) if isinstance(connect, str) else tuple(connect)
         given = settings or BusConfig(robot=robot, connect=endpoints)
         self.name = given.robot
-        self._session = open_client(given, timeout_s)
-        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
+        super().__init__(given, timeout_s)
 
     def subscribe(self, kind: type[T]) -> Subscription[T]:
         """Subscribe to messages of a kind: Pose, Diagnostics, Cloud, Map, NavigationReport or Scan."""
@@ -248,25 +266,13 @@ class Robot:
         replies = self._session.liveliness().get(f"{self.name}/alive", timeout=_QUERY_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
 
-    def close(self) -> None:
-        """End the connection; a second call does nothing."""
-        with suppress(zenoh.ZError):
-            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class Fleet:
+class Fleet(_Connection):
     """A connection to all robots that a router, or a robot, reaches; settings as for Robot."""
 
     def __init__(self, settings: BusConfig, timeout_s: float = 0.0) -> None:
         """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
-        self._session = open_client(settings, timeout_s)
-        self._declared: list[object] = []  # zenoh undeclares what is no longer referred to
+        super().__init__(settings, timeout_s)
 
     def on_message(self, callback: Callable[[str, bytes, bytes], None], topics: Sequence[str]) -> None:
         """Call callback(key, payload, attachment) for each message on topics such as "odom", in a zenoh thread.
@@ -302,17 +308,6 @@ class Fleet:
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-
-    def close(self) -> None:
-        """End the connection; a second call does nothing."""
-        with suppress(zenoh.ZError):
-            self._session.close()  # type: ignore[no-untyped-call]  # the stub has no return type
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
 
 def subscribe(

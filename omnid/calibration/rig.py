@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -44,6 +45,7 @@ BASELINE_RANGE_M = (0.01, 3.0)
 # Relative difference from the baseline by ruler. A tenth is no error of a ruler; 2 % are 4 mm of 200 mm.
 REFUSED_PART, WARNING_PART = 0.1, 0.02
 GivenCameras = tuple[CameraFile, CameraFile]
+FitEach = Callable[[list[PairView], PrintShape], FittedCameras]  # Each camera by its views of a board of that shape.
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,34 +130,48 @@ def calibrate_rig(
         progress(line)
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
-    # 3. Fit each camera to all its views, unless the cameras are known.
+    # 3. Find the view of the cameras, that of a mirror or of a lens, unless the cameras are known.
+    fit_each: FitEach
     if cameras is None:
         chosen = _of_one_lens(view, images, progress)
         direction, shown = view_of_images(chosen, _by_camera(images, views), board, progress)
-        single = fit_cameras(views, images, board, model, direction, AS_DRAWN, progress)
+        fit_each = partial(fit_cameras, images, board, model, direction, progress)
     else:
-        single, shown = FittedCameras.known(cameras, views), []
-    # 4. Fit the transform between the cameras, and the cameras with it.
+        fit_each, shown = (lambda seen, _: FittedCameras.known(cameras, seen)), []
+    # 4. Fit the cameras, and the transform between them.
     refined = cameras is None or refine_cameras
+    found = _fit(views, images, board, fit_each, refined, progress)
+    # 5. Compare the baseline with what it can be.
+    notes = [*images.notes, *_check_baseline(found, board, expected_baseline_m), *shown]
+    # 6. Build the rig with masks and covariance, and predict the errors of drives.
+    return _result(found, images, cameras, notes, with_struts=with_struts, refined=refined)
+
+
+def _fit(
+    views: list[PairView],
+    images: PairedImages,
+    board: AnyBoard,
+    fit_each: FitEach,
+    refined: bool,
+    progress: Progress,
+) -> RigCalibration:
+    """Fit each camera and the transform between them; where refined, the cameras once more with the transform."""
+    # 1. Fit each camera to all its views.
+    single = fit_each(views, AS_DRAWN)
     rejected = [] if refined else _views_of_one_camera(views)
-    found = _fit_rig(single.views, single, board, refined, AS_DRAWN, progress)
-    # 5. Refine the corners with the cameras, and fit the rig again.
+    # 2. Fit the transform between the cameras, and the cameras with it.
+    found = _fit_rig(single, board, refined, AS_DRAWN, progress)
+    # 3. Refine the corners with the cameras, and fit the rig again.
     found = refine_rig_calibration(found, images.sides, refined)
     rejected += [*single.rejected, *found.rejected]
-    # 6. If the print differs from its drawing, fit the cameras and the rig again with its shape.
+    # 4. If the print differs from its drawing, fit the cameras and the rig again with its shape.
     shape = rig_print_shape(found, refined)
     if not shape.is_as_drawn:
         progress("the board is not as drawn: once more with its shape")
-        if cameras is None:
-            single = fit_cameras(list(found.views), images, board, model, direction, shape, progress)
-            rejected += single.rejected
-        found = _fit_rig(single.views if cameras is None else found.views, single, board, refined, shape, progress)
-        rejected += found.rejected
-    found = replace(found, rejected=tuple(rejected))
-    # 7. Compare the baseline with what it can be.
-    notes = [*images.notes, *_check_baseline(found, board, expected_baseline_m), *shown]
-    # 8. Build the rig with masks and covariance, and predict the errors of drives.
-    return _result(found, images, cameras, notes, with_struts=with_struts, refined=refined)
+        single = fit_each(list(found.views), shape)
+        found = _fit_rig(single, board, refined, shape, progress)
+        rejected += [*single.rejected, *found.rejected]
+    return replace(found, rejected=tuple(rejected))
 
 
 def _result(
@@ -204,17 +220,12 @@ def _of_one_lens(choice: ViewChoice, images: PairedImages, progress: Progress) -
 
 
 def _fit_rig(
-    views: Sequence[PairView],
-    single: FittedCameras,
-    board: AnyBoard,
-    refined: bool,
-    shape: PrintShape,
-    progress: Progress,
+    single: FittedCameras, board: AnyBoard, refined: bool, shape: PrintShape, progress: Progress
 ) -> RigCalibration:
-    """Fit the transform between the cameras to views, and the cameras with it if refined."""
+    """Fit the transform between the cameras to their views, and the cameras with it if refined."""
     if not refined:
-        return fit_rig(views, board, single.cameras, refined, shape)
-    selected = select_rig(views, board, single.cameras, single.polynomials, shape)
+        return fit_rig(single.views, board, single.cameras, refined, shape)
+    selected = select_rig(single.views, board, single.cameras, single.polynomials, shape)
     for number, score in enumerate(selected.scores):
         progress(f"rig: {'compared' if number else 'selected'} {score}")
     return selected.calibration

@@ -32,13 +32,13 @@ class FittedCameras:
 
 
 def fit_cameras(
-    views: list[PairView],
     images: PairedImages,
     board: AnyBoard,
     model: ModelChoice,
     direction: View,
-    shape: PrintShape,
     progress: Progress,
+    views: list[PairView],
+    shape: PrintShape,
 ) -> FittedCameras:
     """Fit each camera to all its views; views that do not fit their camera are rejected.
 

@@ -6,18 +6,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from calib.rig_file import read_rig
 from omnid.commands.height_option import height, height_of
-from omnid.commands.log_options import add_cameras, attached_rig_of
+from omnid.commands.log_options import add_log_with_rig, rig_of
 from omnid.sinks.files import check_outputs
 
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `height` to `omnid calibrate`."""
     parser = actions.add_parser("height", help="the height of the cameras above the floor, and their tilt, from a log")
-    parser.add_argument("log", type=Path, metavar="LOG", help="a log in which the floor is seen all around")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    add_cameras(parser, "the {camera} camera's topic")
+    add_log_with_rig(parser, "a log in which the floor is seen all around")
     parser.add_argument("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the file of --rig"
@@ -32,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.output:
         check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
-    rig = read_rig(args.rig) if args.rig else attached_rig_of(args)
+    rig = rig_of(args)
     prepare_kernels()
     found = calibrate_height(args.log, rig, (args.lower, args.upper))
     print(found)

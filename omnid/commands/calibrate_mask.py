@@ -5,17 +5,14 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from calib.rig_file import read_rig
-from omnid.commands.log_options import add_cameras, attached_rig_of
+from omnid.commands.log_options import add_log_with_rig, rig_of
 from omnid.sinks.files import check_outputs
 
 
 def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `mask` to `omnid calibrate`."""
     parser = actions.add_parser("mask", help="masks of what is fixed to the cameras, such as reflections of lenses")
-    parser.add_argument("log", type=Path, metavar="LOG", help="a log in which the robot turns once on the spot")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    add_cameras(parser, "the {camera} camera's topic")
+    add_log_with_rig(parser, "a log in which the robot turns once on the spot")
     parser.add_argument(
         "-o", "--output", type=Path, metavar="FILE", help="write the rig with these masks; may be the file of --rig"
     )
@@ -29,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.output:
         check_outputs([("--output", args.output)], [("the log that is read", args.log)] * args.log.is_file())
-    rig = read_rig(args.rig) if args.rig else attached_rig_of(args)
+    rig = rig_of(args)
     prepare_kernels()
     found = calibrate_mask(args.log, rig, (args.lower, args.upper))
     print(found)

@@ -1,9 +1,10 @@
-"""The options --lower and --upper, which name the cameras, and the rig that is attached to a log."""
+"""The options that name a log, its cameras and its rig, and the rig that they name."""
 
 from __future__ import annotations
 
 import argparse
 from contextlib import closing
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:  # the help does not load it
@@ -18,6 +19,20 @@ def add_cameras(
     """Add --lower and --upper. text: the help of each. metavar: what they name."""
     for camera in ("lower", "upper"):
         parser.add_argument(f"--{camera}", metavar=metavar, help=text.format(camera=camera))
+
+
+def add_log_with_rig(parser: argparse._ActionsContainer, text: str) -> None:
+    """Add LOG, --rig, --lower and --upper. text: the help of LOG."""
+    parser.add_argument("log", type=Path, metavar="LOG", help=text)
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
+    add_cameras(parser, "the {camera} camera's topic")
+
+
+def rig_of(args: argparse.Namespace) -> Rig:
+    """Return the rig of args.rig, or the one that is attached to args.log. Raise OmnidError if there is none."""
+    from calib.rig_file import read_rig
+
+    return read_rig(args.rig) if args.rig else attached_rig_of(args)
 
 
 def attached_rig_of(args: argparse.Namespace) -> Rig:

@@ -53,11 +53,6 @@ def thread_times(pid: int = 0) -> dict[int, ThreadTime]:
     return times
 
 
-def process_time_s(pid: int = 0) -> float:
-    """Return the processor time of a whole process [s] (0: this one), with that of the threads that have ended."""
-    return _parsed(Path(f"/proc/{pid or os.getpid()}/stat").read_text()).used_s
-
-
 def shares(before: dict[int, ThreadTime], after: dict[int, ThreadTime], seconds: float) -> dict[str, ThreadShare]:
     """Return the shares of a core between two readings by name, the largest first."""
     found: dict[str, ThreadShare] = {}

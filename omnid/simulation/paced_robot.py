@@ -15,9 +15,6 @@ from dataclasses import replace
 from itertools import count
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import CAMERAS, Camera, Frame
 from drivers.motion import GyroSample, MotionSample
@@ -39,7 +36,6 @@ from omnid.transport.codec import OK
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
 
-Array = NDArray[np.float64]
 RECENT: Final = 30  # pairs over which the real-time factor is measured: three seconds
 POLL_S: Final = 0.05  # longest sleep, so that `close` takes effect soon
 

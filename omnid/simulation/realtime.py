@@ -14,7 +14,6 @@ from contextlib import suppress
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib import se3
 from drivers.cameras.camera_state import CameraState
@@ -32,7 +31,6 @@ from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
 from omnid.simulation.world import World
 
-Array = NDArray[np.float64]
 POLL_S: Final = 0.002  # Time between two checks whether the motion up to an exposure is known.
 LONGEST_WAIT_S: Final = 0.2  # Longest wait for the motion up to an exposure; then the newest pose is taken.
 SAMPLES: Final = 1  # per pixel and axis: textures are filtered, only edges of surfaces are not

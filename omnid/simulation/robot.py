@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -95,8 +94,3 @@ def traction(wheels: WheelErrors, seed: int) -> Traction:
         return left_m, right_m
 
     return over_ground
-
-
-def with_slips(robot: SimulatedRobot, slips: Sequence[Slip]) -> SimulatedRobot:
-    """Return the robot whose wheels slip at these times."""
-    return replace(robot, wheels=replace(robot.wheels, slips=tuple(slips)))

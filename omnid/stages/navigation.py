@@ -19,7 +19,7 @@ from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.drive import Navigation
 from omnid.core.navigation.follower import STAND
-from omnid.core.navigation.forecast import Forecast, forecast
+from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.local_planner import room_ahead
 from omnid.core.navigation.navigator import RESUME, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
@@ -110,13 +110,16 @@ class NavigationStage:
         return update
 
     def _at_pose(self, odometry: OdometryUpdate) -> NavigationUpdate | None:
-        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
+        # 1. After a reset forget the pose in the map: it leads from another odom.
         self._seq = odometry.seq
         if self._now is not None and self._now.resets != odometry.reset_counter:
-            # Poses in the map from before lead from another odom.
             self._in_map, self._reset_ns = None, odometry.stamp_ns
+        # 2. Put together where the base is and what is about it.
+        T_odom_base, _, velocity, _ = of_base(odometry, self._T_base_rig)
         pose, speed_mps = planar(T_odom_base), float(velocity[0])
-        obstacles = self._obstacles(odometry.stamp_ns)
+        ring = self._young_ring(odometry.stamp_ns)
+        obstacles = None if ring is None else self._ring_points
+        moving = None if ring is None else forecast(ring.moving, (odometry.stamp_ns - ring.stamp_ns) * 1e-9)
         nearest_m = (
             math.inf if obstacles is None else room_ahead(pose, speed_mps, obstacles) - self._outline.half_width_m
         )
@@ -130,21 +133,21 @@ class NavigationStage:
             self._wheels(),
             self._in_map,
             obstacles,
-            self._moving(odometry.stamp_ns),
+            moving,
             self._unknown,
             nearest_m,
         )
+        # 3. Add the pose to a route that is being taught.
         ended = self._routes.record(now, self._tie)
         if ended:
             self._answers.append(RequestAnswer(0, "teach", ended))
+        # 4. Steer.
         return self._update(self._navigator.step(now))
 
-    def _obstacles(self, stamp_ns: int) -> Array | None:
-        """Return the positions (N, 2) of obstacles in odom; None without a ring that is young enough."""
+    def _young_ring(self, stamp_ns: int) -> ObstacleRing | None:
+        """Return the newest ring; None if it is not young enough at that time."""
         ring = self._ring
-        if ring is None or not 0 <= stamp_ns - ring.stamp_ns <= RING_NS:
-            return None
-        return self._ring_points
+        return ring if ring is not None and 0 <= stamp_ns - ring.stamp_ns <= RING_NS else None
 
     def _near_ends(self, ring: ObstacleRing) -> NDArray[np.float32]:
         """Return the ranges (SECTORS,) of near ends of the floor that a ring shows, NaN in other sectors."""
@@ -154,12 +157,6 @@ class NavigationStage:
             if free_m < UNKNOWN_M:
                 ends_m[sector] = max(free_m, edges_m[sector])
         return ends_m
-
-    def _moving(self, stamp_ns: int) -> Forecast | None:
-        """Return where moving obstacles will be, from a time on; None without any."""
-        ring = self._ring
-        age_s = -1.0 if ring is None else (stamp_ns - ring.stamp_ns) * 1e-9
-        return forecast(ring.moving, age_s) if ring is not None and 0 <= age_s <= RING_NS * 1e-9 else None
 
     def _place(self, update: PlaceUpdate) -> None:
         if update.stamp_ns < self._reset_ns:

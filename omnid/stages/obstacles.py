@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
@@ -20,8 +19,6 @@ from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS
 from omnid.stages.pair_rings import PairRings
 from omnid.tracking_state import TrackingState
-
-Array = NDArray[np.float64]
 
 # Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.
 SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {

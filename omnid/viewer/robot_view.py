@@ -63,11 +63,13 @@ class RobotView:
 
     def process(self, message: ReceivedMessage) -> None:
         """Draw a message, if it is of a kind that can be drawn."""
+        # 1. Decode it; what is broken is counted.
         try:
             content = _decoded(message)
         except (OmnidError, FrameDecodeError):
             self.broken += 1
             return
+        # 2. Draw it.
         match content:
             case Pose():
                 self._scene.pose(content)

@@ -9,12 +9,13 @@ The log is that of `tests/benchmark/live_daemon.py`; --rates are those at which 
 from __future__ import annotations
 
 import argparse
+import os
 import tempfile
 import time
 from pathlib import Path
 from typing import Final
 
-from omnid.diagnostics.threads_status import ThreadShare, process_time_s, shares, thread_times
+from omnid.diagnostics.threads_status import ThreadShare, shares, thread_times
 from tests.benchmark.live_daemon import HZ, daemon
 from tests.benchmark.results import Column, ResultTable
 from tests.replay.live import Operator
@@ -36,6 +37,12 @@ def memory_mb(pid: int) -> tuple[float, float]:
     """Return the resident size now and the largest one."""
     status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
     return int(status["VmRSS"].split()[0]) / 1024, int(status["VmHWM"].split()[0]) / 1024
+
+
+def process_time_s(pid: int) -> float:
+    """Return the processor time of a process [s], with that of its threads that have ended."""
+    user, system = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11:13]
+    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(table: ResultTable, rate_hz: float, seconds: float, warm_s: float, settings: list[str]) -> None:

@@ -22,7 +22,7 @@ from omnid.core.control.heading_controller import wrap_angle
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
-from omnid.simulation.robot import Slip, make_robot, with_slips
+from omnid.simulation.robot import Slip, WheelErrors, make_robot
 from omnid.simulation.vehicle import START_NS
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
@@ -188,7 +188,8 @@ def main() -> None:
 
 def drive_row(case: Case, seed: int, size_px: int) -> list[Cell]:
     """Drive; return the figures."""
-    robot = replace(with_slips(make_robot(size_px), case.slips), has_odometry=case.sensors, has_gyro=case.sensors)
+    wheels = WheelErrors(slips=case.slips)
+    robot = replace(make_robot(size_px), wheels=wheels, has_odometry=case.sensors, has_gyro=case.sensors)
     started_s = time.process_time()
     run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
     return [*row(case, run), (time.process_time() - started_s) / max(1, len(run.stamps_ns))]

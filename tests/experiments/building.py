@@ -8,8 +8,9 @@ import numpy as np
 
 from calib.models.camera import Array
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, Point, box, posters, wall
+from omnid.simulation.rendering.shapes import CEILING_M, Point, box, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from tests.simulation.builders import wall
 from tests.simulation.paths import planar_poses
 
 PX_PER_M = 200.0  # resolution of floor and ceiling

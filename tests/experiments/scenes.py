@@ -10,12 +10,12 @@ import numpy as np
 from calib.rig import Rig
 from omnid.simulation.rendering.rigs import RIM, make_rig
 from omnid.simulation.rendering.shapes import CEILING_M
-from omnid.simulation.rendering.shapes import wall as upright
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 from omnid.simulation.rendering.textures import PAINTERS, value_noise
 from tests.experiments.building import building, round_trip
 from tests.simulation import paths
 from tests.simulation.builders import corridor
+from tests.simulation.builders import wall as upright
 from tests.simulation.recipes import TURN_DEG, SimulatedRun
 
 WALL_M = 2.0  # section V.B: distance from the cameras to the wall

@@ -3,9 +3,9 @@
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.simulation.rendering.sensor import MountedSensor, Sensor
-from omnid.simulation.rendering.shapes import box, posters, wall
+from omnid.simulation.rendering.shapes import box, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from tests.simulation.builders import corridor, room
+from tests.simulation.builders import corridor, room, wall
 from tests.simulation.images import render
 from tests.simulation.logs import camchain, tum, write_log
 from tests.simulation.recipes import RECIPES, SimulatedRun, build

@@ -6,11 +6,19 @@ from functools import lru_cache
 
 import numpy as np
 
-from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters, wall
+from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
 
 # Number of worlds of each kind that are kept, as many tests show the same; their textures are a few megabytes each.
 KEPT = 6
+
+
+def wall(rng: Random, kind: str, left: Point, right: Point) -> Rectangle:
+    """Return a wall from floor to ceiling between two points (x, y) [m], left and right as seen from inside."""
+    a, b = np.array([*left, CEILING_M]), np.array([*right, CEILING_M])
+    return Rectangle(
+        a, b - a, np.array([0, 0, -CEILING_M]), painted(rng, kind, (float(np.linalg.norm(b - a)), CEILING_M)), kind
+    )
 
 
 def _flat(rng: Random, kind: str, low: Point, high: Point) -> tuple[Rectangle, Rectangle]:

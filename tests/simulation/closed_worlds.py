@@ -8,9 +8,9 @@ import numpy as np
 
 from calib.models.camera import Array
 from omnid.simulation.rendering import textures
-from omnid.simulation.rendering.shapes import CEILING_M, PX_PER_M, Point, Random, box, posters, wall
+from omnid.simulation.rendering.shapes import CEILING_M, PX_PER_M, Point, Random, box, posters
 from omnid.simulation.rendering.surfaces import Rectangle, Scene
-from tests.simulation.builders import corridor
+from tests.simulation.builders import corridor, wall
 from tests.simulation.paths import planar_poses
 
 KINDS = ("brick", "plaster", "granite", "plaster")

@@ -62,11 +62,6 @@ class SelectedCalibration:
     scores: tuple[ModelScore, ...]
     polynomial: OcamCamera | None = None  # the most general polynomial camera that was fitted
 
-    @property
-    def score(self) -> ModelScore:
-        """Return the score of the selected model."""
-        return next(score for score in self.scores if score.model == self.model)
-
 
 def select_calibration(
     views: Sequence[BoardView],

@@ -25,7 +25,6 @@ from omnid.core.types.panorama import PaddedPanorama
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 Tables = NDArray[np.int32]
 
 # Directions without floor in view side by side, 15 degrees, in which nothing is assumed about it, because struts and

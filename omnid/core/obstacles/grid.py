@@ -19,7 +19,7 @@ from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.cell_kernels import FLOOR, LIMIT, MOST_RATIO, SURFACE, TAKEN_ODDS, VISIBLE, add_pair
 from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
-from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of, level_odds
+from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
 from omnid.core.obstacles.near_field import NearField, lose_before
 from omnid.core.obstacles.settings import RingSettings
@@ -214,16 +214,6 @@ class ObstacleGrid:
             amount,
         )
         return amount
-
-    @property
-    def corner_m(self) -> Array:
-        """Place (2,) of the corner of cell (0, 0) in odom."""
-        return CELL_M * (np.zeros(2) if self._corner is None else self._corner.astype(float))
-
-    @property
-    def floor_odds(self) -> Floats:
-        """Log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
-        return np.asarray(np.minimum(np.minimum(self._odds[FLOOR], self._odds[VISIBLE]), level_odds(self._odds)))
 
     def state(self) -> Bytes:
         """Return the cells (CELLS, CELLS): 0 unknown, 1 free (by all layers), 2 taken."""

@@ -32,7 +32,6 @@ from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.intp]
 
 LANDMARKS = 120  # whose patches are compared, evenly chosen, because the mean of 120 correlations errs by less than 0.1
 # Side of a patch in samples, and their distance, px, so that it is as wide as the tracker's window, and blurred by as

@@ -14,7 +14,6 @@ from omnid.core.odometry.plane_kernels import MAX_SLOPE
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Flags = NDArray[np.bool_]
 
 # Half the side of the window. Slopes err by the third power of it, but a large window leaves the plane. 8
 # was tried as well, on thirteen logs of development (docs/notes/odometry.md): set by trial.

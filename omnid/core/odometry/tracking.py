@@ -12,7 +12,6 @@ from omnid.core.types.panorama import PaddedPanorama
 from omnid.settings import knob
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 
 CONVERGED_PX = 0.01  # OpenCV's default: an iteration that moves the window less is the last one

@@ -58,8 +58,9 @@ class PoseGraphResult:
     poses: Array  # (N, 4, 4)
     weights: Array  # (M,) 1 for odometry, 0 to 1 for loops
     squared: Array  # (M,) squared Mahalanobis distances of the edges from the result
-    connected: Flags  # (N,) nodes that odometry and accepted loops join to a fixed node
-    covariance: Array  # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite: not connected
+    # (6, 6) [t; r] of the last node in its axes, relative to the fixed ones; infinite if neither odometry nor accepted
+    # loops join it to one of them.
+    covariance: Array
     steps: int  # steps of Gauss-Newton
     converged: bool
 
@@ -89,9 +90,9 @@ def optimise(poses: Array, edges: PoseEdges, fixed: Flags | None = None) -> Pose
         decided = bool((np.minimum(weights, 1 - weights) < UNDECIDED).all())
         converged = decided and float(np.abs(change).max()) < CONVERGED
         mu, steps = STEEPER * mu, steps + 1
-    connected = _connected(edges.pairs[weights > ACCEPTED], fixed)
-    covariance = graph.last_covariance(J, weights) if connected[-1] else np.full((6, 6), np.inf)
-    return PoseGraphResult(poses, weights, (residual**2).sum(axis=1), connected, covariance, steps, converged)
+    is_known = _connected(edges.pairs[weights > ACCEPTED], fixed)[-1]
+    covariance = graph.last_covariance(J, weights) if is_known else np.full((6, 6), np.inf)
+    return PoseGraphResult(poses, weights, (residual**2).sum(axis=1), covariance, steps, converged)
 
 
 class _Graph:

@@ -15,7 +15,6 @@ from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 RATIO: Final = 0.85  # largest distance of a match, as a share of the second best one's (Lowe 2004)

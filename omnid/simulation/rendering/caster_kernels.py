@@ -49,17 +49,9 @@ def take_nearer(
     number: np.int32, surface: Floats, rays: Rows, origins: Rows, nearest: Numbers, distance: Floats
 ) -> int:
     """Note a rectangle where it is the nearest one so far: distance (N,) [m] along the rays; return for how many."""
-    n0, n1, n2, u0, u1, u2, v0, v1, v2 = (
-        surface[0],
-        surface[1],
-        surface[2],
-        surface[3],
-        surface[4],
-        surface[5],
-        surface[6],
-        surface[7],
-        surface[8],
-    )
+    n0, n1, n2 = surface[0], surface[1], surface[2]
+    u0, u1, u2 = surface[3], surface[4], surface[5]
+    v0, v1, v2 = surface[6], surface[7], surface[8]
     n, u, v = surface[9], surface[10], surface[11]
     (x, y, z), (a, b, c) = rays, origins
     hits = 0
@@ -97,17 +89,9 @@ def place_on(
     places: Rows,
 ) -> None:
     """Set u, v and the footprint [texels] (3, N) of the rays whose nearest rectangle this is."""
-    n0, n1, n2, u0, u1, u2, v0, v1, v2 = (
-        surface[0],
-        surface[1],
-        surface[2],
-        surface[3],
-        surface[4],
-        surface[5],
-        surface[6],
-        surface[7],
-        surface[8],
-    )
+    n0, n1, n2 = surface[0], surface[1], surface[2]
+    u0, u1, u2 = surface[3], surface[4], surface[5]
+    v0, v1, v2 = surface[6], surface[7], surface[8]
     u, v, density = surface[10], surface[11], surface[13]
     (x, y, z), (a, b, c) = rays, origins
     across, down, footprint = places

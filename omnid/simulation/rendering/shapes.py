@@ -20,14 +20,6 @@ def painted(rng: Random, kind: str, size_m: Point, px_per_m: float = PX_PER_M) -
     return textures.PAINTERS[kind](rng, size, px_per_m)
 
 
-def wall(rng: Random, kind: str, left: Point, right: Point) -> Rectangle:
-    """Return a wall from floor to ceiling between two points (x, y) [m], left and right as seen from inside."""
-    a, b = np.array([*left, CEILING_M]), np.array([*right, CEILING_M])
-    return Rectangle(
-        a, b - a, np.array([0, 0, -CEILING_M]), painted(rng, kind, (float(np.linalg.norm(b - a)), CEILING_M)), kind
-    )
-
-
 def posters(rng: Random, on: Rectangle, count: int, first: int = 0) -> list[Rectangle]:
     """Return posters at random places of a wall, one per equal stretch so that they do not overlap."""
     stretch, hung = on.width_m / max(count, 1), []

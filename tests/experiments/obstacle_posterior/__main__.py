@@ -25,8 +25,10 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import Config
 from omnid.core.mapping.range_scan import azimuths
+from omnid.core.obstacles.cell_kernels import FLOOR, VISIBLE
 from omnid.core.obstacles.column import NEAREST_M, Columns, floor_plane
 from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
+from omnid.core.obstacles.grid_layers import level_odds
 from omnid.core.obstacles.grid_ring import GridRing
 from omnid.core.obstacles.pair_views import FOCAL_PX
 from omnid.core.obstacles.settings import RingSettings
@@ -170,15 +172,21 @@ def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) ->
         scores.excess_m.append(float(ring.free_m[ahead].min() - truth[ahead].min()))
 
 
+def floor_odds(odds: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the log-odds (CELLS, CELLS) that a cell is floor rather than its best other explanation."""
+    return np.minimum(np.minimum(odds[FLOOR], odds[VISIBLE]), level_odds(odds))
+
+
 def add_cells(grid: ObstacleGrid, scene: ObstacleScene, x_m: float, scores: Scores) -> None:
     """Count the cells within 3 m by their log-odds of the floor, and those of them that are free."""
     place = (np.arange(CELLS) + 0.5) * CELL_M
-    corner = grid.corner_m
+    assert grid._corner is not None
+    corner = CELL_M * grid._corner
     px, py = np.meshgrid(place + corner[0] - x_m, place + corner[1])
     distance = np.hypot(px, py)
     inside = (distance < 3.0) & (distance > 0.5)
     truth = scene.ranges_m(x_m, 0.0, np.arctan2(py[inside], px[inside]))
-    number = np.digitize(grid.floor_odds[inside], ODDS_BINS[1:-1])
+    number = np.digitize(floor_odds(grid._odds)[inside], ODDS_BINS[1:-1])
     np.add.at(scores.cells, (number, 0), distance[inside] < truth)
     np.add.at(scores.cells, (number, 1), 1)
 

@@ -14,7 +14,6 @@ from omnid.diagnostics.threads_status import (
     ThreadShares,
     ThreadsStatus,
     ThreadTime,
-    process_time_s,
     shares,
     thread_times,
 )
@@ -45,7 +44,7 @@ def burning(name: str, end: threading.Event) -> threading.Thread:
 
 
 def test_reads_names_and_times_of_running_threads() -> None:
-    before_s, reader, end = process_time_s(), ThreadShares(), threading.Event()
+    reader, end = ThreadShares(), threading.Event()
     named, unnamed = burning("burn (1) x", end), burning("", end)  # a name with what ends the field of names
     times, found = thread_times(), reader()
     end.set()
@@ -56,7 +55,6 @@ def test_reads_names_and_times_of_running_threads() -> None:
     assert times[named.native_id or 0].name == "burn (1) x" and times[unnamed.native_id or 0].name == LIBRARIES
     assert times[os.getpid()].name == MAIN
     assert found["burn (1) x"].threads == 1 and 0 < found["burn (1) x"].share < os.cpu_count()
-    assert process_time_s() - before_s >= 2 * (BURNT_S - TICK_S), "also of threads that have ended"
 
 
 def test_adds_up_the_threads_of_a_name() -> None:

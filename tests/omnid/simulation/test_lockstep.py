@@ -16,7 +16,7 @@ from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.requests import GoalRequest, NavigationFrame
 from omnid.navigation_state import NavigationState
 from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
-from omnid.simulation.robot import Slip, make_robot, with_slips
+from omnid.simulation.robot import Slip, WheelErrors, make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
 
@@ -85,9 +85,8 @@ def test_a_goal_is_reached_by_the_true_robot() -> None:
 
 
 def test_slipping_wheels_hardly_move_the_robot_and_are_noticed() -> None:
-    run = simulate(
-        world(), with_slips(make_robot(SIZE), [Slip(1.5, 9.0, 0.9)]), forward, seconds=2.5, seed=1, config=CONFIG
-    )
+    robot = replace(make_robot(SIZE), wheels=WheelErrors(slips=(Slip(1.5, 9.0, 0.9),)))
+    run = simulate(world(), robot, forward, seconds=2.5, seed=1, config=CONFIG)
     x_m = run.truth_in_odom[:, 0, 3]
     assert x_m[14] - x_m[10] > 0.08 and x_m[24] - x_m[20] < 0.02
     noticed_s = (run.stamps_ns[run.slipping] - run.stamps_ns[0]) * 1e-9

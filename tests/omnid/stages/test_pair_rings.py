@@ -10,7 +10,6 @@ import pytest
 
 from calib import se3
 from omnid.core.obstacles.cell_kernels import SURFACE
-from omnid.core.obstacles.grid import CELL_M
 from omnid.core.obstacles.settings import RingSettings
 from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
@@ -75,7 +74,8 @@ def test_what_is_known_is_known_again_when_odometry_has_found_its_place_again() 
     for seq in range(20):
         base.ring(pairs[seq % 3])
     grid = base.rings._grid
-    corner = np.round(grid.corner_m / CELL_M).astype(int)
+    corner = grid._corner
+    assert corner is not None
     grid._odds[SURFACE, -corner[1] - 6 : -corner[1] + 6, -corner[0] + 8 : -corner[0] + 11] = 6.0
     ranges_m = []
     for seq, state in enumerate((TrackingState.TRACKING, TrackingState.LOST, TrackingState.DEGRADED)):

@@ -68,6 +68,12 @@ def grid() -> ObstacleGrid:
     return made
 
 
+def corner_m(grid: ObstacleGrid) -> np.ndarray:
+    """Return the place (2,) of the corner of cell (0, 0) in odom."""
+    assert grid._corner is not None
+    return CELL_M * grid._corner
+
+
 def after(grid: ObstacleGrid, found: Pairs, pairs: int, first: int = 0) -> GridRing:
     """Return the ring after so many pairs of a base that stands."""
     for n in range(first, first + pairs):
@@ -150,7 +156,7 @@ def test_floor_before_a_surface_that_hides_the_nearest_in_view_stays_free(grid: 
     bare, people = evidence(stains, striped, wall_m=3.0), evidence(stains, striped, wall_m=0.7)
     after(grid, bare, 30)
     after(grid, people, 6, first=30)
-    column, row = np.floor((np.array([0.35, 0.0]) - grid.corner_m) / CELL_M).astype(int)
+    column, row = np.floor((np.array([0.35, 0.0]) - corner_m(grid)) / CELL_M).astype(int)
     assert grid._odds[VISIBLE_LAYER][row, column] == PRIOR[VISIBLE_LAYER] and grid.state()[row, column] == 1
 
 
@@ -286,7 +292,7 @@ def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pair
 def test_nothing_comes_in_through_a_narrow_gap(grid: ObstacleGrid, seen: Pairs, gap_cells: int, comes_in: bool) -> None:
     """A ring about the base that was never free, with a gap; in the dark something may have come to all other floor."""
     after(grid, seen, 20)
-    middle = np.floor(-grid.corner_m / CELL_M).astype(int)
+    middle = np.floor(-corner_m(grid) / CELL_M).astype(int)
     y, x = np.ogrid[: grid._odds.shape[1], : grid._odds.shape[2]]
     x, y = x - middle[0], y - middle[1]
     away = np.hypot(x, y)
@@ -354,7 +360,7 @@ def test_square_follows_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
     far = np.eye(4)
     far[0, 3] = 50.0
     ring = grid.update(20 * PERIOD_NS, far, seen[0])
-    assert np.abs(grid.corner_m - [50.0 - 6.4, -6.4]).max() < 0.1 and not np.isfinite(ring.ranges_m).any()
+    assert np.abs(corner_m(grid) - [50.0 - 6.4, -6.4]).max() < 0.1 and not np.isfinite(ring.ranges_m).any()
 
 
 def test_patch_of_usual_floor_that_shows_none_stays_free_where_floor_behind_it_is_seen(
@@ -422,7 +428,7 @@ def test_what_is_too_near_to_be_seen_lies_about_the_viewpoint(grid: ObstacleGrid
     bare, hidden = (evidence(stains, striped, wall_m=3.0, pole=pole) for pole in (None, Pole(near_m, 0.05)))
 
     def is_free(x_m: float, y_m: float) -> bool:
-        column, row = np.floor((np.array([x_m, y_m]) - grid.corner_m) / CELL_M).astype(int)
+        column, row = np.floor((np.array([x_m, y_m]) - corner_m(grid)) / CELL_M).astype(int)
         return bool(grid.state()[row, column] == 1)
 
     after(grid, bare, 1)
@@ -446,7 +452,7 @@ def test_who_has_left_a_place_too_near_to_see_its_floor_is_no_obstacle_any_longe
 
 def put_low_box(grid: ObstacleGrid, ahead_m: float = 0.65) -> None:
     """Make the grid know a low box, as from farther away."""
-    middle, ahead = np.round(-grid.corner_m / CELL_M).astype(int), round(ahead_m / CELL_M)
+    middle, ahead = np.round(-corner_m(grid) / CELL_M).astype(int), round(ahead_m / CELL_M)
     grid._odds[SURFACE, middle[1] - 4 : middle[1] + 4, middle[0] + ahead : middle[0] + ahead + 2] = 6.0
 
 

@@ -9,8 +9,7 @@ import pytest
 from calib import se3
 from calib.rig import MountedCamera, Rig
 from omnid.simulation.rendering import ray_caster
-from omnid.simulation.rendering.shapes import wall
-from tests.simulation import Rectangle, Scene, build, make_rig, render
+from tests.simulation import Rectangle, Scene, build, make_rig, render, wall
 from tests.simulation.paths import planar_poses
 from tests.simulation.rigs import with_real_mirrors
 

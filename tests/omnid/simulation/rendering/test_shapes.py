@@ -6,8 +6,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from omnid.simulation.rendering.shapes import CEILING_M, PX_PER_M, box, painted, posters, wall
+from omnid.simulation.rendering.shapes import CEILING_M, PX_PER_M, box, painted, posters
 from omnid.simulation.rendering.textures import PAINTERS
+from tests.simulation.builders import wall
 
 
 def test_a_wall_stands_between_its_points_and_faces_inwards() -> None:
