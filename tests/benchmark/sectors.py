@@ -79,8 +79,8 @@ REMARKS: Final = (
     "not seen.",
     "`_wall`: the drive ends 1.2 m before the end wall; in all other rows it is 8 m away. A wall that fills 30 "
     "degrees tells a turn from a step aside by its perspective only: where the pose is lost near the wall, the state "
-    "says so. On seed 600 (development) half of the first landmarks lie one course of bricks too far away; the first "
-    "steps are `degraded`, because two motions are supported by as many landmarks each.",
+    "says so. Most of its bricks are identical: until the first motion has decided on their depths, poses are "
+    "`degraded`. Limits of that were set on the seeds of the two lenses of 30 degrees.",
 )
 
 FULL_TURN_REMARKS: Final = (
