@@ -46,7 +46,7 @@ def selected(seen: list[PairView]) -> SelectedRig:
 @pytest.mark.slow
 def test_terms_of_real_mirrors_are_selected_for_real_mirrors() -> None:
     found = selected(views(with_real_mirrors(PERFECT, 3), 10))
-    assert [score.name for score in found.scores] == ["non-central cameras", "central cameras"]
+    assert [score.name for score in found.scores] == ["cameras below paraboloids", "central cameras"]
     assert isinstance(found.calibration.lower, OcamCamera) and any(found.calibration.lower.wavefront)
     assert found.scores[0].held_out_px < 0.021 < 0.5 * found.scores[1].held_out_px
     assert {"s1", "w_s"} < {name for name, _, _ in found.calibration.parameters[1]}
