@@ -18,6 +18,8 @@ none. The lower panorama alone, followed from the keyframe on, decides:
    The true distance has the votes of all landmarks, that of a larger world not those of landmarks that do not repeat.
 3. Of the distances that a vehicle can have made, the one with most votes decides the depths. While another one has
    nearly as many, or too few landmarks have moved far enough to vote, the pose is in doubt by the difference of both.
+
+Pairs whose pixels were not exposed at once are left as they are (keyframes.py).
 """
 
 from __future__ import annotations
@@ -51,6 +53,8 @@ SAMPLE, SAMPLE_ERROR = 100, 0.1
 # that none is missed. The last turn is as far as the tracker reaches, because it searches 30 px at scale 1.
 DIRECTION_STEP, TURN_STEP, MOST_TURN = math.radians(2.5), math.radians(0.5), math.radians(10.0)
 ROUNDS, FINER = 3, 3  # rounds, each so many times as fine, because a tenth of a degree then remains
+# Share of the bearings that the motion explains, because a wrong one, where the turn is too large, explains 0.6.
+FIT_SHARE = 2 / 3
 # Share of the bearings that fit the best turn from which another turn fits as well, and how far apart both are, rad:
 # with a view of 30 degrees on a wall all of 10 degrees do, with a full turn those of 1.5 degrees, as measured.
 ALIKE_SHARE, ALIKE_TURN = 0.9, math.radians(2.5)
@@ -219,7 +223,8 @@ def _repeats(disparities: Array) -> Flags:
 def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[float, float] | None:
     """Return direction and turn [rad] of the horizontal motion that most bearings (N, 3) fit, before and after it.
 
-    None: other turns fit as well, because what fills a narrow view turns as it moves aside.
+    None: other turns fit as well, because what fills a narrow view turns as it moves aside, or may do so beyond
+    MOST_TURN; or too few bearings fit.
     """
     direction, turn = np.arange(0.0, math.pi, DIRECTION_STEP), np.arange(-MOST_TURN, MOST_TURN + TURN_STEP, TURN_STEP)
     steps = DIRECTION_STEP, TURN_STEP
@@ -231,7 +236,8 @@ def most_likely_motion(before: Array, now: Array, focal_px: float) -> tuple[floa
         best = np.unravel_index(int(scores.argmax()), scores.shape)
         at = float(direction[best[1]]), float(turn[best[0]])
         as_good = scores.max(axis=1) >= ALIKE_SHARE * scores.max()
-        if np.abs(turn[as_good] - at[1]).max() > ALIKE_TURN:
+        is_shown = scores.max() > FIT_SHARE * len(now) and abs(at[1]) < MOST_TURN - ALIKE_TURN
+        if not is_shown or np.abs(turn[as_good] - at[1]).max() > ALIKE_TURN:
             return None
         steps = steps[0] / FINER, steps[1] / FINER
         direction, turn = (middle + step * np.arange(-FINER, FINER + 1) for middle, step in zip(at, steps, strict=True))

@@ -31,7 +31,7 @@ def bearings(points: Array) -> Array:
     return np.asarray(points / np.linalg.norm(points, axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize(("direction_deg", "turn_deg"), [(0.0, 0.0), (30.0, 4.0), (150.0, -7.0)])
+@pytest.mark.parametrize(("direction_deg", "turn_deg"), [(0.0, 0.0), (30.0, 4.0), (150.0, -6.0)])
 def test_the_motion_is_found_without_depths(direction_deg: float, turn_deg: float) -> None:
     before, direction, turn = walls(), math.radians(direction_deg), math.radians(turn_deg)
     moved = MOVED_M * np.array([math.cos(direction), math.sin(direction), 0.0])
@@ -90,3 +90,10 @@ def test_in_a_narrow_view_of_a_wall_no_motion_is_the_likeliest() -> None:
     rng = np.random.default_rng(9)
     wall = np.column_stack([np.full(200, 3.0), rng.uniform(-0.5, 0.5, 200), rng.uniform(-0.4, 0.4, 200)])
     assert most_likely_motion(bearings(wall), bearings(wall - (0.0, 0.1, 0.0)), FOCAL_PX) is None
+
+
+@pytest.mark.parametrize("turn_deg", [8.0, 12.0, 15.0, 25.0])
+@pytest.mark.parametrize("moved_m", [0.0, 0.1, 0.3])
+def test_a_turn_beyond_those_that_are_tried_shows_no_motion(turn_deg: float, moved_m: float) -> None:
+    now = walls() @ se3.rotation_exp([0.0, 0.0, math.radians(turn_deg)]).T + (moved_m, 0.0, 0.0)
+    assert most_likely_motion(bearings(walls()), bearings(now), FOCAL_PX) is None
