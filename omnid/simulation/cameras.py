@@ -10,7 +10,7 @@ from drivers.frame import CAMERAS, Camera, Frame
 from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.polished_floor import PolishedFloor
 from omnid.simulation.rendering.ray_caster import render_grey
-from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.world import World
 
@@ -34,12 +34,17 @@ class SimulatedCameras:
         self, camera: Camera, seq: int, stamp_ns: int, T_world_rig: Array, people: Walkers, *, brightness: float = 1.0
     ) -> Frame:
         """Return the frame of a camera on a rig at T_world_rig (4, 4)."""
-        mounted, sensor = self._mounted[camera], self._sensors[camera]
         scene = Scene((*self._world.standing, *people.faces()))
         light = np.float32(brightness * self._world.brightness)
-        ideal = render_grey(scene, mounted, T_world_rig, self._samples)
+        ideal = self.ideal(camera, scene, T_world_rig)
+        rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
+        width, height = self._mounted[camera].camera.size
+        image = self._sensors[camera].expose(ideal * light, rng)
+        return Frame(seq, stamp_ns, camera, "mono8", image, width, height)
+
+    def ideal(self, camera: Camera, scene: Scene, T_world_rig: Array) -> Floats:
+        """Return the image (H, W) of a scene without the errors of a sensor; another renderer replaces this."""
+        ideal = render_grey(scene, self._mounted[camera], T_world_rig, self._samples)
         if camera in self._floors:
             ideal = self._floors[camera].reflected(ideal, scene, T_world_rig, self._samples)
-        rng = np.random.default_rng([self._seed, 43, CAMERAS.index(camera), seq])
-        width, height = mounted.camera.size
-        return Frame(seq, stamp_ns, camera, "mono8", sensor.expose(ideal * light, rng), width, height)
+        return ideal

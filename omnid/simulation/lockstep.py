@@ -37,6 +37,7 @@ from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
 from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.lockstep_parts import LockstepRequests, Take
+from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
 from omnid.simulation.world import World
@@ -72,6 +73,8 @@ Drive: TypeAlias = Callable[[Moment], Iterable[Request]]
 # Changes the pixels of a frame on its way to the stages: a fault of a camera, its driver or its mirror. The first
 # argument is the time of the frame since the start [s].
 Tamper: TypeAlias = Callable[[float, Frame], Frame]
+# Makes the cameras of a rig in a world, as SimulatedCameras does.
+MakeCameras: TypeAlias = Callable[[Rig, Sensor, World, int, int], SimulatedCameras]
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +133,11 @@ def simulate(
     config: Config | None = None,
     faults: Iterable[Fault] = (),
     tamper: Tamper | None = None,
+    cameras: MakeCameras = SimulatedCameras,
 ) -> SimulatedRun:
     """Drive for a number of seconds of simulated time and return the run.
 
-    tamper: changes the images; None: they are as the simulated cameras make them.
+    tamper: changes the images; None: they are as the simulated cameras make them. cameras: of another renderer.
 
     A map of places (config.places.map) is read, extended and written as by `omnid run`; the pose in the map is computed
     where there is one. Raises OmnidError as `omnid run` does.
@@ -142,7 +146,7 @@ def simulate(
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults), tamper).run(seconds)
+        return _Lockstep(world, robot, drive, seed, config or Config(), tuple(faults), tamper, cameras).run(seconds)
     finally:
         cv2.setNumThreads(threads)
 
@@ -157,11 +161,12 @@ class _Lockstep:
         config: Config,
         faults: tuple[Fault, ...],
         tamper: Tamper | None,
+        cameras: MakeCameras,
     ) -> None:
         self._tamper = tamper
         self._robot, self._drive, self._config, self._faults = robot, drive, config, faults
         self._rig = with_masks(robot.rig)
-        self._cameras = SimulatedCameras(self._rig, robot.sensor, world, seed, robot.samples)
+        self._cameras = cameras(self._rig, robot.sensor, world, seed, robot.samples)
         self._ticks: list[Tick] = []
         self._lines: list[tuple[float, str]] = []
         self._vehicle = Vehicle(

@@ -1,9 +1,9 @@
 """Drives of one version before all that may stand in a way: `python -m tests.benchmark.obstacle_drives --seeds A B`.
 
 What is driven follows from the seed alone (`plan`). Each drive is a line of build/results/obstacle_drives.jsonl; the
-command goes on where it ended as long as the commit is the same. From all lines follow the two published tables: by
-what stands in the way, and by robot, camera and floor. With --real only the drives with all disturbances of images are
-made, which have a table of their own.
+command goes on where it ended as long as the commit is the same. From all lines follow the published tables: by what
+stands in the way, by that and the speed, and by robot, camera and floor. With --real only the drives with all
+disturbances of images are made, which have a table of their own.
 """
 
 from __future__ import annotations
@@ -34,6 +34,16 @@ ROOMS: Final = (CLUTTER, AT_EDGE, WITH_PEOPLE)
 # Where floor, robot or camera are others, each of these meets each of them.
 CHOSEN: Final = ("free", "low box", "edge 8 cm", "bar", "plain pole", "table", "chair", "person crosses", CLUTTER)
 USUALLY: Final = Conditions()
+# What a table by speed tells apart; each of its rows is one of these at one speed.
+GROUPS: Final[dict[str, tuple[str, ...]]] = {
+    "poles": ("plain pole", "pole"),
+    "bars and tines": tuple(kind for kind in KINDS if kind != "table"),
+    "edges": EDGES,
+    "boxes": ("box", "low box"),
+    "tables and furniture": ("table", *FURNITURE),
+    "people": PEOPLE,
+}
+BY_SPEED: Final = [f"{group}, {speed:g} m/s" for group in GROUPS for speed in sorted(SPEEDS_MPS)]
 FINE: Final = Conditions(size_px=960, rate_hz=30.0)
 REAL: Final = Conditions(disturbed=OF_CAMERAS, turns_first=True)
 OF_ALL: Final = "all drives"
@@ -45,6 +55,7 @@ COLUMNS: Final = (
     Column("stops"),
     Column("false stops"),
     Column("driven", "m", 1),
+    Column("highest speed within 1 m of it", "m/s", 2),
 )
 REMARKS: Final = (
     "A simulated robot by the stick, straight on, at 0.3, 0.5, 0.8 and -0.5 m/s (backwards) by turns, 512 px at 10 Hz; "
@@ -66,6 +77,13 @@ class Planned(NamedTuple):
     def name(self) -> str:
         """Name of the drive in LINES."""
         return f"{self.case} {self.seed} {self.conditions}"
+
+    @property
+    def group(self) -> str:
+        """Return what stands in the way, in short, and the speed; empty: a room, a corridor, a white wall or a ramp."""
+        case = self.case.removeprefix(POLISHED)
+        group = next((group for group, cases in GROUPS.items() if case in cases), "")
+        return f"{group}, {self.conditions.speed_mps:g} m/s" if group else ""
 
     @property
     def kind(self) -> str:
@@ -104,27 +122,39 @@ def of_real_images(planned: Iterable[Planned]) -> list[Planned]:
     return [one for one in planned if one.kind == str(REAL)]
 
 
+class Grouping(NamedTuple):
+    """A table: drives of one key are a row."""
+
+    name: str
+    by: str
+    key: Callable[[Planned], str]  # empty: in no row
+    order: Sequence[str] = ()  # of the rows; empty: that of the drives
+
+
+BY_CASE: Final = "what stands in the way"
+GROUPINGS: Final = (
+    Grouping("obstacle_drives", BY_CASE, lambda planned: planned.case),
+    Grouping("obstacle_drives_speeds", f"{BY_CASE} and speed", lambda planned: planned.group, BY_SPEED),
+    Grouping("obstacle_drives_kinds", "robot, camera and floor", lambda planned: planned.kind),
+)
+OF_REAL: Final = (Grouping("obstacle_drives_real", f"{BY_CASE}, with {REAL}", lambda planned: planned.case),)
+
+
 def tables(made: Sequence[Planned], drives: dict[str, Drive], *, real: bool = False) -> list[ResultTable]:
-    """Return the tables of drives that were made, by case and by kind; real: that of real images, by case."""
-    by_case = "what stands in the way"
-    parts: list[tuple[str, str, Callable[[Planned], str]]] = [
-        ("obstacle_drives", by_case, lambda planned: planned.case),
-        ("obstacle_drives_kinds", "robot, camera and floor", lambda planned: planned.kind),
-    ]
-    if real:
-        parts = [("obstacle_drives_real", f"{by_case}, with {REAL}", lambda planned: planned.case)]
+    """Return the tables of drives that were made: GROUPINGS; real: that of real images."""
     found = []
-    for name, by, key in parts:
+    for name, by, key, order in OF_REAL if real else GROUPINGS:
         table = ResultTable(
             name, "obstacles", f"Stops of the collision monitor, by {by}", (Column(by), *COLUMNS), REMARKS, quiet=True
         )
-        table.seeds = sorted({("obstacle stops", planned.seed) for planned in made})
-        for label in (*dict.fromkeys(map(key, made)), OF_ALL):
-            chosen = [drives[planned.name] for planned in made if label in (key(planned), OF_ALL)]
-            total = summed(chosen)
-            table.rows.append(
-                [label, len(chosen), *total[:2], round(total.clearance_m, 3), *total[3:5], round(total[5], 2)]
-            )
+        shown = [planned for planned in made if key(planned)]
+        table.seeds = sorted({("obstacle stops", planned.seed) for planned in shown})
+        known = dict.fromkeys(map(key, shown))
+        for label in (*(label for label in order or known if label in known), OF_ALL):
+            total = summed(chosen := [drives[planned.name] for planned in shown if label in (key(planned), OF_ALL)])
+            clearance_m, driven_m, near_mps = (round(x, 3) for x in (total.clearance_m, total.driven_m, total.near_mps))
+            stops = total.stops, total.false_stops
+            table.rows.append([label, len(chosen), total.contacts, total.own, clearance_m, *stops, driven_m, near_mps])
         found.append(table)
     return found
 

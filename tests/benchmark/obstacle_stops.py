@@ -15,7 +15,7 @@ import math
 import random
 import re
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,8 +28,10 @@ from numpy.typing import NDArray
 
 from omnid.config import load_config
 from omnid.core.control.heading_controller import Setpoint
+from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.lockstep import Moment, Request, SimulatedRun, simulate
+from omnid.simulation.lockstep import Drive as Script
+from omnid.simulation.lockstep import MakeCameras, Moment, Request, SimulatedRun, simulate
 from omnid.simulation.people import Walkers
 from omnid.simulation.rendering.surfaces import Scene
 from omnid.simulation.rendering.textures import PAINTERS
@@ -131,8 +133,16 @@ def ahead(moment: Moment, speed_mps: float = SPEED_MPS, turn_s: float = 0.0) -> 
         yield Setpoint(speed_mps, heading_rad=0.0)
 
 
-def run(case: str, seed: int, conditions: Conditions = Conditions(), overrides: Sequence[str] = ()) -> Drive:
-    """Drive one seed of a case along x."""
+def run(
+    case: str,
+    seed: int,
+    conditions: Conditions = Conditions(),
+    overrides: Sequence[str] = (),
+    *,
+    cameras: MakeCameras = SimulatedCameras,
+    within: Callable[[Script], Script] = lambda script: script,
+) -> Drive:
+    """Drive one seed of a case along x; cameras: of another renderer; within: puts the script into another one."""
     build, is_backwards = BUILDS[conditions.build], conditions.speed_mps < 0
     robot, tamper = replace(fine_robot(conditions.size_px, build), rate_hz=conditions.rate_hz), None
     if conditions.disturbed:
@@ -146,14 +156,18 @@ def run(case: str, seed: int, conditions: Conditions = Conditions(), overrides: 
     world = replace(world, people=tuple(replace(person, start_s=person.start_s + turn_s) for person in world.people))
     # The edge of a room is along x; odom begins with the heading of the start.
     towards_rad = -world.start[2] if case == AT_EDGE else None
+    script: Script = partial(ahead, speed_mps=conditions.speed_mps, turn_s=turn_s)
+    if is_cluttered:
+        script = Wanderer(seed, towards_rad)
     done = simulate(
         world,
         robot,
-        Wanderer(seed, towards_rad) if is_cluttered else partial(ahead, speed_mps=conditions.speed_mps, turn_s=turn_s),
+        within(script),
         seconds=CASES[case] + turn_s,
         seed=seed,
         config=load_config(None, ["places.enabled=false", *limits, *build.settings, *overrides]),
         tamper=tamper,
+        cameras=cameras,
     )
     return judged(done, world, robot, edges, backwards=is_backwards, everywhere=is_cluttered)
 
