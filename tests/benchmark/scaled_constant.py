@@ -12,6 +12,7 @@ import ast
 import contextlib
 import json
 import math
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from importlib.abc import MetaPathFinder
@@ -106,7 +107,8 @@ def scaled(value: Any, factor: float) -> Any:
         return tuple(scaled(part, factor) for part in value)
     if isinstance(value, int):
         return max(1, round(value * factor))
-    return value * factor
+    # A number of numpy keeps its type, as compiled functions expect it.
+    return type(value)(value * factor)
 
 
 def accuracy(folder: Path) -> dict[str, float]:
@@ -158,11 +160,39 @@ def rig(folder: Path) -> dict[str, str]:
     return outcomes
 
 
-KINDS: Final = {"odometry": accuracy, "places": places, "rig": rig}
+def obstacles(folder: Path) -> dict[str, list[float]]:
+    """Return what the obstacle grid says of the kept images of a folder.
+
+    Counts of directions: all with something within 4 m, those of them that are missed, and that have something false
+    before it; those of the things themselves, and missed; those that are open, and told so, to 1, 1.5, 2 and 3 m.
+    """
+    import numpy as np
+
+    from tests.experiments.obstacle_posterior.drives import Scores, judge, kept_images, usual_robot
+    from tests.experiments.obstacle_posterior.scenes import obstacle_scene
+
+    scores, (size_px, seed) = Scores(), map(int, re.findall(r"\d+", folder.name))
+    for file in sorted(folder.glob("*.npz")):
+        judge(obstacle_scene(file.stem, seed), usual_robot(size_px), kept_images(file), scores)
+    missed, of_target = np.sum(scores.target_missed, axis=0).tolist()
+    told, is_open = scores.open.T.tolist()
+    return {
+        "all": [scores.directions, scores.missed, scores.false],
+        "things": [of_target, missed],
+        "open": is_open,
+        "told": told,
+    }
 
 
-def outcomes(kind: str, folders: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Yield the outcome of each log; an error of the program is one."""
+KINDS: Final = {"odometry": accuracy, "places": places, "rig": rig, "obstacles": obstacles}
+
+
+def outcomes(kind: str, folders: Sequence[str], file: str) -> Iterator[tuple[str, Any]]:
+    """Yield the outcome of each log, with a constant of a file changed; an error of the program is one."""
+    if kind == "obstacles" and not file.endswith("_kernels.py"):  # compiled with the changed value where they are
+        from omnid.engine.kernel_cache import prepare_kernels
+
+        prepare_kernels()
     for folder in folders:
         try:
             yield folder, KINDS[kind](Path(folder))
@@ -177,7 +207,7 @@ def main(words: Sequence[str]) -> None:
     if not math.isclose(float(factor), 1.0):
         sys.meta_path.insert(0, finder)
     with contextlib.redirect_stdout(sys.stderr):
-        found = dict(outcomes(kind, folders))
+        found = dict(outcomes(kind, folders, file))
     values = finder.loader.values if finder.loader is not None else []
     print(json.dumps({"values": [str(value) for value in values], "found": found}))
 

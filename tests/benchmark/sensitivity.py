@@ -20,7 +20,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -91,10 +91,10 @@ class Trial:
         return f"{name} {self.factor:g} {' '.join(Path(folder).name for folder in self.folders)}"
 
 
-def chosen() -> list[Constant]:
-    """Return the constants of the list; raises ValueError for one that is not there, or not once."""
+def chosen(names_by_file: Mapping[str, Sequence[str]] = CONSTANTS) -> list[Constant]:
+    """Return the constants of a list; raises ValueError for one that is not there, or not once."""
     everything, found = constants(), []
-    for room, names in CONSTANTS.items():
+    for room, names in names_by_file.items():
         for name in names:
             same = [
                 one for one in everything if one.name == name and re.match(rf"omnid/core/{room}(/|\.py$)", one.path)
