@@ -32,7 +32,7 @@ from tests.experiments.povray import shoot, write_world
 Array = NDArray[np.float64]
 
 CASES: Final = ("plain pole", "pole", "edge 15 cm", "edge 8 cm", "low box", "bar", "polished box", "polished free")
-SPEEDS_MPS: Final = (0.5, 0.8, 0.3)  # by turns
+SPEEDS_MPS: Final = (0.8, 0.5)  # by turns
 GLOSS: Final = 0.1  # share of the light that a polished floor mirrors: Fresnel's for n = 1.5 at 60 degrees
 REST_S, REST_M = 2.0, 0.01  # a base that has moved less in this time is at rest, and the drive ends
 SET_OUT_M: Final = 0.3
