@@ -86,7 +86,7 @@ COLUMNS: Final = (
     Column("of things missed", "%", 2),
     Column("of all missed", "%", 3),
     Column("false before it", "%", 2),
-    Column("open and told so to 1 m", "%", 1),
+    Column("open and said so to 1 m", "%", 1),
     Column("1.5 m", "%", 1),
     Column("2 m", "%", 1),
     Column("3 m", "%", 1),
@@ -130,9 +130,9 @@ def row(trial: Trial, outcome: Outcome) -> list[Cell]:
         return [*head, *[None] * (len(COLUMNS) - len(head) - 1), errors[0][:60]]
     sums = {key: [sum(parts) for parts in zip(*(one[key] for one in found), strict=True)] for key in found[0]}
     (count, missed, false), (things, of_things) = sums["all"], sums["things"]
-    told = [100 * n / max(is_open, 1) for n, is_open in zip(sums["told"], sums["open"], strict=True)]
+    free = [100 * n / max(is_open, 1) for n, is_open in zip(sums["free"], sums["open"], strict=True)]
     shares = [100 * n / max(of, 1) for n, of in ((of_things, things), (missed, count), (false, count))]
-    return [*head, *shares, *told, ""]
+    return [*head, *shares, *free, ""]
 
 
 def main() -> None:

@@ -164,7 +164,7 @@ def obstacles(folder: Path) -> dict[str, list[float]]:
     """Return what the obstacle grid says of the kept images of a folder.
 
     Counts of directions: all with something within 4 m, those of them that are missed, and that have something false
-    before it; those of the things themselves, and missed; those that are open, and told so, to 1, 1.5, 2 and 3 m.
+    before it; those of the things themselves, and missed; those that are open, and said to be, to 1, 1.5, 2 and 3 m.
     """
     import numpy as np
 
@@ -175,12 +175,12 @@ def obstacles(folder: Path) -> dict[str, list[float]]:
     for file in sorted(folder.glob("*.npz")):
         judge(obstacle_scene(file.stem, seed), usual_robot(size_px), kept_images(file), scores)
     missed, of_target = np.sum(scores.target_missed, axis=0).tolist()
-    told, is_open = scores.open.T.tolist()
+    free, is_open = scores.open.T.tolist()
     return {
         "all": [scores.directions, scores.missed, scores.false],
         "things": [of_target, missed],
         "open": is_open,
-        "told": told,
+        "free": free,
     }
 
 

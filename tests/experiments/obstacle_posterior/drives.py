@@ -115,8 +115,8 @@ def drive(case: str, seed: int, robot: SimulatedRobot, steps: int, scores: Score
         judge(scene, robot, exposures(shoot, robot, steps, seed), scores)
 
 
-def judge(scene: ObstacleScene, robot: SimulatedRobot, images: Iterable[Exposed], scores: Scores) -> None:
-    """Add what the grid says of the images of a drive to the scores."""
+def judge(scene: ObstacleScene, robot: SimulatedRobot, images: Iterable[Exposed], scores: Scores) -> ObstacleGrid:
+    """Add what the grid says of the images of a drive to the scores; return the grid."""
     config = Config()
     shape: Geometry = geometry(robot.rig, config.panorama)
     grid = ObstacleGrid(FOCAL_PX * shape.rig.baseline_m, RingSettings())
@@ -131,6 +131,7 @@ def judge(scene: ObstacleScene, robot: SimulatedRobot, images: Iterable[Exposed]
         scores.milliseconds.append(1e3 * (time.thread_time() - begin))
         compare(ring, scene, x_m, scores)
     add_cells(grid, scene, x_m, scores)
+    return grid
 
 
 def usual_robot(size_px: int) -> SimulatedRobot:
