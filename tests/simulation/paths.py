@@ -110,9 +110,7 @@ def _turned(place: Array, heading_rad: float) -> Array:
     """Return places (N, 3) of a turn on the spot, 10 degrees each, that ends at a heading."""
     turn = (heading_rad - place[2] + np.pi) % (2 * np.pi) - np.pi
     steps = max(1, int(np.ceil(abs(turn) / np.deg2rad(10))))
-    return np.column_stack(
-        [np.tile(place[:2], (steps, 1)), place[2] + turn * np.arange(1, steps + 1) / steps]
-    )
+    return np.column_stack([np.tile(place[:2], (steps, 1)), place[2] + turn * np.arange(1, steps + 1) / steps])
 
 
 def _driven(place: Array, way_m: float, segments: Array, nearest_m: float, step_m: float) -> Array:

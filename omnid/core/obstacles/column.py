@@ -63,8 +63,8 @@ STRIP_BOUND: Final = 3.0  # Limit of the log-likelihood ratio of a strip. By jud
 STRIP_PRIOR: Final = 0.5
 # Probability of the floor in rows that may show it, by that of one disparity. By judgement; not measured.
 FLOOR_WEIGHT: Final = 10.0
-# The same of a disparity below the floor, where only holes and what a polished floor mirrors are; by judgement. With 1,
-# a wall of bricks was as likely to be a farther one below the floor: 70 % of such walls were found, and not 94 %.
+# The same of a disparity below the floor, where only holes are, and what a polished floor mirrors. By judgement; with 1,
+# a wall of bricks may be a farther one below the floor: 70 % of such walls were found, with 0.1 94 %.
 BELOW_WEIGHT: Final = 0.1
 LEAST_OTHERS: Final = 1e-4  # bound of the mean likelihood of other explanations. By judgement; not measured.
 
@@ -152,9 +152,10 @@ class Columns:
     def _surface(self, views: Views) -> Floats:
         """Return the log-likelihood ratios (K, DIRECTIONS) of the best run of rows, where k fits best."""
         surface, scale = np.empty((self.bins, DIRECTIONS), np.float32), np.float32(DIFFERENCE_RATIO / UNITS)
-        weights, limits = (FLOOR_WEIGHT, BELOW_WEIGHT), (STRIP_BOUND, STRIP_PRIOR)
+        weights = np.float32(FLOOR_WEIGHT), np.float32(BELOW_WEIGHT)
+        limits = np.float32(STRIP_BOUND), np.float32(STRIP_PRIOR)
         compared = views.lower, views.upright, views.plane, views.live
-        surface_evidence(*compared, self._strips, OUTLIER, scale, *map(np.float32, (*weights, *limits)), surface)
+        surface_evidence(*compared, self._strips, OUTLIER, scale, *weights, *limits, surface)
         return surface
 
     def _level(self, views: Views) -> Floats:

@@ -56,7 +56,7 @@ def ring_of(cells: Bytes, view: RingView, arrivals: Arrivals) -> GridRing:
         [*view.place, view.cell_m / 2, view.max_range_m, view.cell_m, view.gap_share, view.gap_m], np.float64
     )
     kernels.march(cells, origin, view.angles, first, free)
-    # Too near for floor a part of a surface that shows nothing, such as a white margin, is no opening to what is behind.
+    # Too near for floor, a part of a surface that shows nothing, such as a white margin, is no opening.
     kernels.close_openings(first, free, view.nearest_m, NARROW_CELLS * view.cell_m, END_M + view.cell_m, hit)
     # 2. A direction between cells may belong to either side.
     around = np.concatenate([free[-1:], free, free[:1]])

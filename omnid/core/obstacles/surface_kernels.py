@@ -172,8 +172,8 @@ def surface_evidence(
     Images as for floor_evidence. strips (N, 5), from above: first row and end; first disparity that is a surface within
     the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too.
     outlier: as for floor_evidence; half of a strip's rows times it is less than 256.
-    floor_weight, below_weight: probability of the floor, and of a disparity below it, by that of one above it; bound: of
-    the ratio of a strip; prior: less ratio.
+    floor_weight, below_weight: probability of the floor, and of a disparity below it, by that of one above it; bound:
+    of the ratio of a strip; prior: less ratio.
     """
     width, bins = lower.shape[1], len(surface)
     halves, floor = np.empty((2, bins, PART), np.uint8), np.empty(PART, np.uint16)
