@@ -3,8 +3,8 @@
 LOG is a folder NAME_sN of `python -m tests.simulation NAME --seed N` (NAME_dim_sN: with --dim); the world is built
 again from the name and the seed. A sector counts as found where the ring has an obstacle no farther than the true one
 and its tolerance, as unknown where it has none and does not call the way free beyond the obstacle, and as missed where
-it has a farther one or none in a direction that it calls free. A false alarm is an obstacle before the nearest true
-one.
+it has a farther one or none in a direction that it calls free; how many of all are called free is given, too, as what
+lies before a farther obstacle may be unknown. A false alarm is an obstacle before the nearest true one.
 """
 
 from __future__ import annotations
@@ -52,6 +52,7 @@ class Counts:
     """Sectors by class, for each group."""
 
     of: dict[str, dict[str, int]] = field(default_factory=dict)
+    called_free: dict[str, int] = field(default_factory=dict)  # beyond the true obstacle
     false_alarms: dict[str, int] = field(default_factory=dict)
     ranges: dict[str, int] = field(default_factory=dict)  # that the ring gave
     errors_m: dict[str, list[float]] = field(default_factory=dict)
@@ -109,6 +110,7 @@ def compare(ring: ObstacleRing, truth: TrueRing, light: str, counts: Counts) -> 
     is_found = nearest_seen <= limit
     is_unknown = ~is_found & np.isnan(ring.ranges_m) & (ring.free_m <= limit)
     classes = np.where(is_found, "found", np.where(is_unknown, "unknown", "missed"))
+    is_free = ~is_found & (ring.free_m > limit)
     least = around.min(axis=0)
     is_false = known & (ring.ranges_m < least - tolerance_m(least))
     inside = (truth.near_m >= DISTANCES_M[0]) & (truth.near_m < DISTANCES_M[-1])
@@ -117,6 +119,7 @@ def compare(ring: ObstacleRing, truth: TrueRing, light: str, counts: Counts) -> 
         distance = f"{DISTANCES_M[bins[k] - 1]:g} to {DISTANCES_M[bins[k]]:g} m"
         for group in (f"distance|{distance}", f"surface|{truth.kind[k]}", f"light|{light}", "all|all"):
             counts.add(group, [classes[k]])
+            counts.called_free[group] = counts.called_free.get(group, 0) + int(is_free[k])
             counts.false_alarms[group] = counts.false_alarms.get(group, 0) + int(is_false[k])
             counts.ranges[group] = counts.ranges.get(group, 0) + int(known[k])
             if is_found[k] and known[k]:
@@ -175,6 +178,7 @@ def rows(counts: Counts) -> Iterator[list[Cell]]:
             group.split("|")[1],
             total,
             *shares,
+            100 * counts.called_free[group] / total,
             100 * counts.false_alarms[group] / max(1, counts.ranges[group]),
             100 * float(np.median(errors)),
             100 * float(np.quantile(errors, 0.95)),
@@ -194,6 +198,7 @@ def main() -> None:
         Column("sectors of"),
         Column("number"),
         *(Column(one, "%", 2 if one == "missed" else 1) for one in CLASSES),
+        Column("called free", "%", 2),
         Column("false alarms of ranges", "%", 2),
         Column("error, median", "cm", 1),
         Column("error, p95", "cm", 1),

@@ -13,8 +13,9 @@ from ruamel.yaml import YAML
 from calib import se3
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig
+from omnid.simulation.clearance import clearance_m
 from tests.simulation import RECIPES, MountedSensor, Sensor, build, corridor, make_rig, write_log
-from tests.simulation.paths import back_again, spline_path, turns
+from tests.simulation.paths import approaches, back_again, spline_path, turns
 from tests.simulation.recipes import TURN_DEG
 
 SIZE = 96
@@ -107,6 +108,19 @@ def test_turns_and_return_path() -> None:
     assert np.rad2deg(se3.yaw(poses)) == pytest.approx([0, 10, -15])
     back = back_again(poses)
     assert len(back) == 5 and np.array_equal(back[0], back[-1])
+
+
+def test_approaches_come_near_to_what_stands_around_and_go_back() -> None:
+    wall = np.array([[[1.0, -2.0], [1.0, 2.0]], [[-1.0, -2.0], [-1.0, 2.0]]])
+    poses = approaches(1, 300, wall)
+    assert len(poses) == 300
+    distances = [clearance_m(wall, (x, y), 0.0) for x, y in poses[:, :2, 3]]
+    assert min(distances) == pytest.approx(0.3, abs=0.05) and min(distances) >= 0.3
+    assert np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1).max() <= 0.05 + 1e-9
+    turned = np.rad2deg(np.diff(np.unwrap(se3.yaw(poses))))
+    assert np.abs(turned).max() <= 10 + 1e-6
+    at_origin = np.linalg.norm(poses[:, :2, 3], axis=1) < 1e-9
+    assert at_origin[100:].any()
 
 
 def test_struts_and_hub_are_dark_and_fixed() -> None:

@@ -201,6 +201,34 @@ def march(state: Bytes, origin: Doubles, azimuths: Doubles, hit: Doubles, free: 
             r += step
 
 
+@compiled("(f8[::1], f8[::1], f8[::1], f8, f8, f8[::1])", writes=("closed",))
+def close_openings(
+    hit: Doubles, free: Doubles, in_view: Doubles, width: float, least_gap: float, closed: Doubles
+) -> None:
+    """Write the ways `hit` (N,) along all directions of a turn, where those through narrow openings end at them.
+
+    A way that passes between two surfaces nearer than its own, whose ends are less than `width` [m] apart, ends at the
+    farther one of both, unless floor is known up to its own within `least_gap` [m], beyond both, or to where it is in
+    view. free, in_view (N,): known floor, and the nearest in view.
+    """
+    count = len(hit)
+    apart = np.empty(count // 2 + 1, np.float64)
+    for m in range(len(apart)):
+        apart[m] = 2.0 * math.cos(m * math.tau / count)
+    for k in range(count):
+        closed[k] = hit[k]
+        if math.isinf(hit[k]) or hit[k] - free[k] <= least_gap or free[k] >= in_view[k]:
+            continue
+        most = min(int(width / max(free[k], width) * count / math.tau), count // 4)
+        for a in range(1, most + 1):
+            left = hit[(k - a) % count]
+            for b in range(1, most + 1):
+                right = hit[(k + b) % count]
+                end = max(left, right)
+                if free[k] <= end < closed[k] and left * left + right * right - left * right * apart[a + b] < width**2:
+                    closed[k] = end
+
+
 @compiled(
     "(f4[:, ::1], f4[:, ::1], u1[:, ::1], u1[:, ::1], f8[::1], f8[::1], f8[::1], f8[::1], f4[::1], u1[:, ::1])",
     writes=("found", "near", "behind"),

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.usual_floor import Arrivals
+from omnid.core.obstacles.watch import NARROW_CELLS
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -49,12 +50,14 @@ def circle_from(directions: Array, middle_m: Array, radius_m: float) -> Array:
 
 def ring_of(cells: Bytes, view: RingView, arrivals: Arrivals) -> GridRing:
     """Return the ring by the cells (H, W): 0 unknown, 1 free, 2 taken."""
-    hit, free = np.empty(len(view.angles)), np.empty(len(view.angles))
+    first, hit, free = np.empty((3, len(view.angles)))
     # 1. Up to the first taken cell, and to the end of the free floor.
     origin = np.array(
         [*view.place, view.cell_m / 2, view.max_range_m, view.cell_m, view.gap_share, view.gap_m], np.float64
     )
-    kernels.march(cells, origin, view.angles, hit, free)
+    kernels.march(cells, origin, view.angles, first, free)
+    # Too near for floor, a part of a surface that shows nothing, such as a white margin, is no opening.
+    kernels.close_openings(first, free, view.nearest_m, NARROW_CELLS * view.cell_m, END_M + view.cell_m, hit)
     # 2. A direction between cells may belong to either side.
     around = np.concatenate([free[-1:], free, free[:1]])
     free = np.minimum(free, np.minimum(around[:-2], around[2:]))

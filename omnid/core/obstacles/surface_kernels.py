@@ -29,7 +29,7 @@ from omnid.core.obstacles.column_kernels import (
 PART = 96  # Directions of a part, a divisor of column.DIRECTIONS, so that all parts have as many.
 # Sums of likelihoods are never less than this share of one disparity's, so that ratios stay finite.
 LEAST_LIKELIHOOD = np.float32(1e-3)
-STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR = 0, 1, 2, 3, 4
+STRIP_FIRST, STRIP_END, STRIP_SURFACE, STRIP_SHIFTS, STRIP_FLOOR, STRIP_BELOW = 0, 1, 2, 3, 4, 5
 
 
 @inner
@@ -117,7 +117,7 @@ def add_runs(
     value: Floats,
     total: Floats,
     disparities: tuple[int, int],
-    floor_weight: np.float32,
+    weights: np.float32,
     bound: np.float32,
     prior: np.float32,
     run: Floats,
@@ -126,10 +126,10 @@ def add_runs(
 ) -> None:
     """Go on with the runs (K, PART) of a strip's disparities from the first to the end, and raise `surface` to them.
 
-    value (K + 2, PART): likelihoods with a border; floor_weight: 0 where the floor is no explanation; part: of surface
-    (K, W), a row of which is contiguous only where it is cut here. Others as for `add_run`.
+    value (K + 2, PART): likelihoods with a border; weights: sum of those of all explanations; part: of surface (K, W),
+    a row of which is contiguous only where it is cut here. Others as for `add_run`.
     """
-    fourth = math.pow((disparities[1] + floor_weight - 3.0) / 3.0, 0.25)
+    fourth = math.pow((weights - 3.0) / 3.0, 0.25)
     blank = np.float32(2.0 * (fourth - 1.0 / fourth))
     for d in range(disparities[0], disparities[1]):
         if has_run(value[d], value[d + 1], value[d + 2], total, run[d]):
@@ -150,7 +150,7 @@ def keep_peaks(surface: Floats) -> None:
 
 
 @compiled(
-    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4[:, ::1])",
+    "(u1[:, ::1], u1[:, :, ::1], u1[:, :, ::1], u1[:, ::1], i4[:, ::1], u1, f4, f4, f4, f4, f4, f4[:, ::1])",
     writes=("surface",),
 )
 def surface_evidence(
@@ -162,6 +162,7 @@ def surface_evidence(
     outlier: np.uint8,
     scale: np.float32,
     floor_weight: np.float32,
+    below_weight: np.float32,
     bound: np.float32,
     prior: np.float32,
     surface: Floats,
@@ -171,7 +172,8 @@ def surface_evidence(
     Images as for floor_evidence. strips (N, 5), from above: first row and end; first disparity that is a surface within
     the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too.
     outlier: as for floor_evidence; half of a strip's rows times it is less than 256.
-    floor_weight: probability of the floor by that of one disparity; bound: of the ratio of a strip; prior: less ratio.
+    floor_weight, below_weight: probability of the floor, and of a disparity below it, by that of one above it; bound:
+    of the ratio of a strip; prior: less ratio.
     """
     width, bins = lower.shape[1], len(surface)
     halves, floor = np.empty((2, bins, PART), np.uint8), np.empty(PART, np.uint16)
@@ -184,7 +186,7 @@ def surface_evidence(
         run[:], value[0] = NOTHING, NOTHING
         for n in range(len(strips)):
             first, end = strips[n, STRIP_FIRST], strips[n, STRIP_END]
-            mine, last = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS]
+            mine, last, below = strips[n, STRIP_SURFACE], strips[n, STRIP_SHIFTS], strips[n, STRIP_BELOW]
             if last <= mine:
                 continue
             # 1. The differences of both halves: the first one is the second of the strip above.
@@ -204,8 +206,9 @@ def surface_evidence(
                 add(plain, floor_weight, total)
             for d in range(last):
                 likelihoods(sums[d], best, scale, value[d + 1])
-                add(value[d + 1], ONE, total)
+                add(value[d + 1], below_weight if d < below else ONE, total)
             # 3. The runs.
-            weight = floor_weight if strips[n, STRIP_FLOOR] > 0 else NOTHING
-            add_runs(value, total, (mine, last), weight, bound, prior, run, part, surface)
+            weights = below * below_weight + (last - below)
+            weights += floor_weight if strips[n, STRIP_FLOOR] > 0 else NOTHING
+            add_runs(value, total, (mine, last), weights, bound, prior, run, part, surface)
     keep_peaks(surface)

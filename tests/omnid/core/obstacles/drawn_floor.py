@@ -55,6 +55,12 @@ def striped(azimuth: np.ndarray, height_m: np.ndarray) -> np.ndarray:
     return np.asarray(120.0 + 30.0 * np.sin(25 * height_m + np.sin(9 * azimuth)) + 20.0 * np.sin(61 * height_m + 2))
 
 
+def courses(azimuth: np.ndarray, height_m: np.ndarray) -> np.ndarray:
+    """Return grey levels of a wall of bricks: pairs of courses of 9 cm that are all alike, with joints of 1 cm."""
+    face = np.where(height_m % 0.18 < 0.09, 85.0, 95.0) + 0.0 * azimuth
+    return np.where(height_m % 0.09 < 0.01, 170.0, face)
+
+
 @dataclass(frozen=True)
 class Pole:
     """A pole higher than the cameras, of one grey level, straight ahead."""

@@ -14,6 +14,7 @@ from tests.omnid.core.obstacles.drawn_floor import (
     HEIGHT_M,
     T_RECT_BASE,
     Pattern,
+    courses,
     panoramas,
     plain,
     ribbed,
@@ -57,6 +58,14 @@ def test_wall_and_the_floor_before_it_are_found_in_all_directions(columns: Colum
     assert (floor_at(columns, found, 1.1, 1.6) > 1).mean() > 0.9
     assert (floor_at(columns, found, 2.5, 4.0) < -1).mean() > 0.95
     assert (found.surface[int(columns.at_1m / 1.5) :] > 2).mean() < 0.01
+
+
+def test_wall_of_courses_that_are_all_alike_is_none_farther_away_below_the_floor(columns: Columns) -> None:
+    """By another number of courses it fits farther away, but not near its foot: there the floor would be above it."""
+    found = columns.evidence(*panoramas(stains, 1.2, courses))
+    at = round(columns.at_1m / 1.2)
+    assert (found.surface[at - 2 : at + 3].max(axis=0) > 2).mean() > 0.95
+    assert (found.surface[at + 3 :] > 2).mean() < 0.01
 
 
 def test_floor_of_weak_texture_is_weak_evidence_for_the_floor(columns: Columns) -> None:

@@ -46,6 +46,20 @@ def test_the_range_is_that_of_the_first_taken_cell(free: np.ndarray) -> None:
     assert np.isposinf(found.ranges_m[[LEFT, BEHIND]]).all()
 
 
+def test_part_of_a_surface_that_shows_nothing_is_no_opening_unless_floor_is_seen_in_it(free: np.ndarray) -> None:
+    """Behind it, in the object, is a cell that was taken by an error of range."""
+    around, beyond = ahead(0.6, 0.65), ahead(0.9, 0.95)
+    free[ahead(0.6, 1.5)], free[around], free[beyond] = 0, 2, 2
+    free[MIDDLE - 1 : MIDDLE + 2, around[1]] = 0
+    assert ring(free).ranges_m[AHEAD] == pytest.approx(0.6, abs=CELL_M)
+    free[MIDDLE - 1 : MIDDLE + 2, around[1].start : beyond[1].start] = 1
+    assert ring(free).ranges_m[AHEAD] == pytest.approx(0.9, abs=CELL_M)
+    # What is as wide as a person is an opening.
+    free[ahead(0.6, 0.9)] = 0
+    free[MIDDLE - 5, around[1]] = free[MIDDLE + 5, around[1]] = 2
+    assert ring(free).ranges_m[AHEAD] == pytest.approx(0.9, abs=CELL_M)
+
+
 def test_the_free_floor_ends_at_what_is_unknown_unless_it_is_a_gap(free: np.ndarray) -> None:
     free[ahead(1.0, 1.1)] = 0
     assert ring(free).free_m[AHEAD] > 2.0
