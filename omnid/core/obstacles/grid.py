@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
-from omnid.core.obstacles.cell_kernels import FLOOR, LIMIT, MOST_RATIO, SURFACE, TAKEN_ODDS, VISIBLE, add_pair
+from omnid.core.obstacles.cell_kernels import (
+    FLOOR,
+    LIMIT,
+    MOST_RATIO,
+    SURFACE,
+    TAKEN_ODDS,
+    UNSEEN_SURFACE,
+    VISIBLE,
+    add_pair,
+)
 from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
 from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of
 from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
@@ -196,9 +205,9 @@ class ObstacleGrid:
         cells (5, N, N): evidence of the cells; lost (CELLS, CELLS): log-odds that visible floor loses; gone (N, N):
         surfaces that would be seen; weight, at_rest: of the pair, and the part of it by time alone.
         """
-        # What a pair shows around a surface that is known is that surface.
+        # What a pair shows around a surface that is known is that surface, and a little in single directions is noise.
         known = _patches(self._odds[SURFACE][window] > TAKEN_ODDS) > 0
-        shown = np.where(known, np.float32(0), np.clip(cells[SURFACE], 0, MOST_SHOWN))
+        shown = np.where(known, np.float32(0), np.clip(cells[SURFACE] - UNSEEN_SURFACE, 0, MOST_SHOWN))
         amount: Floats = np.empty_like(cells[FLOOR])
         add_pair(
             cells,

@@ -288,6 +288,20 @@ def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pair
     assert ring.free_m[SECTORS // 2 + 10 : SECTORS // 2 + 30].min() > 1.5
 
 
+@pytest.mark.parametrize("is_thin", [False, True])
+def test_what_a_few_directions_of_a_cell_show_is_noise(grid: ObstacleGrid, seen: Pairs, is_thin: bool) -> None:
+    """As rungs of a ladder match each other too near to show floor; all directions show a thin thing at one range."""
+    bare = seen[0]._replace(surface=0 * seen[0].surface)
+    shown = bare.surface.copy()
+    if is_thin:
+        shown[round(COLUMNS.at_1m / 0.6)] = 3.0
+    else:
+        for k in range(round(COLUMNS.at_1m / 0.8), len(shown)):
+            shown[k, 5 * k % 16 :: 16] = 1.5
+    ring = after(grid, [bare, bare._replace(surface=shown)] if is_thin else [bare._replace(surface=shown)], 60)
+    assert ring.free_m.max() < 0.7 if is_thin else np.median(ring.free_m) > WALL_M - 0.5
+
+
 @pytest.mark.parametrize(("gap_cells", "comes_in"), [(2, False), (6, True)])
 def test_nothing_comes_in_through_a_narrow_gap(grid: ObstacleGrid, seen: Pairs, gap_cells: int, comes_in: bool) -> None:
     """A ring about the base that was never free, with a gap; in the dark something may have come to all other floor."""
