@@ -1,9 +1,9 @@
 """Floor, surfaces and edges against the truth: `python -m tests.experiments.obstacle_posterior CASE ... --seeds 1 3`.
 
 A base drives straight into a small room at its true poses (no odometry, no wheels), a pair each 5 cm. Directions of one
-degree whose nearest obstacle or edge lies within 4 m count as found (the ring has it, or something before it), unknown,
-or missed: the way is said to be free beyond it and a tolerance. A false obstacle lies before the nearest true one.
-What is missed of the thing itself is given for ranges below 0.8, to 1.25, to 2 m, beyond, and for all of them.
+degree whose nearest obstacle or edge lies within 0.2 to 4 m count as found (the ring has it, or something before it),
+unknown, or missed: the way is said to be free beyond it and a tolerance. A false obstacle lies before the nearest true
+one. What is missed of the thing itself is given for ranges below 0.8, to 1.25, to 2 m, beyond, and for all of them.
 Free ahead: what is said of the fan of 28 degrees ahead in the last rings, against the truth. The table of evidence
 (--reliability) has the share of cells that are free, by what the grid says of them.
 """

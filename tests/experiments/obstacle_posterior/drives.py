@@ -41,6 +41,7 @@ STEP_M: Final = 0.05
 START_M: Final = -1.2
 PERIOD_NS: Final = 100_000_000
 STANDING: Final = 8  # pairs before the base starts
+RADIUS_M: Final = 0.2  # of the base: nearer directions are not counted, as it would have touched what is there
 FARTHEST_M: Final = 4.0
 AHEAD_RAD: Final = 0.25
 NEIGHBOURS: Final = 2  # directions on either side that an edge may be off
@@ -167,7 +168,7 @@ def compare(ring: GridRing, scene: ObstacleScene, x_m: float, scores: Scores) ->
     around = np.minimum.reduce([np.roll(truth, shift) for shift in range(-NEIGHBOURS, NEIGHBOURS + 1)])
     with np.errstate(invalid="ignore"):
         false = np.isfinite(seen) & (seen < around - 0.1 - 0.03 * around**2)
-    counted = truth < FARTHEST_M
+    counted = (truth > RADIUS_M) & (truth < FARTHEST_M)
     scores.directions += int(counted.sum())
     scores.found += int((found & counted).sum())
     scores.missed += int((missed & counted).sum())

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from omnid.core.obstacles.cell_kernels import LIMIT
 from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
 from tests.experiments.obstacle_posterior.drives import (
+    RADIUS_M,
     START_M,
     STEP_M,
     Scores,
@@ -35,7 +36,6 @@ CASES: Final = ("plain pole", "edge 8 cm", "white wall", "glossy")
 SEED: Final = 1
 SIZE_PX, STEPS = 512, 24  # to 5 cm before x = 0
 AROUND_M: Final = (-1.5, 3.0)  # along x, and half of it to either side
-RADIUS_M: Final = 0.2  # of the base that is drawn
 STATES: Final = ListedColormap(["0.75", "#9fd39f", "#c0392b"])  # unknown, free, taken
 DPI: Final = 100
 
