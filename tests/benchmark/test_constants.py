@@ -8,7 +8,7 @@ from tests.benchmark.constants import PAGE, Constant, by_judgement, constants, c
 
 # Lower them with each reason that is written.
 MOST_WITHOUT_A_REASON = 0
-MOST_BY_JUDGEMENT = 213
+MOST_BY_JUDGEMENT = 196
 
 SOURCE = '''"""Text."""
 NAMED = "text with 3"

