@@ -8,8 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from tests.benchmark import obstacle_sensitivity
 from tests.benchmark.scaled_constant import SCALE, scale_in, scaled
 from tests.benchmark.sensitivity import CONSTANTS, Trial, chosen, words_of
 
@@ -24,6 +26,23 @@ class Limits:
 
 def test_the_sixty_constants_exist_once() -> None:
     assert len(chosen()) == sum(map(len, CONSTANTS.values())) == 60
+
+
+def test_the_constants_of_obstacles_exist_once_and_a_number_of_numpy_keeps_its_type() -> None:
+    assert len(chosen(obstacle_sensitivity.CONSTANTS)) == sum(map(len, obstacle_sensitivity.CONSTANTS.values()))
+    changed = scaled(np.uint8(48), 1.5)
+    assert changed == 72 and isinstance(changed, np.uint8)
+
+
+def test_a_row_has_the_shares_of_all_folders() -> None:
+    found = {"all": [100, 5, 1], "things": [10, 5], "open": [80, 40, 20, 10], "free": [80, 30, 10, 0]}
+    outcome = {"values": ["2", "3"], "found": {"a": found, "b": found}}
+    row = obstacle_sensitivity.row(Trial("obstacles", None, 1.5, ("a", "b")), outcome)
+    assert row[3:] == ["3", 50.0, 5.0, 1.0, 100.0, 75.0, 50.0, 0.0, ""]
+    failed = obstacle_sensitivity.row(
+        Trial("obstacles", None, 1.5, ("a",)), {"values": [], "found": {"a": {"error": "e"}}}
+    )
+    assert failed[-1] == "e" and failed[4] is None
 
 
 def test_scales_before_other_constants_are_computed() -> None:
