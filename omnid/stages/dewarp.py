@@ -54,9 +54,8 @@ class Dewarp:
         # 1. Rectify both images; the noise is measured in some of the pairs.
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
-        lower, lower_light = self._remapped(pair.lower, self._lower, "lower", measured)
-        upper, upper_light = self._remapped(pair.upper, self._upper, "upper", measured)
-        lower_grey, upper_grey = self._inner(lower), self._inner(upper)
+        lower, lower_grey, lower_light = self._remapped(pair.lower, self._lower, "lower", measured)
+        upper, upper_grey, upper_light = self._remapped(pair.upper, self._upper, "upper", measured)
         # 2. Gains for dim images, and the camera that shows less contrast, which decides how much light there is.
         by_level = gain_of(lower_light.level_grey), gain_of(upper_light.level_grey)
         lower_gain, upper_gain = pair_gains(lower_grey, upper_grey, self._visible, by_level)
@@ -78,21 +77,17 @@ class Dewarp:
 
     def _remapped(
         self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
-    ) -> tuple[NDArray[np.uint8], Light]:
-        """Return a panorama with its padding, as the camera gave it, and its light.
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Light]:
+        """Return a panorama as the camera gave it, with its padding and without, and its light.
 
         measured: measure the noise of this camera again.
         """
         smooth = cv2.GaussianBlur(image, (0, 0), self._blur_px) if self._blur_px else image
         remapped = np.asarray(cv2.remap(smooth, *maps, cv2.INTER_LINEAR), np.uint8)
-        inner = self._inner(remapped)
+        inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
         if measured:
             self._noise_grey[camera] = noise_sigma(inner, self._visible)
-        return remapped, light(inner, self._visible, self._noise_grey[camera])
-
-    def _inner(self, remapped: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return a panorama (H, W) without its padding."""
-        return np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
+        return remapped, inner, light(inner, self._visible, self._noise_grey[camera])
 
     def _padded(self, remapped: NDArray[np.uint8], gain: float, camera: Side, steps: Steps) -> PaddedPanorama:
         """Return a panorama multiplied by a gain; steps: of the quantisation of its JPEG."""

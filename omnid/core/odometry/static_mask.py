@@ -40,7 +40,7 @@ class StaticMask:
         self._edges_rad = azimuths_rad
         self._reference: tuple[Image, Flags, Array] | None = None  # panorama at half resolution, structure, pose
         self._streak: NDArray[np.uint8] | None = None
-        self._blocked: Flags | None = None
+        self._blocked: Flags | None = None  # None: nothing is known to be fixed
 
     def observe(self, panorama: Image, T_odom_rect: Array) -> None:
         """Compare the panorama (H, W) at an accepted pose with the last one, once the view should have moved."""
@@ -72,7 +72,11 @@ class StaticMask:
         self._streak = np.where(moving, counted, streak)
         margin = np.ones((2 * REACH_PX + 1, 2 * REACH_PX + 1), np.uint8)
         fixed = cv2.dilate((self._streak >= EVIDENCE).view(np.uint8), margin)
-        self._blocked = np.asarray(cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8).view(bool)
+        # Mostly nothing is: a mask of the whole size would be made, and taken off each frame, for nothing.
+        self._blocked = None
+        if fixed.any():
+            blocked = cv2.resize(fixed, shape[::-1], interpolation=cv2.INTER_NEAREST)
+            self._blocked = np.asarray(blocked, np.uint8).view(bool)
 
 
 def expected_flow(T_before_after: Array, columns: int, edges_rad: tuple[float, float]) -> Array:
