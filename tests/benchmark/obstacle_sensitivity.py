@@ -1,9 +1,10 @@
-"""Sensitivity of the obstacle grid to its constants: `python -m tests.benchmark.obstacle_sensitivity --folder DIR`.
+"""Sensitivity of the obstacle grid to its constants.
 
-Each constant of CONSTANTS is multiplied by 0.67 and by 1.5, in a process of its own, on images that are rendered once:
-drives at true poses into rooms with one thing each (tests/experiments/obstacle_posterior). Outcomes are kept in the
-folder, so that a series that was ended goes on where it was; --minutes ends it. What may not grow is the share of what
-stands there that is told free (missed); what is wanted is that open directions are told free.
+`python -m tests.benchmark.obstacle_sensitivity --folder DIR --seeds N`: each constant of CONSTANTS is multiplied by
+0.67 and by 1.5, in a process of its own, on images that are rendered once: drives at true poses into rooms with one
+thing each (tests/experiments/obstacle_posterior). Outcomes are kept in the folder, so that a series that was ended goes
+on where it was; --minutes ends it. The share of what stands there that is called free (missed) may not grow; open
+directions are to be called free. A constant of `*_kernels.py` takes longer, as its functions are compiled again.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Final
 from tests.benchmark.results import Cell, Column, ResultTable
 from tests.benchmark.seeds import DEVELOPMENT, role_of
 from tests.benchmark.sensitivity import FACTORS, Outcome, Trial, chosen, measured, rounded
+from tests.experiments.obstacle_posterior.drives import keep_images, usual_robot
 
 FAMILY: Final = "obstacle posterior"
 CASES: Final = ("corridor", "low box", "bar", "table", "plain pole", "edge 8 cm", "glossy")
@@ -94,7 +96,7 @@ COLUMNS: Final = (
 )
 REMARKS: Final = (
     "Drives at true poses into seven rooms, with a corridor, a low box, a bar, a table, a plain pole, an edge of 8 cm "
-    "and a glossy floor. Missed: told free beyond what stands there; of things: the directions of the thing itself, at "
+    "and a glossy floor. Missed: called free beyond what stands there; of things: directions of the thing itself, at "
     "all ranges up to 4 m. A row that is as the first one shows that the constant decides nothing here, not that it is "
     "safe.",
 )
@@ -102,8 +104,6 @@ REMARKS: Final = (
 
 def folder_of(top: Path, seed: int) -> Path:
     """Return the folder of the images of a seed, which are rendered where they are missing."""
-    from tests.experiments.obstacle_posterior.drives import keep_images, usual_robot
-
     folder = top / f"posterior_{SIZE_PX}px_s{seed}"
     folder.mkdir(parents=True, exist_ok=True)
     for case in CASES:

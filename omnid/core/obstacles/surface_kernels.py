@@ -169,8 +169,9 @@ def surface_evidence(
 ) -> None:
     """Write the best run (K, W) of strips of rows that are a surface, where it fits best, as a log-likelihood ratio.
 
-    Images as for floor_evidence. strips (N, 5), from above: first row and end; first disparity that is a surface within
-    the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too.
+    Images as for floor_evidence. strips (N, 6), from above: first row and end; first disparity that is a surface within
+    the robot's heights, and end of the disparities, which never rises; 1 where the floor is an explanation, too; end of
+    the disparities that lie below the floor.
     outlier: as for floor_evidence; half of a strip's rows times it is less than 256.
     floor_weight, below_weight: probability of the floor, and of a disparity below it, by that of one above it; bound:
     of the ratio of a strip; prior: less ratio.
