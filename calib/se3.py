@@ -7,11 +7,14 @@ the odometry makes some fifty such calls a frame.
 from __future__ import annotations
 
 import math
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+Vector: TypeAlias = tuple[float, float, float]
+Rows: TypeAlias = list[list[float]]  # of one matrix (3, 3)
 # Below these the series, or the limit, is as exact as the formula.
 SMALL_ANGLE_RAD = 1e-4
 SMALL_NORM = 1e-9
@@ -29,10 +32,9 @@ def inverse(T: ArrayLike) -> Array:
     """Return T_b_a of T_a_b: (R^T, -R^T t)."""
     T = np.asarray(T, float)
     if T.ndim == 2:
-        found = np.eye(4)
-        found[:3, :3] = T[:3, :3].T
-        found[:3, 3] = -(found[:3, :3] @ T[:3, 3])
-        return found
+        (a, b, c, x), (d, e, f, y), (g, h, i, z), last = T.tolist()
+        t = -(a * x + d * y + g * z), -(b * x + e * y + h * z), -(c * x + f * y + i * z)
+        return np.array([[a, d, g, t[0]], [b, e, h, t[1]], [c, f, i, t[2]], last])
     R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
     return transform(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
 
@@ -82,16 +84,28 @@ def rotation_exp(w: ArrayLike) -> Array:
 
 def rotation_log(R: ArrayLike) -> Array:
     """Return the rotation vector (..., 3) [rad] of a rotation matrix, for angles from 0 to pi inclusive."""
+    R = np.asarray(R, float)
+    if R.ndim == 2:
+        return np.array(_rotation_log_of_one(R.tolist()))
     q = quaternion(R)
-    if q.ndim == 1:
-        x, y, z, real = q.tolist()
-        length = math.hypot(x, y, z)
-        return np.asarray(q[:3] * (2.0 if length < SMALL_NORM else 2 * math.atan2(length, real) / length))
     norm = np.linalg.norm(q[..., :3], axis=-1)
     angle = 2 * np.arctan2(norm, q[..., 3])
     small = norm < SMALL_NORM
     scale = np.where(small, 2.0, angle / np.where(small, 1.0, norm))
     return np.asarray(q[..., :3] * scale[..., None])
+
+
+def _rotation_log_of_one(R: Rows) -> Vector:
+    """Return `rotation_log` of one matrix."""
+    x, y, z, real = _quaternion_of_one(R)
+    length = math.hypot(x, y, z)
+    scale = 2.0 if length < SMALL_NORM else 2 * math.atan2(length, real) / length
+    return scale * x, scale * y, scale * z
+
+
+def _cross(v: Vector, w: Vector) -> Vector:
+    """Return v x w."""
+    return v[1] * w[2] - v[2] * w[1], v[2] * w[0] - v[0] * w[2], v[0] * w[1] - v[1] * w[0]
 
 
 def exp(xi: ArrayLike) -> Array:
@@ -107,26 +121,45 @@ def exp(xi: ArrayLike) -> Array:
 
 def _exp_of_one(xi: Array) -> Array:
     """Return `exp` of one twist (6,)."""
-    first, second, third = _series_of_one(math.hypot(*xi[3:].tolist()))
-    W, T = hat(xi[3:]), np.eye(4)
-    square = W @ W
-    T[:3, 3] = xi[:3] + (second * W + third * square) @ xi[:3]
-    T[:3, :3] += first * W + second * square
-    return T
+    tx, ty, tz, x, y, z = xi.tolist()
+    first, second, third = _series_of_one(math.hypot(x, y, z))
+    # hat(w)^2 = w w^T - |w|^2 I
+    xx, yy, zz, xy, xz, yz = (second * v for v in (x * x, y * y, z * z, x * y, x * z, y * z))
+    once = _cross((x, y, z), (tx, ty, tz))
+    twice = _cross((x, y, z), once)
+    a, b, c = first * x, first * y, first * z
+    return np.array(
+        [
+            [1 - yy - zz, xy - c, xz + b, tx + second * once[0] + third * twice[0]],
+            [xy + c, 1 - xx - zz, yz - a, ty + second * once[1] + third * twice[1]],
+            [xz - b, yz + a, 1 - xx - yy, tz + second * once[2] + third * twice[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
 
 
 def log(T: ArrayLike) -> Array:
     """Return the twist (..., 6) = [translation; rotation vector] whose exp is T."""
     T = np.asarray(T, float)
-    w = rotation_log(T[..., :3, :3])
     if T.ndim == 2:
-        _, second, third = _series_of_one(math.hypot(*w.tolist()))
-        W = hat(w)
-        return np.concatenate([np.linalg.solve(np.eye(3) + second * W + third * W @ W, T[:3, 3]), w])
+        return _log_of_one(T)
+    w = rotation_log(T[..., :3, :3])
     _, b, c = _series(np.linalg.norm(w, axis=-1))
     W = hat(w)
     V = np.eye(3) + b * W + c * W @ W
     return np.concatenate([np.linalg.solve(V, T[..., :3, 3:])[..., 0], w], axis=-1)
+
+
+def _log_of_one(T: Array) -> Array:
+    """Return `log` of one transform, with the inverse of V in closed form: I - W/2 + (1 - a/2 cot(a/2)) / a^2 W^2."""
+    rows = T.tolist()
+    w = _rotation_log_of_one([row[:3] for row in rows[:3]])
+    t, angle = (rows[0][3], rows[1][3], rows[2][3]), math.hypot(*w)
+    half, square = angle / 2, angle * angle
+    factor = 1 / 12 + square / 720 if angle < SMALL_ANGLE_RAD else (1 - half / math.tan(half)) / square
+    once = _cross(w, t)
+    twice = _cross(w, once)
+    return np.array([*(t[k] - once[k] / 2 + factor * twice[k] for k in range(3)), *w])
 
 
 def adjoint(T: ArrayLike) -> Array:
@@ -143,7 +176,7 @@ def quaternion(R: ArrayLike) -> Array:
     """Return the unit quaternion (..., 4) = (x, y, z, w), w >= 0, of R (..., 3, 3)."""
     R = np.asarray(R, float)
     if R.ndim == 2:
-        return _quaternion_of_one(R)
+        return np.array(_quaternion_of_one(R.tolist()))
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     # Four times the outer product q q^T: its longest column is the best conditioned estimate of q.
     K = np.empty((*R.shape[:-2], 4, 4))
@@ -161,9 +194,9 @@ def quaternion(R: ArrayLike) -> Array:
     return np.asarray(np.where(q[..., 3:] < 0, -q, q))
 
 
-def _quaternion_of_one(R: Array) -> Array:
-    """Return `quaternion` of one matrix (3, 3)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+def _quaternion_of_one(R: Rows) -> tuple[float, float, float, float]:
+    """Return `quaternion` of one matrix."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
     columns = (
         (1 + xx - yy - zz, xy + yx, xz + zx, zy - yz),
         (xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx),
@@ -174,7 +207,8 @@ def _quaternion_of_one(R: Array) -> Array:
     longest = columns[diagonal.index(max(diagonal))]
     length = math.hypot(*longest)
     sign = -1.0 if longest[3] < 0 else 1.0
-    return np.array([sign * value / length for value in longest])
+    x, y, z, real = (sign * value / length for value in longest)
+    return x, y, z, real
 
 
 def rotation(q: ArrayLike) -> Array:

@@ -76,7 +76,7 @@ def read_header(data: NDArray[np.uint8]) -> JpegHeader:
         if marker == _INTERVAL:
             interval = int.from_bytes(segment[4:6], "big")
         if marker == _TABLES:
-            tables |= _quantisation(data[offset + 4 : offset + 2 + length].tobytes())
+            tables.update(_quantisation(data[offset + 4 : offset + 2 + length].tobytes()))
         offset += 1 if marker == _FILL else 2 + length
     return JpegHeader()
 
@@ -116,8 +116,12 @@ def coding_sigma(steps: Steps, highest: int) -> float:
     return math.sqrt(sum(step * step for step in counted) / (12 * _COEFFICIENTS))
 
 
-def _quantisation(segment: bytes) -> dict[int, Steps]:
-    """Return the whole tables of a segment by their numbers; each has steps of 8 or of 16 bits."""
+@lru_cache(maxsize=16)
+def _quantisation(segment: bytes) -> Mapping[int, Steps]:
+    """Return the whole tables of a segment by their numbers; each has steps of 8 or of 16 bits.
+
+    A camera sends the same segments with each image.
+    """
     found: dict[int, Steps] = {}
     offset = 0
     while offset < len(segment) and len(found) < _MOST_TABLES:

@@ -65,7 +65,9 @@ class DenseStereo:
         disparity = dense.disparity.copy()
         columns, rows = dense.pixels[wrong].astype(np.intp).T
         disparity[rows, columns] = np.nan
-        return DensePoints(disparity, dense.pixels[~wrong], dense.points[~wrong], dense.variance_m2[~wrong])
+        kept = np.flatnonzero(~wrong)
+        pixels, points, variance_m2 = (a.take(kept, axis=0) for a in (dense.pixels, dense.points, dense.variance_m2))
+        return DensePoints(disparity, pixels, points, variance_m2)
 
     def _match(
         self, panoramas: Panoramas, correction: DenseCorrection | None

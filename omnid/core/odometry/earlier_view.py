@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.earlier_kernels import HALF_PX, correlate
+from omnid.core.odometry.earlier_kernels import compare
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.types.panorama import PaddedPanorama
 
@@ -47,19 +47,16 @@ def contradicted(
 
     A point that the earlier panorama does not show is not contradicted.
     """
-    # 1. Where the earlier panorama showed the points, and whether it did.
+    # 1. Where the earlier panorama showed the points.
     there = se3.apply(earlier.T_earlier_now, points)
     seen = cylinder.pixels(there)
     if earlier.exposure is not None:
         seen -= earlier.exposure.shift(there).lower
-    columns = np.clip(np.rint(lower.own(seen[:, 0])), 0, lower.width - 1).astype(np.intp)
-    rows = np.clip(np.rint(seen[:, 1]), 0, cylinder.height - 1).astype(np.intp)
-    shown = cylinder.shows(seen[:, 0]) & earlier.usable[rows, columns]
-    # 2. The correlations of both hypotheses, which differ only where the windows do.
-    found = np.empty((len(points), 2))
-    here = np.column_stack([pixels[:, 0] + lower.pad_px, pixels[:, 1]]).astype(np.int64)
-    padded = np.column_stack([lower.padded(seen[:, 0]), seen[:, 1]])
-    correlate(lower.image, earlier.lower.image, here, padded, found)
-    moved_px = np.hypot(cylinder.wrap(seen[:, 0] - pixels[:, 0]), seen[:, 1] - pixels[:, 1])
-    in_world, on_rig = found[:, 0], found[:, 1]
-    return np.asarray(shown & ((in_world < LEAST) | ((moved_px > HALF_PX) & (on_rig > in_world))))
+    seen[:, 0] = earlier.lower.padded(seen[:, 0])
+    # 2. The hypotheses, where it did.
+    now, before, wrong = lower.image, earlier.lower.image, np.empty(len(points), bool)
+    (height, width), pad_px, turn_px = now.shape, lower.pad_px, cylinder.turn_px
+    compare(
+        now.reshape(-1), before.reshape(-1), height, width, pixels, seen, earlier.usable, pad_px, turn_px, LEAST, wrong
+    )
+    return wrong

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.exposure_times import NO_VELOCITY, Exposure
 from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
 from omnid.core.odometry.frame_to_map import CoarsePose, FrameToMap
 from omnid.core.odometry.keyframes import KeyframeRequest, Keyframes
@@ -59,11 +59,13 @@ class FrameExposures:
 
     def predicted(self, frame: StereoFrame, dt_s: float) -> Exposure:
         """Return the exposure of the frame to which a step of dt_s was predicted."""
-        return Exposure.of(frame.times, self._motion.at_exposure(dt_s), self._model)
+        velocity = NO_VELOCITY if frame.times.is_at_once else self._motion.at_exposure(dt_s)
+        return Exposure.of(frame.times, velocity, self._model)
 
     def now(self, frame: StereoFrame) -> Exposure:
         """Return the exposure of a frame by the velocity that the filter has now."""
-        return Exposure.of(frame.times, self._motion.now(), self._model)
+        velocity = NO_VELOCITY if frame.times.is_at_once else self._motion.now()
+        return Exposure.of(frame.times, velocity, self._model)
 
     def refine(
         self, frame: StereoFrame, coarse: CoarsePose, exposure: Exposure, T_odom_prev: Array, dt_s: float

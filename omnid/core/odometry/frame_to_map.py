@@ -133,11 +133,11 @@ class FrameToMap:
         """
         # 1. Align the patches of the keyframes in the lower panorama.
         T_odom_curr = se3.inverse(coarse.T_curr_odom)
-        landmarks, _ = self._map.visible(T_odom_curr)
+        landmarks, predicted = self._map.visible(T_odom_curr)
         in_view = len(landmarks)
         in_curr = se3.apply(coarse.T_curr_odom, self._map.store.table.points[landmarks])
         shift = exposure.shift(in_curr)
-        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, shift.lower)
+        aligned = self._map.align(frame.lower, T_odom_curr, landmarks, predicted[:, :2] - shift.lower)
         landmarks, pixels = landmarks[aligned.found], aligned.pixels[aligned.found]
         # 2. The views: aligned pixels, with the disparities of the tracks, corrected to the stamp of the pair.
         disparity, variance = np.full(len(self._map), np.nan), np.zeros(len(self._map))
@@ -161,7 +161,9 @@ class FrameToMap:
         of_depth = by_motion.derivatives[:, 2] - by_motion.derivatives[:, 1]
         assumed = AssumedMotion(exposure.motion, of_depth[kept])
         landmarks, views, pixels, tracks = landmarks[kept], views[kept], pixels[kept], coarse.tracks
-        rejected = tracks.pixels[~np.isin(tracks.landmarks, landmarks)]
+        is_kept = np.zeros(len(self._map), bool)
+        is_kept[landmarks] = True
+        rejected = tracks.pixels[~is_kept[tracks.landmarks]]
         visible, tracked, supporting = (
             round(tracks.each_counts * n) for n in (tracks.visible, len(tracks.landmarks), len(coarse.landmarks))
         )

@@ -130,17 +130,14 @@ class LocalMap:
         rows = np.flatnonzero(is_inside)
         return rows, predicted[rows]
 
-    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, shift: Array) -> AlignedPatches:
+    def align(self, lower: PaddedPanorama, T_odom_rect: Array, landmarks: Indices, predicted: Array) -> AlignedPatches:
         """Align the keyframes' patches of landmarks (M,) with a panorama whose pose is known well.
 
-        A patch is found where it has texture and moved little from its prediction. shift: see ViewShift.lower.
+        predicted (M, 2): their pixels by that pose. A patch is found where it has texture and moved little from there.
         """
         table, keyframes = self.store.table, self.store.keyframes
-        T_rect_odom = se3.inverse(T_odom_rect)
-        points = se3.apply(T_rect_odom, table.points[landmarks])
-        predicted = view(points, self._model.cylinder, self._model.baseline_m)[:, :2] - shift
         anchors = table.anchor[landmarks]
-        T_curr_ref = self.store.from_anchors(T_rect_odom, landmarks)
+        T_curr_ref = self.store.from_anchors(se3.inverse(T_odom_rect), landmarks)
         surfaces = table.anchor_points[landmarks], table.slopes[landmarks]
         images = {seq: keyframe.lower for seq, keyframe in keyframes.items()}
         templates = plane_templates(

@@ -66,10 +66,11 @@ class MotionFilter:
 
     def predict(self, dt_s: float) -> Array:
         """Predict the state dt_s later and return the expected motion T_prev_curr (4, 4)."""
-        F = np.eye(12)
-        F[:6, 6:] = dt_s * np.eye(6)
-        noise = np.diag(self._psd)
-        Q = np.block([[noise * dt_s**3 / 3, noise * dt_s**2 / 2], [noise * dt_s**2 / 2, noise * dt_s]])
+        F, Q, velocity, acceleration = np.eye(12), np.zeros((12, 12)), np.arange(6), np.arange(6, 12)
+        F[velocity, acceleration] = dt_s
+        Q[velocity, velocity] = self._psd * dt_s**3 / 3
+        Q[velocity, acceleration] = Q[acceleration, velocity] = self._psd * dt_s**2 / 2
+        Q[acceleration, acceleration] = self._psd * dt_s
         self._filter.predict(F=F, Q=Q)
         return se3.exp(self.velocity * dt_s)
 

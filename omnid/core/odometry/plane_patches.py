@@ -52,10 +52,10 @@ def plane_templates(
 ) -> Image:
     """Return templates (N, TEMPLATE, TEMPLATE) of patches at pixels (N, 2) of images, as the current view shows them.
 
-    anchors (N,): the key of the image of each. surfaces: points (N, 3) [m] at the patches' centres and slopes (N, 2) of
-    the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from these. upper: the current
-    panorama is the upper one. The templates' pixels are whole pixels of the current panorama, which shows the centres
-    at predicted (N, 2). Where a plane is seen edge on, the patch is not bent.
+    anchors (N,): the key of the image of each, one of the images. surfaces: points (N, 3) [m] at the patches' centres
+    and slopes (N, 2) of the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from
+    these. upper: the current panorama is the upper one. The templates' pixels are whole pixels of the current panorama,
+    which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent.
     """
     templates = np.empty((len(pixels), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
     points, slopes = (np.ascontiguousarray(part) for part in surfaces)
@@ -63,9 +63,9 @@ def plane_templates(
     height_m = model.baseline_m if upper else 0.0
     # All panoramas of a run have the same columns.
     centres = _padded(next(iter(images.values())), pixels) if images else pixels
-    for key in np.unique(anchors).tolist():
+    for key, panorama in images.items():
         plane_kernels.sample(
-            images[key].image,
+            panorama.image,
             np.flatnonzero(anchors == key),
             centres,
             points,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.earlier_kernels import HALF_PX, correlate
+from omnid.core.odometry.earlier_kernels import HALF_PX, SAME, copy_windows, correlations
 from omnid.core.odometry.earlier_view import EarlierView, contradicted
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.types.panorama import PaddedPanorama
@@ -106,22 +106,28 @@ def test_at_rest_a_point_is_confirmed() -> None:
     assert not contradicted(wrapped(image), pixels, CYLINDER.rays(pixels), CYLINDER, view).any()
 
 
-@pytest.mark.parametrize("seen", [(20.0, 30.0), (20.3, 30.6), (1.0, 30.0), (20.0, 118.0)])
-def test_correlation_is_that_of_numpy(seen: tuple[float, float]) -> None:
+@pytest.mark.parametrize("seen", [(20.0, 30.0), (20.3, 30.6), (33.9, 7.1)])
+def test_correlations_are_those_of_numpy(seen: tuple[float, float]) -> None:
     now, earlier = texture(3), texture(4)
-    found = np.empty((1, 2))
-    correlate(now, earlier, np.array([[40, 50]]), np.array([seen]), found)
-    side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
-    window = now[47:54, 37:44]
-    same = np.corrcoef(window.ravel(), earlier[47:54, 37:44].ravel())[0, 1]
-    inside = seen[0] >= HALF_PX and seen[1] < 120 - HALF_PX - 1
-    if not inside:
-        assert np.isnan(found).all()
-        return
-    assert found[0, 1] == pytest.approx(same, abs=1e-3)
-    u, v = np.meshgrid(seen[0] + side, seen[1] + side)
+    room = np.empty(3 * SAME, np.int32)
+    copy_windows(now.ravel(), earlier.ravel(), now.shape[1], 40, 50, np.array(seen), room)
+    in_world, on_rig = correlations(room)
+    window = now[47:54, 37:44].ravel()
+    assert on_rig == pytest.approx(np.corrcoef(window, earlier[47:54, 37:44].ravel())[0, 1], abs=1e-6)
+    u, v = np.meshgrid(*(at + np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32) for at in seen))
     patch = cv2.remap(earlier.astype(np.float32), u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-    assert found[0, 0] == pytest.approx(np.corrcoef(window.ravel(), patch.ravel())[0, 1], abs=0.02)
+    assert in_world == pytest.approx(np.corrcoef(window, patch.ravel())[0, 1], abs=0.02)
+
+
+@pytest.mark.parametrize("row", [0.0, 2.0, 117.0, 119.0])
+def test_a_window_that_leaves_the_image_contradicts_nothing(row: float) -> None:
+    """Those of the middle row, of other texture, contradict more than half."""
+    now, earlier = texture(3), texture(4)
+    pixels = np.column_stack([np.arange(0.0, 480, 5), np.full(96, row)])
+    view = EarlierView(wrapped(earlier), EVERYWHERE, np.eye(4))
+    middle = np.column_stack([pixels[:, 0], np.full(96, 60.0)])
+    assert not contradicted(wrapped(now), pixels, CYLINDER.rays(pixels), CYLINDER, view).any()
+    assert contradicted(wrapped(now), middle, CYLINDER.rays(middle), CYLINDER, view).mean() > 0.5
 
 
 def test_a_sector_has_no_points_beyond_its_ends() -> None:

@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.local_map import LocalMap
+from omnid.core.odometry.patch_alignment import AlignedPatches
 from omnid.core.odometry.tracking import KltSettings
+from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.odometry.test_landmarks import MODEL, POSE, keyframe, views
 from tests.omnid.core.scenery import texture, turned, wrapped
 
 TURN_PX = 150
-AT_STAMP = np.zeros(2)  # all pixels are exposed at the stamp
 T_TURNED = POSE @ se3.exp([0, 0, 0, 0, 0, TURN_PX * 2 * np.pi / 480])
 
 
@@ -67,14 +68,20 @@ def test_without_a_pyramid_landmarks_are_found_near_the_guess_only(local_map: Lo
     assert len(local_map.track(far, guess, near=True).landmarks) < 0.5 * len(local_map.track(far, guess).landmarks)
 
 
+def aligned_everywhere(local_map: LocalMap, lower: PaddedPanorama, T_odom_rect: Array) -> AlignedPatches:
+    """Align the patches of all landmarks, which that pose must see."""
+    landmarks, predicted = local_map.visible(T_odom_rect)
+    assert len(landmarks) == len(local_map)
+    return local_map.align(lower, T_odom_rect, landmarks, predicted[:, :2])
+
+
 def test_patches_are_aligned_to_hundredths_of_a_pixel_where_the_pose_is_known(local_map: LocalMap) -> None:
-    every = np.arange(len(local_map))
-    patches = local_map.align(wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED, every, AT_STAMP)
+    patches = aligned_everywhere(local_map, wrapped(turned(texture(1), TURN_PX + 0.4)), T_TURNED)
     pixels, aligned = patches.pixels, patches.found
     assert aligned.mean() > 0.95
     error = pixels[aligned] - local_map.store.table.views[aligned, :2] - (TURN_PX + 0.4, 0)
     assert np.abs(MODEL.cylinder.wrap(error[:, 0])).max() < 0.05 and np.abs(error[:, 1]).max() < 0.05
-    far = local_map.align(wrapped(turned(texture(1), TURN_PX + 5)), T_TURNED, every, AT_STAMP)
+    far = aligned_everywhere(local_map, wrapped(turned(texture(1), TURN_PX + 5)), T_TURNED)
     assert far.found.mean() < 0.2
 
 
@@ -90,7 +97,7 @@ def test_each_landmark_is_aligned_with_its_own_keyframe() -> None:
     seen = np.column_stack([points, points[:, 1] + 8])
     local_map.add_keyframe(keyframe(2, image=other), seen, np.zeros((len(seen), 2)))
     for image, seq in ((wrapped(texture(1)), 1), (other, 2)):
-        aligned = local_map.align(image, POSE, np.arange(len(local_map)), AT_STAMP)
+        aligned = aligned_everywhere(local_map, image, POSE)
         close = aligned.found & (np.abs(aligned.pixels - local_map.store.table.views[:, :2]).max(axis=1) < 0.1)
         assert local_map.store.anchor_shares(np.flatnonzero(close))[seq] > 0.8
         assert close.sum() > 30
