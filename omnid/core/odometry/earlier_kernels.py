@@ -119,8 +119,9 @@ def correlations(room: Places) -> tuple[float, float]:
         c += same
         cc += same * same
         ac += mine * same
-    in_world = correlation(a, aa, b / SCALE, bb / (SCALE * SCALE), ab / SCALE)
-    return in_world, correlation(a, aa, c, cc, ac)
+    one, square = float(a), float(aa)
+    in_world = correlation(one, square, b / SCALE, bb / (SCALE * SCALE), ab / SCALE)
+    return in_world, correlation(one, square, float(c), float(cc), float(ac))
 
 
 @inner

@@ -68,7 +68,7 @@ def test_without_a_pyramid_landmarks_are_found_near_the_guess_only(local_map: Lo
     assert len(local_map.track(far, guess, near=True).landmarks) < 0.5 * len(local_map.track(far, guess).landmarks)
 
 
-def aligned_everywhere(local_map: LocalMap, lower: PaddedPanorama, T_odom_rect: Array) -> AlignedPatches:
+def aligned_everywhere(local_map: LocalMap, lower: PaddedPanorama, T_odom_rect: NDArray[np.float64]) -> AlignedPatches:
     """Align the patches of all landmarks, which that pose must see."""
     landmarks, predicted = local_map.visible(T_odom_rect)
     assert len(landmarks) == len(local_map)
