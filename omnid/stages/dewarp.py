@@ -14,8 +14,8 @@ from calib.panorama import Maps, remap_tables, visible
 from drivers.jpeg import Steps
 from omnid.camera_config import TimingConfig
 from omnid.config import PanoramaConfig
-from omnid.core.stereo.photometry import Light, brightened, gain_of, light, noise_sigma, pair_gains
-from omnid.core.stereo.tiles import Side, TileMonitor, tile_columns
+from omnid.core.stereo.photometry import brightened, gain_of, light, noise_sigma, pair_gains
+from omnid.core.stereo.tiles import SIDES, Side, TileMonitor, tile_columns
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.pixel_times import PixelTimes
 from omnid.errors import OmnidError
@@ -54,15 +54,19 @@ class Dewarp:
         # 1. Rectify both images; the noise is measured in some of the pairs.
         measured = self._pairs % NOISE_PAIRS == 0
         self._pairs += 1
-        lower, lower_grey, lower_light = self._remapped(pair.lower, self._lower, "lower", measured)
-        upper, upper_grey, upper_light = self._remapped(pair.upper, self._upper, "upper", measured)
-        # 2. Gains for dim images, and the camera that shows less contrast, which decides how much light there is.
-        by_level = gain_of(lower_light.level_grey), gain_of(upper_light.level_grey)
-        lower_gain, upper_gain = pair_gains(lower_grey, upper_grey, self._visible, by_level)
-        dimmer = min(lower_light, upper_light, key=lambda light: light.contrast_to_noise)
-        # 3. Times of exposure of the pixels, and parts of the images that are dead or blind.
+        lower, lower_grey = self._remapped(pair.lower, self._lower, "lower", measured)
+        upper, upper_grey = self._remapped(pair.upper, self._upper, "upper", measured)
+        # 2. The light of each, and of the camera that shows less contrast, which decides how much there is.
+        images: dict[Side, NDArray[np.uint8]] = {"lower": lower_grey, "upper": upper_grey}
+        sums = {side: self._tiles.sums(side, image) for side, image in images.items()}
+        lights = [light(sums[side], self._noise_grey[side]) for side in SIDES]
+        dimmer = min(lights, key=lambda light: light.contrast_to_noise)
+        # 3. Gains for dim images.
+        by_level = gain_of(lights[0].level_grey), gain_of(lights[1].level_grey)
+        lower_gain, upper_gain = pair_gains(sums["lower"], sums["upper"], by_level)
+        # 4. Times of exposure of the pixels, and parts of the images that are dead or blind.
         times = PixelTimes(pair.skew_s + self.upper_delay_s, *self._rows_s)
-        tiles = self._tiles.update(pair.stamp_ns, {"lower": lower_grey, "upper": upper_grey}, self._noise_grey)
+        tiles = self._tiles.update(pair.stamp_ns, images, sums, self._noise_grey)
         return Panoramas(
             pair.seq,
             pair.stamp_ns,
@@ -77,8 +81,8 @@ class Dewarp:
 
     def _remapped(
         self, image: NDArray[np.uint8], maps: Maps, camera: Side, measured: bool
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Light]:
-        """Return a panorama as the camera gave it, with its padding and without, and its light.
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return a panorama as the camera gave it, with its padding and without.
 
         measured: measure the noise of this camera again.
         """
@@ -87,7 +91,7 @@ class Dewarp:
         inner = np.ascontiguousarray(remapped[:, self._pad_px : -self._pad_px])
         if measured:
             self._noise_grey[camera] = noise_sigma(inner, self._visible)
-        return remapped, inner, light(inner, self._visible, self._noise_grey[camera])
+        return remapped, inner
 
     def _padded(self, remapped: NDArray[np.uint8], gain: float, camera: Side, steps: Steps) -> PaddedPanorama:
         """Return a panorama multiplied by a gain; steps: of the quantisation of its JPEG."""
@@ -112,7 +116,7 @@ def _tables(geometry: Geometry, config: PanoramaConfig) -> _Tables:
     lower, upper = (remap_tables(rig, mounted, cylinder, config.pad_px) for mounted in (rig.lower, rig.upper))
     both = visible(rig.lower, lower, config.rim_margin_px)
     both &= visible(rig.upper, upper, config.rim_margin_px)
-    shared = _inner(both, config.margin_px)[:, config.pad_px : -config.pad_px]
+    shared = np.ascontiguousarray(_inner(both, config.margin_px)[:, config.pad_px : -config.pad_px])
     for table in (*lower, *upper, shared):
         table.setflags(write=False)
     return _Tables(lower, upper, _blur_px((lower, upper)), shared)
@@ -133,4 +137,4 @@ def _inner(region: NDArray[np.bool_], margin_px: int) -> NDArray[np.bool_]:
     side = 2 * margin_px + 1
     inner = cv2.erode(region.astype(np.uint8), np.ones((side, side), np.uint8), borderValue=1) > 0
     inner[: margin_px + 1], inner[len(inner) - margin_px - 1 :] = False, False
-    return np.ascontiguousarray(inner)
+    return inner

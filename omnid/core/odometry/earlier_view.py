@@ -54,9 +54,8 @@ def contradicted(
         seen -= earlier.exposure.shift(there).lower
     seen[:, 0] = earlier.lower.padded(seen[:, 0])
     # 2. The hypotheses, where it did.
-    now, before, wrong = lower.image, earlier.lower.image, np.empty(len(points), bool)
+    now, before, usable = lower.image, earlier.lower.image, np.ascontiguousarray(earlier.usable)
     (height, width), pad_px, turn_px = now.shape, lower.pad_px, cylinder.turn_px
-    compare(
-        now.reshape(-1), before.reshape(-1), height, width, pixels, seen, earlier.usable, pad_px, turn_px, LEAST, wrong
-    )
+    wrong = np.empty(len(points), bool)
+    compare(now.reshape(-1), before.reshape(-1), height, width, pixels, seen, usable, pad_px, turn_px, LEAST, wrong)
     return wrong

@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
-from omnid.core.stereo.tile_kernels import column_energies, tile_sums
+from omnid.core.stereo.tile_kernels import column_energies
+from omnid.core.stereo.tile_sums import TILE_COLUMNS, TILE_ROWS, TileSampler, TileSums, borders
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -31,12 +32,6 @@ Flags = NDArray[np.bool_]
 Side = Literal["lower", "upper"]
 SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 
-# Of a full turn; a sector has fewer. So many because 6 degrees, 15 columns of a panorama at scale 1 (512 px images),
-# are less than the narrowest part that matters.
-TILE_COLUMNS: Final = 60
-TILE_ROWS: Final = 4  # 63 rows at scale 1. By judgement; not measured.
-SPACING_PX: Final = 2  # of the pixels that are judged, because a quarter of them is enough in a quarter of the time ...
-LEAST_SAMPLES: Final = 100  # ... where a tile has so many, because a few may keep their greys by chance, as at 160 px
 # Share of a tile that shows the world; tiles that show less are not judged. By judgement; not measured.
 JUDGED_SHARE: Final = 0.5
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts, because one may be a glitch of a driver
@@ -54,8 +49,7 @@ TEXTURE_GREY: Final = 4.0  # standard deviation, because it is more than what su
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (source: ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
-# Grey level from which a pixel is saturated, and share of such pixels in a tile. By judgement; not measured.
-SATURATED_GREY, SATURATED_SHARE = np.uint8(250), 0.8
+SATURATED_SHARE: Final = 0.8  # of the pixels of a tile. By judgement; not measured.
 # A column is blurred if its energy by the other camera's is below this share of the usual, in BLURRED_COLUMNS columns,
 # because a poster that only one camera sees is all the texture of a column: 0.15 was left in rendered corridors. A drop
 # leaves less.
@@ -108,47 +102,39 @@ class TileMonitor:
 
     def __init__(self, visible: Flags, columns: int = TILE_COLUMNS) -> None:
         """visible (H, W): pixels that show the world; columns of tiles in W."""
-        self._shape = visible.shape
         self._columns = columns
-        tile_pixels = visible.size / (TILE_ROWS * columns)
-        self._spacing_px = SPACING_PX if tile_pixels >= LEAST_SAMPLES * SPACING_PX**2 else 1
-        self._visible = self._sample(visible.view(np.uint8))
-        self._tiles = _borders(self._visible.shape[0], TILE_ROWS), _borders(self._visible.shape[1], columns)
-        ones = np.ones_like(self._visible)
-        visible_pixels = self._sums(ones, ones)[0]
-        self._counts = np.maximum(visible_pixels, 1)
-        areas = np.diff(self._tiles[0])[:, None] * np.diff(self._tiles[1])
-        self._judged = np.asarray(visible_pixels >= JUDGED_SHARE * areas)
+        self._samplers = {side: TileSampler(visible, columns) for side in SIDES}
+        sampler = self._samplers["lower"]
+        self._counts = np.maximum(sampler.pixels, 1)
+        self._judged = np.asarray(sampler.pixels >= JUDGED_SHARE * sampler.areas)
         # Pixels at half resolution, all of which show the world, and so do their neighbours.
         height, width = visible.shape[0] // 2, visible.shape[1] // 2
         shown = cv2.erode(visible.astype(np.uint8), np.ones((5, 5), np.uint8))[: 2 * height, : 2 * width]
         self._half = np.ascontiguousarray(shown.reshape(height, 2, width, 2).min(axis=(1, 3)))
-        self._half_columns = _borders(width, columns)
+        self._half_columns = borders(width, columns)
         shown_columns = np.add.reduceat(self._half.sum(axis=0, dtype=np.int64), self._half_columns[:-1])
         self._half_counts = np.maximum(shown_columns, 1)
-        self._before: dict[Side, Image] = {}
         self._since_ns = dict.fromkeys(SIDES, 0)
         self._lively = {side: np.zeros(self._judged.shape) for side in SIDES}  # share of pairs that changed
         self._still = {side: np.zeros(self._judged.shape, np.intp) for side in SIDES}  # pairs in a row without change
         self._faint = {side: np.zeros(columns, np.intp) for side in SIDES}  # pairs in a row with little energy
 
-    def update(self, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]) -> TileStates:
-        """Return the states for panoramas (H, W) as the cameras gave them, whose noise is noise_grey.
+    def sums(self, side: Side, panorama: Image) -> TileSums:
+        """Return the sums of a camera's next panorama (H, W) as the camera gave it; ValueError for another shape."""
+        return self._samplers[side].add(panorama)
 
-        Raises ValueError if a panorama has another shape: the compiled loops do not check their bounds.
-        """
-        for side in SIDES:
-            if images[side].shape != self._shape:
-                raise ValueError(f"the {side} panorama is {images[side].shape}, not {self._shape}")
+    def update(
+        self, stamp_ns: int, images: dict[Side, Image], sums: dict[Side, TileSums], noise_grey: dict[Side, float]
+    ) -> TileStates:
+        """Return the states for panoramas (H, W) as the cameras gave them, with their sums and their noise."""
         # 1. What each camera shows by itself.
         blind, dead = {}, {}
-        for side in SIDES:
-            sample = self._sample(images[side])
-            before, self._before[side] = self._before.get(side, sample), sample
-            grey, square, saturated, change = self._sums(sample, before) / self._counts
+        for side, found in sums.items():
+            grey, square = found.grey / self._counts, found.square / self._counts
             contrast = np.sqrt(np.maximum(square - grey**2, 0.0))
+            saturated, change = found.saturated / self._counts, found.change / self._counts
             blind[side] = self._dark_or_glaring(grey, contrast, saturated, noise_grey[side])
-            dead[side] = self._dead(side, change, contrast, blind[side], noise_grey[side], is_first=before is sample)
+            dead[side] = self._dead(side, change, contrast, blind[side], noise_grey[side], is_first=found.is_first)
         # 2. What one camera does not show that the other one does.
         energy = {side: self._energy(images[side]) for side in SIDES}
         for side, other in zip(SIDES, reversed(SIDES), strict=True):
@@ -217,24 +203,10 @@ class TileMonitor:
         self._faint[side] = np.where(is_faint, self._faint[side] + 1, 0)
         return np.asarray(self._faint[side] >= IN_A_ROW)
 
-    def _sample(self, image: Image) -> Image:
-        return np.ascontiguousarray(image[:: self._spacing_px, :: self._spacing_px])
-
-    def _sums(self, image: Image, before: Image) -> NDArray[np.int32]:
-        """Return the sums (4, TILE_ROWS, C) of `tile_sums` of samples of an image and the one before."""
-        sums = np.empty((4, TILE_ROWS, self._columns), np.int32)
-        tile_sums(image, before, self._visible, *self._tiles, SATURATED_GREY, sums)
-        return sums
-
 
 def of_pixels(tiles: Flags, shape: tuple[int, int]) -> Flags:
     """Return flags of the pixels (H, W) of tiles (TILE_ROWS, C)."""
     return np.asarray(cv2.resize(tiles.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST), np.uint8) > 0
-
-
-def _borders(pixels: int, tiles: int) -> NDArray[np.int32]:
-    """Return the first pixel of each tile along a side, and the end (tiles + 1,)."""
-    return np.rint(np.arange(tiles + 1) * pixels / tiles).astype(np.int32)
 
 
 def tile_columns(cylinder: Cylinder) -> int:

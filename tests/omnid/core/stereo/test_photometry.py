@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from omnid.core.stereo.photometry import (
     MAX_GAIN,
@@ -15,10 +16,19 @@ from omnid.core.stereo.photometry import (
     noise_sigma,
     pair_gains,
 )
+from omnid.core.stereo.tile_sums import TileSampler, TileSums
 from tests.omnid.core.scenery import texture
 
 SHAPE = (160, 640)
 EVERYWHERE = np.ones(SHAPE, bool)
+
+
+def sums_of(image: NDArray[np.uint8], visible: NDArray[np.bool_] = EVERYWHERE) -> TileSums:
+    return TileSampler(visible).add(image)
+
+
+def gains_of(lower: NDArray[np.uint8], upper: NDArray[np.uint8], gains: tuple[float, float]) -> tuple[float, float]:
+    return pair_gains(sums_of(lower), sums_of(upper), gains)
 
 
 @pytest.mark.parametrize("sigma", [2.0, 5.0, 12.0])
@@ -48,10 +58,10 @@ def test_dim_panoramas_are_brought_to_one_level_and_bright_ones_are_left() -> No
     image[:80] = 10
     visible = EVERYWHERE.copy()
     visible[:80] = False
-    gain = gain_of(light(image, visible, 1.0).level_grey)
-    assert light(brightened(image, gain), visible, 1.0).level_grey == pytest.approx(TARGET_LEVEL, abs=0.5)
+    gain = gain_of(light(sums_of(image, visible), 1.0).level_grey)
+    assert light(sums_of(brightened(image, gain), visible), 1.0).level_grey == pytest.approx(TARGET_LEVEL, abs=0.5)
     bright = np.full(SHAPE, 120, np.uint8)
-    assert brightened(bright, gain_of(light(bright, visible, 1.0).level_grey)) is bright
+    assert brightened(bright, gain_of(light(sums_of(bright, visible), 1.0).level_grey)) is bright
     assert gain_of(0.0) == MAX_GAIN
 
 
@@ -59,20 +69,20 @@ def test_dim_panoramas_are_brought_to_one_level_and_bright_ones_are_left() -> No
 def test_the_dimmer_panorama_of_a_pair_becomes_as_bright_as_the_other(share: float) -> None:
     lower = (20 + texture(2, SHAPE, 4.0)).clip(0, 250)
     pair = lower.astype(np.uint8), (share * np.roll(lower, 6, axis=0)).astype(np.uint8)
-    gains = pair_gains(*pair, EVERYWHERE, (1.0, 1.0))
+    gains = gains_of(*pair, (1.0, 1.0))
     assert gains == (1.0, 1.0 if share > 0.9 else pytest.approx(1 / share, rel=0.03))
-    assert pair_gains(*pair[::-1], EVERYWHERE, (1.0, 1.0)) == pytest.approx(gains[::-1])
+    assert gains_of(*pair[::-1], (1.0, 1.0)) == pytest.approx(gains[::-1])
     # A dim pair has gains already, and a third of one camera behind a hand is no dimmer image.
-    assert pair_gains(*pair, EVERYWHERE, (1.5, 1.5 / share)) == (1.5, 1.5 / share)
+    assert gains_of(*pair, (1.5, 1.5 / share)) == (1.5, 1.5 / share)
     pair[1][:, : SHAPE[1] // 3] = 5
-    assert pair_gains(*pair, EVERYWHERE, (1.0, 1.0)) == pytest.approx(gains, rel=0.03)
+    assert gains_of(*pair, (1.0, 1.0)) == pytest.approx(gains, rel=0.03)
     # Two thirds behind it leave no more than a third that shows the brightness.
     pair[1][:, : 2 * SHAPE[1] // 3] = 5
-    assert share < 0.9 or pair_gains(*pair, EVERYWHERE, (1.0, 1.0)) == (1.0, 1.0)
+    assert share < 0.9 or gains_of(*pair, (1.0, 1.0)) == (1.0, 1.0)
 
 
 def test_the_gain_of_a_covered_camera_is_bounded() -> None:
     lower, black = np.full(SHAPE, 100, np.uint8), np.full(SHAPE, 3, np.uint8)
-    assert pair_gains(lower, black, EVERYWHERE, (1.0, MAX_GAIN)) == (1.0, MAX_GAIN)
+    assert gains_of(lower, black, (1.0, MAX_GAIN)) == (1.0, MAX_GAIN)
     nothing = 0 * black
-    assert pair_gains(lower, nothing, EVERYWHERE, (1.0, MAX_GAIN)) == (1.0, MAX_GAIN)
+    assert gains_of(lower, nothing, (1.0, MAX_GAIN)) == (1.0, MAX_GAIN)

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from omnid.core.stereo.tile_sums import TILE_COLUMNS, TILE_ROWS
 from omnid.core.stereo.tiles import (
     ALL_LIVE,
     BLACK_GREY,
     IN_A_ROW,
     SIDES,
-    TILE_COLUMNS,
-    TILE_ROWS,
     Side,
     TileMonitor,
     TileStates,
@@ -25,6 +24,14 @@ SHAPE = (256, 900)
 NOISE_GREY = {"lower": 2.0, "upper": 2.0}
 PART = slice(300, 600)  # columns: a third
 INSIDE, OUTSIDE = slice(21, 39), [*range(19), *range(41, 60)]  # tiles of it, and those that it does not touch
+
+
+def states_after(
+    monitor: TileMonitor, stamp_ns: int, images: dict[Side, Image], noise_grey: dict[Side, float]
+) -> TileStates:
+    """Return the states after a pair."""
+    sums = {side: monitor.sums(side, images[side]) for side in SIDES}
+    return monitor.update(stamp_ns, images, sums, noise_grey)
 
 
 class Cameras:
@@ -47,7 +54,7 @@ class Cameras:
     def update(self, images: dict[Side, Image]) -> TileStates:
         """Return the states after a pair, 0.1 s after the one before."""
         self._stamp_ns += 100_000_000
-        return self.monitor.update(self._stamp_ns, images, NOISE_GREY)
+        return states_after(self.monitor, self._stamp_ns, images, NOISE_GREY)
 
     def _noisy(self, image: Image) -> Image:
         noise = self._noise_grey * self._rng.standard_normal(SHAPE)
@@ -217,12 +224,13 @@ def test_a_small_panorama_of_little_noise_is_live() -> None:
     scene[:, ::9] = 180
     for number in range(100):
         images = {side: np.rint(scene + noise_grey * rng.standard_normal(shape)).astype(np.uint8) for side in SIDES}
-        assert monitor.update(100_000_000 * number, images, dict.fromkeys(SIDES, noise_grey)) is ALL_LIVE
+        noise = dict.fromkeys(SIDES, noise_grey)
+        assert states_after(monitor, 100_000_000 * number, images, noise) is ALL_LIVE
 
 
 def test_a_panorama_of_another_shape_is_refused() -> None:
     cameras = Cameras()
     images = cameras.images()
     images["upper"] = images["upper"][:-1]
-    with pytest.raises(ValueError, match="upper panorama"):
+    with pytest.raises(ValueError, match="a panorama is"):
         cameras.update(images)
