@@ -25,8 +25,9 @@ from pathlib import Path
 from omnid.config import load_config
 from omnid.formats.place_file import read_places
 from omnid.runs.place_maps import new_places
-from tests.benchmark.batch import SAMPLE, dask
+from tests.benchmark.batch import SAMPLE
 from tests.benchmark.results import Column, ResultTable
+from tests.omnid.batch.dask_cluster import dask_cluster
 from tests.simulation import paths, write_log
 from tests.simulation.closed_worlds import ring, two_laps_path
 from tests.simulation.recipes import mild_rig
@@ -101,7 +102,7 @@ def measure(
             same = None if count == 1 else len(side_by_side) == 1
             table.add(f"{name}, {count} at a time", least_s, processor_s, done[0].keyframes, same)
         if find_spec("distributed") is not None:
-            with dask(top) as (address, _):
+            with dask_cluster(top) as (address, _):
                 run = built(logs, top / "dask.omap", "--dask", address, *words)
             same = run.output.read_bytes() in side_by_side if side_by_side else None
             table.add(f"{name}, two dask workers", run.time_s, None, run.keyframes, same)
