@@ -22,7 +22,7 @@ from omnid.errors import OmnidError
 from omnid.messages import FramePair, Panoramas
 from omnid.stages.geometry import Geometry
 
-NOISE_PAIRS = 10  # noise is measured in every tenth pair: it changes slowly
+NOISE_NS = 1_000_000_000  # Time between two measurements of the noise, because exposure changes it slowly.
 BLUR_SHARE = 0.6  # sigma of the blur by the additional pixels that a pixel of the panorama covers
 MIN_SHARED_PART = 0.05  # Least share of the panorama that both cameras must see.
 
@@ -32,7 +32,7 @@ class Dewarp:
 
     def __init__(self, geometry: Geometry, config: PanoramaConfig, timing: TimingConfig | None = None) -> None:
         self._noise_grey: dict[Side, float] = {}  # noise of each camera before its gain
-        self._pairs = 0
+        self._measured_ns: int | None = None  # stamp of the pair in which the noise was measured last
         self._pad_px = config.pad_px
         timing = timing or TimingConfig()
         rig, cylinder = geometry.rig, geometry.cylinder
@@ -52,8 +52,9 @@ class Dewarp:
     def process(self, pair: FramePair) -> Panoramas:
         """Return the panoramas of a pair."""
         # 1. Rectify both images; the noise is measured in some of the pairs.
-        measured = self._pairs % NOISE_PAIRS == 0
-        self._pairs += 1
+        since_ns = NOISE_NS if self._measured_ns is None else abs(pair.stamp_ns - self._measured_ns)
+        if measured := since_ns >= NOISE_NS:
+            self._measured_ns = pair.stamp_ns
         lower, lower_grey = self._remapped(pair.lower, self._lower, "lower", measured)
         upper, upper_grey = self._remapped(pair.upper, self._upper, "upper", measured)
         # 2. The light of each, and of the camera that shows less contrast, which decides how much there is.
