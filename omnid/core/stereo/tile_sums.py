@@ -18,10 +18,10 @@ Numbers = NDArray[np.int32]
 # are less than the narrowest part that matters.
 TILE_COLUMNS: Final = 60
 TILE_ROWS: Final = 4  # 63 rows at scale 1. By judgement; not measured.
-SPACING_PX: Final = (
-    2  # of the pixels that are counted, because a quarter of them is enough in a quarter of the time ...
-)
-LEAST_SAMPLES: Final = 100  # ... where a tile has so many, because a few may keep their greys by chance, as at 160 px
+# Rows and columns from one counted pixel to the next, because a quarter of the pixels is enough in a quarter of the
+# time, where a tile has LEAST_SAMPLES of them: a few may keep their greys by chance, as at 160 px.
+SPACING_PX: Final = 2
+LEAST_SAMPLES: Final = 100
 # Grey level from which a pixel is saturated. By judgement; not measured.
 SATURATED_GREY: Final = np.uint8(250)
 

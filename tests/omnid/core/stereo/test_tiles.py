@@ -226,11 +226,3 @@ def test_a_small_panorama_of_little_noise_is_live() -> None:
         images = {side: np.rint(scene + noise_grey * rng.standard_normal(shape)).astype(np.uint8) for side in SIDES}
         noise = dict.fromkeys(SIDES, noise_grey)
         assert states_after(monitor, 100_000_000 * number, images, noise) is ALL_LIVE
-
-
-def test_a_panorama_of_another_shape_is_refused() -> None:
-    cameras = Cameras()
-    images = cameras.images()
-    images["upper"] = images["upper"][:-1]
-    with pytest.raises(ValueError, match="a panorama is"):
-        cameras.update(images)
