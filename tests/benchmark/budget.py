@@ -152,7 +152,7 @@ def main() -> None:
         type=float,
         default=10.0,
         help="pairs a second by their stamps, whatever the log's own "
-        "rate is: the map takes 5 a second; the motion from pair to pair stays (default: %(default)s)",
+        "rate is: the map takes at most 5 a second; the motion from pair to pair stays (default: %(default)s)",
     )
     parser.add_argument("--runs", type=int, default=5, help="runs, of which the medians are printed (default: 5)")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="computing processes per core beside it")

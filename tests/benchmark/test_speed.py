@@ -48,7 +48,7 @@ def recording() -> tuple[LogReader, Rig]:
 @pytest.mark.parametrize("hz", [10, 30])
 @pytest.mark.parametrize("threaded", [True, False], ids=["threaded", "inline"])
 def test_pairs_per_second(tmp_path: Path, threaded: bool, hz: int) -> None:
-    """hz: pairs a second by their stamps; the map takes 5 of them."""
+    """hz: pairs a second by their stamps; the map takes at most 5 of them."""
     reader, rig = recording()
     config = load_config(None, PROFILES[PROFILE] if PROFILE else ())
     frames, statistics = list(reader.frames()), RunStatistics()
