@@ -128,7 +128,7 @@ class MappingConfig:
 
     rate_hz: float = knob(
         5.0,
-        "pairs a second that enter the map at most, each with dense stereo, once the view has changed; 0: all; "
+        "pairs a second that enter the map, each with dense stereo; 0: all; "
         "keyframes only while no client receives and no log records the cloud of a live run",
         low=0,
         high=1000,

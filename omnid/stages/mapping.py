@@ -22,13 +22,11 @@ Array = NDArray[np.float64]
 Position: TypeAlias = tuple[float, float]  # x, y [m]
 
 MIN_VOXEL_FRAMES = 2  # frames that must have seen a voxel, also in a short run; one where there are fewer than 4
-# Frames of the run for each frame required, up to mapping.min_frames, by trial on development seeds: with 10 three
-# times as many wrong points stay, with 7 a tenth less is seen (tests/benchmark/cloud_error.py).
-FRAMES_PER_VOXEL_FRAME = 8
-# Motion after which a pair is due, because less shows the same points again: with 0.03 m and 2 degrees twice as many
-# pairs enter the map, whose points are no nearer to the world (tests/benchmark/cloud_error.py).
-NEW_VIEW_M, NEW_VIEW_RAD = 0.15, math.radians(8)
-STANDING_NS = 1_000_000_000  # A pair of the same view is due after this time, because what is seen may have moved.
+FRAMES_PER_VOXEL_FRAME = 10  # frames of the run for each frame required, up to mapping.min_frames
+# Less motion shows the same points again. Measured: with 15 cm and 8 degrees half as many pairs enter the map, but of
+# its points up to 2.4 times as many are wrong where as much is seen (tests/benchmark/cloud_error.py).
+SAME_VIEW_M, SAME_VIEW_TRACE = 0.03, 3 - math.radians(2) ** 2
+STANDING_NS = 1_000_000_000  # Least time between two pairs of the same view that enter the map.
 FINEST_STEP_M = 0.001  # Least distance between two vertices of the path: a robot at rest adds none.
 SPARSE_NS = 1_000_000_000  # Time between two pairs that enter the map at LoadLevel.SPARSE_MAP.
 STAMP_JITTER_NS = 5_000_000  # Tolerance of stamps: a period of the cameras that divides that of the map then does so.
@@ -91,11 +89,11 @@ class Mapping:
         return self._update(odometry.seq, odometry.stamp_ns)
 
     def _is_due(self, odometry: OdometryUpdate) -> bool:
-        """True if a pair is to enter the map: once the view has changed, or some time has passed, and not too often.
+        """True if a pair is to enter the map: so often, and sooner where the view has changed.
 
-        Dense stereo costs as much as the odometry of a pair. A keyframe, whose dense stereo the odometry needs anyway,
-        is due after half the time, and after any motion: then another pair can do without. While no client reads the
-        map, keyframes are enough: one that reads it later finds all of it, of fewer views.
+        Dense stereo costs as much as the odometry of a pair. A robot at rest sees nothing new. A keyframe, whose dense
+        stereo the odometry needs anyway, is due after half the time: then another pair can do without. While no client
+        reads the map, keyframes are enough: one that reads it later finds all of it, of fewer views.
         """
         if not (odometry.is_keyframe or self._is_read()):
             return False
@@ -105,15 +103,10 @@ class Mapping:
         shed_ns = SPARSE_NS if load is LoadLevel.SPARSE_MAP else 0
         if self._mapped is None or not (self._min_gap_ns or shed_ns):
             return True
-        since_ns = odometry.stamp_ns - self._mapped[0]
-        moved = se3.log(se3.inverse(self._mapped[1]) @ odometry.T_odom_rig)
-        is_same_view = np.linalg.norm(moved[:3]) < NEW_VIEW_M and np.linalg.norm(moved[3:]) < NEW_VIEW_RAD
-        wait_ns = max(self._min_gap_ns, shed_ns)
-        if odometry.is_keyframe:
-            wait_ns //= 2
-        elif is_same_view:
-            wait_ns = max(wait_ns, STANDING_NS)
-        return since_ns >= wait_ns - STAMP_JITTER_NS
+        since_ns, moved = odometry.stamp_ns - self._mapped[0], se3.inverse(self._mapped[1]) @ odometry.T_odom_rig
+        is_same_view = np.linalg.norm(moved[:3, 3]) < SAME_VIEW_M and np.trace(moved[:3, :3]) > SAME_VIEW_TRACE
+        wait_ns = max(self._min_gap_ns, shed_ns, STANDING_NS if is_same_view else 0)
+        return since_ns >= (wait_ns / 2 if odometry.is_keyframe else wait_ns) - STAMP_JITTER_NS
 
     def finish(self) -> list[MapUpdate]:
         """Return the final map, if there was a pair."""

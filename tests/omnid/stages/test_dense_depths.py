@@ -80,7 +80,7 @@ def test_two_threads_that_read_at_the_same_time_compute_the_depth_once() -> None
         (5.0, 1.0, 10),  # as often as the rate says, of 30 pairs a second for 2 s
         (0.0, 0.0, 60),  # all
         (5.0, 0.0, 2),  # at rest, once a second
-        (5.0, 0.5, 7),  # as soon as the view has changed by 15 cm, which is every ninth pair
+        (1000.0, 0.5, 30),  # as soon as the view has changed by 3 cm, which is every second pair
     ],
 )
 def test_pairs_enter_the_map_at_its_rate_while_the_robot_moves(rate_hz: float, speed_mps: float, expected: int) -> None:
@@ -146,7 +146,7 @@ def test_keyframes_alone_enter_a_map_without_readers() -> None:
         update = OdometryUpdate(
             seq,
             stamp_ns,
-            se3.transform(np.eye(3), np.array([3 * stamp_ns * 1e-9, 0, 0])),
+            se3.transform(np.eye(3), np.array([stamp_ns * 1e-9, 0, 0])),
             np.eye(6),
             np.zeros(6),
             np.eye(6),
