@@ -153,7 +153,7 @@ def test_reports_a_corrupt_length(tmp_path: Path) -> None:
         (b"SQLite format 3\0" + bytes(50), "file is not a database"),
         (b"#ROSBAG V2.0\n" + bytes(50), "`omnid log recover`"),
         (zstandard.compress(bytes(50)), "zstd -d"),
-        (gzip.compress(bytes(50)), "gzip -d"),
+        (gzip.compress(bytes(50), mtime=0), "gzip -d"),  # else it holds the time, and names of tests must not
         (b"PK\x03\x04" + bytes(50), "unzip"),
         (MAGIC, "`omnid log recover`"),
     ],
