@@ -34,21 +34,16 @@ COLUMNS: Final = (
 )
 
 
-class Receiver:
-    """Notes when an operator receives poses."""
-
-    def __init__(self, operator: Operator) -> None:
-        self._operator = operator
-        self.latencies_ms: list[float] = []
-
-    def watch(self, seconds: float) -> None:
-        """Note the latency of each pose for so long."""
-        until, seen = time.monotonic() + seconds, len(self._operator.poses)
-        while time.monotonic() < until:
-            time.sleep(0.001)
-            now_ns, poses = time.time_ns(), self._operator.poses
-            self.latencies_ms += [1e-6 * (now_ns - pose.stamp_ns) for pose in poses[seen:]]
-            seen = len(poses)
+def received_ms(operator: Operator, seconds: float) -> list[float]:
+    """Return the latencies of the poses that an operator receives in so long a time."""
+    found: list[float] = []
+    until, seen = time.monotonic() + seconds, len(operator.poses)
+    while time.monotonic() < until:
+        time.sleep(0.001)
+        now_ns, new = time.time_ns(), operator.poses[seen:]
+        found += [1e-6 * (now_ns - pose.stamp_ns) for pose in new]
+        seen += len(new)
+    return found
 
 
 def row(name: str, latencies_ms: Sequence[float]) -> list[Cell]:
@@ -66,9 +61,7 @@ def measure(rate_hz: float, per_core: int, seconds: float) -> list[float]:
         daemon(Path(folder), rate_hz / float(HZ)) as (_, operator, _),
     ):
         time.sleep(FIRST_S)
-        receiver = Receiver(operator)
-        receiver.watch(seconds)
-        return receiver.latencies_ms
+        return received_ms(operator, seconds)
 
 
 def main() -> None:

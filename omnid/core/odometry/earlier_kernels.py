@@ -26,7 +26,7 @@ LANES = 8
 SAME, SEEN = SIDE_PX * LANES, 2 * SIDE_PX * LANES
 NEXT = np.uint64(1)  # exact
 # Between pixels, weights are multiples of 1 / STEPS^2, and greys of 1 / SCALE, so that sums are of whole numbers, which
-# the compiler adds in any order. 64 steps are exact to 2 grey levels where a pixel is black and the next one white.
+# the compiler adds in any order. 64 steps are exact to 4 grey levels where a pixel is black and the next one white.
 STEPS, SCALE = np.int32(64), np.int32(16)
 HALF_GREY, SHIFT = np.int32(128), np.int32(8)  # exact: STEPS^2 / SCALE is 2^8, and half of it is rounded up
 

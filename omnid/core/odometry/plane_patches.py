@@ -55,7 +55,8 @@ def plane_templates(
     anchors (N,): the key of the image of each, one of the images. surfaces: points (N, 3) [m] at the patches' centres
     and slopes (N, 2) of the disparity there, both in the rectified frames of the images; T_curr_ref (N, 4, 4) from
     these. upper: the current panorama is the upper one. The templates' pixels are whole pixels of the current panorama,
-    which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent.
+    which shows the centres at predicted (N, 2). Where a plane is seen edge on, the patch is not bent. KeyError for an
+    anchor without an image.
     """
     templates = np.empty((len(pixels), TEMPLATE_PX, TEMPLATE_PX), np.uint8)
     points, slopes = (np.ascontiguousarray(part) for part in surfaces)
@@ -63,10 +64,13 @@ def plane_templates(
     height_m = model.baseline_m if upper else 0.0
     # All panoramas of a run have the same columns.
     centres = _padded(next(iter(images.values())), pixels) if images else pixels
-    for key, panorama in images.items():
+    rows = {key: np.flatnonzero(anchors == key) for key in images}
+    if sum(map(len, rows.values())) != len(anchors):
+        raise KeyError(f"anchors {set(anchors.tolist()) - set(images)} have no image")
+    for key, chosen in rows.items():
         plane_kernels.sample(
-            panorama.image,
-            np.flatnonzero(anchors == key),
+            images[key].image,
+            chosen,
             centres,
             points,
             slopes,

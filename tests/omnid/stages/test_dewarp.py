@@ -52,6 +52,18 @@ def test_the_visible_region_has_a_margin(rig_geometry: Geometry, frames: list[Fr
     assert shares[0] > visible.mean() > shares[1]
 
 
+def test_noise_is_measured_again_after_a_second(rig_geometry: Geometry, frames: list[Frame]) -> None:
+    (pair,), _ = run_pairs(rig_geometry, frames[:2])
+    noise = np.random.default_rng(1).normal(0, 8, pair.lower.shape)
+    noisy = replace(pair, lower=np.clip(np.rint(pair.lower + noise), 0, 255).astype(np.uint8))
+    dewarp = Dewarp(rig_geometry, CONFIG.panorama)
+    first, soon, later = (
+        dewarp.process(replace(each, stamp_ns=stamp_ns)).lower.noise_grey
+        for each, stamp_ns in ((pair, 0), (noisy, 900_000_000), (noisy, 1_000_000_000))
+    )
+    assert soon == first < 0.5 * later
+
+
 def test_a_dim_image_is_brightened_and_its_noise_is_known(rig_geometry: Geometry, frames: list[Frame]) -> None:
     pair = run_pairs(rig_geometry, frames)[0][0]
     dewarp = Dewarp(rig_geometry, Config().panorama)

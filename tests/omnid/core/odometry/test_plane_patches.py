@@ -150,3 +150,10 @@ def test_slopes_of_a_plane_beside_a_step_and_with_gaps() -> None:
     for unknown, centre in ((plane * np.nan, 20.0), (plane, np.nan)):
         found = disparity_slopes(unknown, np.array([[98.0, 50.0]]), np.array([centre]))
         np.testing.assert_array_equal(found, [[0, 0]])
+
+
+def test_a_patch_whose_image_is_missing_is_an_error() -> None:
+    pixels = pixels_of(2)
+    surfaces, T = surfaces_at(pixels), np.tile(np.eye(4), (2, 1, 1))
+    with pytest.raises(KeyError, match="8"):
+        plane_templates({7: panorama(np.eye(4))}, np.array([7, 8]), pixels, surfaces, T, MODEL, pixels)
