@@ -45,6 +45,10 @@ COMMANDS = (
     "install-service",
 )
 MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
+# Commands of earlier versions, and what to use in their place.
+REMOVED = {
+    "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command line",
+}
 WRONG_INPUT = 2
 # What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.
 _CHOICE = re.compile(r"argument (?P<name>.*): invalid choice: '(?P<found>.*)' \(choose from (?P<all>.*)\)", re.DOTALL)
@@ -87,6 +91,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     bound_image_size()
     limit_blas_threads()
     words = list(sys.argv[1:] if argv is None else argv)
+    for command, instead in REMOVED.items():
+        if words[: len(command.split())] == command.split():
+            print(f"omnid: `omnid {command}` was removed: {instead}", file=sys.stderr)
+            return WRONG_INPUT
     args = _parser(words).parse_args(words)
     return _guarded(args)
 

@@ -1,1 +1,1 @@
-"""Logs: reading, writing, recovery and rotation of MCAP files."""
+"""Logs: reading of MCAP files, bags and folders of images; writing and rotation of MCAP files."""

@@ -1,6 +1,6 @@
 """A folder of recordings: file names, number of files kept, and free space on the disk.
 
-    <name>_20260131T235900Z_001.mcap.part   being written, or left by a program that crashed: see `omnid log recover`
+    <name>_20260131T235900Z_001.mcap.part   being written, or left by a program that crashed: readable up to its end
     <name>_20260131T235900Z_001.mcap        complete
 
 The time is that of the first message, UTC; the number counts the files of one run and those of the same second. No

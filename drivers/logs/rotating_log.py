@@ -131,7 +131,7 @@ class RotatingLog:
             self._on_event(logging.WARNING, f"recording: refused a message; further ones are counted: {reason}")
 
     def _stop(self, error: DriverError) -> None:
-        """Close the file; its data on the disk is kept for `omnid log recover`."""
+        """Close the file; its data on the disk is kept."""
         if self.state.status != "stopped":
             self.state.status, self._lost_before = "stopped", self.state.lost
             self.state.stops += 1

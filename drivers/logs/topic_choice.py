@@ -34,10 +34,7 @@ def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[C
     """
     images = {name: kind for name, kind in topics.items() if _is_image(name, kind)}
     if not topics:
-        raise DriverError(
-            f"no messages can be read in {log}: `omnid log info` says whether it was cut, and "
-            "`omnid log recover` saves what is left of it"
-        )
+        raise DriverError(f"no messages can be read in {log}: `omnid log info` says whether it was cut")
     if not images:
         raise DriverError(
             f"no image topics in {log}: found {_listed(topics)}; record {IMAGE} or {COMPRESSED_IMAGE} of both cameras"

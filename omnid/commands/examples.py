@@ -95,7 +95,6 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "record": ("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),
         "report": ("report out.mcap -o report.html",),
         "log info": ("log info recordings/*.mcap",),
-        "log recover": ("log recover robot_20260131T235900Z_001.mcap.part",),
         "map build": (
             "map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
             "map build wednesday.mcap -o place.omap --extend",

@@ -1,4 +1,4 @@
-"""`omnid log`: show the content of logs, and recover an MCAP file that is cut or corrupt."""
+"""`omnid log`: show the content of logs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from omnid.utc import utc
 
 if TYPE_CHECKING:
     from drivers.logs.mcap_info import LogInfo
-    from drivers.logs.mcap_recovery import Recovery
 
 MAX_COLUMN = 60  # Most characters of a topic or a type, so that a line of the table fits a terminal.
+_MEND = "`mcap recover`, of mcap's own command line"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add `log` to the command line."""
-    parser = subparsers.add_parser("log", help="show the content of logs, and recover broken ones")
+    parser = subparsers.add_parser("log", help="show the content of logs")
     actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
     info = actions.add_parser("info", help="topics, types, counts, times, attachments, and whether the log is whole")
     info.add_argument(
@@ -33,16 +33,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     )
     add_json(info)
     info.set_defaults(run=run_info)
-    recover = actions.add_parser("recover", help="write all readable messages of a cut or corrupt log to a new one")
-    recover.add_argument("log", type=Path, metavar="FILE", help=".mcap or .mcap.part, of any program")
-    recover.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="OUT",
-        help="default: FILE without .part, or FILE.recovered.mcap; nothing is overwritten",
-    )
-    recover.set_defaults(run=run_recover)
 
 
 def run_info(args: argparse.Namespace) -> int:
@@ -68,40 +58,6 @@ def run_info(args: argparse.Namespace) -> int:
     return code
 
 
-def run_recover(args: argparse.Namespace) -> int:
-    """Recover a log. A whole log is copied only if --output is given."""
-    from drivers.logs.mcap_recovery import recover
-
-    out = args.output or _default_output(args.log)
-    found = recover(args.log, out)
-    if found.whole and args.output is None:
-        out.unlink()
-        print(_shown(f"{args.log} is whole: there is nothing to recover; -o FILE makes a copy"))
-        return 0
-    print("\n".join(map(_shown, _reported(found, args.log, out))))
-    return 0
-
-
-def _default_output(path: Path) -> Path:
-    from drivers.logs.log_folder import PART_SUFFIX, complete_path
-
-    return complete_path(path) if path.name.endswith(PART_SUFFIX) else path.with_name(f"{path.stem}.recovered.mcap")
-
-
-def _reported(found: Recovery, path: Path, out: Path) -> Iterator[str]:
-    yield f"{out}: {found.messages} messages and {found.attachments} attachments saved"
-    if found.whole:
-        yield f"{path} was already whole"
-        return
-    if found.lost:
-        yield f"lost: {found.lost} messages"
-    elif found.lost is None:
-        yield "lost: unknown, the log has no count of its messages"
-    if found.broken:
-        yield f"skipped: {found.broken} corrupt chunks or records"
-    yield f"{path} is readable up to byte {found.end} of {path.stat().st_size}; it was not changed"
-
-
 def _described(found: LogInfo) -> Iterator[str]:
     yield f"log          {_shown(str(found.path))}"
     yield f"size         {_bytes(found.size_bytes)}"
@@ -121,15 +77,14 @@ def _described(found: LogInfo) -> Iterator[str]:
 def _state(found: LogInfo) -> str:
     from drivers.logs.mcap_info import LogState
 
-    advice = f"`omnid log recover {_shown(str(found.path))}`"
     if found.state is LogState.BROKEN and found.path.suffix not in (".mcap", ".part"):
         return f"cut or corrupt, with {found.broken} corrupt records: what can be read is used"
     if found.state is LogState.BROKEN:
-        corrupt = f", with {found.broken} corrupt chunks or records," if found.broken else ""
+        corrupt = f", with {found.broken} corrupt chunks or records" if found.broken else ""
         position = f"byte {found.readable_bytes} of {found.size_bytes}"
-        return f"cut or corrupt after {position}{corrupt}: {advice} saves the readable messages"
+        return f"cut or corrupt after {position}{corrupt}: omnid reads what is before; for other programs: {_MEND}"
     if found.state is LogState.UNINDEXED:
-        return f"{found.state.value}, so some readers refuse it: {advice} adds one"
+        return f"{found.state.value}: omnid reads it; for other programs: {_MEND}"
     return str(found.state.value)
 
 

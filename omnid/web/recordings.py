@@ -140,7 +140,7 @@ def _state(path: Path) -> str:
             is_complete = has_footer(file) and not path.name.endswith(PART_SUFFIX)
     except DriverError:
         return "no log"
-    return "whole" if is_complete else "cut: omnid log recover"
+    return "whole" if is_complete else "cut"
 
 
 def recordings_routes(recordings: Recordings) -> list[BaseRoute]:

@@ -26,7 +26,6 @@ from calib.rig_file import parse_rig, read_rig
 from drivers.errors import DriverError
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
-from drivers.logs.mcap_recovery import recover
 from omnid.config import Config, load_config
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
@@ -67,12 +66,6 @@ class Format(NamedTuple):
 
 class TooLongError(Exception):
     """A file took too long."""
-
-
-def read_log(path: Path) -> None:
-    """Read a log as a replay does, and recover it."""
-    read_frames(path)
-    recover(path, path.with_name("recovered.mcap"))
 
 
 def read_frames(path: Path) -> None:
@@ -121,7 +114,7 @@ FORMATS: Final = {
     "omnid.toml": Format(lambda _: dump(Config()).encode(), load_config),
     "place.omap": Format(map_bytes, read_places),
     "truth.txt": Format(lambda folder: (folder / "truth.txt").read_bytes(), read_tum),
-    "log.mcap": Format(lambda folder: (folder / "log.mcap").read_bytes(), read_log),
+    "log.mcap": Format(lambda folder: (folder / "log.mcap").read_bytes(), read_frames),
     "log.db3": Format(lambda folder: write_db3(folder / "bag", pairs(4)).read_bytes(), read_frames),
     "log.bag": Format(lambda folder: write_bag(folder / "log.bag", pairs(4), "LZ4").read_bytes(), read_frames),
     "odom.cdr": Format(lambda _: messages()["odom"], lambda path: decode_pose(path.read_bytes(), b"")),

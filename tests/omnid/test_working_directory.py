@@ -62,7 +62,6 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "record": (("rec", "--lower", "/dev/null", "--upper", "/dev/zero"), "not a video device"),
     "report": (("none.mcap", "-o", "report.html"), "none.mcap"),
     "log info": (("none.mcap",), "none.mcap"),
-    "log recover": (("none.mcap",), "none.mcap"),
     "map build": (("none.mcap", "-o", "place.omap", "--rig", "none.toml"), "none"),
     "map info": (("none.omap",), NO_FILE),
     "map show": (("none.omap", "-o", "place.html"), NO_FILE),

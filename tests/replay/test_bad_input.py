@@ -331,7 +331,7 @@ def test_other_files_than_a_rig_say_what_to_do_with_them(omnid: Command, tmp_pat
     assert f"use it as it is, --rig {rig}" in omnid.refused("calibrate", "import", rig, "-o", tmp_path / "out.toml")
 
 
-def test_a_log_that_was_cut_names_the_command_that_recovers_it(omnid: Command, tmp_path: Path, scene: Path) -> None:
+def test_a_log_without_topics_names_the_command_that_examines_it(omnid: Command, tmp_path: Path, scene: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes((scene / "log.mcap").read_bytes()[:2000])
-    assert "`omnid log recover`" in omnid.refused("replay", cut, "--rig", scene / "rig.toml")
+    assert "`omnid log info`" in omnid.refused("replay", cut, "--rig", scene / "rig.toml")

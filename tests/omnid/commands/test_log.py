@@ -1,4 +1,4 @@
-"""`omnid log` and `omnid record` as programs: recovery of killed recordings, and any bytes as input."""
+"""`omnid log` and `omnid record` as programs: killed recordings, and any bytes as input."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import re
 import signal
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 from mcap.reader import make_reader
-from rosbags.highlevel import AnyReader
 
+from drivers.logs.log_reader import LogReader
 from drivers.logs.mcap_writer import LogWriter
 from tests.drivers.logs.mcap_logs import BARE, LOWER, START_NS, Entry, pairs, text, write_log
 from tests.replay.command import Command
@@ -60,7 +61,7 @@ def printed(process: subprocess.Popen[str], count: int) -> list[int]:
     return [int(process.stdout.readline().split()[1]) for _ in range(count)]
 
 
-def test_a_kill_costs_at_most_a_second_and_the_rest_is_recovered(tmp_path: Path, scene: Path, omnid: Command) -> None:
+def test_a_kill_costs_at_most_a_second_and_the_rest_is_read(tmp_path: Path, scene: Path, omnid: Command) -> None:
     folder = tmp_path / "log"
     with recording(scene, folder) as process:
         stamps = printed(process, 150)  # 2.5 s
@@ -70,24 +71,19 @@ def test_a_kill_costs_at_most_a_second_and_the_rest_is_recovered(tmp_path: Path,
     (part,) = folder.iterdir()
     assert part.suffixes == [".mcap", ".part"]
     assert omnid("log", "info", part).code == 1
-    assert omnid("log", "recover", part).code == 0
-    path = part.with_suffix("")
-    assert omnid("log", "info", path).code == 0
-    with path.open("rb") as file:
-        saved = sum(1 for _ in make_reader(file, validate_crcs=True).iter_messages())
-    with AnyReader([path]) as bag:
-        times = [stamp for _, stamp, _ in bag.messages()]
+    with closing(LogReader(part)) as reader:
+        times = [frame.stamp_ns for frame in reader.frames()]
     # The writer syncs once a second; on a busy computer the sync itself may take most of another one.
-    assert len(times) == saved and max(stamps) - max(times) < 2 * 10**9
+    assert max(stamps) - max(times) < 2 * 10**9
     shortly_before_ns = max(times) - 216_000_000  # the order of simultaneous images of both cameras is arbitrary
     assert sum(stamp < shortly_before_ns for stamp in times) == sum(stamp < shortly_before_ns for stamp in stamps)
-    replayed = omnid.replay(path, "--inline")
+    replayed = omnid.replay(part, "--inline")
     assert replayed.code == 0, replayed.err
     # Images whose partner was dropped on a busy machine, and those at which the log turns back: they come twice.
     alone = sum(
         replayed.count(f"{reason}_{camera}") for reason in ("unpaired", "repeated") for camera in ("lower", "upper")
     )
-    assert 2 * replayed.count("pairs") + alone == saved and replayed.count("poses") == replayed.count("pairs") > 50
+    assert 2 * replayed.count("pairs") + alone == len(times) and replayed.count("poses") == replayed.count("pairs") > 50
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -129,46 +125,34 @@ def test_info_shows_the_damage_and_advice(omnid: Command, tmp_path: Path) -> Non
     os.truncate(path, path.stat().st_size - 1)
     code, out, _ = omnid("log", "info", bare, path)
     assert code == 1 and f"cut or corrupt after byte {path.read_bytes().index(bytes([15, 4, 0, 0]))}" in out
-    assert f"`omnid log recover {path}`" in out and "rig.toml (2.0 kB)" in out and "without an index" in out
+    assert out.count("`mcap recover`") == 2 and "rig.toml (2.0 kB)" in out and "without an index" in out
     code, out, err = omnid("log", "info", tmp_path / "no.mcap", bare)
     assert code == 2 and "No such file" in err and LOWER in out
 
 
-def test_refuses_a_log_that_is_being_written(omnid: Command, tmp_path: Path) -> None:
+def test_info_of_a_log_that_is_being_written(omnid: Command, tmp_path: Path) -> None:
     with LogWriter(tmp_path / "log.mcap") as log:
         for entry in pairs(20):
             log.write(*entry)
         code, out, _ = omnid("log", "info", tmp_path / "log.mcap")
         assert code == 0 and "being written" in out and "recover" not in out
-        assert "being written" in omnid.refused("log", "recover", tmp_path / "log.mcap")
 
 
-def test_recover_reports_its_result_and_overwrites_nothing(omnid: Command, tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", pairs(30), [("rig.toml", b"1")])
-    assert "was already whole" in omnid("log", "recover", path, "-o", tmp_path / "copy.mcap").out
-    assert "nothing to recover" in omnid("log", "recover", path).out
-    assert not (tmp_path / "log.recovered.mcap").exists()
-    os.truncate(path, path.stat().st_size - 1)
-    code, out, err = omnid("log", "recover", path)
-    assert (code, err) == (0, "") and "60 messages and 1 attachments saved" in out and "no count of its messages" in out
-    assert omnid("log", "info", tmp_path / "log.recovered.mcap").code == 0
-    assert "it exists and is not overwritten" in omnid.refused("log", "recover", path)
-    assert "No such file" in omnid.refused("log", "recover", tmp_path / "no.mcap")
+def test_a_removed_command_says_what_to_use(omnid: Command, tmp_path: Path) -> None:
+    assert "`mcap recover`" in omnid.refused("log", "recover", tmp_path / "log.mcap")
 
 
 def test_any_bytes_give_no_traceback(omnid: Command, tmp_path: Path) -> None:
     whole = write_log(tmp_path / "whole.mcap", pairs(5), [("rig.toml", b"1")], chunk_size=700).read_bytes()
-    path, out, chance = tmp_path / "log.mcap", tmp_path / "out.mcap", random.Random(3)
+    path, chance = tmp_path / "log.mcap", random.Random(3)
     codes = set()
     for _ in range(60):
         data = bytearray(whole)
         for _ in range(chance.choice((1, 4))):
             data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
         path.write_bytes(data[: chance.choice((len(data), chance.randrange(len(data))))])
-        out.unlink(missing_ok=True)
-        for words in (("info", path), ("recover", path, "-o", out)):
-            code, stdout, err = omnid("log", *words)
-            assert code in (0, 1, 2) and err.count("\n") == (code == 2)
-            assert all(line.isprintable() for line in (stdout + err).splitlines())
-            codes.add((words[0], code))
-    assert codes >= {("info", 0), ("info", 1), ("recover", 0), ("recover", 2)}
+        code, stdout, err = omnid("log", "info", path)
+        assert err.count("\n") == (code == 2)
+        assert all(line.isprintable() for line in (stdout + err).splitlines())
+        codes.add(code)
+    assert codes == {0, 1}

@@ -40,8 +40,8 @@ def test_recordings_are_listed_and_reported(server: WebServer, recordings: Path,
         found = listed(server)
     assert {name: entry["state"] for name, entry in found.items()} == {
         "images_20261122T050000Z_001.mcap": "whole",
-        "cut.mcap.part": "cut: omnid log recover",
-        "cut.mcap": "cut: omnid log recover",
+        "cut.mcap.part": "cut",
+        "cut.mcap": "cut",
         "empty.mcap": "no log",
         r"<b>\xff\n.mcap": "no log",
         "now.mcap.part": "being written",
