@@ -120,15 +120,6 @@ class Rig:
         T_upper_rig = se3.inverse(se3.transform(R_rig_upper, viewpoint))
         return replace(self, upper=replace(self.upper, T_cam_rig=T_upper_rig))
 
-    def of_one_image(self, topic: str) -> Rig:
-        """Return the rig whose two views are parts of the images of one topic; CalibError without masks for them."""
-        if self.lower.mask is None or self.upper.mask is None:
-            raise CalibError(
-                f"rig: topic {topic!r} is that of both cameras: [lower.mask] and [upper.mask] must tell "
-                "which part of its images is whose"
-            )
-        return replace(self, topics=(topic, topic))
-
     @property
     def T_rect_rig(self) -> Array:
         """Return T_rect_rig (4, 4): origin in the lower viewpoint, z towards the upper one, x nearest the rig's x.

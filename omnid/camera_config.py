@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 from drivers.cameras.v4l2_settings import EXPOSURE_MODES, PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
+from drivers.errors import DriverError
 from omnid.settings import knob
 
 
@@ -50,10 +51,12 @@ class CamerasConfig:
         shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 
-    @property
-    def is_one_device(self) -> bool:
-        """True where one device is both cameras: its images hold both views."""
-        return self.lower == self.upper
+    def require_two_devices(self) -> None:
+        """Raise DriverError where one device is named for both cameras."""
+        if self.lower == self.upper:
+            raise DriverError(
+                f"cameras.lower and cameras.upper are both {self.lower!r}: expected two devices, see `omnid cameras`"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,9 +36,10 @@ from calib.boards.corner_grid import (
 from calib.boards.corner_refinement import refine_corners
 from calib.boards.derived_images import DerivedImage, Image, derived_images
 from calib.boards.opencv_boards import are_same, confirmed, grids_nearby, opencv_grids, shared_part
-from calib.image_area import MIN_SIDE_PX
 from calib.models.camera import Array
 
+# Shorter side of the smallest image that is searched.
+MIN_SIDE_PX = 32
 # Number of grids per image that are grown and checked, those closest to the board's corner count. By judgement; not
 # measured.
 TRIED_GRIDS = 5

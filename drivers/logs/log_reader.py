@@ -97,10 +97,9 @@ class LogReader:
                 if sample is not None:
                     yield from samples.push(sample)
                 continue
-            cameras = [camera for camera, topic in self._cameras.items() if topic == logged.topic]
-            image = self._image(logged) if cameras else None
-            for camera in cameras if image is not None else []:
-                assert image is not None
+            camera = next((camera for camera, topic in self._cameras.items() if topic == logged.topic), None)
+            image = None if camera is None else self._image(logged)
+            if camera is not None and image is not None:
                 for frame in buffer.push(camera, image):
                     yield from samples.until(frame.stamp_ns)
                     yield frame

@@ -26,7 +26,7 @@ Wanted = Mapping[Camera, str | None]
 
 
 def choose_topics(log: str, topics: Mapping[str, str], wanted: Wanted) -> dict[Camera, str]:
-    """Return the topics of the two cameras; one and the same is both if it is wanted so: its images hold both views.
+    """Return the topics of the two cameras.
 
     log: its name for error messages. topics: name -> type. wanted: requested topics, which must exist; a camera
     without one is identified by a word of its topic's name. Raises DriverError, which lists the candidates, where the
@@ -126,13 +126,9 @@ def _both(log: str, images: Mapping[str, str], found: Mapping[Camera, str | None
         raise DriverError(f"cannot tell the cameras in {log} apart: found {_listed(images)}; give --lower and --upper")
     if lower is None or upper is None:
         missing = "lower" if lower is None else "upper"
-        advice = f"give --{missing} TOPIC"
-        if len(images) == 1:
-            advice += (
-                "; if its images hold both views, give it as --lower and --upper (to calibrate a rig, "
-                "--lower-area and --upper-area)"
-            )
-        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; {advice}")
+        raise DriverError(f"no {missing} camera in {log}: found only {_listed(images)}; give --{missing} TOPIC")
+    if lower == upper:
+        raise DriverError(f"topic {lower!r} of {log} is named for both cameras: expected two topics")
     return {"lower": lower, "upper": upper}
 
 

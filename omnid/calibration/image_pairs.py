@@ -7,7 +7,6 @@ from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from calib.image_area import ImageArea, TwoViews
 from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Frame, gray
@@ -16,7 +15,6 @@ from drivers.logs.log_reader import LogReader
 from omnid.calibration.images import (
     Image,
     Images,
-    image_topic,
     is_log,
     one_size,
     read_images,
@@ -38,7 +36,6 @@ class PairedImages:
 
     sides: tuple[Images, Images]
     topics: tuple[str, str] = ("", "")
-    one_image: TwoViews | None = None  # the areas of both views, where one image holds them
     notes: tuple[str, ...] = ()  # about images that were left out
 
     @property
@@ -59,23 +56,6 @@ def read_pairs(source: Path, lower: str | None = None, upper: str | None = None)
             "and upper_001.png in a folder, or images with nearly equal stamps in a log"
         )
     return _each_once(pairs)
-
-
-def read_two_views(source: Path, areas: tuple[ImageArea, ImageArea], topic: str | None) -> PairedImages:
-    """Read images of which each holds both views: of a folder, or of a log's topic."""
-    if areas[0] == areas[1]:
-        raise OmnidError(
-            "calibrate rig: --lower-area and --upper-area are the same, so the board would be found at one place for "
-            "both: give the rectangle of each view; of views one around the other the inner one's is that of its circle"
-        )
-    if is_log(source):
-        topic = image_topic(source, topic)
-    images = read_images([str(source)], topic)
-    height, width = next(iter(images.values())).shape
-    views = TwoViews(areas, (width, height))
-    lower, upper = ({name: views.view(image, side) for name, image in images.items()} for side in (0, 1))
-    topics = (topic, topic) if topic else ("", "")
-    return _each_once(PairedImages((lower, upper), topics, views))
 
 
 def _each_once(pairs: PairedImages) -> PairedImages:

@@ -22,14 +22,13 @@ from calib.fit.boards.rig_fit import RigCalibration, fit_rig, refine_rig_calibra
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
-from calib.image_area import ImageArea
 from calib.models.names import sees_directly
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import is_turned_over
 from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
 from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
-from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs, read_two_views
+from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
 from omnid.calibration.images import Image, Images
 from omnid.calibration.missing_views import missing_views
 from omnid.calibration.progress import Progress, silent
@@ -96,9 +95,7 @@ class RigResult:
 
     def save_report(self, path: str | PathLike[str]) -> None:
         """Write an HTML page with residuals, coverage and panoramas."""
-        one_image = self.images.one_image
-        rig = self.rig if one_image is None else one_image.of_areas(self.rig)
-        write_file(Path(path), rig_report_html(self.calibration, self.images, rig).encode())
+        write_file(Path(path), rig_report_html(self.calibration, self.images, self.rig).encode())
 
 
 def calibrate_rig(
@@ -112,7 +109,6 @@ def calibrate_rig(
     view: ViewChoice = "auto",
     with_struts: bool = False,
     expected_baseline_m: float | None = None,
-    areas: tuple[ImageArea, ImageArea] | None = None,
     progress: Progress = silent,
 ) -> RigResult:
     """Calibrate two cameras and the transform between them by images of a board.
@@ -120,12 +116,10 @@ def calibrate_rig(
     source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
     upper_*. cameras: known cameras, which stay as they are unless refine_cameras. model, view, progress: as in
     `calibrate_camera`. with_struts: masks with hub and struts, not only the rim. expected_baseline_m: by ruler; a
-    result that differs by a tenth is refused. areas: of the lower and the upper view in images that hold both, which
-    are all images of the folder or of the log's topic; the result is the rig of the whole images. Raises OmnidError or
-    CalibError where the images do not suffice.
+    result that differs by a tenth is refused. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images, each once.
-    images = _read(Path(source), topics, areas, cameras)
+    images = _read(Path(source), topics, cameras)
     for line in images.notes:
         progress(line)
     # 2. Find the board in all of them.
@@ -133,8 +127,7 @@ def calibrate_rig(
     # 3. Find the view of the cameras, that of a mirror or of a lens, unless the cameras are known.
     fit_each: FitEach
     if cameras is None:
-        chosen = _of_one_lens(view, images, progress)
-        direction, shown = view_of_images(chosen, _by_camera(images, views), board, progress)
+        direction, shown = view_of_images(view, _by_camera(images, views), board, progress)
         fit_each = partial(fit_cameras, images, board, model, direction, progress)
     else:
         fit_each, shown = (lambda seen, _: FittedCameras.known(cameras, seen)), []
@@ -188,35 +181,17 @@ def _result(
     rig = replace(rig, covariance=rig_covariance(found, rig))
     drives = drive_uncertainty(rig) if refined else None
     missing = missing_views(found.views, rig) if drives else ""
-    if images.one_image is not None:
-        rig = images.one_image.of_whole_image(rig)
     return RigResult(rig, found, images, (*notes, *_order_notes(rig), *unmasked), drives, missing)
 
 
 def _read(
     source: Path,
     topics: tuple[str | None, str | None],
-    areas: tuple[ImageArea, ImageArea] | None,
     cameras: GivenCameras | None,
 ) -> PairedImages:
-    """Return the images of both cameras, or both views of the images of one; OmnidError if cameras do not fit them."""
-    if areas is None:
-        images = read_pairs(source, *topics)
-        return images if cameras is None else _of_sizes(images, cameras)
-    if cameras is not None:
-        raise OmnidError("calibrate rig: expected no camera files beside the areas of both views: they are fitted")
-    named = sorted({topic for topic in topics if topic})
-    if len(named) > 1:
-        raise OmnidError(f"calibrate rig: expected one topic with both views, found {' and '.join(named)}")
-    return read_two_views(source, areas, named[0] if named else None)
-
-
-def _of_one_lens(choice: ViewChoice, images: PairedImages, progress: Progress) -> ViewChoice:
-    """Return the view, mirror where one view lies around the other: one lens alone sees a board at one place only."""
-    if choice != "auto" or images.one_image is None or images.one_image.inner is None:
-        return choice
-    progress("view: mirror, as one view lies around the other")
-    return "mirror"
+    """Return the images of both cameras; OmnidError if the given cameras do not fit them."""
+    images = read_pairs(source, *topics)
+    return images if cameras is None else _of_sizes(images, cameras)
 
 
 def _fit_rig(

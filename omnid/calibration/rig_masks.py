@@ -35,12 +35,8 @@ def masked_rig(
         if mask is None and not sees_directly(camera)
     ]
     warnings = [
-        f"no rim of a mirror was found in the {name} camera's images: "
-        + (
-            f"the daemon searches for it at start, or add [{name}.mask] by hand"
-            if images.one_image is None
-            else "its mask is its area"
-        )
+        f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or add "
+        f"[{name}.mask] by hand"
         for name in mirrors
     ]
     return replace(rig, lower=replace(rig.lower, mask=masks[0]), upper=replace(rig.upper, mask=masks[1])), warnings

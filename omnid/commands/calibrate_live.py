@@ -113,11 +113,7 @@ def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Ima
     from omnid.calibration.camera_pairs import newest_pairs
     from omnid.engine.logging_setup import log
 
-    if config.cameras.is_one_device:
-        raise OmnidError(
-            f"cameras.lower and cameras.upper are both {config.cameras.lower!r}, expected two devices: record images "
-            "that hold both views by `omnid record`, and take `omnid calibrate rig --lower-area --upper-area`"
-        )
+    config.cameras.require_two_devices()
     sources = []
     for camera in ("lower", "upper"):
         sources.append(V4l2Camera(config.cameras.settings(camera), camera, on_event=log))

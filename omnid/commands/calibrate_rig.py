@@ -8,7 +8,6 @@ from pathlib import Path
 
 from calib.camera_file import read_camera
 from calib.fit.boards.camera_selection import MODEL_CHOICES
-from calib.image_area import ImageArea
 from omnid.calibration.rig import GivenCameras, calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.board_options import add_board_options, board_of
@@ -41,14 +40,6 @@ def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> 
     parser.add_argument("--upper-camera", type=Path, metavar="FILE", help="the same for the upper camera")
     parser.add_argument("--refine-cameras", action="store_true", help="adjust the given cameras as well")
     add_cameras(parser, "a log's topic of the {camera} camera")
-    for side in ("lower", "upper"):
-        parser.add_argument(
-            f"--{side}-area",
-            type=_area,
-            metavar="X,Y,W,H",
-            help=f"where each image holds both views: left, top, width and height of the {side} view [px]; an area "
-            "within the other one is a disc, and the other view is what lies around it",
-        )
     parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
     parser.add_argument("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP)
     parser.add_argument(
@@ -80,7 +71,6 @@ def run(args: argparse.Namespace) -> int:
         view=args.view,
         with_struts=args.mask,
         expected_baseline_m=expected_m,
-        areas=_areas(args),
         progress=progress_of(args),
     )
     found = replace(found, rig=with_height(found.rig, args))
@@ -90,26 +80,6 @@ def run(args: argparse.Namespace) -> int:
     print_result(args.output, found)
     print(f"{args.output}: {height_of(found.rig)}")
     return 0
-
-
-def _area(text: str) -> ImageArea:
-    """Return the area of an option; ArgumentTypeError for anything else."""
-    try:
-        left, top, width, height = map(int, text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(
-            f"expected left, top, width and height in pixels like 0,0,768,768, found {text!r}"
-        ) from error
-    return ImageArea(left, top, width, height)
-
-
-def _areas(args: argparse.Namespace) -> tuple[ImageArea, ImageArea] | None:
-    """Return the areas of both views; raises OmnidError if only one is given."""
-    if args.lower_area is None and args.upper_area is None:
-        return None
-    if args.lower_area is None or args.upper_area is None:
-        raise OmnidError("calibrate rig: expected both --lower-area and --upper-area or neither, found one")
-    return args.lower_area, args.upper_area
 
 
 def _given(args: argparse.Namespace) -> GivenCameras | None:

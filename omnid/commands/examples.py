@@ -51,8 +51,6 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "calibrate camera": ("calibrate camera boards/*.png --corners 6x7 --square-mm 30 -o camera.toml",),
         "calibrate rig": (
             "calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml",
-            "calibrate rig DIR --corners 6x7 --square-mm 30 --lower-area 0,0,800,800 --upper-area 800,0,800,800 "
-            "-o rig.toml",
             "calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml",
         ),
         "calibrate check": ("calibrate check drive.mcap --rig rig.toml",),

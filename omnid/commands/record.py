@@ -44,9 +44,7 @@ def run(args: argparse.Namespace) -> int:
     config = settings_of(args, named)
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, ...] = ("lower", "upper")
-    if config.cameras.is_one_device:
-        cameras = ("lower",)
-        _log(logging.INFO, f"{config.cameras.lower} is both cameras: its images, with both views, are the lower one's")
+    config.cameras.require_two_devices()
     with ExitStack() as closing:
         sources: dict[Camera, V4l2Camera] = {}
         for name in cameras:

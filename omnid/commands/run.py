@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
-from collections import Counter, defaultdict, deque
+from collections import Counter, defaultdict
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.cameras.log_camera import LogCamera, LogMotion
     from drivers.frame import Camera
     from omnid.config import Config
-    from omnid.runs.live_robot import LiveCamera, OpenCamera
+    from omnid.runs.live_robot import OpenCamera
 
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -87,23 +87,11 @@ def _require_no_log_options(args: argparse.Namespace) -> None:
 
 
 def _devices(config: Config) -> OpenCamera:
-    from calib.rig_file import read_rig
-    from drivers.cameras.shared_camera import SharedCamera
     from drivers.cameras.v4l2_camera import V4l2Camera
     from omnid.engine.logging_setup import log
 
-    if not config.cameras.is_one_device:
-        return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
-    # One device: its images hold both views, and the rig's masks state which part belongs to which camera.
-    read_rig(Path(config.cameras.rig)).of_one_image(config.cameras.lower)
-    opened = deque[SharedCamera](maxlen=1)
-
-    def open_view(camera: Camera) -> LiveCamera:
-        if camera == "lower":  # which a run opens first
-            opened.append(SharedCamera(V4l2Camera(config.cameras.settings(camera), camera, on_event=log)))
-        return opened[-1].lower if camera == "lower" else opened[-1].upper
-
-    return open_view
+    config.cameras.require_two_devices()
+    return lambda camera: V4l2Camera(config.cameras.settings(camera), camera, on_event=log)
 
 
 def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, LogMotion]:

@@ -53,10 +53,7 @@ def cameras(wanted: Mapping[str, V4l2Settings], known: list[CaptureDevice], root
     nodes = {_resolved(settings.device, root) for settings in wanted.values()}
     if len(nodes) < len(wanted):
         yield Finding(
-            "warning",
-            "cameras",
-            "both names lead to one device",
-            "right if its images hold both views; else configure one device for each, see `omnid cameras`",
+            "error", "cameras", "both names lead to one device", "configure one device for each, see `omnid cameras`"
         )
     yield from buses(streams)
 

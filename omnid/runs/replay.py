@@ -201,9 +201,7 @@ class _Replay:
         found = self._options.rig
         if found is None:
             return attached_rig(reader, self._log)
-        rig = read_rig(found) if isinstance(found, Path) else found
-        lower, upper = reader.topics["lower"], reader.topics["upper"]
-        return rig.of_one_image(lower) if lower == upper else rig
+        return read_rig(found) if isinstance(found, Path) else found
 
     def _messages(self, graph: Graph, reader: LogReader, pairing: Synchronise) -> Stream[Frame | MotionSample]:
         if not self._options.paced:

@@ -22,7 +22,6 @@ class Decoder:
     def __init__(self, rig: Rig) -> None:
         self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
         self._fitted: set[Camera] = set()
-        self._last: tuple[Frame, Image] | None = None  # one image may hold both cameras' views, and be decoded once
         self.broken = 0
         self.fault = ""
 
@@ -32,7 +31,7 @@ class Decoder:
         OmnidError if a camera's first image has another size than the rig's camera.
         """
         try:
-            image = self._image(frame)
+            image = gray(frame)
         except FrameDecodeError as error:
             self._skip(str(error))
             return None
@@ -47,16 +46,6 @@ class Decoder:
             )
         self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
         return None
-
-    def _image(self, frame: Frame) -> Image:
-        """Return the image of a frame."""
-        if self._last is not None:
-            last, image = self._last
-            if last.data is frame.data and last.stamp_ns == frame.stamp_ns and last.camera != frame.camera:
-                return image
-        image = gray(frame)
-        self._last = frame, image
-        return image
 
     def _skip(self, fault: str) -> None:
         self.broken += 1

@@ -11,37 +11,28 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 
 import omnid
 from calib import se3
-from calib.camera_file import CameraFile, camera_toml
 from calib.models.equirectangular import full_turn
 from calib.panorama import fit_cylinder
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.formats.tum import Trajectory, read_tum
 from omnid.recordings.evaluation import evaluate
-from tests.benchmark.boards_chain import BOARD, PAIRS, SENSOR, calibrate, in_true_frame
 from tests.benchmark.results import Column, ResultTable
-from tests.simulation import corridor, one_image, paths, write_log
-from tests.simulation.boards import BoardRenderer, board_pose, board_poses_around_rig
+from tests.simulation import corridor, paths, write_log
 from tests.simulation.rigs import lens, lens_rig
 
 STEP_M: Final = 0.05
-STITCHED, ONE_IMAGE = FULL_TURNS = ("equirectangular", "one_image")
-# Boards before cameras that see the full turn: distances, azimuths and elevations of stitched images without their
-# seam, which is behind, and angles from the axis of two mirrors of which one is seen around the other.
-DISTANCE_M, AZIMUTH_DEG, ELEVATION_DEG, AXIS_DEG = (0.5, 1.0), 140.0, (-35.0, 40.0), (75.0, 120.0)
+STITCHED: Final = "equirectangular"
 
 
 class Case(NamedTuple):
@@ -69,7 +60,6 @@ CASES: Final = (
     Case("pinhole", 30, beyond_m=1.2),
     Case("pinhole", 90, beyond_m=1.2),
     Case(STITCHED, 360, (1280, 640)),
-    Case(ONE_IMAGE, 360, (1280, 1280)),
 )
 
 REMARKS: Final = (
@@ -83,62 +73,22 @@ REMARKS: Final = (
     "`degraded`. Limits of that were set on the seeds of the two lenses of 30 degrees.",
 )
 
-FULL_TURN_REMARKS: Final = (
-    "`equirectangular_360`: stitched images of 1280x640 px. `one_image_360`: two mirrors on one axis in images of "
-    "1280x1280 px, the lower one a disc of 0.4 of the width, the upper one the ring around it. `by boards`: the same "
-    "drive with the rig that `omnid calibrate rig` makes, with all defaults, of 24 positions of a 9x6 board of 50 mm "
-    "(noise 2); of stitched images only the transform is fitted. Wanted are 0.1 % and 3 mm.",
-)
+FULL_TURN_REMARKS: Final = ("`equirectangular_360`: stitched images of 1280x640 px. Wanted are 0.1 % and 3 mm.",)
 
 
 def rig_of(case: Case) -> Rig:
     """Return the true rig of a case."""
-    if case.model == ONE_IMAGE:
-        return one_image.coaxial_rig(case.size[0])
     return lens_rig(full_turn(case.size) if case.model == STITCHED else lens(case.model, case.field_deg, case.size))
 
 
 def measure(case: Case, seed: int, pairs: int, table: ResultTable) -> None:
-    """Render a drive, replay it, and add its row; with a rig by boards as well where the cameras see the full turn."""
-    rig, is_one = rig_of(case), case.model == ONE_IMAGE
+    """Render a drive, replay it, and add its row."""
+    rig = rig_of(case)
     poses, scene = paths.spline_path(seed, pairs, STEP_M), corridor(seed, STEP_M * pairs + 2.0 + case.beyond_m)
     with TemporaryDirectory() as name:
         folder = Path(name)
-        (one_image.write_log if is_one else write_log)(folder, rig, poses, scene, seed=seed)
+        write_log(folder, rig, poses, scene, seed=seed)
         add_row(f"{case.name}, seed {seed}", folder, read_rig(folder / "rig.toml"), seed, table)
-        if case.model in FULL_TURNS:
-            found = by_boards(rig, folder / "boards", seed)
-            add_row(f"{case.name} by boards, seed {seed}", folder, found, seed, table)
-
-
-def by_boards(truth: Rig, folder: Path, seed: int) -> Rig:
-    """Return the rig that `calibrate rig` makes of rendered images of boards, in the frame of the true one."""
-    if truth.topics[0] == truth.topics[1]:
-        poses = board_poses_around_rig(truth, BOARD, PAIRS, seed=seed, distance_m=DISTANCE_M, elevation_deg=AXIS_DEG)
-        one_image.write_boards(folder, truth, BOARD, poses, SENSOR.noise_sigma, seed)
-        lower, upper = one_image.areas(truth)
-        options = ["--lower-area", lower, "--upper-area", upper]
-    else:
-        write_stitched_boards(truth, folder, seed)
-        (folder / "camera.toml").write_text(camera_toml(CameraFile(truth.lower.camera)))
-        options = [f"--{side}-camera={folder / 'camera.toml'}" for side in ("lower", "upper")]
-    print(calibrate(folder, folder / "rig.toml", options), file=sys.stderr)
-    found = in_true_frame(read_rig(folder / "rig.toml"), truth)
-    return replace(found, topics=truth.topics)
-
-
-def write_stitched_boards(rig: Rig, folder: Path, seed: int) -> None:
-    """Render pairs of images of boards all around but behind, and write them as lower_*.png, upper_*.png."""
-    folder.mkdir()
-    rng = np.random.default_rng([seed, 12])
-    for number in range(PAIRS):
-        azimuth = np.deg2rad(AZIMUTH_DEG) * (2 * (number + rng.uniform()) / PAIRS - 1)
-        elevation = np.deg2rad(rng.uniform(*ELEVATION_DEG))
-        ray = np.array([*(math.cos(elevation) * np.array([math.cos(azimuth), math.sin(azimuth)])), math.sin(elevation)])
-        T = board_pose(ray, rng.uniform(*DISTANCE_M), np.deg2rad(30) * rng.uniform(-1, 1, 3), BOARD)
-        for side, mounted in (("lower", rig.lower), ("upper", rig.upper)):
-            made = BoardRenderer(BOARD, mounted).render_board(T, seed=1000 * seed + number, sensor=SENSOR)
-            cv2.imwrite(str(folder / f"{side}_{number:02d}.png"), made.image)
 
 
 def add_row(name: str, folder: Path, rig: Rig, seed: int, table: ResultTable) -> None:
@@ -189,7 +139,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     full_turns = ResultTable("sectors_full_turns", "accuracy", title, columns, FULL_TURN_REMARKS)
     for case in CASES:
         for seed in args.seeds if args.only is None or case.name in args.only else []:
-            measure(case, seed, args.pairs, full_turns if case.model in FULL_TURNS else sectors)
+            measure(case, seed, args.pairs, full_turns if case.model == STITCHED else sectors)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from drivers.frame import Camera
 from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.log_reader import LogReader
 from drivers.logs.topic_choice import MotionTopics, choose_motion_topics, choose_topics
-from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, LOWER, START_NS, Entry, pairs, text, write_log
+from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
 
 CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)
 
@@ -60,18 +59,6 @@ def test_prefers_compressed_images_and_ignores_depth() -> None:
     assert choose_topics("log", both, {"lower": raw, "upper": None})["lower"] == raw
 
 
-def test_one_topic_is_both_cameras_only_if_it_is_given_for_both(tmp_path: Path) -> None:
-    path = write_log(tmp_path / "log.mcap", [entry for entry in pairs(3) if entry.topic == LOWER])
-    with pytest.raises(DriverError, match="no upper camera"):
-        LogReader(path)
-    with closing(LogReader(path, lower=LOWER, upper=LOWER)) as reader:
-        frames = list(reader.frames())
-        assert [frame.camera for frame in frames] == ["lower", "upper"] * 3 and reader.pair_estimate() == 3
-        assert all(
-            a.stamp_ns == b.stamp_ns and a.data is b.data for a, b in zip(frames[::2], frames[1::2], strict=True)
-        )
-
-
 @pytest.mark.parametrize(
     ("topics", "wanted", "message"),
     [
@@ -83,7 +70,7 @@ def test_one_topic_is_both_cameras_only_if_it_is_given_for_both(tmp_path: Path) 
             "no upper camera in log: found only /lower/a; give --upper",
         ),
         ({"/cam/image": IMAGE}, {}, "no lower camera in log: found only /cam/image"),
-        ({"/cam/image": IMAGE}, {}, "if its images hold both views, give it as --lower and --upper"),
+        ({"/cam": IMAGE}, {"lower": "/cam", "upper": "/cam"}, "topic '/cam' of log is named for both cameras"),
         (
             {"/a": IMAGE, "/b": IMAGE},
             {},

@@ -264,13 +264,6 @@ def test_images_that_are_read_are_kept(four: Path, option: str, capsys: pytest.C
     assert image.read_bytes() == before
 
 
-def test_an_area_says_what_is_expected(four: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        run(four, "-o", four / "rig.toml", "--lower-area", "0,0,480")
-    assert ended.value.code == 2
-    assert "--lower-area: expected left, top, width and height in pixels like 0,0,768,768" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize(
     ("square_mm", "words", "message"),
     [
@@ -300,29 +293,3 @@ def test_suggests_the_right_number_of_corners(
         shutil.copy(path, tmp_path)
     assert run(tmp_path, "-o", tmp_path / "rig.toml", *given(folder), corners="8x5") == 2
     assert "try --corners 6x7" in capsys.readouterr().err
-
-
-def test_both_views_in_one_image_give_the_rig_of_the_whole_image(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for path in folder.glob("lower_0[0-3].png"):
-        both = path, path.with_name(path.name.replace("lower", "upper"))
-        sides = [cv2.imread(str(one), cv2.IMREAD_GRAYSCALE) for one in both]
-        cv2.imwrite(str(tmp_path / f"{path.stem[6:]}.png"), np.hstack([np.zeros((480, 30), np.uint8), *sides]))
-    out = tmp_path / "rig.toml"
-    areas = ("--lower-area", "30,0,480,480", "--upper-area", "510,0,480,480")
-    assert run(tmp_path, "-o", out, *areas, "--report", tmp_path / "report.html", "--model", "omni") == 0
-    found = read_rig(out)
-    assert found.lower.camera.size == found.upper.camera.size == (990, 480)
-    assert found.lower.camera.center == pytest.approx((LOWER.center[0] + 30, LOWER.center[1]), abs=0.3)
-    assert found.upper.camera.center == pytest.approx((UPPER.center[0] + 510, UPPER.center[1]), abs=0.3)
-    assert found.baseline_m == pytest.approx(TRUTH.baseline_m, abs=1e-3) and turn_off_deg(found) < 0.1
-    assert found.upper.mask is not None and found.upper.mask.contains(np.array([[750.0 + 100, 240.0]])).all()
-    assert found.of_one_image("/camera").topics == ("/camera", "/camera")
-    capsys.readouterr()
-    assert run(tmp_path, "-o", out, *areas[:2]) == 2
-    assert "both --lower-area and --upper-area" in capsys.readouterr().err
-    assert run(tmp_path, "-o", out, *areas[:3], "600,0,480,480") == 2
-    assert "within the image, which is 990x480 px" in capsys.readouterr().err
-    assert run(tmp_path, "-o", out, *areas[:3], areas[1]) == 2
-    assert "--lower-area and --upper-area are the same" in capsys.readouterr().err
