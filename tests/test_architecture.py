@@ -225,13 +225,6 @@ def test_rooms_keep_clear_of_modules_that_are_not_theirs(rule: Rule) -> None:
     assert breaches(rule, ROOT) == []
 
 
-def test_tests_mirror_the_rooms() -> None:
-    """A test folder below tests/calib, tests/drivers or tests/omnid has the name of a room."""
-    folders = {path.parent for layer in LAYERS for path in (ROOT / "tests" / layer).rglob("test_*.py")}
-    missing = [folder for folder in folders if not (ROOT / folder.relative_to(ROOT / "tests")).is_dir()]
-    assert missing == []
-
-
 @pytest.mark.parametrize(
     ("name", "text", "found"),
     [

@@ -59,6 +59,7 @@ def test_close_stops_the_wheels(name: str) -> None:
             motor.send(FORWARD)
 
 
+@pytest.mark.hazard("H40")
 @pytest.mark.parametrize("name", NAMES)
 def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) -> None:
     watchdog_ms = shortest_watchdog_ms(name)

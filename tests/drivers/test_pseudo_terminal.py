@@ -49,6 +49,7 @@ def refusal(motor: SerialMotor, command: VelocityCommand) -> str:
     raise AssertionError("it was not tried again")
 
 
+@pytest.mark.hazard("H43")
 @pytest.mark.parametrize("linked", [True, False])
 def test_a_motor_does_not_talk_to_the_terminal_of_another_program(linked: bool, tmp_path: Path) -> None:
     simulated, link = SimulatedMotor(), tmp_path / "motor"

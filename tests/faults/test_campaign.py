@@ -30,6 +30,7 @@ def test_mutated_files_give_a_result_or_one_line(short: Path) -> None:
     assert found == [] and 0 < memory_mb < 400
 
 
+@pytest.mark.hazard("H09")
 @pytest.mark.slow
 def test_mutated_commands_never_move_the_wheels(tmp_path: Path, course: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "results"))

@@ -359,12 +359,6 @@ def example(name: str, *words: object, cwd: Path) -> str:
     return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment, check=True).stdout
 
 
-def test_examples_are_short() -> None:
-    programs = [path for path in (ROOT / "omnid" / "examples").glob("*.py") if path.name != "__init__.py"]
-    assert len(programs) >= 3
-    assert all(len(path.read_text().splitlines()) <= 22 for path in programs)
-
-
 @pytest.mark.parametrize("name", ["replay_log", "images_to_poses", "rectify_image"])
 def test_an_example_without_its_files_says_how_it_is_called(tmp_path: Path, name: str) -> None:
     with pytest.raises(subprocess.CalledProcessError) as raised:

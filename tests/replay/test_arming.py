@@ -46,6 +46,7 @@ def expect_stand(operator: Operator, base: Base) -> None:
     assert not base.line.moved_since(since_s)
 
 
+@pytest.mark.hazard("H01")
 def test_nothing_moves_until_armed_and_a_stop_or_a_fault_lasts(tmp_path: Path, course: Path, command: Command) -> None:
     def omnid(daemon: Daemon, word: str) -> tuple[int, str]:
         """Run a command on this robot; return the exit code and its output."""
@@ -112,6 +113,7 @@ def test_without_a_robot_the_error_says_what_to_do(course: Path) -> None:
             assert err.startswith("omnid: bus cannot reach ") and err.count("\n") == 1
 
 
+@pytest.mark.hazard("H41")
 @pytest.mark.slow
 def test_sigterm_with_subscribers_that_do_not_read_stops_the_wheels_and_ends_in_time(
     tmp_path: Path, course: Path

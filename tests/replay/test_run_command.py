@@ -59,6 +59,7 @@ def test_publishes_poses_drives_the_wheels_and_ends_on_sigterm(tmp_path: Path, c
     assert all(line.startswith("omnid: ") for line in err.splitlines())
 
 
+@pytest.mark.hazard("H35")
 def test_ends_where_the_cameras_are_exchanged(tmp_path: Path, scene: Path) -> None:
     """Before the wheels turn, in one line, with exit code 2."""
     taken = images(scene / "log.mcap")

@@ -231,6 +231,7 @@ def test_after_a_command_that_was_refused_a_stop_comes_first(simulated: Simulate
         assert not motor.send(VelocityCommand(0, 0.3, 0.0, 0.0)).watchdog_expired
 
 
+@pytest.mark.hazard("H42")
 def test_no_other_program_can_open_the_port(simulated: SimulatedMotor) -> None:
     os.chmod(simulated.port, 0o666)
     assert opens_as_another_user(simulated.port)

@@ -78,6 +78,7 @@ def test_does_not_move_without_a_pose_or_without_a_setpoint(bench: Bench) -> Non
     assert bench.controller.state.stops == {} and bench.lines == [], "no motion was stopped"
 
 
+@pytest.mark.hazard("H13")
 def test_stops_where_the_pose_is_stale(driving: Bench) -> None:
     def late() -> None:
         driving.send_pose(age_s=1.0)
@@ -89,6 +90,7 @@ def test_stops_where_the_pose_is_stale(driving: Bench) -> None:
     assert driving.lines == ["the wheels stop: the pose is stale"]
 
 
+@pytest.mark.hazard("H13")
 def test_stops_where_the_pose_is_lost(driving: Bench) -> None:
     def lose() -> None:
         driving.send_pose(state="lost")
@@ -101,6 +103,7 @@ def test_stops_where_the_pose_is_lost(driving: Bench) -> None:
     assert driving.last.velocity_mps > 0.0, "found again, and a new setpoint"
 
 
+@pytest.mark.hazard("H13")
 def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
     """At half of the limits, which it comes to within the deceleration, and back again."""
     speeds = [driving.last.velocity_mps]
@@ -115,6 +118,7 @@ def test_drives_slowly_where_the_pose_is_degraded(driving: Bench) -> None:
     assert driving.lines == [] and not driving.controller.state.stops
 
 
+@pytest.mark.hazard("H05")
 def test_stops_where_no_more_setpoints_come(driving: Bench) -> None:
     for _ in range(9):
         driving.send_pose()
@@ -203,6 +207,7 @@ def test_a_setpoint_that_arrived_before_the_stop_but_is_passed_on_after_it_is_vo
     assert is_stop(driving.last)
 
 
+@pytest.mark.hazard("H40")
 def test_stops_on_an_overloaded_host_and_voids_earlier_setpoints(driving: Bench) -> None:
     send_both(driving)
     driving.tick(late_s=0.26)

@@ -78,6 +78,7 @@ class Lockstep:
             self.controller.tick()
 
 
+@pytest.mark.hazard("H11")
 @pytest.mark.parametrize("heading_rad", [3.0, -3.0, 0.2])
 def test_the_yaw_rate_holds_on_the_way_to_a_far_heading(heading_rad: float) -> None:
     robot = Lockstep()
@@ -86,6 +87,7 @@ def test_the_yaw_rate_holds_on_the_way_to_a_far_heading(heading_rad: float) -> N
     assert robot.driver.fastest_radps <= RIPPLE * LIMITS.yaw_rate_radps
 
 
+@pytest.mark.hazard("H12")
 @pytest.mark.parametrize("jump_rad", [1.5, -1.5, 3.1])
 def test_a_pose_that_jumps_does_not_turn_a_base_that_drives_straight_on(jump_rad: float) -> None:
     robot = Lockstep()
@@ -106,6 +108,7 @@ def test_after_a_jump_a_heading_is_the_one_of_the_corrected_odometry() -> None:
     assert robot.driver.fastest_radps <= RIPPLE * LIMITS.yaw_rate_radps
 
 
+@pytest.mark.hazard("H12")
 def test_a_setpoint_from_before_a_jump_is_void_and_the_robot_stays_armed() -> None:
     robot = Lockstep()
     robot.controller = Controller(

@@ -147,6 +147,7 @@ def test_slows_down_at_the_end(robot: Robot) -> None:
     assert robot.error is None and robot.link._process.returncode == 0
 
 
+@pytest.mark.hazard("H39")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGABRT])
 def test_survives_signals_that_end_the_daemon(robot: Robot, number: int) -> None:
     robot.drive()
@@ -185,6 +186,7 @@ def _sends_pose(robot: Robot) -> bool:
     return robot.link._channel.lost == lost
 
 
+@pytest.mark.hazard("H03")
 def test_a_stop_rides_along_with_everything_that_follows_and_needs_a_later_request(tmp_path: Path) -> None:
     """The process misses the stop itself, then receives a request that is older and one that is younger than it."""
     with started(tmp_path, MANUAL) as robot:
@@ -207,6 +209,7 @@ def test_a_stop_rides_along_with_everything_that_follows_and_needs_a_later_reque
         robot.drive()
 
 
+@pytest.mark.hazard("H08")
 def test_a_contact_that_has_ended_and_whose_messages_were_lost_still_stops_the_base(robot: Robot) -> None:
     """The count of contacts rides along with everything that follows, and latches without an operator, too."""
     robot.drive()
@@ -240,6 +243,7 @@ while True:
 """
 
 
+@pytest.mark.hazard("H39")
 def test_slows_down_when_the_daemon_is_killed(tmp_path: Path) -> None:
     with contextlib.closing(Base(tmp_path)) as base:
         command = [sys.executable, "-c", OWNER, str(base.port)]

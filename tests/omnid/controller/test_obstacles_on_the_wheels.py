@@ -68,6 +68,7 @@ def robot(tmp_path: Path) -> Iterator[RobotWithRings]:
             robot.link.close()
 
 
+@pytest.mark.hazard("H16")
 def test_the_wheels_stop_before_an_obstacle_and_may_back_out(robot: RobotWithRings) -> None:
     wait_until(lambda: robot.drives(0.3, FREE), "motion")
     wait_until(lambda: robot.stands(0.3, WALL), "the stop")
@@ -77,6 +78,7 @@ def test_the_wheels_stop_before_an_obstacle_and_may_back_out(robot: RobotWithRin
     wait_until(lambda: robot.drives(-0.3, WALL), "the way back")
 
 
+@pytest.mark.hazard("H21")
 def test_the_wheels_stop_when_no_more_rings_come(robot: RobotWithRings) -> None:
     wait_until(lambda: robot.drives(0.3, FREE), "motion")
     wait_until(lambda: robot.stands(0.3, None), "the stop")
@@ -84,6 +86,7 @@ def test_the_wheels_stop_when_no_more_rings_come(robot: RobotWithRings) -> None:
     wait_until(lambda: robot.drives(0.3, FREE), "motion again, without arming")
 
 
+@pytest.mark.hazard("H21")
 def test_without_any_ring_the_wheels_never_turn(robot: RobotWithRings) -> None:
     begin_s = time.monotonic()
     wait_until(lambda: robot.drives(0.3, None) or time.monotonic() > begin_s + 1.5, "1.5 s")

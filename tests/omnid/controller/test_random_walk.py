@@ -386,6 +386,7 @@ def walk(seed: int, mode: str, ticks: int) -> None:
     assert seen["driven"] > 0.1 * ticks and seen["driven by planner"] > 0, seen
 
 
+@pytest.mark.hazard("H01")
 @pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
 def test_nothing_moves_without_arm_and_a_live_command_of_the_owner(mode: str) -> None:
     walk(1, mode, TICKS)

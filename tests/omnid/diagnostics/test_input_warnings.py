@@ -77,6 +77,7 @@ def test_after_poses_that_were_refused_a_few_landmarks_are_no_pose(tmp_path: Pat
     assert (np.linalg.norm(wrong, axis=1) < 13 * sigma_m).all()
 
 
+@pytest.mark.hazard("H35")
 def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene: Path) -> None:
     for turn_deg in ((3.0, 0.0, 0.0), (0.0, -3.0, 0.0), (0.0, 0.0, 3.0)):
         write_rig(tmp_path / "rig.toml", with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg))
@@ -115,6 +116,7 @@ def test_the_topics_of_an_inverted_rig_are_used(omnid: Command, tmp_path: Path, 
     np.testing.assert_allclose(a[:, :3, 3], b[:, :3, 3], atol=0.02)
 
 
+@pytest.mark.hazard("H34")
 @pytest.mark.parametrize(("dead", "words"), [(("lower",), ()), (("lower", "upper"), ("--inline",))])
 def test_pairs_of_a_frozen_camera_give_no_pose(
     omnid: Command, tmp_path: Path, scene: Path, dead: tuple[str, ...], words: tuple[str, ...]

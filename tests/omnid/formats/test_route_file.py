@@ -117,6 +117,7 @@ def test_other_bytes_are_refused(content: bytes) -> None:
         parse_route(content, "r")
 
 
+@pytest.mark.hazard("H33")
 def test_damaged_files_are_refused_or_the_same_route() -> None:
     rng, good = random.Random(2), route_bytes(route())
     for _ in range(400):

@@ -35,6 +35,7 @@ runpy.run_module("omnid", run_name="__main__")
 """
 
 
+@pytest.mark.hazard("H25")
 def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing on a robot watches the program that has asked for a drive: it goes on without the network."""
     monkeypatch.setattr(navigation, "SILENCE_S", 0.5)
@@ -50,6 +51,7 @@ def test_a_silent_robot_is_not_reported_to_stop(monkeypatch: pytest.MonkeyPatch)
     assert "it drives on (`omnid stop`" in str(caught.value)
 
 
+@pytest.mark.hazard("H25")
 @pytest.mark.parametrize("is_answered", [True, False])
 @pytest.mark.parametrize(
     ("words", "number"),

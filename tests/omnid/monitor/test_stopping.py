@@ -35,6 +35,7 @@ time.sleep(1000)
 """
 
 
+@pytest.mark.hazard("H51")
 def test_a_stop_gets_through_when_all_sessions_are_taken(tmp_path: Path) -> None:
     endpoint, stopped, few = free_endpoint(), [False], tmp_path / "few.json5"
     few.write_text("{transport: {unicast: {max_sessions: 4}}}")

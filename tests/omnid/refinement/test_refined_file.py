@@ -70,6 +70,7 @@ def test_no_file_is_no_line(base: Path) -> None:
     assert started(base)[2] == [] and started(base)[0].used is None
 
 
+@pytest.mark.hazard("H36")
 def test_the_file_of_another_calibration_is_not_used_and_is_replaced(base: Path) -> None:
     opened(base).write(change(read_rig(base)))
     again = read_rig(base).with_upper_moved(np.array([0, 0, 1e-3]), np.zeros(2))
@@ -121,6 +122,7 @@ def test_a_rig_of_the_user_and_the_calibration_itself_are_never_written(base: Pa
     assert file.path.read_bytes() == content
 
 
+@pytest.mark.hazard("H36")
 def test_the_limits_hold_against_the_calibration_from_run_to_run(base: Path) -> None:
     file = opened(base)
     file.write(change(read_rig(base), 0.7, 0.03))

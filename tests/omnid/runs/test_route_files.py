@@ -106,6 +106,7 @@ class SlowFolder(RouteFolder):
         return super().read(name)
 
 
+@pytest.mark.hazard("H50")
 def test_a_halt_overtakes_what_waits_for_a_disk_and_ends_it(tmp_path: Path) -> None:
     site = Site(tmp_path)
     site.robot.send(FINISH)
@@ -130,6 +131,7 @@ def test_a_halt_overtakes_what_waits_for_a_disk_and_ends_it(tmp_path: Path) -> N
     assert site.work().state is NavigationState.DRIVING, "a request after the halt is granted"
 
 
+@pytest.mark.hazard("H26")
 def test_what_waits_for_a_disk_begins_nothing_after_a_stop_or_a_long_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

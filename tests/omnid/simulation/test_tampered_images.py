@@ -49,6 +49,7 @@ def stop_s(run: SimulatedRun, reason: str) -> float:
     return next(at_s for at_s, line in run.lines if line == text) - STARTS_S
 
 
+@pytest.mark.hazard("H22")
 def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -> None:
     """It would go on by memory, and by landmarks of the other half."""
     run = drive(Frozen(AHEAD, starts_s=STARTS_S))
@@ -60,6 +61,7 @@ def test_a_base_stops_within_a_second_where_half_of_the_images_freezes_ahead() -
     assert set(run.states[5:]) == {"tracking"}
 
 
+@pytest.mark.hazard("H22")
 def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
     """A third of the images, behind it."""
     run = drive(Frozen(BEHIND, starts_s=STARTS_S))
@@ -67,6 +69,7 @@ def test_a_base_that_drives_away_from_a_dead_part_drives_on() -> None:
     np.testing.assert_allclose(run.T_odom_base[-1, :2, 3], run.truth_in_odom[-1, :2, 3], atol=0.03)
 
 
+@pytest.mark.hazard("H23")
 @pytest.mark.parametrize("gyro", [True, False])
 def test_in_the_dark_a_base_stops_although_wheels_carry_its_pose(gyro: bool) -> None:
     """Half a second, and the ramp."""

@@ -164,6 +164,7 @@ def test_drives_to_a_goal_of_the_base_in_odom_and_in_the_map(tmp_path: Path) -> 
     np.testing.assert_allclose(robot.pose, [0.2, 1.5, -0.4], atol=0.03)
 
 
+@pytest.mark.hazard("H27")
 def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
 
@@ -187,6 +188,7 @@ def test_refuses_with_the_remedy_and_sends_nothing(tmp_path: Path) -> None:
     assert len(robot.updates[-1].answers) == 9
 
 
+@pytest.mark.hazard("H24")
 def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()

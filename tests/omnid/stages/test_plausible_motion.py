@@ -109,6 +109,7 @@ def test_people_who_walk_past_are_no_contradiction(scene: Path) -> None:
     assert list(stops(rig, crowded, true_motions(scene))) == [("", "")] * STRAIGHT_PAIRS
 
 
+@pytest.mark.hazard("H38")
 @pytest.mark.parametrize(("factor", "expected"), [(3.0, NOT_COMMANDED), (0.25, NOT_SEEN)])
 def test_a_rig_of_another_size_stops_the_base(scene: Path, factor: float, expected: str) -> None:
     """All epipolar lines are right with it; only the wheels can tell."""
@@ -120,6 +121,7 @@ def test_a_rig_of_another_size_stops_the_base(scene: Path, factor: float, expect
     assert found[-1][1] == expected and any(slow and not reason for slow, reason in found)
 
 
+@pytest.mark.hazard("H38")
 def test_images_that_stand_stop_the_base(scene: Path) -> None:
     """The same scene with other noise: no comparison of pixels finds it."""
     rng = np.random.default_rng(3)

@@ -83,6 +83,7 @@ def frames(lower: Iterable[int], upper: Iterable[int]) -> list[Frame]:
     ]
 
 
+@pytest.mark.hazard("H34")
 @pytest.mark.parametrize("dead", [("lower",), ("upper",), ("lower", "upper")])
 def test_pairs_of_a_frozen_camera_are_left_out(rig: Rig, dead: tuple[Camera, ...]) -> None:
     """The images of the other camera go on; two images after the camera lives again there is a pair again."""

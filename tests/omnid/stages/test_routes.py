@@ -27,6 +27,7 @@ from tests.omnid.stages.test_navigation import (
 )
 
 
+@pytest.mark.hazard("H29")
 def test_a_route_is_taught_and_repeated(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()
@@ -84,6 +85,7 @@ def test_a_route_is_taught_in_a_new_map_while_nothing_is_recognised_yet(tmp_path
             assert "not localised" in robot.send(RouteRequest(RouteAction.TEACH, "hall")).answer.refusal
 
 
+@pytest.mark.hazard("H28")
 def test_after_a_reset_a_place_from_before_it_is_none(tmp_path: Path) -> None:
     robot = Robot(tmp_path)
     robot.pass_on()

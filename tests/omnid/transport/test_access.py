@@ -116,6 +116,7 @@ def visitor(credentials: Path, endpoint: str, name: str | None) -> BusConfig:
     return BusConfig(connect=(endpoint,), tls_ca=str(credentials / "ca.pem"), **own)
 
 
+@pytest.mark.hazard("H44")
 @needs_openssl
 @pytest.mark.parametrize("name", ["stranger", None], ids=["wrong certificate", "no certificate"])
 def test_refuses_connections_without_a_valid_certificate(credentials: Path, name: str | None) -> None:
@@ -150,6 +151,7 @@ def asks_to_arm(driver: Driver) -> bool:
         return False
 
 
+@pytest.mark.hazard("H02")
 @needs_openssl
 def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(credentials: Path) -> None:
     config = robot(credentials, command_names=("driver",))
@@ -173,6 +175,7 @@ def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(credentials:
         assert guest.alive, "a client without the permission to drive can still subscribe"
 
 
+@pytest.mark.hazard("H44", "H49")
 def test_users_need_their_password_and_the_permission_to_drive(tmp_path: Path) -> None:
     (tmp_path / "users").write_text("ada:countess\nbob:builder\n")
     for name, password in (("ada", "countess"), ("bob", "builder"), ("eve", "builder")):

@@ -20,6 +20,7 @@ from tests.omnid.transport.bus_fixtures import free_endpoint, robot, script
 from tests.waiting import wait_until
 
 
+@pytest.mark.hazard("H49")
 def test_a_query_for_several_keys_is_no_request() -> None:
     """Else one query would arm the robots of a whole site, and give each topic a payload of another."""
     with robot() as (_, program, received):
@@ -71,6 +72,7 @@ with zenoh.open(config) as session:
 """
 
 
+@pytest.mark.hazard("H52")
 @pytest.mark.parametrize("key", ["cmd/imu", "cmd/route", "cmd/arm", "cmd/nothing", "@request/arm", "@request/path"])
 def test_a_flood_on_one_key_is_bounded_and_keeps_no_other_key_out(key: str) -> None:
     """Of the flood no more than the budget is passed on; a stop and a command on another key get through."""

@@ -125,6 +125,7 @@ def test_refuses_commands_that_are_too_old(accepted: AcceptedCommands, later_s: 
     assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 1}
 
 
+@pytest.mark.hazard("H06")
 @pytest.mark.parametrize("later_s", [5.0, 60.0, 86400.0])
 def test_refuses_commands_of_the_future(accepted: AcceptedCommands, later_s: float) -> None:
     accepted.receive("cmd/twist", twist(later_s=later_s))
@@ -185,6 +186,7 @@ def stream(start_ns: int, count: int = 5) -> list[bytes]:
     return [codec.twist_stamped_cdr(start_ns + round(i * 5e7), "base_link", 0.3, 0.0) for i in range(count)]
 
 
+@pytest.mark.hazard("H06")
 def test_refuses_a_stream_that_is_replayed_after_66_s(accepted: AcceptedCommands) -> None:
     for payload in stream(now_ns(-66.0)):
         accepted.receive("cmd/twist", payload)
@@ -199,6 +201,7 @@ def test_takes_commands_of_another_clock_where_it_is_configured(later_s: float) 
     assert accepted.receiver.accepted == 5 and accepted.receiver.refused == {}
 
 
+@pytest.mark.hazard("H06")
 def test_refuses_replayed_and_reordered_commands_of_another_clock() -> None:
     accepted, recorded = AcceptedCommands(synchronised=False), stream(10**12)
     for payload in recorded:
@@ -243,6 +246,7 @@ def damaged(rng: random.Random, good: bytes) -> bytes:
     return bytes(data)
 
 
+@pytest.mark.hazard("H09")
 @pytest.mark.parametrize("seed", range(3))
 def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands, seed: int) -> None:
     """None raises, each is counted, and numbers of payloads that are still valid are finite and in range."""
@@ -280,6 +284,7 @@ def test_a_request_to_arm_is_validated_like_commands(accepted: AcceptedCommands)
     assert receiver.refused == {"malformed": 2, "too old": 1, "no stamp": 1, "stamp in the future": 1, "too long": 1}
 
 
+@pytest.mark.hazard("H48")
 def test_is_not_armed_beside_a_robot_of_the_same_name() -> None:
     unique, accepted = [False], AcceptedCommands()
     receiver = CommandReceiver(accepted, StampRule(STALE_S), is_unique=lambda: unique[0])
@@ -290,6 +295,7 @@ def test_is_not_armed_beside_a_robot_of_the_same_name() -> None:
     assert len(accepted.arms) == 1
 
 
+@pytest.mark.hazard("H03")
 def test_a_request_that_was_sent_before_the_stop_and_comes_after_it_is_refused(accepted: AcceptedCommands) -> None:
     early = arm()
     accepted.receive("cmd/stop", b"")
@@ -347,6 +353,7 @@ def test_the_arrival_is_that_of_the_message_not_of_its_decoding(
     assert accepted.arrivals_ns[0] < decoded_ns[0]
 
 
+@pytest.mark.hazard("H08")
 @pytest.mark.parametrize(("topic", "contact"), [("cmd/bumper", BUMPER), ("cmd/cliff", CLIFF)])
 def test_only_a_false_with_a_fresh_stamp_says_that_a_contact_has_ended(topic: str, contact: str) -> None:
     """A true counts whatever its stamp, and so does what cannot be read: a stop needs no stamp."""
@@ -391,6 +398,7 @@ def test_after_an_arming_a_bumper_whose_clock_began_again_may_release() -> None:
     assert [holds for _, holds in accepted.contacts] == [True, False, False]
 
 
+@pytest.mark.hazard("H08")
 def test_an_old_release_that_is_sent_again_does_not_release_where_clocks_differ() -> None:
     accepted = AcceptedCommands(synchronised=False)
     for payload, sent_ns in ((bool_cdr(False), 10), (bool_cdr(True), 11), (bool_cdr(False), 10)):

@@ -13,6 +13,7 @@ from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, script, se
 from tests.waiting import wait_until
 
 
+@pytest.mark.hazard("H48")
 def test_starts_disarmed_beside_a_robot_of_the_same_name() -> None:
     router = free_endpoint()
     with script(ROUTER, router), contextlib.ExitStack() as stack:
@@ -48,6 +49,7 @@ def test_a_token_of_a_stranger_keeps_no_robot_from_starting(token: str) -> None:
         wait_until(lambda: bus.status().level == OK)
 
 
+@pytest.mark.hazard("H48")
 def test_with_users_only_the_robot_declares_tokens_below_its_name(tmp_path: Path) -> None:
     endpoint, users = free_endpoint(), tmp_path / "users"
     users.write_text("eve:secret\n")
@@ -69,6 +71,7 @@ def test_with_users_only_the_robot_declares_tokens_below_its_name(tmp_path: Path
             del held
 
 
+@pytest.mark.hazard("H48")
 def test_warns_once_of_a_robot_of_the_same_name_that_appears_later() -> None:
     """Two robots start as clients without a router, which connects them later."""
     router, warnings = free_endpoint(), list[str]()

@@ -83,6 +83,7 @@ def test_requests_are_passed_on() -> None:
     assert not received.lines and received.receiver.accepted == 6
 
 
+@pytest.mark.hazard("H27")
 @pytest.mark.parametrize("age_s", [-2.0, 2.0, 3600.0])
 def test_a_goal_of_another_time_is_refused_and_a_halt_is_not(age_s: float) -> None:
     received, sent_ns = Received(), time.time_ns() - round(age_s * 1e9)
@@ -97,6 +98,7 @@ def test_a_goal_of_another_time_is_refused_and_a_halt_is_not(age_s: float) -> No
     assert Received(synchronised=False).send("goal", goal(sent_ns)) is not None
 
 
+@pytest.mark.hazard("H27")
 @pytest.mark.parametrize("synchronised", [True, False])
 @pytest.mark.parametrize(
     ("topic", "text"), [("route", "repeat hall"), ("route", "teach hall"), ("navigation", "resume")]
@@ -114,6 +116,7 @@ def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(
         assert received.send(end_topic, string_cdr(end)) is not None
 
 
+@pytest.mark.hazard("H27")
 def test_requests_of_another_clock_that_are_recorded_and_sent_again_are_refused() -> None:
     """A request to arm lets the stamps begin again, as of another sender."""
     received, recorded = Received(synchronised=False), string_cdr("repeat hall stamp=1000")
@@ -150,6 +153,7 @@ def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
     assert received.receiver.status().values[f"refused, cmd/{topic}"] == "1"
 
 
+@pytest.mark.hazard("H33")
 def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
     rng, received = random.Random(4), Received(synchronised=False)
     good = {

@@ -68,6 +68,7 @@ def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:
     assert len(lines) == 1 and "no velocity of left or of right" in lines[0]
 
 
+@pytest.mark.hazard("H15")
 def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
     """No stamp, absurd or infinite rates, another source in use, damaged bytes: counted, one line for each topic."""
     taken: list[MotionSample] = []

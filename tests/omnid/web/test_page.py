@@ -440,6 +440,7 @@ def test_text_of_the_robot_is_never_html(browser: Any) -> None:
         screenshot(page, "hostile")
 
 
+@pytest.mark.hazard("H46")
 def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: Path) -> None:
     token = tmp_path / "token"
     with contextlib.ExitStack() as ends:
@@ -457,6 +458,7 @@ def test_a_server_that_goes_is_noticed_and_found_again(browser: Any, tmp_path: P
         shows(page, "warnings", "cannot reach")
 
 
+@pytest.mark.hazard("H45")
 def test_another_site_in_the_same_browser_can_do_nothing(browser: Any) -> None:
     with served("--connect", free_endpoint()) as server:
 

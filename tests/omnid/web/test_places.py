@@ -29,6 +29,7 @@ def test_a_connection_without_a_token_of_the_address_with_most_of_them_goes(monk
     assert kept[0] in found._places.values() and kept[1] in found._places.values()
 
 
+@pytest.mark.hazard("H51")
 def test_more_silent_connections_than_places_keep_no_request_out(server: WebServer, bus: Bus) -> None:
     with contextlib.ExitStack() as stack:
         for _ in range(MOST_CONNECTIONS + 100):

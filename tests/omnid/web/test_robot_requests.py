@@ -101,6 +101,7 @@ def test_what_is_no_request_and_what_finds_no_robot_is_not_done(at_50_s: None) -
     assert not asyncio.run(requests.arm(asked(str(NOW_MS)))).done and requests.arms == 1
 
 
+@pytest.mark.hazard("H47")
 def test_what_lets_the_robot_move_and_comes_late_or_without_a_stamp_is_refused(at_50_s: None) -> None:
     requests = RobotRequests(RobotFeed(BusConfig()))
     late = NOW_MS - 1001

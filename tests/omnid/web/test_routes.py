@@ -146,6 +146,7 @@ def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[We
     assert len(navigator.goals) == count
 
 
+@pytest.mark.hazard("H47")
 def test_the_stick_drives_while_the_page_shows_the_state_of_the_robot(robot: tuple[WebServer, Navigator]) -> None:
     server, navigator = robot
     limits = VelocityLimits()

@@ -83,6 +83,7 @@ def test_every_answer_has_the_headers_that_protect_the_page(server: WebServer, p
         assert server.token not in answer.text
 
 
+@pytest.mark.hazard("H45")
 @pytest.mark.parametrize(
     ("method", "path"),
     [
@@ -248,6 +249,7 @@ def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> N
     assert max(x for x, *_ in path_of(range(5))) <= 1.0
 
 
+@pytest.mark.hazard("H46")
 def test_a_stop_is_repeated_until_the_status_confirms_it(server: WebServer, bus: Bus) -> None:
     received, is_stopped = list[str](), [False]
     bus.subscribe_commands(lambda request: received.append(request.topic), {}, lambda: is_stopped[0])

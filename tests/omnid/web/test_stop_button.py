@@ -35,6 +35,7 @@ setInterval(() => {
 """
 
 
+@pytest.mark.hazard("H46")
 @pytest.mark.skipif(NODE is None, reason="needs node")
 def test_a_stop_on_a_connection_that_is_lost_is_sent_on_another_one(tmp_path: Path) -> None:
     """A network that has gone ends no request for minutes: it gets no answer, and no error."""

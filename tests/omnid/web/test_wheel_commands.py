@@ -250,6 +250,7 @@ def test_nothing_drives_or_arms_while_a_stop_is_not_confirmed(
     assert rover.topics[-1] == "cmd/arm"
 
 
+@pytest.mark.hazard("H47")
 def test_arming_that_was_asked_for_before_a_stop_and_comes_after_it_is_refused(
     rover: Rover, connected: RobotFeed, clock_ms: list[int]
 ) -> None:

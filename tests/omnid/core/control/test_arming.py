@@ -122,6 +122,7 @@ def test_refuses_to_arm_before_the_first_pose(bench: Bench) -> None:
     assert bench.controller.state.arm_answer.refusal == safety_rules.NO_POSE and not bench.controller.state.armed
 
 
+@pytest.mark.hazard("H01")
 def test_is_disarmed_at_the_start(bench: Bench) -> None:
     expect_stand(bench)
     assert bench.controller.state.reason == safety_rules.NOT_ARMED
@@ -130,6 +131,7 @@ def test_is_disarmed_at_the_start(bench: Bench) -> None:
     assert bench.last.velocity_mps == 0.3 and bench.controller.state.disarmed_by == ""
 
 
+@pytest.mark.hazard("H04")
 @pytest.mark.parametrize("reason", FAULTS)
 def test_a_fault_that_has_passed_keeps_the_wheels_stopped(driving: Bench, reason: str) -> None:
     FAULTS[reason](driving)
@@ -165,6 +167,7 @@ def test_without_an_operator_a_fault_that_has_passed_is_over(reason: str) -> Non
     assert not any("cmd/arm" in line for line in bench.lines)
 
 
+@pytest.mark.hazard("H02")
 @pytest.mark.parametrize("settings", ["manual", "automatic"])
 def test_a_stop_latches_in_both_modes(settings: str) -> None:
     bench = Bench(UNATTENDED) if settings == "automatic" else Bench()
@@ -294,6 +297,7 @@ def test_an_old_stop_that_is_repeated_does_not_release_a_newer_one(mode: str) ->
     assert not arming.armed and arming.answer.refusal == OLDER_THAN_STOP
 
 
+@pytest.mark.hazard("H08")
 @pytest.mark.parametrize("contact", [BUMPER, CLIFF])
 @pytest.mark.parametrize("wired", ["bus", "motor controller"])
 @pytest.mark.parametrize("mode", [MANUAL, AUTOMATIC])
@@ -327,6 +331,7 @@ def test_bumper_and_cliff_latch_in_both_modes_and_no_request_is_accepted_while_t
     assert bench.controller.state.armed and not is_stop(bench.last)
 
 
+@pytest.mark.hazard("H37")
 def test_a_doubt_slows_the_base_down_and_says_what_differs_and_by_how_much(driving: Bench) -> None:
     """Half of the limits of speed; with the check of motion off, nothing."""
     doubt = Witness(WITNESSES[0], "by 0.5 s")

@@ -63,6 +63,7 @@ def test_free_is_free() -> None:
         assert after(FREE_RING, motion) == (motion, "")
 
 
+@pytest.mark.hazard("H16")
 @pytest.mark.parametrize("point", [(0.39, 0.0), (0.3, 0.2), (0.26, -0.1), (0.2, 0.0)])
 def test_stops_before_an_obstacle_in_the_stop_polygon_and_lets_the_base_back_out(point: tuple[float, float]) -> None:
     assert after(with_points(point)) == (Twist(), monitor_module.BLOCKED)
@@ -71,6 +72,7 @@ def test_stops_before_an_obstacle_in_the_stop_polygon_and_lets_the_base_back_out
     assert after(with_points((-point[0], point[1])), Twist(-0.3)) == (Twist(), monitor_module.BLOCKED)
 
 
+@pytest.mark.hazard("H16")
 @pytest.mark.parametrize("distance_m", [0.5, 0.8, 1.1])
 def test_the_speed_is_the_distance_by_the_time_to_collision(distance_m: float) -> None:
     settings = replace(SETTINGS, slow_m=0.0)
@@ -128,6 +130,7 @@ def test_a_base_that_stands_needs_no_ring() -> None:
     assert (monitor.step(S, Twist(1.0)), monitor.reason) == (Twist(), monitor_module.RING_STALE)
 
 
+@pytest.mark.hazard("H16")
 def test_drives_slowly_past_what_is_beside_its_way() -> None:
     allowed, reason = after(with_points((0.6, 0.3)))
     assert allowed.velocity_mps == pytest.approx(SETTINGS.slow_mps) and reason == monitor_module.NEAR
@@ -135,6 +138,7 @@ def test_drives_slowly_past_what_is_beside_its_way() -> None:
     assert after(with_points((-0.6, 0.3))) == (AHEAD, "")
 
 
+@pytest.mark.hazard("H16")
 def test_an_arc_is_judged_on_the_arc() -> None:
     # On an arc of 0.5 m to the left the base meets what is ahead on the left, not what is straight ahead.
     arc, point = Twist(0.3, 0.6), (0.45, 0.62)
@@ -151,6 +155,7 @@ def test_turns_on_the_spot_unless_a_corner_would_touch() -> None:
     assert after(with_points((0.27, 0.2)), turn)[0].yaw_rate_radps > -0.3
 
 
+@pytest.mark.hazard("H19")
 def test_a_long_base_turns_on_the_spot_as_far_as_floor_was_seen_beside_it() -> None:
     """A plain wall 0.55 m to its left, which its front reaches; one that may be at its side already is no reason."""
     settings, turn = replace(SETTINGS, front_m=0.6), Twist(0.0, 0.5)
@@ -176,6 +181,7 @@ def test_where_a_base_may_not_drive_it_may_turn_to_a_heading() -> None:
     assert monitor.step(15 * S, arc, to_heading=True) == Twist()
 
 
+@pytest.mark.hazard("H19")
 def test_an_unknown_way_is_approached_slowly_or_not_at_all() -> None:
     wall = with_unknown(-20, 20)
     assert after(wall) == (Twist(), monitor_module.UNKNOWN)
@@ -204,6 +210,7 @@ def test_beyond_the_longest_range_of_a_short_ring_nothing_is_free(free_m: float,
     assert (allowed.velocity_mps == 2.0) == is_free
 
 
+@pytest.mark.hazard("H19")
 def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
     """As behind a plain pole; beside a wall the floor is often seen to be free not quite as far as it."""
     for sectors, free_m, is_unknown in ((8, 0.4, True), (4, 0.4, False), (8, 2.9, False)):
@@ -212,6 +219,7 @@ def test_a_wall_that_is_seen_past_an_unknown_place_makes_it_no_freer() -> None:
         assert (after((3.0,) * 360, Twist(-0.5), free=(*free[180:], *free[:180]))[0] == Twist(-0.5)) != is_unknown
 
 
+@pytest.mark.hazard("H19")
 def test_a_place_beside_before_which_a_wall_is_seen_does_not_keep_a_base_from_turning() -> None:
     """A person there would hide the wall."""
     free = tuple(0.0 if -150 < k - 179.5 < -100 else 3.0 for k in range(360))
@@ -225,6 +233,7 @@ def test_a_few_unknown_sectors_between_free_ones_mean_nothing() -> None:
     assert after(with_unknown(-3, 3))[1] == monitor_module.UNKNOWN
 
 
+@pytest.mark.hazard("H19")
 @pytest.mark.parametrize(("yaw_rate_radps", "goes_on"), [(0.0, True), (0.05, True), (-0.05, True), (0.2, False)])
 def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, goes_on: bool) -> None:
     """A corrected heading takes a corner nearer by a little; a turn into it is another thing, and so is an obstacle."""
@@ -236,6 +245,7 @@ def test_a_base_drives_along_what_is_unknown_beside_it(yaw_rate_radps: float, go
     assert (after(near, slow) == (slow, "")) == (yaw_rate_radps == 0.0)
 
 
+@pytest.mark.hazard("H22")
 @pytest.mark.parametrize("policy", ["stop", "slow", "ignore"])
 @pytest.mark.parametrize("unknown", ["stop", "ignore"])
 def test_towards_dead_and_blind_parts_of_the_images_counts_as_without_a_fresh_ring(policy: str, unknown: str) -> None:
@@ -250,6 +260,7 @@ def test_towards_dead_and_blind_parts_of_the_images_counts_as_without_a_fresh_ri
         assert after(ranges, away, settings, unwatched=unwatched) == (away, "")
 
 
+@pytest.mark.hazard("H23")
 def test_in_the_dark_the_base_does_not_even_turn() -> None:
     """Directions that are unknown because they are plain do not keep a base from turning away; no image at all does."""
     ranges, turn = (math.nan,) * 360, Twist(0.0, 1.0)
@@ -260,6 +271,7 @@ def test_in_the_dark_the_base_does_not_even_turn() -> None:
     assert monitor_module.remedy(monitor_module.BLOCKED) == monitor_module.REMEDY
 
 
+@pytest.mark.hazard("H21")
 @pytest.mark.parametrize(("stale", "expected_mps"), [("stop", 0.0), ("slow", SETTINGS.slow_mps), ("ignore", 0.5)])
 def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: float) -> None:
     settings = replace(SETTINGS, stale=stale)
@@ -270,6 +282,7 @@ def test_a_stale_ring_and_a_missing_one_stop_the_base(stale: str, expected_mps: 
     assert missing.step(S, AHEAD).velocity_mps == pytest.approx(expected_mps)
 
 
+@pytest.mark.hazard("H20")
 @pytest.mark.parametrize("age_s", [0.1, 0.2, 0.3, 0.4, 0.5])
 @pytest.mark.parametrize("speed_mps", [0.6, -0.6, 1.5])
 def test_an_older_ring_makes_the_base_no_freer(age_s: float, speed_mps: float) -> None:
@@ -299,6 +312,7 @@ def test_a_ring_is_moved_by_all_of_the_way_until_a_late_tick(late_s: float) -> N
     assert allowed.velocity_mps == pytest.approx(0.3 / SETTINGS.time_s, rel=0.02)
 
 
+@pytest.mark.hazard("H20")
 def test_a_ring_from_before_all_motions_that_are_remembered_is_stale() -> None:
     monitor = CollisionMonitor(replace(SETTINGS, stale_s=10.0), 1.5)
     monitor.set_ring(ControllerRing(10 * S, FREE_RING))
@@ -354,6 +368,7 @@ def test_the_ring_is_moved_by_the_motion_since_its_images() -> None:
     assert still.step(10 * S + S // 2, Twist(0.1)) == Twist(0.1)
 
 
+@pytest.mark.hazard("H17")
 def test_a_person_who_comes_from_the_side_stops_the_base_and_one_who_leaves_does_not() -> None:
     crossing = MovingPoint(0.9, 0.9, 0.0, -1.0, 0.25)
     allowed, reason = after(FREE_RING, moving=(crossing,))
@@ -377,6 +392,7 @@ def test_is_slow_beside_who_may_turn_round() -> None:
         assert back == (Twist(pytest.approx(-SETTINGS.slow_mps)), monitor_module.MOVING)
 
 
+@pytest.mark.hazard("H17")
 def test_a_new_one_slows_the_base_down_where_it_may_go() -> None:
     """Seen twice, it seems to walk beside the way; three looks make the sigma smaller than 0.4 m/s."""
     new = MovingPoint(1.0, 1.6, 0.0, -0.1, 0.2, 0.1, 0.6)

@@ -32,6 +32,7 @@ def offer(selector: CommandSelector, at_s: float, source: str = OPERATOR, sender
     return selector.current == command
 
 
+@pytest.mark.hazard("H07")
 def test_a_higher_source_takes_over_at_once_and_keeps_the_lower_one_out(selector: CommandSelector) -> None:
     assert offer(selector, 0.0, PLANNER) and offer(selector, 0.1, OPERATOR)
     assert not any(offer(selector, 0.1 + 0.1 * k, PLANNER) for k in range(6))
@@ -45,6 +46,7 @@ def test_the_replaced_source_must_send_again(selector: CommandSelector) -> None:
     assert selector.current is not None and selector.current.source == "joystick"
 
 
+@pytest.mark.hazard("H07")
 def test_the_first_sender_of_a_source_keeps_it_until_it_is_silent(selector: CommandSelector) -> None:
     assert offer(selector, 0.0, sender="a")
     for k in range(10):

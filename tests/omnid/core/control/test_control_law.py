@@ -55,6 +55,7 @@ def test_a_base_before_a_post_turns_to_a_heading_and_drives_on_from_there() -> N
     assert heading_rad > math.radians(85) and driven_m > 0.5
 
 
+@pytest.mark.hazard("H19")
 @pytest.mark.parametrize("rate_hz", [20, 50, 200])
 @pytest.mark.parametrize("wanted", [Setpoint(0.5, heading_rad=0.0), Setpoint(0.5, None, 0.02), Setpoint(0.008)])
 @pytest.mark.parametrize("is_seen", [True, False])

@@ -26,6 +26,7 @@ def test_the_longest_lead_is_a_reaction_and_a_braking_at_the_smaller_limits() ->
     assert longest_lead_rad(HeadingLimits(yaw_rate_radps=20), VelocityLimits(yaw_rate_radps=20)) == math.pi / 2
 
 
+@pytest.mark.hazard("H11")
 def test_a_blocked_base_gets_no_goal_beyond_the_longest_lead(goal: HeadingGoal) -> None:
     goal.update(2.0, 0.0)
     for error_rad in (None, 3.0):

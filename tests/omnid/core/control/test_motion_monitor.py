@@ -141,6 +141,7 @@ def test_what_robots_do_is_no_contradiction(wish: Wish, world: World) -> None:
     assert [entry for entry in history if entry[1] or entry[2]] == []
 
 
+@pytest.mark.hazard("H38")
 @pytest.mark.parametrize(
     ("wish", "world", "expected"),
     [

@@ -21,6 +21,7 @@ def any_number(rng: random.Random) -> float:
     return rng.choice(EXTREMES) if rng.random() < 0.3 else rng.gauss(0.0, rng.choice([0.1, 1.0, 10.0]))
 
 
+@pytest.mark.hazard("H10")
 @pytest.mark.parametrize("seed", range(5))
 def test_never_exceeds_a_limit(seed: int) -> None:
     rng, sent = random.Random(seed), STOP
@@ -44,6 +45,7 @@ def assert_within(last: Twist, sent: Twist, dt_s: float) -> None:
         assert abs(sent.velocity_mps) <= 0.5 * (passed_s - braking_s) * SLACK + tiny
 
 
+@pytest.mark.hazard("H10")
 @pytest.mark.parametrize("seed", range(3))
 def test_is_finite_and_bounded_after_any_previous_motion(seed: int) -> None:
     rng = random.Random(seed)

@@ -122,6 +122,7 @@ def ends_at(obstacles: list[tuple[float, float]]) -> float | None:
     return None if found is None else float(found.follower.path.goal[0])
 
 
+@pytest.mark.hazard("H32")
 def test_the_way_back_ends_before_what_is_seen_beside_it_and_after_three_metres() -> None:
     walls = [(x, side) for x in np.arange(-1.0, 5.0, 0.05) for side in (-0.6, 0.6)]
     assert ends_at(walls) == pytest.approx(1.0, abs=0.11)
@@ -143,6 +144,7 @@ def test_comes_again_when_the_way_is_free_or_to_look(is_open: bool, expected_s: 
     assert giving.phase is Phase.RETURN and waited_s == pytest.approx(expected_s, abs=0.11)
 
 
+@pytest.mark.hazard("H32")
 def test_goes_back_only_as_far_as_it_is_free() -> None:
     """Somebody has come behind the base: it never comes near."""
     behind_m = 0.8
@@ -184,6 +186,7 @@ def test_goes_back_around_a_corner_and_comes_again() -> None:
     assert clearance_m(base) > 0.02
 
 
+@pytest.mark.hazard("H32")
 def test_fails_where_it_is_taken_away_while_it_gives_way() -> None:
     base = BaseAmongOthers((), lambda _: person(3.0, 0.0), 9, NavigationSettings(corridor_m=0.0))
     base.run(60, lambda answer: answer.reason == GIVES_WAY, rest_s=0.5)

@@ -88,6 +88,7 @@ def clearance_m(base: BaseAmongBoxes) -> float:
     return min(base.boxes.clearance_m(sample.pose[:2]) for sample in base.samples) - OUTLINE.half_width_m
 
 
+@pytest.mark.hazard("H31")
 @pytest.mark.parametrize(
     "boxes",
     [
@@ -109,6 +110,7 @@ def test_goes_around_boxes_and_reaches_the_goal(boxes: Boxes) -> None:
     assert max(offsets) < SETTINGS.corridor_m + 0.1
 
 
+@pytest.mark.hazard("H31")
 @pytest.mark.parametrize(
     "boxes",
     [

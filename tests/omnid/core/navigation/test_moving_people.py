@@ -91,6 +91,7 @@ class BaseAmongPeople(BaseAmongBoxes):
         return min(sample.speed_mps for sample in self.samples if first_m < sample.pose[0] < last_m)
 
 
+@pytest.mark.hazard("H18")
 def test_a_person_who_crosses_is_let_pass_without_contact() -> None:
     for seed, side in ((1, 1), (2, -1)):
         base = BaseAmongPeople(seed, (2.6, side * 1.9), (0.0, -side * 0.8), 2.6)
@@ -111,6 +112,7 @@ def test_nothing_changes_where_the_person_has_passed_before_or_comes_after(at_m:
     assert sum(sample.navigation.reason != "" for sample in base.samples) <= 2
 
 
+@pytest.mark.hazard("H18")
 @pytest.mark.parametrize(("seed", "aside_m"), [(5, 0.3), (6, -0.2)])
 def test_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float) -> None:
     base = BaseAmongPeople(seed, (7.0, aside_m), (-0.4, 0.0), 1.0)
@@ -121,6 +123,7 @@ def test_goes_around_a_person_who_comes_along_the_path(seed: int, aside_m: float
     assert NavigationState.AVOIDING in states and states.count(NavigationState.BLOCKED) <= 2
 
 
+@pytest.mark.hazard("H18")
 def test_stands_when_a_person_walks_into_it() -> None:
     base = BaseAmongPeople(5, (7.0, 0.0), (-0.7, 0.0), 1.0)
     assert base.run(60).state is NavigationState.REACHED

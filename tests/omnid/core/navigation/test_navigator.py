@@ -46,6 +46,7 @@ def assert_stands(base: DrivenBase) -> None:
     assert abs(base.v) < 0.01 and abs(base.w) < 0.02
 
 
+@pytest.mark.hazard("H24")
 def test_cancel_stops_at_once_and_then_gives_the_wheels_free() -> None:
     base = driving()
     base.navigator.cancel("cancelled by a request")
@@ -69,6 +70,7 @@ def test_pause_halts_and_resume_goes_on() -> None:
     assert base.run(60).state is NavigationState.REACHED
 
 
+@pytest.mark.hazard("H26")
 def test_a_stop_ends_the_drive_and_arming_does_not_start_it_again() -> None:
     base = driving()
     base.law.stop(round(base.t_s * 1e9))
@@ -79,6 +81,7 @@ def test_a_stop_ends_the_drive_and_arming_does_not_start_it_again() -> None:
     assert base.pose[0] == pytest.approx(x, abs=1e-3)
 
 
+@pytest.mark.hazard("H26")
 def test_a_fault_pauses_the_drive_until_a_person_arms_and_resumes() -> None:
     base = driving()
     base.law.arming._automatic = False  # as with controller.arming = "manual"
@@ -98,6 +101,7 @@ def test_a_fault_pauses_the_drive_until_a_person_arms_and_resumes() -> None:
     assert base.run(60).state is NavigationState.REACHED
 
 
+@pytest.mark.hazard("H28")
 def test_stops_where_the_map_is_lost_for_too_far_and_goes_on_when_it_is_found() -> None:
     base = driving(NavigationFrame.MAP)
     base.localised, x = False, base.pose[0]
@@ -108,6 +112,7 @@ def test_stops_where_the_map_is_lost_for_too_far_and_goes_on_when_it_is_found() 
     assert base.run(60).state is NavigationState.REACHED
 
 
+@pytest.mark.hazard("H28")
 def test_fails_where_the_map_is_not_found_again() -> None:
     base = driving(NavigationFrame.MAP)
     base.localised = False
@@ -116,6 +121,7 @@ def test_fails_where_the_map_is_not_found_again() -> None:
     assert_stands(base)
 
 
+@pytest.mark.hazard("H28")
 def test_a_new_odom_ends_a_drive_in_it_and_a_drive_in_the_map_waits_for_its_place() -> None:
     base = driving()
     base.resets = 1
@@ -127,6 +133,7 @@ def test_a_new_odom_ends_a_drive_in_it_and_a_drive_in_the_map_waits_for_its_plac
     assert_stands(base)
 
 
+@pytest.mark.hazard("H31")
 def test_gives_up_without_progress() -> None:
     base = driving()
     base.slip = 0.0
@@ -176,6 +183,7 @@ def test_a_new_goal_ends_the_stops_of_the_one_before() -> None:
     assert not base.navigator.stopping and base.navigator.state is NavigationState.DRIVING
 
 
+@pytest.mark.hazard("H30")
 def test_waits_while_the_operator_drives_and_fails_where_it_was_taken_far_away() -> None:
     base = driving()
     for _ in range(100):

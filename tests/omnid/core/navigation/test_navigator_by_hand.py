@@ -105,6 +105,7 @@ def test_the_way_by_odometry_alone_is_measured_along_it_and_ends_where_the_map_i
     assert steps.step(places[-1][0] + 0.9, in_map=UNLOCALISED).state is NavigationState.DRIVING, "it begins again"
 
 
+@pytest.mark.hazard("H28")
 def test_a_pose_in_the_map_counts_once() -> None:
     """The drive ends as without any where no more of them come, as the search for places hangs."""
     steps = Steps(NavigationFrame.MAP)
@@ -114,6 +115,7 @@ def test_a_pose_in_the_map_counts_once() -> None:
     assert steps.step(1.5).state is NavigationState.DRIVING
 
 
+@pytest.mark.hazard("H26")
 @pytest.mark.parametrize(
     ("halted_by", "state"), [(ASKED, NavigationState.CANCELLED), ("the bumper is pressed", NavigationState.PAUSED)]
 )

@@ -105,6 +105,7 @@ def test_a_route_moves_with_the_keyframes_of_its_map() -> None:
     assert np.abs(route.in_map(places) - expected)[:, :2].max() < 0.08, "neighbours stand in for what is gone"
 
 
+@pytest.mark.hazard("H29")
 def test_a_keyframe_of_another_map_does_not_count() -> None:
     poses = way()
     places = Map(poses)
@@ -223,6 +224,7 @@ def test_in_a_way_there_and_back_the_heading_decides_where_it_begins() -> None:
     assert one == pytest.approx(6.0, abs=0.3) and other == pytest.approx(2.0, abs=0.3)
 
 
+@pytest.mark.hazard("H29")
 def test_a_robot_that_is_not_near_is_refused() -> None:
     poses = way()
     with pytest.raises(OmnidError, match=r"3\.\d m away from the route: drive it there"):

@@ -106,6 +106,7 @@ def test_an_edge_is_not_forgotten_where_the_floor_beyond_it_fits_by_another_peri
     assert np.median(after(grid, seen, 20, first=26).free_m) > WALL_M - 0.5, "it was none"
 
 
+@pytest.mark.hazard("H19")
 def test_plain_wall_is_unknown_and_nothing_behind_it_is_free(grid: ObstacleGrid) -> None:
     near_m = 1.3
     ring = after(grid, evidence(stains, plain, wall_m=near_m), 40)
@@ -113,6 +114,7 @@ def test_plain_wall_is_unknown_and_nothing_behind_it_is_free(grid: ObstacleGrid)
     assert ring.free_m.max() <= near_m + 0.2 and np.median(ring.free_m) > near_m - 0.35
 
 
+@pytest.mark.hazard("H19")
 @pytest.mark.parametrize("grey", [120.0, 190.0])
 def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: float) -> None:
     """A column of a plain pole shows nothing; the floor that it hides is missing, one degree wide or two."""
@@ -122,6 +124,7 @@ def test_floor_behind_a_thin_plain_pole_is_not_free(grid: ObstacleGrid, grey: fl
     assert ring.free_m[beside].min() > 2.0
 
 
+@pytest.mark.hazard("H19")
 @pytest.mark.parametrize("grey", [120.0, 190.0])
 def test_floor_that_was_free_is_not_while_a_thin_plain_pole_hides_it(grid: ObstacleGrid, grey: float) -> None:
     """As the base drives around a pole it hides floor that was seen from elsewhere, and shows what it hid."""
@@ -131,6 +134,7 @@ def test_floor_that_was_free_is_not_while_a_thin_plain_pole_hides_it(grid: Obsta
     assert after(grid, bare, 8, first=39).free_m[AHEAD].min() > 2.0
 
 
+@pytest.mark.hazard("H19")
 def test_nothing_is_free_before_hidden_floor_that_is_the_nearest_in_view(grid: ObstacleGrid) -> None:
     """A thin plain pole is nearer than all floor in view: it may be anywhere before what it hides."""
     near_m = 0.5 * COLUMNS.nearest_floor_m
@@ -211,6 +215,7 @@ def test_floor_beside_a_step_is_not_free(grid: ObstacleGrid) -> None:
     assert free[96, 100] and free[100, 104]
 
 
+@pytest.mark.hazard("H19")
 def test_without_fresh_evidence_the_floor_around_ends(grid: ObstacleGrid, seen: Pairs) -> None:
     assert after(grid, seen, 20).free_m.min() > 0.6
     dark = seen[0]._replace(
@@ -278,6 +283,7 @@ def test_an_edge_is_wide_and_a_low_thing_may_be_narrow(
     assert (grid.state()[100 + cells // 2, 100 + cells // 2] == 1) == is_free
 
 
+@pytest.mark.hazard("H19")
 def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pairs) -> None:
     """As a bar under which the floor is seen: the pairs between them contradict it, so that it is never taken."""
     shown = seen[0].surface.copy()
@@ -320,6 +326,7 @@ def test_nothing_comes_in_through_a_narrow_gap(grid: ObstacleGrid, seen: Pairs, 
     assert is_free.any() != comes_in and is_free.all() != comes_in
 
 
+@pytest.mark.hazard("H19")
 @pytest.mark.parametrize(("range_m", "free_m"), [(1.3, 1.35), (0.8, 0.4)])
 def test_what_comes_into_view_ends_the_free_floor_until_it_goes(
     grid: ObstacleGrid, seen: Pairs, range_m: float, free_m: float
@@ -399,6 +406,7 @@ def test_single_directions_that_a_floor_mirrors_are_not_somebody(grid: ObstacleG
     assert np.isnan(ring.arrivals.ranges_m).all()
 
 
+@pytest.mark.hazard("H17")
 @pytest.mark.parametrize("grey", [120.0, 190.0])
 def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid, seen: Pairs, grey: float) -> None:
     """Somebody plain, 30 cm wide; the room that stands, and who has stood there from the start, have not come."""
@@ -417,6 +425,7 @@ def test_who_steps_onto_free_floor_is_found_in_the_first_pair(grid: ObstacleGrid
     assert np.isnan(after(grid, person, 20).arrivals.ranges_m).all()
 
 
+@pytest.mark.hazard("H17")
 def test_who_comes_is_where_the_cameras_see_them_wherever_they_are_on_the_base(grid: ObstacleGrid, seen: Pairs) -> None:
     """The cameras are 0.4 m ahead of the base's origin and 0.3 m to the right; the base has turned by 50 degrees."""
     T_base_eye, T_odom_base = np.eye(4), np.eye(4)

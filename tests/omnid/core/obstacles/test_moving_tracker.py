@@ -66,6 +66,7 @@ def test_what_was_put_down_and_stands_does_not_move(seed: int) -> None:
     assert not any(found[5:])
 
 
+@pytest.mark.hazard("H17")
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("speed_mps", [0.8, 1.2, 1.6])
 def test_two_looks_tell_who_comes_and_three_how_fast(side: int, speed_mps: float) -> None:

@@ -99,6 +99,7 @@ def first(found: list[tuple[float, Witness]], *, is_fault: bool) -> tuple[float,
     return next((at_s, result) for at_s, result in found if result.reason and result.is_fault >= is_fault)
 
 
+@pytest.mark.hazard("H37")
 @pytest.mark.parametrize(
     "errors",
     [
@@ -121,6 +122,7 @@ def test_honest_accounts_agree(errors: Errors, turns: bool) -> None:
     assert {result for _, result in driven(errors, 20.0, turns=turns)} == {AGREE}
 
 
+@pytest.mark.hazard("H37")
 @pytest.mark.parametrize("late_s", [0.5, 1.0])
 def test_late_images_are_a_doubt_within_1_s_and_a_fault_soon_after(late_s: float) -> None:
     """From the first motion on; steady motion shows no delay, its beginning does."""
@@ -132,6 +134,7 @@ def test_late_images_are_a_doubt_within_1_s_and_a_fault_soon_after(late_s: float
         assert doubt.reason == IMAGES_OR_WHEELS and fault.reason in (IMAGES_OR_WHEELS, IMAGES_DIFFER)
 
 
+@pytest.mark.hazard("H37")
 def test_the_delay_is_measured_and_who_is_late_is_named() -> None:
     """Of three accounts: the images against wheels and gyro, or the wheels against both others."""
     images = [result for at_s, result in driven(Errors(images_late_s=0.6), 12.0) if at_s > 9.0]
@@ -141,6 +144,7 @@ def test_the_delay_is_measured_and_who_is_late_is_named() -> None:
     assert {result.reason for result in wheels} == {WHEELS_DIFFER} and all(result.is_fault for result in wheels)
 
 
+@pytest.mark.hazard("H37")
 @pytest.mark.parametrize("scale", [0.5, 0.85, 1.2])
 def test_another_scale_is_a_fault_within_3_m(scale: float) -> None:
     """Half of the speed within a second of driving at it."""
@@ -150,6 +154,7 @@ def test_another_scale_is_a_fault_within_3_m(scale: float) -> None:
     assert 0.5 * (fault_s - BEGINS_S) < max(limit_m, 3.2) + 0.5, fault_s
 
 
+@pytest.mark.hazard("H37")
 @pytest.mark.parametrize("yaw_deg", [10.0, -20.0])
 @pytest.mark.parametrize("turns", [True, False])
 def test_a_rig_that_is_turned_on_its_base_is_named(yaw_deg: float, turns: bool) -> None:

@@ -118,6 +118,7 @@ def test_motion_is_that_of_the_base_seen_from_the_rig() -> None:
     assert np.max(twists) < 40
 
 
+@pytest.mark.hazard("H14")
 def test_slip_is_noticed_and_wheels_are_left_out_until_they_agree() -> None:
     sensors, end_s = driven(SensorErrors(), 30)
     slips, rng = sensors.slips, np.random.default_rng(3)
@@ -134,6 +135,7 @@ def test_slip_is_noticed_and_wheels_are_left_out_until_they_agree() -> None:
     assert abs(sensors.values[DISTANCE] - 1) < 0.01
 
 
+@pytest.mark.hazard("H14")
 def test_wheels_with_wrong_settings_are_calibrated_again_and_refused_where_they_make_no_sense() -> None:
     sensors, _ = driven(SensorErrors(distance=1.4), 60)
     assert abs(sensors.values[DISTANCE] - 1.4) < 0.02 and sensors.wheels_are_sane
@@ -183,6 +185,7 @@ def test_late_samples_and_any_order_give_the_same_motion() -> None:
     assert np.allclose(one.twist, other.twist, atol=1e-12)
 
 
+@pytest.mark.hazard("H14")
 def test_a_wheel_that_slips_in_the_dark_is_noticed_by_the_gyro() -> None:
     """The base goes straight on, one wheel turns faster: the distance is not to be believed either."""
     sensors, end_s = driven(SensorErrors(), 30)

@@ -152,6 +152,7 @@ def test_a_rig_that_moves_during_the_run_is_detected(turned: Turned, true: tuple
     assert monitor.finding.turn_deg == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.hazard("H35")
 def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
     """Three new views of it are enough, long before a whole check is due."""
     place, config = geometry(read_rig(rooms / "rig.toml"), PanoramaConfig()), Config()

@@ -70,6 +70,7 @@ def frozen(cameras: Cameras, pairs: int, side: Side = "upper") -> Iterator[TileS
         yield cameras.update(images)
 
 
+@pytest.mark.hazard("H22")
 def test_a_part_that_stays_as_it_was_is_dead_at_the_second_repetition_and_live_when_it_changes() -> None:
     """The first image of the part is no repetition."""
     cameras = Cameras()
@@ -125,6 +126,7 @@ def test_a_plain_part_is_dead_only_if_it_has_always_changed() -> None:
         assert (states is not ALL_LIVE) == is_dead
 
 
+@pytest.mark.hazard("H22")
 def test_dark_and_saturated_parts_are_blind_at_once() -> None:
     """Each of them, in one image."""
     cameras = Cameras()
@@ -153,6 +155,7 @@ def test_a_lamp_makes_no_direction_unknown() -> None:
     assert states.blind["lower"][0, INSIDE].all() and not states.unknown.any()
 
 
+@pytest.mark.hazard("H22")
 @pytest.mark.parametrize("side", SIDES)
 def test_a_part_that_only_one_camera_shows_blurred_is_blind(side: Side) -> None:
     """A drop on its mirror: the noise stays, the texture goes."""
