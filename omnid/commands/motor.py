@@ -85,11 +85,7 @@ def ask(question: str) -> str:
 def _lines(before: DriveSettings, drive: DriveSettings) -> dict[str, str]:
     """Return keys and TOML values: always those of the wiring, those of the scale only where the test changed them."""
     wiring = {name: str(getattr(drive, name)).lower() for name in ("swapped", "reverse_left", "reverse_right")}
-    scale = {
-        name: repr(getattr(drive, name))
-        for name in ("gear", "ticks_per_turn", "max_wheel_mps")
-        if getattr(drive, name) != getattr(before, name)
-    }
+    scale = {"gear": repr(drive.gear)} if drive.gear != before.gear else {}
     return wiring | scale
 
 

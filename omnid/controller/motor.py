@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 from drivers.errors import DriverError
-from drivers.motors.protocols.protocol_registry import PROTOCOLS
+from drivers.motors.protocols.protocol_registry import motor_protocol
 from drivers.motors.serial_motor import SerialMotor
 from omnid.controller.motor_settings import MotorSettings
 
@@ -34,7 +34,7 @@ def open_motor(config: MotorSettings, closing: ExitStack) -> tuple[SerialMotor, 
     simulated = _simulated(config, closing) if config.port == SIMULATED else None
     driver = SerialMotor(
         simulated.port if simulated else config.port,
-        PROTOCOLS[config.protocol](config.drive.geometry()),
+        motor_protocol(config.protocol)(config.drive.geometry()),
         baud=config.baud,
         timeout_s=ANSWER_SHARE / config.rate_hz,
         watchdog_ms=config.watchdog_ms,
@@ -44,11 +44,9 @@ def open_motor(config: MotorSettings, closing: ExitStack) -> tuple[SerialMotor, 
 
 
 def _simulated(config: MotorSettings, closing: ExitStack) -> SimulatedMotor:
-    from drivers.motors.simulated.controller_registry import (
-        SIMULATED_CONTROLLERS,  # a real robot's process does not load the simulation
-    )
-    from drivers.motors.simulated.simulated_motor import SimulatedMotor
+    # A real robot's process does not load the simulation.
+    from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
 
-    simulated = SimulatedMotor(SIMULATED_CONTROLLERS[config.protocol](config.drive.geometry()))
+    simulated = SimulatedMotor(simulated_controller(config.protocol, config.drive.geometry()))
     closing.callback(simulated.close)
     return simulated

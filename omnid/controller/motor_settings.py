@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from omnid.settings import knob
 
 
@@ -20,13 +19,8 @@ class DriveSettings:
         high=10,
     )
     wheel_radius_m: float = knob(0.05, "radius of the wheels, m", low=0.001, high=5)
-    max_wheel_mps: float = knob(
-        1.0, "highest speed of a wheel, m/s; for roboteq_power and _mixed: at full power", low=0.001, high=20
-    )
+    max_wheel_mps: float = knob(1.0, "highest speed of a wheel, m/s", low=0.001, high=20)
     gear: float = knob(1.0, "turns of the motor per turn of the wheel", low=0.001, high=10_000)
-    ticks_per_turn: float = knob(
-        1000.0, "ros_arduino_bridge: ticks of the encoder per turn of the motor", low=1, high=1_000_000
-    )
     pole_pairs: int = knob(7, "vesc: pole pairs of the motor", low=1, high=100)
     reverse_left: bool = knob(False, "the left motor turns the other way round")
     reverse_right: bool = knob(False, "the right motor turns the other way round")
@@ -43,7 +37,7 @@ class MotorSettings:
     """The motor controller: where it is, its protocol, how often it gets a command."""
 
     port: str = knob("", "serial port of the motor controller, or simulated; empty: none")
-    protocol: str = knob("line", "protocol of the motor controller", choices=tuple(PROTOCOLS))
+    protocol: str = knob("line", "line, roboteq, odrive_ascii, vesc, or a protocol of another package")
     baud: int = knob(0, "bits per second; 0: the protocol's own", low=0, high=4_000_000)
     rate_hz: float = knob(20.0, "commands per second", low=5, high=200)
     watchdog_ms: int = knob(

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from drivers.motor import VelocityCommand, stop_command
 from drivers.motors.serial_motor import LateReplyError, NoReplyError, SerialMotor
@@ -25,15 +25,6 @@ ANSWER_S: Final = 1.0  # A stop is repeated for this time: a busy computer delay
 LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 LARGEST_TURNS: Final = 1000.0
-# The setting that makes the number of turns right; controllers of other protocols take m/s, and know the rest.
-SCALES: Final[Mapping[str, str]] = {
-    "roboteq": "gear",
-    "odrive_ascii": "gear",
-    "vesc": "gear",
-    "ros_arduino_bridge": "ticks_per_turn",
-    "roboteq_power": "max_wheel_mps",
-    "roboteq_mixed": "max_wheel_mps",
-}
 MIXES_ITSELF: Final = "line"
 _SIDES: Final = {"l": "left", "r": "right", "b": "both", "n": "none", "a": "again"}
 
@@ -90,7 +81,7 @@ class WiringTest:
                     break
                 self._ask(f"Both motors turned the {first.side} wheel, which cannot be. Press Enter to see it again: ")
         drive = replace(plain, **wiring(first, second))
-        if not self._turns or self._config.protocol not in SCALES:
+        if not self._turns:
             return drive
         with ExitStack() as closing:
             motor, _ = open_motor(replace(self._config, drive=drive), closing)
@@ -137,7 +128,7 @@ class WiringTest:
             answer = self._ask(f"{commanded:.2f} turns were commanded. How many were there (Enter if as many)? ")
             turns = _number(answer) if answer else commanded
             if turns is not None and 0 < turns <= LARGEST_TURNS:
-                return rescaled(drive, SCALES[self._config.protocol], turns / commanded)
+                return rescaled(drive, turns / commanded)
 
     def _move(self, motor: SerialMotor, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
         """Drive for this time, then stop; return the time for which it drove, s."""
@@ -180,13 +171,11 @@ def wiring(first: Seen, second: Seen) -> dict[str, bool]:
     return {"swapped": first.side == "right", "reverse_left": not left.forward, "reverse_right": not right.forward}
 
 
-def rescaled(drive: DriveSettings, name: str, ratio: float) -> DriveSettings:
-    """Return the drive with the setting `name` corrected; ratio: true by commanded turns."""
+def rescaled(drive: DriveSettings, ratio: float) -> DriveSettings:
+    """Return the drive with the gear corrected; ratio: true by commanded turns."""
     if abs(ratio - 1) <= RIGHT_SCALE:
         return drive
-    corrected = getattr(drive, name) * (ratio if name == "max_wheel_mps" else 1 / ratio)
-    changed: dict[str, Any] = {name: float(f"{corrected:.4g}")}
-    return replace(drive, **changed)
+    return replace(drive, gear=float(f"{drive.gear / ratio:.4g}"))
 
 
 def _number(text: str) -> float | None:

@@ -21,9 +21,8 @@ from drivers.cameras.log_camera import LogClock
 from drivers.frame import Camera, Frame
 from drivers.imu.simulated_witmotion import SimulatedWitMotion
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_base import Pose
-from drivers.motors.simulated.simulated_motor import SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
 from omnid.simulation.cameras import SimulatedCameras
 from omnid.simulation.clearance import DriveRecord, clearance_m, footprints
 from omnid.simulation.lockstep import with_masks
@@ -51,7 +50,7 @@ class RealtimeRobot:
         """Open the terminal. report: takes a line at each contact with an obstacle."""
         self.rig = with_masks(robot.rig)
         self._robot, self._world = robot, world
-        controller = SIMULATED_CONTROLLERS[protocol](drive)
+        controller = simulated_controller(protocol, drive)
         base = controller.base
         base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
         self._motor = SimulatedMotor(controller)

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from drivers.motor import VelocityCommand
-from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
-from drivers.motors.simulated.lockstep_motor import LockstepMotor
+from drivers.motors.protocols.protocol_registry import motor_protocol
 from drivers.motors.simulated.simulated_base import Pose
+from drivers.motors.simulated.simulated_motor import LockstepMotor, simulated_controller
 from omnid.config import Config
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import TickReport
@@ -58,11 +57,11 @@ class Vehicle:
         self.people = Walkers(world.people)
         self._take_tick = take_tick
         drive = config.motor.drive.geometry()
-        self.twin = SIMULATED_CONTROLLERS[config.motor.protocol](drive)
+        self.twin = simulated_controller(config.motor.protocol, drive)
         base = self.twin.base
         base.pose, base.limits, base.traction = world.start, robot.limits, traction(robot.wheels, seed)
         self.motor = LockstepMotor(
-            PROTOCOLS[config.motor.protocol](drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
+            motor_protocol(config.motor.protocol)(drive), self.twin, config.motor.watchdog_ms, lambda: self.now_ns
         )
         self.controller = Controller(
             self.motor,

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from drivers.motor import VelocityCommand, is_stop, stop_command
-from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
-from drivers.motors.simulated.lockstep_motor import LockstepMotor
+from drivers.motors.protocols.protocol_registry import motor_protocol
 from drivers.motors.simulated.simulated_base import LONGEST_ADVANCE_S, SimulatedBase
+from drivers.motors.simulated.simulated_motor import LockstepMotor, simulated_controller
 from omnid.controller.motor_settings import MotorSettings
 
 
@@ -18,12 +17,12 @@ class SimulatedWheels:
 
     def __init__(self, settings: MotorSettings) -> None:
         drive = settings.drive.geometry()
-        self._controller = SIMULATED_CONTROLLERS[settings.protocol](drive)
+        self._controller = simulated_controller(settings.protocol, drive)
         self._now_ns, self._moves = 0, False
         self._rearm_s = 0.5e-3 * settings.watchdog_ms
         self._sent = self._stops = 0
         self._motor = LockstepMotor(
-            PROTOCOLS[settings.protocol](drive), self._controller, settings.watchdog_ms, lambda: self._now_ns
+            motor_protocol(settings.protocol)(drive), self._controller, settings.watchdog_ms, lambda: self._now_ns
         )
 
     @property

@@ -10,17 +10,17 @@ from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import Framer, T, Transaction
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
 from drivers.motors.serial_motor import SerialMotor
-from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
 from drivers.motors.simulated.simulated_base import MotionLimits
 from drivers.motors.simulated.simulated_line import SimulatedLine
-from drivers.motors.simulated.simulated_motor import SimulatedController, SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController, SimulatedMotor
 from drivers.motors.simulated.simulated_vesc import SimulatedVesc
 
 NAMES = sorted(PROTOCOLS)
 PATIENCE_S = 20.0  # bounds a wait on a loaded machine; not a measured limit
 REPLY_S = 2.0
 LONG_MS = 10_000
-BASE = DifferentialDrive(track_m=0.4, wheel_radius_m=0.08, max_wheel_mps=1.0, gear=12.0, ticks_per_turn=300.0)
+SHORT_MS = 100
+BASE = DifferentialDrive(track_m=0.4, wheel_radius_m=0.08, max_wheel_mps=1.0, gear=12.0)
 INSTANT = MotionLimits(acceleration_mps2=1e4, yaw_acceleration_radps2=1e5)
 
 
@@ -29,11 +29,6 @@ def controller_of(name: str, drive: DifferentialDrive = BASE, watchdog_ms: int =
     if name == "vesc":
         return SimulatedVesc(drive, watchdog_ms)
     return SimulatedLine(drive, heading_input=False) if name == "line" else SIMULATED_CONTROLLERS[name](drive)
-
-
-def shortest_watchdog_ms(name: str) -> int:
-    """Return a short watchdog time that the controller accepts."""
-    return 2000 if name == "ros_arduino_bridge" else 100
 
 
 def run(transaction: Transaction[T], controller: SimulatedController, framer: Framer) -> T:

@@ -16,8 +16,7 @@ from drivers.motor import MotorStatus, VelocityCommand, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.motor_protocol import Framer, MotorProtocol
 from drivers.motors.protocols.protocol_registry import PROTOCOLS
-from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
-from drivers.motors.simulated.simulated_motor import SimulatedController
+from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController
 from tests.contract.simulated_motors import BASE, LONG_MS, NAMES, controller_of, run
 
 WIRINGS = [
@@ -82,7 +81,7 @@ def test_drives_the_commanded_arc_and_reports_it(name: str, drive: DifferentialD
     assert chord_m == pytest.approx(2 * 0.8 * math.sin(0.5), rel=0.01)  # a turn of 1 rad at a radius of 0.8 m
     assert (status.velocity_mps, status.yaw_rate_radps) == pytest.approx((0.4, 0.5), rel=0.02)
     assert not status.watchdog_expired and status.fault == 0
-    assert status.battery_v == 12.0 or name == "ros_arduino_bridge"
+    assert status.battery_v == 12.0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -96,7 +95,7 @@ def test_limiting_the_wheel_speed_keeps_the_curvature(name: str, velocity_mps: f
     assert connection.base.errors == 0
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name not in ("waveshare_json", "ros_arduino_bridge")])
+@pytest.mark.parametrize("name", NAMES)
 def test_reports_fault_and_battery(name: str) -> None:
     connection = Connection(name)
     connection.base.fault, connection.base.battery_v = 16, 9.5

@@ -21,9 +21,9 @@ from tests.contract.simulated_motors import (
     NAMES,
     PATIENCE_S,
     REPLY_S,
+    SHORT_MS,
     connected_motor,
     controller_of,
-    shortest_watchdog_ms,
     until,
 )
 
@@ -62,7 +62,7 @@ def test_close_stops_the_wheels(name: str) -> None:
 @pytest.mark.hazard("H40")
 @pytest.mark.parametrize("name", NAMES)
 def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) -> None:
-    watchdog_ms = shortest_watchdog_ms(name)
+    watchdog_ms = SHORT_MS
     with connected_motor(name, watchdog_ms=watchdog_ms) as (motor, simulated):
         motor.send(stop_command(0))
         motor.send(FORWARD)
@@ -90,7 +90,7 @@ def test_a_stop_comes_before_motion_after_the_host_was_suspended(name: str, monk
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_missing_reply_is_an_error_and_a_stop_comes_before_motion(name: str) -> None:
-    with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, simulated):
+    with connected_motor(name, watchdog_ms=SHORT_MS, timeout_s=SHORT_S) as (motor, simulated):
         first_status(motor)
         simulated.drop_replies = True
         assert until(lambda: type(send_error(motor)) is NoReplyError), "LateReplyError at first"
@@ -116,7 +116,7 @@ def test_a_late_reply_stops_nothing(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_stops_are_sent_while_no_replies_come(name: str) -> None:
     """As where only the wire of the replies is broken: commands still arrive, and no watchdog expires by them."""
-    with connected_motor(name, watchdog_ms=shortest_watchdog_ms(name), timeout_s=SHORT_S) as (motor, simulated):
+    with connected_motor(name, watchdog_ms=SHORT_MS, timeout_s=SHORT_S) as (motor, simulated):
         assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
         simulated.drop_replies = True
         assert until(lambda: type(send_error(motor)) is NoReplyError)
@@ -130,7 +130,7 @@ def test_stops_are_sent_while_no_replies_come(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_a_controller_that_was_switched_off_and_on_gets_its_watchdog_and_settings_again(name: str) -> None:
     """As by an emergency stop that takes its power, while the serial adapter stays: the port is never gone."""
-    watchdog_ms = shortest_watchdog_ms(name)
+    watchdog_ms = SHORT_MS
     with connected_motor(name, watchdog_ms=watchdog_ms, timeout_s=SHORT_S) as (motor, simulated):
         assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
         simulated.drop_input = True
@@ -175,7 +175,7 @@ def test_an_endless_stream_is_an_error(name: str) -> None:
         assert first_status(motor) is not None
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if name != "ros_arduino_bridge"])  # it reports no voltage
+@pytest.mark.parametrize("name", NAMES)
 def test_a_late_reply_is_discarded(name: str) -> None:
     with connected_motor(name) as (motor, simulated):
         simulated.base.battery_v = 9.5
@@ -196,7 +196,7 @@ def test_a_missing_reply_at_the_connection_is_an_error(name: str) -> None:
         SerialMotor(simulated.port, PROTOCOLS[name](BASE), watchdog_ms=LONG_MS, connect_s=PATIENCE_S).close()
 
 
-@pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "ros_arduino_bridge")])
+@pytest.mark.parametrize(("name", "other"), [("line", "roboteq"), ("roboteq", "vesc"), ("vesc", "odrive_ascii")])
 def test_detects_another_protocol(name: str, other: str) -> None:
     controller = controller_of(name)
     with contextlib.closing(SimulatedMotor(controller)) as simulated, pytest.raises(DriverError, match="protocol"):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 
-_SIZES = ("track_m", "wheel_radius_m", "max_wheel_mps", "gear", "ticks_per_turn", "pole_pairs")
+_SIZES = ("track_m", "wheel_radius_m", "max_wheel_mps", "gear", "pole_pairs")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,6 @@ class DifferentialDrive:
     wheel_radius_m: float = 0.05
     max_wheel_mps: float = 1.0  # limit of every wheel speed command
     gear: float = 1.0  # turns of the motor per turn of the wheel
-    ticks_per_turn: float = 1000.0  # of the encoder, per turn of the motor
     pole_pairs: int = 7  # of the motor
     reverse_left: bool = False
     reverse_right: bool = False

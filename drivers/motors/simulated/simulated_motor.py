@@ -1,4 +1,4 @@
-"""A simulated controller on a pseudo-terminal, for demonstrations and tests."""
+"""Simulated controllers: on a pseudo-terminal in real time, or in lock step with a simulated clock."""
 
 from __future__ import annotations
 
@@ -9,11 +9,18 @@ import threading
 import time
 import tty
 from collections import deque
-from typing import Protocol
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
 
-from drivers.motor import VelocityCommand
+from drivers.errors import DriverError
+from drivers.motor import MotorStatus, VelocityCommand, stop_command
+from drivers.motors.protocols.differential_drive import DifferentialDrive
+from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
 from drivers.motors.simulated.simulated_base import STEP_S, Pose, SimulatedBase
 from drivers.motors.simulated.simulated_line import SimulatedLine
+from drivers.motors.simulated.simulated_odrive import SimulatedODrive
+from drivers.motors.simulated.simulated_roboteq import SimulatedRoboteq
+from drivers.motors.simulated.simulated_vesc import SimulatedVesc
 
 READ_LIMIT_BYTES = 4096
 POSES_KEPT = 1000  # Number of poses that are kept with their times: those of some seconds.
@@ -29,6 +36,23 @@ class SimulatedController(Protocol):
 
     def feed(self, data: bytes) -> bytes:
         """Return the replies to received bytes."""
+
+
+SIMULATED_CONTROLLERS: Final[Mapping[str, Callable[[DifferentialDrive], SimulatedController]]] = {
+    "line": SimulatedLine,
+    "roboteq": SimulatedRoboteq,
+    "odrive_ascii": SimulatedODrive,
+    "vesc": SimulatedVesc,
+}
+
+
+def simulated_controller(protocol: str, drive: DifferentialDrive) -> SimulatedController:
+    """Return the simulated controller of a protocol; raise DriverError for one that has none."""
+    if protocol not in SIMULATED_CONTROLLERS:
+        raise DriverError(
+            f"motor.protocol {protocol!r} has no simulated controller: one of {', '.join(SIMULATED_CONTROLLERS)} has"
+        )
+    return SIMULATED_CONTROLLERS[protocol](drive)
 
 
 class SimulatedMotor:
@@ -142,3 +166,43 @@ class SimulatedMotor:
         replies = self.controller.feed(data)
         if replies and not self.drop_replies:
             self.send(self.garbage + replies)
+
+
+class LockstepMotor:
+    """A MotorDriver whose bytes reach the controller at once; like the serial driver it begins with a stop."""
+
+    def __init__(
+        self, protocol: MotorProtocol, controller: SimulatedController, watchdog_ms: int, clock_ns: Callable[[], int]
+    ) -> None:
+        """Connect; DriverError where the controller does not take the watchdog's time."""
+        self._protocol, self._controller, self._clock_ns = protocol, controller, clock_ns
+        self._framer = protocol.framer()
+        self.status: MotorStatus | None = None  # the last reply
+        self.cut = False  # fault: no byte arrives at either end
+        self._run(protocol.connect(watchdog_ms))
+        self._run(protocol.drive(stop_command(0), clock_ns() * 1e-9))
+
+    def send(self, command: VelocityCommand) -> MotorStatus:
+        """Send a command and return the controller's reply; DriverError without one."""
+        self.status = None
+        self.status = self._run(self._protocol.drive(command, self._clock_ns() * 1e-9))
+        return self.status
+
+    def close(self) -> None:
+        """Stop the wheels."""
+        self._run(self._protocol.drive(stop_command(0), self._clock_ns() * 1e-9))
+
+    def _run(self, transaction: Transaction[T]) -> T:
+        try:
+            frames = self._exchange(next(transaction))
+            while frames:
+                frames = [*frames[1:], *self._exchange(transaction.send(frames[0]))]
+        except StopIteration as done:
+            result: T = done.value
+            return result
+        raise DriverError("the simulated motor controller gave no answer")
+
+    def _exchange(self, data: bytes) -> list[bytes]:
+        if self.cut or not data:
+            return []
+        return self._framer.feed(self._controller.feed(data))

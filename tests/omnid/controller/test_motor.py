@@ -27,6 +27,12 @@ def test_simulates_every_protocol(protocol: str) -> None:
     assert twin.base.commanded_mps == [0.0, 0.0], "closing stops the wheels"
 
 
+@pytest.mark.parametrize("port", ["simulated", "/dev/null"])
+def test_refuses_a_protocol_that_nobody_has(port: str) -> None:
+    with ExitStack() as closing, pytest.raises(DriverError, match=r"motor\.protocol 'waveshare_json'"):
+        open_motor(MotorSettings(port=port, protocol="waveshare_json"), closing)
+
+
 def test_refuses_a_watchdog_of_fewer_than_four_ticks() -> None:
     with ExitStack() as closing, pytest.raises(DriverError, match="give at least 200, 4 ticks"):
         open_motor(MotorSettings(port="simulated", rate_hz=20.0, watchdog_ms=199), closing)

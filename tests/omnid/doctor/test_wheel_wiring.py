@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.simulated.controller_registry import SIMULATED_CONTROLLERS
-from drivers.motors.simulated.simulated_motor import SimulatedController, SimulatedMotor
+from drivers.motors.simulated.simulated_motor import SIMULATED_CONTROLLERS, SimulatedController, SimulatedMotor
 from omnid.config import load_config
 from omnid.controller.motor_settings import DriveSettings, MotorSettings
 from omnid.doctor.wheel_wiring import Seen, WiringTest, toml_with, wiring
@@ -90,13 +89,12 @@ class Person:
 @contextlib.contextmanager
 def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, Person, SimulatedMotor]]:
     """Yield settings that do not know the wiring, a person, and the base."""
-    drive = DriveSettings(wheel_radius_m=RADIUS_M, gear=20.0, ticks_per_turn=400.0)
+    drive = DriveSettings(wheel_radius_m=RADIUS_M, gear=20.0)
     true = replace(drive.geometry(), **wiring)  # type: ignore[arg-type]
     watched = WatchedController(SIMULATED_CONTROLLERS[protocol](true))
     with contextlib.closing(SimulatedMotor(watched)) as motor:
-        watchdog_ms = 2000 if protocol == "ros_arduino_bridge" else 1000
         # At 5 Hz an answer may take 0.16 s: a busy computer is not what is tested here.
-        settings = MotorSettings(motor.port, protocol, rate_hz=5.0, watchdog_ms=watchdog_ms, drive=drive)
+        settings = MotorSettings(motor.port, protocol, rate_hz=5.0, watchdog_ms=1000, drive=drive)
         yield settings, Person(watched), motor
 
 
@@ -104,11 +102,8 @@ def simulated(protocol: str, **wiring: object) -> Iterator[tuple[MotorSettings, 
     ("protocol", "true"),
     [
         pytest.param("roboteq", {"swapped": True, "reverse_left": True, "gear": 10.0}, marks=pytest.mark.slow),
-        ("roboteq_power", {"reverse_right": True, "max_wheel_mps": 2.0}),
         pytest.param("odrive_ascii", {"swapped": True, "gear": 40.0}, marks=pytest.mark.slow),
         pytest.param("vesc", {"reverse_left": True, "reverse_right": True, "gear": 10.0}, marks=pytest.mark.slow),
-        pytest.param("waveshare_json", {"swapped": True, "reverse_right": True}, marks=pytest.mark.slow),
-        ("ros_arduino_bridge", {"reverse_left": True, "ticks_per_turn": 800.0}),
     ],
 )
 def test_the_settings_follow_from_what_the_wheels_did(protocol: str, true: dict[str, object]) -> None:

@@ -58,7 +58,7 @@ def test_does_not_change_commands_within_the_limits() -> None:
     assert DifferentialDrive().limited(command(0.0, 0.0)) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("name", ["track_m", "wheel_radius_m", "max_wheel_mps", "gear", "ticks_per_turn", "pole_pairs"])
+@pytest.mark.parametrize("name", ["track_m", "wheel_radius_m", "max_wheel_mps", "gear", "pole_pairs"])
 @pytest.mark.parametrize("bad", [0, -1, math.nan, math.inf])
 def test_refuses_invalid_sizes(name: str, bad: float) -> None:
     with pytest.raises(DriverError, match=name):

@@ -9,7 +9,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
-from drivers.motors.protocols.roboteq import MIXED, POWER, Roboteq
+from drivers.motors.protocols.roboteq import Roboteq
 from tests.drivers.motors.transactions import UnfinishedError, result, written
 
 DRIVE = DifferentialDrive(track_m=0.5, wheel_radius_m=0.5 / math.pi, gear=10.0, max_wheel_mps=2.0)  # 600 rpm at 1 m/s
@@ -17,10 +17,8 @@ TURN = VelocityCommand(0, 0.5, 0.0, 1.0)
 ANSWERS = (b"+", b"+", b"S=150:450", b"V=246", b"FF=0")
 
 
-def test_bytes_of_each_mode() -> None:
+def test_bytes_of_a_command_and_of_the_setup() -> None:
     assert written(Roboteq(DRIVE).drive(TURN, 0.0)) == b"!S 1 150\r!S 2 450\r?S\r?V 2\r?FF\r"
-    assert written(Roboteq(DRIVE, POWER).drive(TURN, 0.0)) == b"!G 1 125\r!G 2 375\r?M\r?V 2\r?FF\r"
-    assert written(Roboteq(DRIVE, MIXED).drive(TURN, 0.0)) == b"!G 1 250\r!G 2 -125\r?M\r?V 2\r?FF\r"
     assert written(Roboteq(DRIVE).connect(500)) == b"^ECHOF 1\r^RWD 500\r~RWD\r~MXMD\r"
 
 
@@ -28,8 +26,6 @@ def test_status_in_the_units_of_the_base() -> None:
     status = result(Roboteq(DRIVE).drive(TURN, 0.0), *ANSWERS[:4], b"FF=20")
     assert (status.velocity_mps, status.yaw_rate_radps) == pytest.approx((0.5, 1.0))
     assert (status.battery_v, status.fault) == (24.6, 20) and math.isnan(status.heading_rad)
-    power = result(Roboteq(DRIVE, POWER).drive(TURN, 0.0), b"+", b"+", b"M=125:375", b"V=246", b"FF=0")
-    assert (power.velocity_mps, power.yaw_rate_radps) == pytest.approx((0.5, 1.0))
 
 
 def test_skips_echoes_and_counts_invalid_lines() -> None:
@@ -56,10 +52,9 @@ def test_reads_back_the_watchdog() -> None:
         result(Roboteq(DRIVE).connect(500), b"+", b"+", b"RWD=0", b"MXMD=0")
 
 
-@pytest.mark.parametrize(("mode", "mixing"), [("rpm", b"MXMD=1"), (POWER, b"MXMD=2"), (MIXED, b"MXMD=0")])
-def test_requires_the_mixing_mode_of_the_protocol(mode: str, mixing: bytes) -> None:
-    with pytest.raises(DriverError, match="mixing"):
-        result(Roboteq(DRIVE, mode).connect(500), b"+", b"+", b"RWD=500", mixing)
+def test_a_controller_that_mixes_its_channels_is_refused() -> None:
+    with pytest.raises(DriverError, match="switch mixing off"):
+        result(Roboteq(DRIVE).connect(500), b"+", b"+", b"RWD=500", b"MXMD=1")
 
 
 def test_refuses_a_controller_with_one_channel() -> None:
