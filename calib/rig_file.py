@@ -2,8 +2,8 @@
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
 optional table [covariance] has a version of its own: see covariance_table.py and rig_covariance.py. The optional table
-[times] has the times of exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined] is
-read by refined_rig.py.
+[times] has the times of exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined],
+which earlier versions of omnid wrote, is ignored.
 """
 
 from __future__ import annotations

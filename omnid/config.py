@@ -46,7 +46,7 @@ class LiveConfig:
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
-    """Is the rig right? Checks, and refinement; the file of the calibration, cameras.rig, is never written."""
+    """Is the rig right? Checks of the images against it."""
 
     check: str = knob(
         "refuse",
@@ -56,16 +56,6 @@ class RigConfig:
     check_s: float = knob(
         5.0, "time between two views that a live run compares with the rig, s; 0: none", low=0, high=3600
     )
-    refine: str = knob(
-        "report",
-        "estimate all parameters of the rig from windows of keyframes, in a process of low "
-        "priority; where they do not fit, report it and write the refined rig to refined_file; 'use': "
-        "the next start uses that file",
-        choices=("off", "report", "use"),
-    )
-    refined_file: str = knob("rig.refined.toml", "file of the refined rig; delete it to go back to the calibration")
-    refine_keyframes: int = knob(20, "keyframes of a window, 0.25 m or 15 deg apart", low=15, high=80)
-    refine_s: float = knob(300.0, "time between two windows, s", low=0, high=86_400)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +246,10 @@ RENAMED: Final[Mapping[str, str]] = MappingProxyType(
         "stereo.rig_check": "rig.check",
         "live.check_s": "rig.check_s",
         "navigation.blocked_s": "a blocked base gives way (navigation.give_way_s) and goes on by itself",
+        **dict.fromkeys(
+            ("rig.refine", "rig.refined_file", "rig.refine_keyframes", "rig.refine_s"),
+            "a run does not refine its rig: `omnid calibrate drive` does, on a recording",
+        ),
         "mapping.heights_m": "obstacles.ring.heights_m, which are above the floor",
     }
 )

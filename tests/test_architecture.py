@@ -33,7 +33,7 @@ TIERS: Mapping[str, str] = {
     "omnid.transport",
     "parts of a run": "omnid.stages omnid.recordings omnid.service",
     "what watches and writes a run": "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration "
-    "omnid.refinement omnid.batch",
+    "omnid.batch",
     "runs and clients": "omnid.runs omnid.simulation omnid.client omnid.monitor omnid.doctor",
     "interfaces": "omnid omnid.api omnid.web omnid.viewer omnid.examples omnid.commands omnid.cli omnid.__main__",
 }

@@ -1,9 +1,9 @@
-"""The rig's entry of the status: its state, by columns of the panoramas, and the landmarks of its refinement."""
+"""The rig's entry of the status: its state, by columns of the panoramas."""
 
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
 from omnid.core.rig.driving_views import VIEWS
 from omnid.core.rig.rig_health import RigHealth
@@ -34,16 +34,8 @@ ADVICE: Final = MappingProxyType(
 )
 
 
-class RefinementReport(NamedTuple):
-    """Result of the refinement: severity, a line where the rig does not fit, and values."""
-
-    level: int
-    message: str
-    values: dict[str, str]
-
-
-def rig_status(health: RigHealth, refinement: RefinementReport | None, refined_in_use: str = "") -> DiagnosticStatus:
-    """Return the entry; refined_in_use: the file of the refined rig with which the run began."""
+def rig_status(health: RigHealth) -> DiagnosticStatus:
+    """Return the entry."""
     # 1. The state, with the words of the first pairs while the drive has shown nothing.
     state, finding = health.state, health.finding
     level, message = LEVELS[state], ADVICE[state]
@@ -65,11 +57,4 @@ def rig_status(health: RigHealth, refinement: RefinementReport | None, refined_i
         }
     if finding is not None:
         values["age_s"] = f"{health.finding_age_s:.0f}"
-    # 3. The refinement; the message is that of the graver one.
-    if refined_in_use:
-        values["refined_in_use"] = refined_in_use
-    if refinement is not None:
-        values |= refinement.values
-        if refinement.level > level:
-            level, message = refinement.level, refinement.message
     return DiagnosticStatus(RIG, level, message, values)

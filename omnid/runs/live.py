@@ -22,7 +22,6 @@ from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare, priorities
 from omnid.errors import OmnidError
-from omnid.refinement.refined_file import RefinedRigFile
 from omnid.runs.live_robot import LiveRobot
 from omnid.runs.session import Session
 from omnid.runs.systemd import print_stacks_when_killed
@@ -43,7 +42,6 @@ class LiveRun:
         """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
         self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
         self._graph = _graph_that_waits(config) if robot.waits else _graph_in_time(config, report)
-        self._refined: RefinedRigFile | None = None
         self._connected = False
 
     def run(self) -> int:
@@ -70,7 +68,7 @@ class LiveRun:
             give_back_code("llvmlite")  # which has loaded the compiled functions, and does nothing else in a run
             self._connected = True
             run_places = RunPlaces(self._config, geometry, session.warn)
-            LiveWiring(session, geometry, self._refined, self._robot, self._report).wire(run_places)
+            LiveWiring(session, geometry, self._robot, self._report).wire(run_places)
             if self._show is not None:
                 from omnid.runs.live_status import add_terminal_ticker
 
@@ -99,18 +97,9 @@ class LiveRun:
             raise SystemExit(0)
 
     def _geometry(self, session: Session) -> Geometry:
-        rig = self._rig or self._rig_of_file()
+        rig = self._rig or read_rig(Path(self._config.cameras.rig))
         with closing(self._robot.first_frames()) as frames:
             return session.geometry(rig, frames)
-
-    def _rig_of_file(self) -> Rig:
-        """Return the rig of the configuration, or the refined one that an earlier run has written."""
-        settings, path = self._config.rig, Path(self._config.cameras.rig)
-        calibration = read_rig(path)
-        if settings.refine == "off":
-            return calibration
-        self._refined = RefinedRigFile(Path(settings.refined_file), calibration, path)
-        return self._refined.start(self._report, is_wanted=settings.refine == "use")
 
 
 def _graph_in_time(config: Config, report: Report) -> Graph:

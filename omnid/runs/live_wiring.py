@@ -11,11 +11,13 @@ from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.controller.link import DriveLink
 from omnid.core.control.command_sources import PLANNER
+from omnid.core.rig.rig_health import RigHealth
 from omnid.diagnostics.floor_status import floor_status
 from omnid.diagnostics.images_status import ImagesStatus
 from omnid.diagnostics.load_ladder import PERIOD_S, LoadLadder
 from omnid.diagnostics.motion_status import motion_status
 from omnid.diagnostics.places_status import places_status
+from omnid.diagnostics.rig_status import rig_status
 from omnid.diagnostics.status import Latency, StatusCollector, StatusSources
 from omnid.diagnostics.threads_status import ThreadsStatus
 from omnid.engine.graph import NEWEST, Sink, Stream
@@ -25,7 +27,6 @@ from omnid.light.exposure_control import ExposureControl
 from omnid.light.grey_levels import UsefulArea
 from omnid.load_level import LoadLevel
 from omnid.messages import OdometryUpdate
-from omnid.refinement.refined_file import RefinedRigFile
 from omnid.runs.live_commands import NO_PLANNER, LiveCommands
 from omnid.runs.live_robot import LiveRobot
 from omnid.runs.live_status import add_status_tickers
@@ -33,7 +34,7 @@ from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.record import open_recorder
-from omnid.runs.rig_checks import LiveRig, live_health
+from omnid.runs.rig_checks import RigViews
 from omnid.runs.route_files import RouteFiles
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import TICKERS, Session
@@ -51,13 +52,8 @@ from omnid.transport.navigation_commands import RequestQueue
 class LiveWiring:
     """Joins the parts of one run."""
 
-    def __init__(
-        self, session: Session, geometry: Geometry, refined: RefinedRigFile | None, robot: LiveRobot, report: Report
-    ) -> None:
-        """Connect the wheels, the bus, the samples of wheels and gyro, and the recording.
-
-        refined: the file of the refined rig; None where the rig is not refined.
-        """
+    def __init__(self, session: Session, geometry: Geometry, robot: LiveRobot, report: Report) -> None:
+        """Connect the wheels, the bus, the samples of wheels and gyro, and the recording."""
         config = session.config
         self._session, self._geometry, self._robot, self._report = session, geometry, robot, report
         self._latency, self._ladder = Latency(session.clock_ns), LoadLadder()
@@ -68,8 +64,8 @@ class LiveWiring:
             config, self._pairing.motion, session, self._controller, report, with_images=robot.brings_samples
         )
         self._recorder = self._open_recorder() if config.record.enabled else None
-        self._front_end = FrontEnd(geometry, config, live_health(geometry, config, refined), load=self._load)
-        self._rig = LiveRig(session, self._front_end, self._ladder, refined)
+        self._rig = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
+        self._front_end = FrontEnd(geometry, config, self._rig, load=self._load)
 
     def wire(self, run_places: RunPlaces) -> None:
         """Join the robot, stages, sinks and tickers."""
@@ -128,9 +124,11 @@ class LiveWiring:
         poses: dict[str, Sink[OdometryUpdate]] = {}
         if config.bus.panorama_hz:
             poses["panorama"] = PanoramaSink(bus, config.bus.panorama_hz, session.offset_ns)
+        if self._rig.uses_views:
+            poses["rig"] = RigViews(self._rig)
         recorder, controller = self._recorder, self._controller
         return Sinks(
-            poses={**poses, **self._rig.pose_sinks},
+            poses=poses,
             rings={"controller-ring": RingToController(controller)} if controller else {},
             counters={"statistics": session.statistics, "latency": self._latency},
             bus=BusSink(
@@ -154,7 +152,7 @@ class LiveWiring:
             ThreadsStatus(),
             images,
             exposure.status,
-            self._rig.status,
+            partial(rig_status, self._rig),
             *([received.navigation.status] if controller else ()),
             motion_status(self._front_end.odometry, self._pairing.motion, sensors.receiver, sensors.gyro),
             *([partial(places_status, stages.places)] if stages.places else ()),

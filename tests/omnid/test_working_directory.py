@@ -142,15 +142,6 @@ def test_the_controller_and_the_program_of_a_report_do_not_run_it(hostile: Path,
     assert done.stdout == "<!DOCTYPE html>\n", done
 
 
-def test_the_process_of_the_refinement_does_not_run_it(hostile: Path) -> None:
-    """It fails for a request that is none, after it has loaded what it needs to read one."""
-    ask = (
-        "from omnid.refinement.rig_refinement import _Estimate\n"
-        "asked = _Estimate(None)\nasked.wait()\nprint(asked.answer())"
-    )
-    assert run(hostile, "-c", ask).stdout == "the estimate ended with exit code 1\n"
-
-
 def test_the_viewer_does_not_run_it(hostile: Path) -> None:
     pytest.importorskip("rerun")
     ask = (

@@ -23,7 +23,6 @@ EXCHANGE: Final = (
 )
 CALIBRATE: Final = "give the rig of these cameras, or calibrate it: `omnid calibrate check` shows by how much it is off"
 LATE_OR_MOVED: Final = "; if the rig was right before, one of the cameras is late now, or was moved"
-GO_ON: Final = "give the rig of these cameras with --rig, or go on all the same with --set rig.check=warn"
 
 
 class RigContradictedError(OmnidError):
@@ -38,9 +37,9 @@ class RigHealth:
     then the rig counts as fitting.
     """
 
-    def __init__(self, cylinder: Cylinder, mode: str, every_s: float = 0.0, hint: str = "") -> None:
-        """every_s: time between two views of the drive; 0: none is used. hint: ends the reason of a refusal."""
-        self._mode, self._hint = mode, hint
+    def __init__(self, cylinder: Cylinder, mode: str, every_s: float = 0.0) -> None:
+        """every_s: time between two views of the drive; 0: none is used."""
+        self._mode = mode
         self._cylinder = cylinder
         self._first = FirstPairs(cylinder)
         self._again: FirstPairs | None = None  # the pairs of a later check, until it has decided or ended
@@ -126,7 +125,7 @@ class RigHealth:
             return
         self._first.add(pair, exposure)
         if self._first.state.is_contradicted and self._mode == "refuse":
-            raise RigContradictedError(self.warning + self._hint)
+            raise RigContradictedError(self.warning)
 
     def check_again(self) -> None:
         """Check the next pairs as the first ones, as the pose was lost: cables may have been exchanged meanwhile.

@@ -18,9 +18,9 @@ from omnid.camera_config import PairConfig
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_matches import POINTS
 from omnid.core.rig.driving_views import MIN_PLACES, VIEWS
-from omnid.core.rig.rig_health import RigContradictedError, RigHealth
+from omnid.core.rig.rig_health import RigHealth
 from omnid.core.rig.rig_state import RigState
-from omnid.diagnostics.rig_status import RefinementReport, rig_status
+from omnid.diagnostics.rig_status import rig_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
@@ -102,7 +102,7 @@ def monitor_after(
 
 
 def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
-    status = rig_status(true[0], None)
+    status = rig_status(true[0])
     assert (status.name, status.level, status.message) == (RIG, 0, "fits")
     assert float(status.values["turn_deg"]) < 0.05 and abs(float(status.values["offset_px"])) < 0.03
     assert status.values["state"] == "fits" and int(status.values["new_views"]) == len(true[1]) - VIEWS
@@ -113,19 +113,19 @@ def test_a_correct_rig_is_good(true: tuple[RigHealth, Collector]) -> None:
 @pytest.mark.parametrize("turn_deg", [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 0.5), (0.3, 0.2, -0.35)])
 def test_half_a_degree_is_a_warning(turned: Turned, turn_deg: tuple[float, float, float]) -> None:
     monitor, _ = turned(turn_deg)
-    status = rig_status(monitor, None)
+    status = rig_status(monitor)
     assert status.level == 1 and status.message.startswith("drifted: ") and monitor.finding and monitor.finding.drift
     assert np.rad2deg(monitor.finding.drift.turn) == pytest.approx(turn_deg, abs=0.05)
     assert float(status.values["turn_deg"]) == pytest.approx(np.linalg.norm(turn_deg), abs=0.05)
 
 
 def test_three_degrees_are_an_error(turned: Turned) -> None:
-    status = rig_status(turned((0.0, 3.0, 0.0))[0], None)
+    status = rig_status(turned((0.0, 3.0, 0.0))[0])
     assert status.level == 2 and status.message.startswith("broken: ")
 
 
 def test_a_robot_that_stands_gets_no_finding(true: tuple[RigHealth, Collector]) -> None:
-    status = rig_status(monitor_after(true, true[1][:1] * 100), None)
+    status = rig_status(monitor_after(true, true[1][:1] * 100))
     assert (status.level, status.values) == (0, {"state": "unchecked", "new_views": "1", "needed_views": str(VIEWS)})
     assert status.message.startswith("not checked yet")
 
@@ -163,7 +163,7 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tu
         turned = wrapped(np.roll(right.upper.panorama, columns * (number >= 4), axis=1))
         health.drive(replace(right, upper=turned, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state.is_contradicted == (number >= 6), "the newest three views decide"
-    assert rig_status(health, None).level == 2
+    assert rig_status(health).level == 2
     assert poses.process(true[1][8]).state is TrackingState.DEGRADED
     fits = FrontEnd(place, config, RigHealth(place.cylinder, "refuse", PERIOD_S)).poses
     assert fits.process(true[1][8]).state is TrackingState.TRACKING
@@ -172,14 +172,14 @@ def test_a_mirror_that_is_knocked_makes_the_poses_degraded(rooms: Path, true: tu
 def test_the_status_has_the_result_of_the_start(rooms: Path, true: tuple[RigHealth, Collector]) -> None:
     right = read_rig(rooms / "rig.toml")
     health = started(true, [])
-    assert rig_status(health, None).message.startswith("not checked yet") and health.state is RigState.UNCHECKED
+    assert rig_status(health).message.startswith("not checked yet") and health.state is RigState.UNCHECKED
     health = started(true, true[1][:2])
-    status = rig_status(health, None)
+    status = rig_status(health)
     assert (status.level, status.message, status.values["state"]) == (0, "fits", "fits") and not health.is_checking
     for turn_deg, level, words in ((0.8, 1, "do not quite fit"), (3.0, 2, "contradict the rig")):
         _, seen = monitored(rooms, with_upper_rotated(right, (turn_deg, 0.0, 0.0)), 4)
         health = started(true, seen)
-        status = rig_status(health, None)
+        status = rig_status(health)
         assert status.level == level and words in status.message
         assert health.state is (RigState.BROKEN if level == 2 else RigState.DRIFTED)
 
@@ -208,7 +208,7 @@ def test_the_drive_overrules_the_start_except_for_exchanged_cameras(
         for number, one in enumerate(later[:VIEWS]):
             health.drive(replace(one, seq=number, stamp_ns=round(number * PERIOD_S * SECONDS)))
         assert health.state is state and begun in (state, RigState.BROKEN, RigState.FITS)
-    assert rig_status(health, None).level == 2 and "exchange" in rig_status(health, None).message
+    assert rig_status(health).level == 2 and "exchange" in rig_status(health).message
 
 
 def test_a_check_in_the_dark_changes_no_state(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
@@ -265,24 +265,6 @@ def test_after_a_loss_a_late_camera_may_be_why_the_rig_does_not_fit(
     assert health.warning.endswith("one of the cameras is late now, or was moved")
 
 
-def test_the_refinement_is_part_of_the_entry(true: tuple[RigHealth, Collector]) -> None:
-    health = started(true, true[1][:2])
-    fits = rig_status(health, RefinementReport(0, "", {"windows": "1"}), "a.toml")
-    assert (fits.level, fits.message) == (0, "fits")
-    assert (fits.values["windows"], fits.values["refined_in_use"]) == ("1", "a.toml")
-    moved = rig_status(health, RefinementReport(1, "moved", {"windows": "2"}))
-    assert (moved.level, moved.message, moved.values["state"]) == (1, "moved", "fits")
-
-
-def test_a_refusal_ends_with_the_hint(turned: Turned, true: tuple[RigHealth, Collector]) -> None:
-    _, wrong = turned((0.0, 3.0, 0.0))
-    assert true[0]._views is not None
-    health = RigHealth(true[0]._views._cylinder, "refuse", hint="; delete a.toml")
-    with pytest.raises(RigContradictedError, match=r"contradict the rig.*; delete a\.toml$"):
-        for one in wrong[:4]:
-            health.begin(one)
-
-
 @pytest.mark.parametrize(("gain", "noise"), [(0.0, 0.0), (0.0, 2.0), (0.0, 6.0), (0.02, 12.0)])
 def test_darkness_is_no_alarm(true: tuple[RigHealth, Collector], gain: float, noise: float) -> None:
     """In the dark, noise gives points without a match."""
@@ -295,11 +277,11 @@ def test_darkness_is_no_alarm(true: tuple[RigHealth, Collector], gain: float, no
         ]
         return replace(one, lower=replace(one.lower, image=images[0]), upper=replace(one.upper, image=images[1]))
 
-    status = rig_status(monitor_after(true, [dark(one) for one in true[1]]), None)
+    status = rig_status(monitor_after(true, [dark(one) for one in true[1]]))
     assert status.level == 0 and status.values["state"] == "unchecked", status
 
 
 def test_a_covered_camera_is_an_error(true: tuple[RigHealth, Collector]) -> None:
     covered = [replace(one, upper=replace(one.upper, image=np.full_like(one.upper.image, 9))) for one in true[1]]
-    status = rig_status(monitor_after(true, covered), None)
+    status = rig_status(monitor_after(true, covered))
     assert status.level == 2 and "covered" in status.message

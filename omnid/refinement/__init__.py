@@ -1,1 +1,0 @@
-"""Refinement of the rig while the daemon runs."""
