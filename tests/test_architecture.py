@@ -51,7 +51,7 @@ class Rule:
 RULES = (
     Rule("calib", ("drivers", "omnid")),
     Rule("drivers", ("calib", "omnid")),
-    Rule("omnid.core", ("drivers.cameras", "drivers.logs", "drivers.motors", "drivers.imu")),
+    Rule("omnid.core", ("drivers.cameras", "drivers.logs", "drivers.motors")),
     Rule("omnid.core.control", ("calib.se3", "calib.se2_arrays", "calib.models", "calib.panorama", "calib.rig")),
     Rule("omnid.core.control", ("omnid.core.odometry", "omnid.core.places", "omnid.core.navigation")),
     Rule("omnid.core.odometry", ("omnid.core.places", "omnid.core.obstacles", "omnid.core.navigation")),

@@ -17,13 +17,12 @@ from omnid.commands.map_option import add_map, map_settings
 from omnid.errors import OmnidError
 
 AUTO, REAL_TIME = "auto", "1.0"
-IMU_BAUD = 115_200  # Baud rate at which the stamps of the simulated gyro are right.
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.motors.simulated.simulated_base import Pose
     from omnid.runs.live_robot import LiveRobot
     from omnid.simulation.paced_robot import PacedRobot
-    from omnid.simulation.realtime import RealtimeRobot
+    from omnid.simulation.realtime import RealtimeRobot, SimulatedGyro
     from omnid.simulation.robot import SimulatedRobot
 
 
@@ -98,9 +97,8 @@ def run(args: argparse.Namespace) -> int:
     geometry = config.motor.drive.geometry()
     with closing(RealtimeRobot(world, _robot(args), config.motor.protocol, geometry, args.seed, warn)) as robot:
         config = replace(config, motor=replace(config.motor, port=robot.port))
-        if config.motion.imu == "auto" and not config.motion.imu_port:
-            config = replace(config, motion=replace(config.motion, imu_port=robot.imu_port, imu_baud=IMU_BAUD))
-        code = LiveRun(config, _connected(robot), log, robot.rig, show).run()
+        gyro = robot.open_gyro() if config.motion.imu == "auto" else None
+        code = LiveRun(config, _connected(robot, gyro), log, robot.rig, show).run()
     return _end(args, robot, code)
 
 
@@ -123,7 +121,7 @@ def _robot(args: argparse.Namespace) -> SimulatedRobot:
     return make_robot(args.size, read_rig(args.rig) if args.rig else None)
 
 
-def _connected(robot: RealtimeRobot) -> LiveRobot:
+def _connected(robot: RealtimeRobot, gyro: SimulatedGyro | None) -> LiveRobot:
     """Return the robot as the run sees it; cameras that are opened together have one clock."""
     from drivers.cameras.log_camera import LogClock
     from drivers.frame import Camera
@@ -137,7 +135,7 @@ def _connected(robot: RealtimeRobot) -> LiveRobot:
         opened[camera] += 1
         return robot.open_camera(camera, clocks[opened[camera]])
 
-    return ConnectedRobot(open_camera)
+    return ConnectedRobot(open_camera, gyro=gyro)
 
 
 def _write_truth(path: Path, truth: dict[int, Pose], offset_ns: int) -> None:

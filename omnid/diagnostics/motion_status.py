@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.imu.witmotion import WitMotionGyro
 from omnid.core.odometry.motion_sensors import BIAS, DISTANCE, GYRO_OFFSET, TURN, WHEEL_OFFSET, MotionSensors
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.stages.odometry import OdometryStage
@@ -21,7 +20,6 @@ def motion_status(
     odometry: OdometryStage,
     inbox: MotionInbox,
     receiver: SensorReceiver | None = None,
-    gyro: WitMotionGyro | None = None,
 ) -> Callable[[], DiagnosticStatus]:
     """Return a function that returns the entry: samples, their estimated errors, and the sensor that differs."""
     sensors = odometry.sensors
@@ -38,8 +36,6 @@ def motion_status(
             values |= _estimates(sensors, wheels=bool(inbox.wheels), gyro=bool(inbox.gyro))
         if receiver is not None:
             values |= {f"{REFUSED_PREFIX}{key}": str(count) for key, count in sorted(receiver.refused.items())}
-        if gyro is not None:
-            values |= {"imu_broken": str(gyro.broken), "imu_restarts": str(gyro.restarts)}
         witness = odometry.witness
         text = f"{witness.reason} {witness.detail}".strip()
         if not sensors.wheels_are_sane or sensors.is_slipping:

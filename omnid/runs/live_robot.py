@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, closing
+from functools import partial
 from itertools import islice
 from typing import Final, Protocol, TypeAlias
 
@@ -82,9 +83,14 @@ class ConnectedRobot:
 
     waits: Final = False
 
-    def __init__(self, open_camera: OpenCamera, motion: MotionSource | None = None) -> None:
-        """motion: wheels and gyro where the images are those of a log; None: those of the robot."""
-        self._open_camera, self._motion = open_camera, motion
+    def __init__(
+        self, open_camera: OpenCamera, motion: MotionSource | None = None, gyro: MotionSource | None = None
+    ) -> None:
+        """motion: wheels and gyro where the images are those of a log; None: those of the robot.
+
+        gyro: that of a simulated robot; None: samples of a gyro come by the bus.
+        """
+        self._open_camera, self._motion, self._gyro = open_camera, motion, gyro
         self.brings_samples = motion is not None
         self._cameras: dict[Camera, LiveCamera] = {}
 
@@ -104,9 +110,9 @@ class ConnectedRobot:
 
     def sources(self, graph: Graph, take: Callable[[MotionSample], None]) -> list[Stream[Frame]]:
         """Add the cameras, and the samples of a log."""
-        motion = self._motion
-        if motion is not None:
-            graph.source("motion", lambda: map(take, motion.samples()), wake=motion.close)
+        for name, motion in (("motion", self._motion), ("gyro", self._gyro)):
+            if motion is not None:
+                graph.source(name, partial(map, take, motion.samples()), wake=motion.close)
         return [graph.source(name, camera.frames, wake=camera.close) for name, camera in self._cameras.items()]
 
     def states(self) -> Mapping[Camera, CameraState]:

@@ -61,7 +61,7 @@ class LiveWiring:
         self._bus = session.open_bus(geometry.rig, gives_time=robot.waits)
         self._pairing = Synchronise(geometry.rig, config.pair, config.motion.R_base_imu)
         self._sensors = SensorSources(
-            config, self._pairing.motion, session, self._controller, report, with_images=robot.brings_samples
+            config, self._pairing.motion, session.offset_ns, self._controller, report, with_images=robot.brings_samples
         )
         self._recorder = self._open_recorder() if config.record.enabled else None
         self._rig = RigHealth(geometry.cylinder, config.rig.check, config.rig.check_s)
@@ -72,7 +72,6 @@ class LiveWiring:
         session, robot = self._session, self._robot
         config, graph = session.config, session.graph
         # 1. From the cameras to pairs.
-        self._sensors.add_to(graph)
         frames = robot.sources(graph, self._pairing.motion.add)
         pairs = graph.stage("pair", self._pairing, *frames)
         area = UsefulArea(self._geometry.rig, self._geometry.cylinder)
@@ -154,7 +153,7 @@ class LiveWiring:
             exposure.status,
             partial(rig_status, self._rig),
             *([received.navigation.status] if controller else ()),
-            motion_status(self._front_end.odometry, self._pairing.motion, sensors.receiver, sensors.gyro),
+            motion_status(self._front_end.odometry, self._pairing.motion, sensors.receiver),
             *([partial(places_status, stages.places)] if stages.places else ()),
             *([partial(floor_status, stages.floor)] if stages.floor else ()),
             *self._robot.status,

@@ -1,4 +1,4 @@
-"""Sources of wheel and gyro samples of a live run: the motor controller, a serial IMU, the bus, or a log."""
+"""Sources of wheel and gyro samples of a live run: the motor controller, the bus, or a log."""
 
 from __future__ import annotations
 
@@ -7,17 +7,13 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Protocol
 
-from drivers.imu.witmotion import WitMotionGyro
 from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.topic_choice import MotionTopics
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.link import DriveLink
-from omnid.core.odometry.motion_settings import MotionSensorSettings
-from omnid.engine.graph import Graph
 from omnid.engine.logging_setup import Report
 from omnid.errors import OmnidError
-from omnid.runs.session import Session
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.transport.sensor_receiver import SensorReceiver
 from omnid.transport.topics import IMU, JOINT_STATES, WHEEL_ODOM
@@ -59,57 +55,30 @@ class MotionSource(Protocol):
 class SensorSources:
     """One source for the wheels and one for the gyro.
 
-    Wheels: the motor controller, else a topic of the bus. Gyro: the serial IMU, else a topic of the bus. Where the
-    images come from a log or a simulation, so do both, because samples of another motion would not fit these images.
+    Wheels: the motor controller, else a topic of the bus. Gyro: a topic of the bus. Where the images come from a log
+    or a simulation, so do both, because samples of another motion would not fit these images.
     """
 
     def __init__(
         self,
         config: Config,
         inbox: MotionInbox,
-        session: Session,
+        offset_ns: int,
         controller: DriveLink | None,
         report: Report,
         *,
         with_images: bool = False,
     ) -> None:
-        """Open the IMU. Raise DriverError where its port cannot be opened.
-
-        with_images: the samples come with the images, so nothing is opened.
-        """
-        self._inbox = inbox
-        self.gyro: WitMotionGyro | None = None
-        joints = joint_wheels(config)
-        topics: set[str] = set() if with_images else self._open(config.motion, session, controller, report, joints)
-        self.receiver = SensorReceiver(
-            inbox.add, session.offset_ns, frozenset(topics), partial(report, logging.WARNING), joints
-        )
-
-    def _open(
-        self,
-        settings: MotionSensorSettings,
-        session: Session,
-        controller: DriveLink | None,
-        report: Report,
-        joints: JointWheels | None,
-    ) -> set[str]:
-        """Open the devices; return the topics of the bus from which samples are taken."""
+        """offset_ns: from the stamps of images to Unix time. with_images: the samples come with the images."""
+        settings, joints = config.motion, joint_wheels(config)
         topics = set()
-        if settings.wheels == "auto":
+        if settings.wheels == "auto" and not with_images:
             if controller is not None:
-                controller.take_wheels = self._inbox.add
+                controller.take_wheels = inbox.add
             else:
                 topics.add(JOINT_STATES if joints else WHEEL_ODOM)
-        if settings.imu == "auto":
-            if settings.imu_port:
-                self.gyro = WitMotionGyro(settings.imu_port, settings.imu_baud, partial(report, logging.WARNING))
-                session.outputs.callback(self.gyro.close)
-            else:
-                topics.add(IMU)
-        return topics
-
-    def add_to(self, graph: Graph) -> None:
-        """Let a thread of the graph read the IMU, if there is one."""
-        gyro = self.gyro
-        if gyro is not None:
-            graph.source("imu", lambda: map(self._inbox.add, gyro.samples()), wake=gyro.close)
+        if settings.imu == "auto" and not with_images:
+            topics.add(IMU)
+        self.receiver = SensorReceiver(
+            inbox.add, offset_ns, frozenset(topics), partial(report, logging.WARNING), joints
+        )

@@ -1,6 +1,6 @@
-"""A simulated robot in real time: cameras for `omnid run`, a motor controller and a gyro on pseudo-terminals.
+"""A simulated robot in real time: cameras for `omnid run`, a motor controller on a pseudo-terminal, a gyro.
 
-The daemon is the same as on a robot: it opens the terminals as its serial ports, and takes the frames as those of two
+The daemon is the same as on a robot: it opens the terminal as its serial port, and takes the frames as those of two
 cameras. Only the wheels decide what the cameras see next.
 """
 
@@ -19,7 +19,7 @@ from calib import se3
 from drivers.cameras.camera_state import CameraState
 from drivers.cameras.log_camera import LogClock
 from drivers.frame import Camera, Frame
-from drivers.imu.simulated_witmotion import SimulatedWitMotion
+from drivers.motion import GyroSample
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.simulated.simulated_base import Pose
 from drivers.motors.simulated.simulated_motor import SimulatedMotor, simulated_controller
@@ -36,7 +36,7 @@ SAMPLES: Final = 1  # per pixel and axis: textures are filtered, only edges of s
 
 
 class RealtimeRobot:
-    """A robot whose time is that of the computer; `port` is its serial port, `imu_port` that of its gyro."""
+    """A robot whose time is that of the computer; `port` is its serial port."""
 
     def __init__(
         self,
@@ -58,8 +58,6 @@ class RealtimeRobot:
         self._gyro_noise = random.Random(seed + 1)
         self._turned = (0, base.pose[2])  # time [ns] and heading [rad] of the last measurement of the gyro
         self._yaw_rate_radps = 0.0
-        self._imu = SimulatedWitMotion(self._rates, robot.gyro.rate_hz) if robot.has_gyro else None
-        self.imu_port = self._imu.port if self._imu else ""
         self._rendered = SimulatedCameras(self.rig, robot.sensor, world, seed, SAMPLES)
         self._standing = footprints(world.standing, robot.height_m)
         self.drive = DriveRecord(report)  # with the stamps of the lower camera
@@ -68,13 +66,15 @@ class RealtimeRobot:
         """Return a camera; clock: start of both cameras."""
         return SimulatedCamera(self, camera, clock, self._robot.rate_hz)
 
+    def open_gyro(self) -> SimulatedGyro | None:
+        """Return the gyro, None where the robot has none."""
+        return SimulatedGyro(self.rates_radps, self._robot.gyro.rate_hz) if self._robot.has_gyro else None
+
     def close(self) -> None:
-        """Close the terminals."""
-        if self._imu is not None:
-            self._imu.close()
+        """Close the terminal."""
         self._motor.close()
 
-    def _rates(self) -> tuple[float, float, float]:
+    def rates_radps(self) -> tuple[float, float, float]:
         """Return what the gyro measures about x, y, z [rad/s]: over the time since the pose before, as it was noted."""
         poses, errors = self._motor.poses, self._robot.gyro
         if poses:
@@ -123,6 +123,27 @@ class RealtimeRobot:
     def walkers(self) -> Walkers:
         """Return the people at the start; each camera has its own copies, which walk in the same way."""
         return Walkers(self._world.people)
+
+
+class SimulatedGyro:
+    """The gyro of a RealtimeRobot: measures at a rate in real time; late measurements are left out."""
+
+    def __init__(self, rates_radps: Callable[[], tuple[float, float, float]], rate_hz: float) -> None:
+        """rates_radps: called for each measurement."""
+        self._rates, self._period_s = rates_radps, 1.0 / rate_hz
+        self._closed = False
+
+    def samples(self) -> Iterator[GyroSample]:
+        """Yield the measurements, stamped by CLOCK_MONOTONIC, until closed."""
+        due_s = time.monotonic()
+        while not self._closed:
+            time.sleep(max(0.0, due_s - time.monotonic()))
+            yield GyroSample(time.monotonic_ns(), *self._rates())
+            due_s = max(due_s + self._period_s, time.monotonic())
+
+    def close(self) -> None:
+        """End samples(); may be called twice, from any thread."""
+        self._closed = True
 
 
 class SimulatedCamera:

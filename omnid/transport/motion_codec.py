@@ -29,11 +29,11 @@ def wheel_cdr(sample: WheelSample, stamp_ns: int) -> bytes:
     return odometry_cdr(stamp_ns, np.eye(4), _UNKNOWN_VARIANCE * np.eye(6), velocity, np.zeros((6, 6)))
 
 
-def gyro_cdr(sample: GyroSample, stamp_ns: int) -> bytes:
-    """Encode angular velocities about the axes of the base."""
+def gyro_cdr(sample: GyroSample, stamp_ns: int, frame: str = BASE_FRAME) -> bytes:
+    """Encode angular velocities about the axes of a frame."""
     rates = ros.geometry_msgs__msg__Vector3(sample.x_radps, sample.y_radps, sample.z_radps)
     message = ros.sensor_msgs__msg__Imu(
-        header_message(stamp_ns, BASE_FRAME),
+        header_message(stamp_ns, frame),
         ros.geometry_msgs__msg__Quaternion(0.0, 0.0, 0.0, 1.0),
         _UNKNOWN,
         rates,

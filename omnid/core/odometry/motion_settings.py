@@ -20,14 +20,7 @@ class MotionSensorSettings:
         "speeds of the wheels: those that the motor controller reports, of the bus (cmd/wheel_odom) or of the log",
         choices=("auto", "off"),
     )
-    imu: str = knob("auto", "gyro: that of imu_port, of the bus (cmd/imu) or of the log", choices=("auto", "off"))
-    imu_port: str = knob("", "serial port of an IMU of WitMotion (WT61, WT901 ...), by a persistent name; empty: none")
-    imu_baud: int = knob(
-        9600,
-        "its baud rate; 9600 carries 10 measurements a second: set it to 115200 and 100 Hz with its maker's program",
-        low=1200,
-        high=4_000_000,
-    )
+    imu: str = knob("auto", "gyro: that of the bus (cmd/imu) or of the log", choices=("auto", "off"))
     wheel_topic: str = knob(
         "",
         "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "

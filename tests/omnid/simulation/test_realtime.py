@@ -12,7 +12,6 @@ import pytest
 
 from drivers.cameras.log_camera import LogClock
 from drivers.frame import Frame
-from drivers.imu.witmotion import WitMotionGyro
 from drivers.motor import VelocityCommand
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
@@ -56,8 +55,9 @@ def test_the_gyro_measures_the_turn_of_the_base() -> None:
     with (
         closing(RealtimeRobot(load_world("room", 1), make_robot(SIZE), "line", drive)) as robot,
         closing(SerialMotor(robot.port, LineProtocol(drive), timeout_s=1.0, watchdog_ms=2000)) as motor,
-        closing(WitMotionGyro(robot.imu_port, 115_200)) as gyro,
     ):
+        gyro = robot.open_gyro()
+        assert gyro is not None
         turned_rad, first_ns, last_ns, begin_rad = 0.0, 0, 0, robot.pose_at(0)[2]
         for sample in gyro.samples():
             motor.send(VelocityCommand(0, 0.2, 1.0, 0.0))

@@ -1,1 +1,0 @@
-"""Inertial measurement units on serial ports."""
