@@ -64,9 +64,7 @@ class BusConfig:
         "arrival: for senders with another clock, stamps must only rise",
         choices=("synchronised", "arrival"),
     )
-    ros2: str = knob(
-        "off", "connection to ROS 2: by rmw_zenoh or by zenoh-bridge-ros2dds", choices=("off", "rmw_zenoh", "ros2dds")
-    )
+    ros2: str = knob("off", "connection to ROS 2 by its middleware rmw_zenoh", choices=("off", "rmw_zenoh"))
     ros2_domain: int = knob(0, "ROS_DOMAIN_ID, for rmw_zenoh", low=0, high=232)
     panorama_hz: float = knob(
         2.0, "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none", low=0, high=60

@@ -28,22 +28,16 @@ class RosGraph:
 
     def publisher(self, topic: str, settings: Topic) -> str:
         """Declare a publisher and return its token, "" where ROS 2 is off."""
-        name, is_kept = ros_name(self._config.robot, topic), settings.transient_local
-        if self._config.ros2 == "rmw_zenoh":
-            entity = self._entity(topic)
-            return self._declare(self._node.publisher(entity, name, settings.schema, transient_local=is_kept))
-        if self._config.ros2 == "ros2dds":
-            zid = str(self._session.zid())
-            return self._declare(ros2.bridge_token(zid, "MP", name[1:], settings.schema, transient_local=is_kept))
-        return ""
+        if self._config.ros2 == "off":
+            return ""
+        name, entity = ros_name(self._config.robot, topic), self._entity(topic)
+        token = self._node.publisher(entity, name, settings.schema, transient_local=settings.transient_local)
+        return self._declare(token)
 
     def subscription(self, topic: str, schema: str) -> None:
         """Declare a subscription, where ROS 2 is not off."""
-        name = ros_name(self._config.robot, topic)
-        if self._config.ros2 == "rmw_zenoh":
-            self._declare(self._node.subscription(self._entity(topic), name, schema))
-        elif self._config.ros2 == "ros2dds":
-            self._declare(ros2.bridge_token(str(self._session.zid()), "MS", name[1:], schema))
+        if self._config.ros2 != "off":
+            self._declare(self._node.subscription(self._entity(topic), ros_name(self._config.robot, topic), schema))
 
     def _entity(self, topic: str) -> int:
         """Return the number of a topic, which is unique in the node."""
@@ -63,12 +57,12 @@ class TopicPublisher:
         topic, ros = PUBLISHED[name], ros_name(config.robot, name)
         plain = f"{config.robot}/{name.removeprefix('/')}"
         token = graph.publisher(name, topic)
-        key = ros2.data_key(config.ros2_domain, ros, topic.schema) if config.ros2 == "rmw_zenoh" else ros[1:]
-        other = config.ros2 != "off" and key != plain
-        declared = _declared_keeper if topic.transient_local and config.ros2 != "off" else _declared_publisher
-        self._plain = (_declared_publisher if other else declared)(session, plain, topic)
-        self._ros = declared(session, key, topic) if other else None
-        self._gid = ros2.gid_of(token) if config.ros2 == "rmw_zenoh" else b""
+        self._plain = _declared_publisher(session, plain, topic)
+        self._ros: zenoh.Publisher | ext.AdvancedPublisher | None = None
+        if config.ros2 == "rmw_zenoh":
+            declared = _declared_keeper if topic.transient_local else _declared_publisher
+            self._ros = declared(session, ros2.data_key(config.ros2_domain, ros, topic.schema), topic)
+        self._gid = ros2.gid_of(token)
         self._seq = 0
 
     @property
@@ -86,8 +80,7 @@ class TopicPublisher:
         self._plain.put(payload, attachment=attachment)
         if self._ros is not None:
             self._seq += 1
-            ros_attachment = ros2.attachment(self._seq, time.time_ns(), self._gid) if self._gid else None
-            self._ros.put(payload, attachment=ros_attachment)
+            self._ros.put(payload, attachment=ros2.attachment(self._seq, time.time_ns(), self._gid))
 
 
 def _declared_publisher(session: zenoh.Session, key: str, topic: Topic) -> zenoh.Publisher:

@@ -2,8 +2,6 @@
 
 rmw_zenoh (attachment_helpers.cpp, liveliness_utils.cpp of ros2/rmw_zenoh): a data key with the type and its hash, an
 attachment to every sample, liveliness tokens for the node and each of its publishers and subscriptions.
-zenoh-bridge-ros2dds (liveliness_mgt.rs of zenoh-plugin-ros2dds): the plain name as the key, and a token such as
-another bridge declares.
 """
 
 from __future__ import annotations
@@ -18,8 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 
 RELIABLE_LAST_10: Final = "::,10:,:,:,,"  # what is empty is rmw_zenoh's default: reliable, volatile, keep last
 TRANSIENT_LOCAL: Final = ":1:,1:,:,:,,"  # the newest message is kept for later subscribers, as of /tf_static
-BRIDGE_RELIABLE_LAST_10: Final = ":1:0:0,10"  # no key, then Cyclone DDS' numbers: reliable, volatile, keep last
-BRIDGE_TRANSIENT_LOCAL: Final = ":1:1:0,1"
 GID_BYTES: Final = 16
 
 
@@ -85,13 +81,6 @@ class RmwNode:
     def _endpoint(self, kind: str, entity: int, topic: str, schema: str, quality: str) -> str:
         where = f"@ros2_lv/{self.domain}/{self.zid}/0/{entity}/{kind}/%/%/{self.name}"
         return f"{where}/{topic.replace('/', '%')}/{dds_type(schema)}/{type_hash(schema)}/{quality}"
-
-
-def bridge_token(zid: str, kind: str, key: str, schema: str, *, transient_local: bool = False) -> str:
-    """Return the token that announces a publisher (kind MP) or a subscription (MS) to a bridge."""
-    plain = (key.replace("/", "§"), schema.replace("/", "§"))
-    quality = BRIDGE_TRANSIENT_LOCAL if transient_local else BRIDGE_RELIABLE_LAST_10
-    return "/".join((f"@/{zid}/@ros2_lv/{kind}", *plain, quality))
 
 
 def node_name(robot: str) -> str:

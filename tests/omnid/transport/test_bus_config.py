@@ -75,7 +75,6 @@ def test_default_is_local_without_multicast_and_denies_writing() -> None:
     ("ros2", "stops", "commands"),
     [
         ("off", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
-        ("ros2dds", ["robot7/cmd/stop"], ["robot7/cmd/**"]),
         ("rmw_zenoh", ["robot7/cmd/stop", "5/robot7/cmd/stop/**"], ["robot7/cmd/**", "5/robot7/cmd/**"]),
     ],
 )

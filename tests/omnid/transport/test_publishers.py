@@ -6,7 +6,6 @@ import contextlib
 import re
 
 import pytest
-import zenoh
 from zenoh import ext
 
 from omnid.client import Robot, Unreachable, subscribe
@@ -33,32 +32,10 @@ def test_all_topics_are_announced_to_rmw_zenoh() -> None:
     assert [parts[5:] for parts in found if parts[5] == "NN"] == [["NN", "%", "%", "omnid"]]
 
 
-def test_the_bridge_discovers_topics_by_their_plain_names() -> None:
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="ros2dds"))) as bus, client(endpoint) as session:
-        bus.subscribe_commands(lambda *_: None, COMMANDS)
-        found = {token.split("/", 3)[3] for token in tokens(endpoint, "@/*/@ros2_lv/**", len(TOPICS))}
-        odom, tf = (session.declare_subscriber(key, zenoh.handlers.RingChannel(1)) for key in ("omnid/odom", "tf"))
-        wait_until(
-            lambda: (
-                bus.publish("odom", odometry(1)) is None
-                and bus.publish("/tf", b"tf") is None
-                and odom.try_recv() is not None
-                and tf.try_recv() is not None
-            )
-        )
-    assert "MP/omnid§odom/nav_msgs§msg§Odometry/:1:0:0,10" in found
-    assert "MP/tf/tf2_msgs§msg§TFMessage/:1:0:0,10" in found
-    assert "MS/omnid§cmd§twist/geometry_msgs§msg§TwistStamped/:1:0:0,10" in found
-
-
-@pytest.mark.parametrize(
-    ("mode", "key"), [("rmw_zenoh", ros2.data_key(0, "/tf_static", codec.TRANSFORM_SCHEMA)), ("ros2dds", "tf_static")]
-)
-def test_late_subscribers_of_ros_receive_the_static_frames(mode: str, key: str) -> None:
+def test_late_subscribers_of_ros_receive_the_static_frames() -> None:
     """A subscriber that is transient local in ROS 2 is an AdvancedSubscriber with history of zenoh."""
-    endpoint = free_endpoint()
-    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2=mode))) as bus:
+    endpoint, key = free_endpoint(), ros2.data_key(0, "/tf_static", codec.TRANSFORM_SCHEMA)
+    with contextlib.closing(Bus(BusConfig(listen=(endpoint,), ros2="rmw_zenoh"))) as bus:
         for payload in (b"before a refinement", b"frames"):
             bus.publish("/tf_static", payload)
         with client(endpoint) as session:
@@ -70,17 +47,12 @@ def test_late_subscribers_of_ros_receive_the_static_frames(mode: str, key: str) 
             bus.publish("/tf_static", b"refined")
             wait_until(lambda: len(came) == 2)
             subscriber.undeclare()
-        quality, pattern = (
-            (ros2.TRANSIENT_LOCAL, "@ros2_lv/**")
-            if mode == "rmw_zenoh"
-            else (ros2.BRIDGE_TRANSIENT_LOCAL, "@/*/@ros2_lv/**")
-        )
-        publishers = tokens(endpoint, pattern, len(PUBLISHED) - 1)  # /clock is that of a simulation
+        publishers = tokens(endpoint, "@ros2_lv/**", len(PUBLISHED) - 1)  # /clock is that of a simulation
     kept = {
         topic
         for topic in ("tf_static", "map", "tf", "map_pose")
         for token in publishers
-        if re.search(f"[%/§]{topic}/", token) and token.endswith("/" + quality)
+        if re.search(f"[%/]{topic}/", token) and token.endswith("/" + ros2.TRANSIENT_LOCAL)
     }
     assert not any("clock" in token for token in publishers)
     assert came == [b"frames", b"refined"] and kept == {"tf_static", "map"}

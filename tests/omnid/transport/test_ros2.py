@@ -1,4 +1,4 @@
-"""The bus as ROS 2 sees it, byte by byte: rmw_zenoh and zenoh-bridge-ros2dds."""
+"""The bus as ROS 2 sees it, byte by byte: rmw_zenoh."""
 
 from __future__ import annotations
 
