@@ -45,9 +45,12 @@ COMMANDS = (
     "install-service",
 )
 MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
-# Commands of earlier versions, and what to use in their place.
+# Commands and options of earlier versions, and what to use in their place.
 REMOVED = {
+    "listen --all": "one program for each robot, with --robot NAME; many robots: Grafana on /metrics of `omnid web`",
     "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command line",
+    "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
+    "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
 }
 WRONG_INPUT = 2
 # What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.
@@ -91,9 +94,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     bound_image_size()
     limit_blas_threads()
     words = list(sys.argv[1:] if argv is None else argv)
-    for command, instead in REMOVED.items():
-        if words[: len(command.split())] == command.split():
-            print(f"omnid: `omnid {command}` was removed: {instead}", file=sys.stderr)
+    for removed, instead in REMOVED.items():
+        command, _, option = removed.partition(" --")
+        given = {word.partition("=")[0] for word in words}
+        if words[: len(command.split())] == command.split() and (not option or f"--{option}" in given):
+            print(f"omnid: `omnid {removed}` was removed: {instead}", file=sys.stderr)
             return WRONG_INPUT
     args = _parser(words).parse_args(words)
     return _guarded(args)

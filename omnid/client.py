@@ -42,7 +42,6 @@ from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.requests import Answer
 from omnid.transport.scan_codec import Scan, decode_scan
 from omnid.transport.session import Unreachable
-from omnid.transport.topics import STOP
 
 __all__ = [
     "CONNECT_S",
@@ -51,7 +50,6 @@ __all__ = [
     "Cloud",
     "Diagnostics",
     "Driver",
-    "Fleet",
     "Map",
     "NavigationReport",
     "Pose",
@@ -265,49 +263,6 @@ class Robot(_Connection):
         """True if the robot's daemon runs and can be reached."""
         replies = self._session.liveliness().get(f"{self.name}/alive", timeout=_QUERY_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
-
-
-class Fleet(_Connection):
-    """A connection to all robots that a router, or a robot, reaches; settings as for Robot."""
-
-    def __init__(self, settings: BusConfig, timeout_s: float = 0.0) -> None:
-        """Connect; raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings."""
-        super().__init__(settings, timeout_s)
-
-    def on_message(self, callback: Callable[[str, bytes, bytes], None], topics: Sequence[str]) -> None:
-        """Call callback(key, payload, attachment) for each message on topics such as "odom", in a zenoh thread.
-
-        key: `<robot>/<topic>`; a robot's name may have slashes. The newest message of each robot comes first, where it
-        is kept. The callback must be quick and never raise.
-        """
-
-        def on_sample(sample: zenoh.Sample) -> None:
-            callback(str(sample.key_expr), sample.payload.to_bytes(), _attachment(sample))
-
-        for topic in topics:
-            self._declared.append(self._session.declare_subscriber(f"**/{topic}", on_sample))
-            for reply in self._session.get(f"**/{topic}", timeout=_QUERY_TIMEOUT_S):
-                if reply.ok is not None:
-                    on_sample(reply.ok)
-
-    def on_alive(self, callback: Callable[[str, bool], None]) -> None:
-        """Call callback(robot, True) for each daemon that is there or comes, callback(robot, False) when it is gone."""
-
-        def on_token(sample: zenoh.Sample) -> None:
-            callback(str(sample.key_expr).rpartition("/")[0], sample.kind == zenoh.SampleKind.PUT)
-
-        tokens = self._session.liveliness()
-        self._declared.append(tokens.declare_subscriber("**/alive", on_token, history=True))
-
-    def stop(self, robot: str) -> None:
-        """Stop the wheels of a robot until it is armed; may block while it does not read."""
-        self._session.put(
-            f"{robot}/{STOP}",
-            b"",
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.REAL_TIME,
-            express=True,
-        )
 
 
 def subscribe(

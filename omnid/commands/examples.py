@@ -80,14 +80,12 @@ EXAMPLES: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
         "route delete": ("route delete morning",),
         "listen": (
             "listen",
-            "listen --all --connect tcp/router:7447",
             "listen --robot rover --connect tcp/robot:7447 --tum path.txt --mcap received.mcap",
         ),
         "view": ("view out.mcap", "view out.mcap -o out.rrd", "view out.mcap --web --port 9090"),
         "web": (
             "web",
             "web --connect tcp/robot:7447",
-            "web --all --connect tcp/router:7447",
             "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml",
         ),
         "record": ("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),

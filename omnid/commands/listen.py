@@ -18,7 +18,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `listen` to the command line."""
     parser = subparsers.add_parser("listen", help="show pose, state, rates and latencies of a robot, and record them")
     add_robot(parser)
-    parser.add_argument("--all", action="store_true", help="a table of all robots that the router or robot reaches")
     parser.add_argument("--load", action="store_true", help="the share of a core that each thread of the robot takes")
     parser.add_argument("--tum", type=Path, metavar="FILE", help="write the poses in the TUM format")
     parser.add_argument("--mcap", type=Path, metavar="FILE", help="record all received messages to a log")
@@ -57,9 +56,4 @@ def run(args: argparse.Namespace) -> int:
     from omnid.monitor.follow import listen
 
     check_seconds(args.seconds)
-    if args.all:
-        from omnid.monitor.fleet import check_all, listen_to_all
-
-        check_all(args.robot, {"--tum": args.tum, "--mcap": args.mcap, "--load": args.load or None})
-        return listen_to_all(config_of(args).bus, args.seconds)
     return listen(config_of(args).bus, args.tum, args.mcap, args.seconds, shows_load=args.load)

@@ -84,7 +84,10 @@ def run(args: argparse.Namespace) -> int:
         return _log(args, config, place)
     code = show_robot(config.bus, args.seconds, place)
     if code == 1:
-        print(f"omnid: no pose of {config.bus.robot} came: `omnid listen --all` shows the robots", file=sys.stderr)
+        print(
+            f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there",
+            file=sys.stderr,
+        )
     return code
 
 

@@ -16,15 +16,12 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     """Add `web` to the command line."""
     parser = subparsers.add_parser(
         "web",
-        help="a page with state, path, warnings, recordings, stop and arm",
+        help="a page with state, path, warnings, stop and arm",
         description="Serve a page about a robot: state, path, map, warnings with their "
-        "remedy, recordings, a stop and an arm button; /metrics for Prometheus. It prints "
+        "remedy, a stop and an arm button; /metrics for Prometheus. It prints "
         "the address with a token: who knows it may stop and arm the robot.",
     )
     add_robot(parser)
-    parser.add_argument(
-        "--all", action="store_true", help="a page with all robots that the router or robot reaches, and one about each"
-    )
     parser.add_argument(
         "--listen",
         default="127.0.0.1:8447",
@@ -51,7 +48,6 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="a further name of this machine, "
         "in addresses of browsers; without --listen on the network: localhost only",
     )
-    parser.add_argument("--recordings", type=Path, metavar="DIR", help="default: record.folder of the settings")
     parser.add_argument("--tls-certificate", type=Path, metavar="FILE", help="serve over TLS; PEM")
     parser.add_argument("--tls-key", type=Path, metavar="FILE", help="the private key of the certificate, PEM")
     add_settings(parser)
@@ -60,22 +56,14 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from omnid.monitor.fleet import check_all
-
     require_packages()
     from omnid.web.server import WebSettings, serve
 
     if (args.tls_certificate is None) != (args.tls_key is None):
         raise OmnidError("--tls-certificate and --tls-key belong together: name both")
-    if args.all:
-        check_all(args.robot, {"--recordings": args.recordings})
     config = config_of(args)
     tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
-    folder = args.recordings or Path(config.record.folder)
-    serve(
-        config.bus,
-        WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), folder, tls, args.all),
-    )
+    serve(config.bus, WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), tls))
     return 0
 
 

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, MutableMapping
 from typing import Any, Final
 
-from omnid.report.page_script import chart_script, policy
 from omnid.web.access import Access
 from omnid.web.places import ConnectionPlaces
 
@@ -20,8 +19,6 @@ POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
     "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-# A report shows text from logs of unknown origin: it runs its own script only, loads nothing, and has no origin.
-REPORT_POLICY: Final = f"{policy(chart_script())}; frame-ancestors 'none'; sandbox allow-scripts"
 _HEADERS: Final = (
     (b"x-content-type-options", b"nosniff"),
     (b"x-frame-options", b"DENY"),

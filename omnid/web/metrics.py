@@ -29,33 +29,6 @@ def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], c
     return "".join(_lines(state, browsers, refused, counts))
 
 
-def fleet_metrics(
-    robots: Mapping[str, RobotState], browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]
-) -> str:
-    """Return the metrics of all robots, by the label `robot`, and of the server; arguments as those of `metrics`."""
-    return "".join((*_robots(robots), *_server(browsers, refused, counts)))
-
-
-def _robots(robots: Mapping[str, RobotState]) -> Iterator[str]:
-    for name, kind, text, value in (
-        ("omnid_up", "gauge", "1 if the daemon's token is on the bus", lambda state: float(state.alive is True)),
-        ("omnid_pose_rate_hz", "gauge", "Poses received per second", lambda state: state.rate_hz),
-        ("omnid_poses_total", "counter", "Poses received", lambda state: state.poses),
-        ("omnid_poses_missed_total", "counter", "Skipped sequence numbers", lambda state: state.missed),
-    ):
-        yield from _metric(name, kind, text, [({"robot": robot}, value(state)) for robot, state in robots.items()])
-    yield from _metric(
-        "omnid_status_level",
-        "gauge",
-        "0 good, 1 warning, 2 error, 3 stale",
-        [
-            ({"robot": robot, "part": short_name(part.name)}, part.level)
-            for robot, state in robots.items()
-            for part in state.statuses.values()
-        ],
-    )
-
-
 def _lines(
     state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]
 ) -> Iterator[str]:

@@ -10,7 +10,6 @@ import re
 import signal
 import socket
 import sys
-import tempfile
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
@@ -26,11 +25,8 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.web.access import Access, token_of
 from omnid.web.feed import RobotFeed
-from omnid.web.fleet_feed import FleetFeed
-from omnid.web.fleet_page import FleetPage
 from omnid.web.guard import Guard
 from omnid.web.places import BACKLOG, Acceptor, ConnectionPlaces
-from omnid.web.recordings import Recordings, recordings_routes
 from omnid.web.robot_page import RobotPage
 from omnid.web.site import Site
 
@@ -53,9 +49,7 @@ class WebSettings:
     token_file: Path | None = None
     stop_token_file: Path | None = None  # file of a second token, which may see and stop but not arm
     names: tuple[str, ...] = ()  # further names of this machine
-    recordings: Path = Path("recordings")
     tls: tuple[Path, Path] | None = None  # certificate and key, PEM
-    all_robots: bool = False  # a page about all robots, and one about each
 
 
 def serve(bus: BusConfig, settings: WebSettings) -> None:
@@ -68,14 +62,15 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
         raise OmnidError("--stop-token-file has the token of --token-file, which may arm: name another file")
     if settings.token_file is None and is_journal(sys.stdout):
         raise OmnidError("omnid web prints its token, and the journal would keep it: name a --token-file")
-    with _listening(settings.listen) as listener, tempfile.TemporaryDirectory(prefix="omnid-web-") as reports:
+    with _listening(settings.listen) as listener:
         host, port = listener.getsockname()[:2]
         local = ipaddress.ip_address(host).is_loopback
         own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", *_names_of_machine())
         access = Access(
             token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}", stop_token
         )
-        guard, follow = _site(bus, settings, access, Path(reports))
+        page = RobotPage(RobotFeed(bus))
+        guard = Site(page.routes(), page.metrics, access, settings.tls is not None).guard
         server = _Server(_uvicorn_config(guard, settings), guard.places)
         raise_file_limit()
         scheme = "http" if settings.tls is None else "https"
@@ -86,7 +81,7 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
                 "the page can be reached from the network without encryption: everyone who can listen there learns the "
                 "token, and may arm the robot; use --tls-certificate and --tls-key, or a network that you trust",
             )
-        asyncio.run(_run(server, follow, listener))
+        asyncio.run(_run(server, page.feed.run, listener))
 
 
 def _print_addresses(url: str, token: str, stop_token: str) -> None:
@@ -97,18 +92,6 @@ def _print_addresses(url: str, token: str, stop_token: str) -> None:
     print(f"{url}?token={token}", flush=True)
     if stop_token:
         print(f"{url}?token={stop_token} (may see and stop, not arm)", flush=True)
-
-
-def _site(bus: BusConfig, settings: WebSettings, access: Access, reports: Path) -> tuple[Guard, Follow]:
-    """Return the server's application, and the function that follows the robots; reports: a folder for them."""
-    secure = settings.tls is not None
-    if settings.all_robots:
-        fleet = FleetPage(FleetFeed(bus), bus)
-        return Site("fleet.html", fleet.routes(), fleet.metrics, access, secure).guard, fleet.run
-    page = RobotPage(RobotFeed(bus))
-    recordings = Recordings(settings.recordings, reports)
-    site = Site("index.html", [*page.routes(), *recordings_routes(recordings)], page.metrics, access, secure)
-    return site.guard, page.feed.run
 
 
 async def _run(server: _Server, follow: Follow, listener: socket.socket) -> None:

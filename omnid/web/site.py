@@ -27,13 +27,13 @@ class Site:
     """The answers to requests that the guard has let in."""
 
     def __init__(
-        self, index: str, routes: Sequence[BaseRoute], metrics: Callable[[Guard], str], access: Access, secure: bool
+        self, routes: Sequence[BaseRoute], metrics: Callable[[Guard], str], access: Access, secure: bool
     ) -> None:
-        """index: the first page, a file of STATIC. routes: further addresses.
+        """routes: addresses of the robot's page.
 
         secure: True if the server speaks TLS, so that browsers send the cookie over TLS only.
         """
-        self._page, self._metrics_text, self._access, self._secure = index, metrics, access, secure
+        self._metrics_text, self._access, self._secure = metrics, access, secure
         outer = [
             Route("/", self._index),
             Route("/login", self._login, methods=["POST"]),
@@ -49,7 +49,7 @@ class Site:
         if token is not None:
             return self._let_in(token)
         if self._access.has_token(request.scope):
-            return FileResponse(STATIC / self._page)
+            return FileResponse(STATIC / "index.html")
         return FileResponse(STATIC / "login.html", status_code=401)
 
     async def _logout(self, request: Request) -> Response:

@@ -260,44 +260,6 @@ def full(reports: Subscription[Diagnostics]) -> Diagnostics:
     return report
 
 
-FLEET = 24
-
-
-def test_a_fleet_on_one_router_loses_no_pose() -> None:
-    endpoint = free_endpoint()
-    with contextlib.ExitStack() as ends:
-        router = ends.enter_context(script(ROUTER, endpoint))
-        listener = ends.enter_context(counter(endpoint))
-        sinks = []
-        for number in range(FLEET):
-            bus = Bus(BusConfig(robot=f"robot{number}", mode="client", listen=(), connect=(endpoint,)))
-            ends.callback(bus.close)
-            wait_until(lambda bus=bus: bus.connect() is None and bus._session is not None)
-            sinks.append(sink_on(bus))
-        publish(sinks, 0, 30)
-        new_counts(listener)
-        before_s, started_s = cpu_s(router.pid), time.monotonic()
-        publish(sinks, 30, 300)
-        share = (cpu_s(router.pid) - before_s) / (time.monotonic() - started_s)
-        time.sleep(0.5)
-        found = new_counts(listener)
-    columns = (
-        Column("robots"),
-        Column("poses/s each"),
-        Column("sent"),
-        Column("received"),
-        Column("missed"),
-        Column("one way p50", "ms", 2),
-        Column("one way p99", "ms", 2),
-        Column("router, of one core", "%", 0),
-    )
-    table = ResultTable("bus_fleet", "speed", "Robots of one process behind a router", columns)
-    table.add(
-        FLEET, RATE_HZ, FLEET * 300, found["received"], found["missed"], found["p50_ms"], found["p99_ms"], 100 * share
-    )
-    assert found["newest"] == 329 and found["missed"] == 0
-
-
 def cpu_s(pid: int) -> float:
     """Return the processor time of a process so far [s]."""
     fields = re.sub(r".*\)", "", Path(f"/proc/{pid}/stat").read_text()).split()

@@ -128,18 +128,11 @@ def test_no_command_runs_it(hostile: Path) -> None:
     assert not wrong
 
 
-def test_the_controller_and_the_program_of_a_report_do_not_run_it(hostile: Path, tmp_path: Path) -> None:
+def test_the_controller_does_not_run_it(hostile: Path, tmp_path: Path) -> None:
     log, recordings = short_log(tmp_path / "log.mcap"), tmp_path / "recordings"
     recordings.mkdir()
     done = run(hostile, "-m", "omnid", "replay", log, "--motor", "simulated", "--record", recordings / "a.mcap")
     assert done.returncode == 0, done.stderr
-    report = (
-        "import asyncio, sys\nfrom pathlib import Path\nfrom omnid.web.recordings import Recordings\n"
-        "found = Recordings(Path(sys.argv[1]), Path(sys.argv[2]))\n"
-        "print(asyncio.run(found.report(found.list()[0].key)).read_text()[:15])"
-    )
-    done = run(hostile, "-c", report, recordings, tmp_path)
-    assert done.stdout == "<!DOCTYPE html>\n", done
 
 
 def test_the_viewer_does_not_run_it(hostile: Path) -> None:

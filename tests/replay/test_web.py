@@ -18,8 +18,6 @@ pytest.importorskip("starlette", reason="needs the packages of omnid[web]")
 pytest.importorskip("websockets", reason="needs the packages of omnid[web]")
 from tests.omnid.web.servers import Shown, WebServer, served
 
-RECORDED = ("--set", "record.enabled=true", "--set")
-
 
 def state(server: WebServer, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
     """Return the state on a page that is opened now, as soon as a condition holds."""
@@ -28,10 +26,9 @@ def state(server: WebServer, holds: Callable[[dict[str, Any]], object]) -> dict[
 
 
 def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Path, course: Path) -> None:
-    folder = tmp_path / "recordings"
     with (
-        robot(course, tmp_path, *MANUAL, *RECORDED, f"record.folder={folder}") as (daemon, operator, base),
-        served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", folder) as server,
+        robot(course, tmp_path, *MANUAL) as (daemon, operator, base),
+        served("--connect", f"tcp/127.0.0.1:{daemon.port}") as server,
     ):
         operator.drive(0.3)
         assert not state(server, lambda found: found["wheels"] and found["pose"])["wheels"]["armed"]
@@ -55,7 +52,6 @@ def test_arm_and_stop_from_the_page_and_a_daemon_that_starts_again(tmp_path: Pat
         assert daemon.end()[0] == 0
         gone = state(server, lambda found: found["alive"] is False and len(found["warnings"]) == 1)
         assert gone["wheels"] is None and gone["warnings"][0]["name"] == "robot"
-        assert '"state":"whole"' in server.request("/recordings", headers=server.bearer).text
         with started(command_line(course, daemon.port, base.port, *MANUAL), daemon.port):
             again = state(server, lambda found: found["alive"] and found["fresh"] and found["wheels"])
             assert not again["wheels"]["armed"]

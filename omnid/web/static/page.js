@@ -8,7 +8,6 @@ import { wireGoal } from "./goal.js";
 import { wireStick } from "./stick.js";
 import { inWords } from "./words.js";
 import { showMapFile, wireMap } from "./map.js";
-import { wireRecordings } from "./recordings.js";
 import { byId, element, fixed } from "./elements.js";
 
 const LEVELS = ["good", "warn", "bad", "warn"];
@@ -177,12 +176,6 @@ byId("closer").addEventListener("click", () => plan.zoom(1.5));
 byId("wider").addEventListener("click", () => plan.zoom(1 / 1.5));
 byId("fit").addEventListener("click", () => plan.fit());
 plan.onFit = (fits) => byId("fit").setAttribute("aria-pressed", String(fits));
-if (location.pathname.startsWith("/robot/")) { // one of several: recordings of other machines cannot be listed
-  byId("back").hidden = false;
-  byId("recordings-box").hidden = true;
-} else {
-  wireRecordings();
-}
 wireMap();
 connection.open();
 askForPanorama();

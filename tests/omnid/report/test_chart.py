@@ -12,7 +12,6 @@ import pytest
 
 from omnid.report.report import report_html
 from omnid.report.report_data import collect_report_data
-from omnid.web.guard import REPORT_POLICY
 from tests.omnid.report.recorded_logs import drive, odom, run, save
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
@@ -34,7 +33,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(params=[(390, 844), (1440, 900)], ids=["phone", "desk"])
 def page(request: pytest.FixtureRequest, report: Path) -> Iterator[Any]:
-    """The report as the page of `omnid web` sends it, without an error in the browser."""
+    """The report as a file, without an error in the browser."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
     with playwright.sync_playwright() as tools:
         browser = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
@@ -42,14 +41,7 @@ def page(request: pytest.FixtureRequest, report: Path) -> Iterator[Any]:
         errors: list[str] = []
         found.on("pageerror", lambda error: errors.append(str(error)))
         found.on("console", lambda message: errors.append(message.text))
-        found.route(
-            "**/*",
-            lambda route: route.fulfill(
-                body=report.read_text("utf-8"),
-                headers={"content-type": "text/html; charset=utf-8", "content-security-policy": REPORT_POLICY},
-            ),
-        )
-        found.goto("http://127.0.0.1:1/report")
+        found.goto(report.as_uri())
         yield found
         browser.close()
     assert errors == []

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -30,11 +29,6 @@ def bus(endpoint: str) -> Iterator[Bus]:
 
 
 @pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("recordings")
-
-
-@pytest.fixture(scope="module")
-def server(bus: Bus, endpoint: str, recordings: Path) -> Iterator[WebServer]:
-    with served("--robot", ROBOT, "--connect", endpoint, "--recordings", recordings) as found:
+def server(bus: Bus, endpoint: str) -> Iterator[WebServer]:
+    with served("--robot", ROBOT, "--connect", endpoint) as found:
         yield found

@@ -112,7 +112,7 @@ def test_commands_and_websockets_come_from_the_own_page(kind: str, headers: dict
     [
         ("/", "navigate", ""),
         ("/", "cors", "cross-site"),
-        ("/recordings", "navigate", "cross-site"),
+        ("/metrics", "navigate", "cross-site"),
         ("/metrics", "no-cors", "cross-site"),
         ("/static/page.js", "no-cors", "cross-site"),
     ],

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from omnid.web.access import Access, Role
-from omnid.web.guard import POLICY, REPORT_POLICY, Guard, Message, Receive, Scope, Send
+from omnid.web.guard import POLICY, Guard, Message, Receive, Scope, Send
 
 HOST = "127.0.0.1:8447"
 ACCESS = Access("abcde-fghjk-mnpqr-stuvw", frozenset(("127.0.0.1",)), False, "omnid_8447")
@@ -71,7 +71,7 @@ def test_a_request_with_the_token_passes_and_its_answer_is_protected() -> None:
 
 
 def test_headers_of_the_application_come_before_those_of_the_guard() -> None:
-    own = (b"content-security-policy", REPORT_POLICY.encode())
+    own = (b"content-security-policy", b"default-src 'none'")
     sent, *_ = asked(cookie=COOKIE, answered=(own, (b"x-more", b"1")))
     assert dict(sent[0]["headers"]) == {**PROTECTION, b"x-more": b"1", own[0]: own[1]}
     assert len(sent[0]["headers"]) == len(PROTECTION) + 1, "each of them once"

@@ -27,9 +27,8 @@ from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import CALIBRATION
-from tests.omnid.transport.bus_fixtures import ROUTER, free_endpoint, odometry, script
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.web.servers import WebServer, served
-from tests.omnid.web.test_fleet_page import Robots
 from tests.omnid.web.test_routes import Navigator
 from tests.replay.live import robot, started
 from tests.replay.test_arming import MANUAL
@@ -44,11 +43,11 @@ WAIT_MS = 20_000
 # A page of another site that tries everything; the browser sends the cookie along where its rules allow that.
 EVIL = """<!DOCTYPE html><title>evil</title><form id="form" method="post" action="http://HOST/stop"
  target="frame"></form>
-<iframe name="frame"></iframe><iframe src="http://HOST/"></iframe><img src="http://HOST/recordings">
+<iframe name="frame"></iframe><iframe src="http://HOST/"></iframe><img src="http://HOST/metrics">
 <script src="http://HOST/static/page.js"></script><script>
 const tries = [fetch("http://HOST/stop", {method: "POST", mode: "no-cors", credentials: "include"}),
   fetch("http://HOST/arm", {method: "POST", mode: "no-cors", credentials: "include", body: "x"}),
-  fetch("http://HOST/recordings", {credentials: "include"}).then((answer) => answer.text())];
+  fetch("http://HOST/metrics", {credentials: "include"}).then((answer) => answer.text())];
 let opened = "no";
 const socket = new WebSocket("ws://HOST/live");
 socket.onmessage = () => { opened = "yes"; };
@@ -132,10 +131,9 @@ def expect_it_fits(page: Any, size: str) -> None:
 
 
 def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, course: Path) -> None:
-    more = ("--set", "bus.panorama_hz=2", "--set", "record.enabled=true", "--set", f"record.folder={tmp_path / 'rec'}")
     with (
-        robot(course, tmp_path, *MANUAL, *more) as (daemon, operator, base),
-        served("--connect", f"tcp/127.0.0.1:{daemon.port}", "--recordings", tmp_path / "rec") as server,
+        robot(course, tmp_path, *MANUAL, "--set", "bus.panorama_hz=2") as (daemon, operator, base),
+        served("--connect", f"tcp/127.0.0.1:{daemon.port}") as server,
     ):
         operator.drive(0.3)
         for size, scheme in (("phone", "light"), ("desk", "dark")):
@@ -154,9 +152,6 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, c
                 wait_until(lambda: not base.drives, "the stop")
                 shows(page, "armed", "not armed")
                 page.wait_for_function("() => document.getElementById('panorama').naturalWidth > 100", timeout=WAIT_MS)
-                page.locator("#recordings-box > summary").scroll_into_view_if_needed()
-                press("#recordings-box > summary")
-                shows(page, "recordings", "being written")
                 press("#parts-box > summary")
                 shows(page, "parts", "odometry")
                 expect_it_fits(page, size)
@@ -171,14 +166,6 @@ def test_the_page_shows_drives_and_stops_a_robot(browser: Any, tmp_path: Path, c
         assert daemon.end()[0] == 0
         with opened(browser, server) as page:
             shows(page, "warnings", "its daemon has ended")
-            page.click("#recordings-box > summary")
-            page.click("#recordings button")
-            link = page.wait_for_selector("#recordings a", timeout=WAIT_MS)
-            with page.context.expect_page() as new:
-                link.click()
-            new.value.wait_for_load_state()
-            assert "omnid" in new.value.title() and new.value.locator("svg").count() > 0
-            screenshot(new.value, "report")
             screenshot(page, "ended")
 
 
@@ -382,41 +369,6 @@ def test_stick_keys_and_a_tap_drive_a_simulated_robot(browser: Any, size: str, s
         shows(page, "armed", "not armed")
         expect_it_fits(page, size)
         assert daemon.end()[0] == 0
-
-
-def test_the_page_of_all_robots(browser: Any) -> None:
-    endpoint = free_endpoint()
-    with contextlib.ExitStack() as ends:
-        ends.enter_context(script(ROUTER, endpoint))
-        robots = Robots(endpoint)
-        for bus in robots.buses.values():
-            ends.callback(bus.close)
-        server = ends.enter_context(served("--all", "--connect", endpoint))
-        publishing = threading.Event()
-        thread = threading.Thread(target=lambda: [robots.publish() for _ in iter(lambda: publishing.wait(0.1), True)])
-        thread.start()
-        ends.callback(thread.join)
-        ends.callback(publishing.set)
-        for size, scheme in (("phone", "dark"), ("desk", "light")):
-            robots.obeys = {"hall/one"}
-            with opened(browser, server, size, scheme) as page:
-                shows(page, "robots", "hall/one")
-                shows(page, "robots", "tracking")
-                expect_it_fits(page, size)
-                page.click("#stop")
-                shows(page, "stop-answer", "NOT confirmed by two: use the emergency stop. 1 of 2 robots stop")
-                screenshot(page, f"{size}-fleet")
-                robots.obeys.add("two")
-                page.keyboard.press("Space")
-                shows(page, "stop-answer", "all 2 robots stop")
-                page.click("text=hall/one")
-                page.wait_for_url("**/robot/**")
-                shows(page, "robot", "hall/one")
-                shows(page, "state", "tracking")
-                expect_it_fits(page, size)
-                page.click("#back")
-                page.wait_for_url(f"http://{server.host}/")
-                shows(page, "robots", "hall/one")
 
 
 def test_text_of_the_robot_is_never_html(browser: Any) -> None:

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-import os
-import re
-import signal
 import socket
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
 from starlette.requests import Request
 
-from omnid.errors import OmnidError
-from omnid.web import places, recordings, site
+from omnid.web import places, site
 from omnid.web.access import COOKIE_S, Access
 from omnid.web.places import Acceptor, ConnectionPlaces
-from omnid.web.recordings import Recordings, _reason, recordings_routes
 from omnid.web.site import Site
 
 TOKEN = "abcdefghijklmnop"
@@ -27,7 +20,7 @@ TOKEN = "abcdefghijklmnop"
 
 def new_site(secure: bool = False) -> Site:
     access = Access(TOKEN, frozenset(("localhost",)), False, "omnid_1", "")
-    return Site("index.html", [], lambda _: "omnid_up 1\n", access, secure)
+    return Site([], lambda _: "omnid_up 1\n", access, secure)
 
 
 def ask(
@@ -199,140 +192,3 @@ def test_where_the_system_has_no_more_files_a_silent_connection_goes(monkeypatch
         listener.close()
 
     asyncio.run(check())
-
-
-def test_the_newest_recordings_are_listed_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for number in (3, 1, 4, 2):
-        (tmp_path / f"{number}.mcap").write_bytes(b"x" * number)
-        os.utime(tmp_path / f"{number}.mcap", (1000.4 + number, 1000.4 + number))
-    (tmp_path / "link.mcap").symlink_to(tmp_path / "1.mcap")
-    found = Recordings(tmp_path, tmp_path)
-    assert [one.path.name for one in found.list()] == ["4.mcap", "3.mcap", "2.mcap", "1.mcap"]
-    monkeypatch.setattr(recordings, "MOST_LISTED", 2)
-    described = found.described()
-    assert described["folder"] == str(tmp_path)
-    assert [(one["name"], one["size_bytes"], one["changed_s"], one["state"]) for one in described["recordings"]] == [
-        ("4.mcap", 4, 1004, "no log"),
-        ("3.mcap", 3, 1003, "no log"),
-    ]
-    key = described["recordings"][0]["key"]
-    assert len(key) == 24 and key != described["recordings"][1]["key"]
-    assert Recordings(tmp_path / "missing", tmp_path).list() == []
-
-
-class Quick(Recordings):
-    """Recordings whose reports are made at once."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, folder)
-        self.made = list[str]()
-        self.goes_on = asyncio.Event()
-        self.goes_on.set()
-
-    async def _make(self, log: Path) -> Path:
-        await self.goes_on.wait()
-        self.made.append(log.name)
-        page = log.with_suffix(f".{len(self.made)}.html")
-        page.write_text(log.name)
-        return page
-
-
-def test_a_report_is_made_once_for_each_version_and_the_oldest_goes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(recordings, "MOST_REPORTS", 2)
-    for name in "abc":
-        (tmp_path / f"{name}.mcap").write_bytes(b"")
-
-    async def check() -> None:
-        found = Quick(tmp_path)
-        keys = {one.path.stem: one.key for one in found.list()}
-        first = await found.report(keys["a"])
-        assert await found.report(keys["a"]) == first and found.made == ["a.mcap"]
-        await found.report(keys["b"])
-        assert first.exists()
-        await found.report(keys["c"])
-        assert not first.exists() and len(list(tmp_path.glob("*.html"))) == 2
-        (tmp_path / "c.mcap").write_bytes(b"more")
-        await found.report(keys["c"])
-        assert found.made == ["a.mcap", "b.mcap", "c.mcap", "c.mcap"]
-        found.goes_on.clear()
-        waiting = asyncio.create_task(found.report(keys["a"]))
-        while not found._busy.locked():
-            await asyncio.sleep(0)
-        with pytest.raises(OmnidError, match="another report is being made"):
-            await found.report(keys["b"])
-        with pytest.raises(OmnidError, match="not there any more"):
-            await found.report("0")
-        found.goes_on.set()
-        assert (await waiting).read_text() == "a.mcap"
-
-    asyncio.run(check())
-
-
-def test_a_report_is_answered_as_a_page_or_as_json(tmp_path: Path) -> None:
-    (tmp_path / "a.mcap").write_bytes(b"")
-
-    async def check() -> None:
-        found = Quick(tmp_path)
-        key = found.list()[0].key
-        report = recordings_routes(found)[1].endpoint  # type: ignore[attr-defined]
-        for method, asked, status, words in (
-            ("POST", key, 200, b'{"done":true,"text":""}'),
-            ("POST", "0", 409, b'{"done":false,'),
-            ("GET", key, 200, None),
-        ):
-            scope = {"type": "http", "method": method, "path": "/", "headers": [], "path_params": {"key": asked}}
-            answer = await report(Request(scope))
-            assert answer.status_code == status and (words is None or answer.body.startswith(words))
-        assert "sandbox" in answer.headers["content-security-policy"]
-
-    asyncio.run(check())
-
-
-@pytest.mark.parametrize(
-    ("program", "words"),
-    [
-        ("open(page, 'w').write('it')", ""),
-        ("", "failed (exit code 0)"),
-        ("open(page, 'w').write('it'); sys.exit(1)", "failed (exit code 1)"),
-        ("print('one; omnid: two', 'omnid: three', sep=chr(10), file=sys.stderr); sys.exit(2)", "omnid: three"),
-    ],
-)
-def test_a_report_is_there_where_its_program_ends_well_and_has_made_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str, words: str
-) -> None:
-    code = f"import os, sys; page = sys.argv[-1]; {program}"
-    monkeypatch.setattr(recordings, "python", lambda *given: [sys.executable, "-S", "-c", code, *given])
-    (tmp_path / "a.mcap").write_bytes(b"")
-    found = Recordings(tmp_path, tmp_path)
-    made = found.report(found.list()[0].key)
-    if words:
-        with pytest.raises(OmnidError, match=re.escape(words)):
-            asyncio.run(made)
-    else:
-        assert asyncio.run(made).read_text() == "it"
-
-
-def test_a_report_that_takes_too_long_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recordings, "REPORT_S", 0.001)
-    (tmp_path / "a.mcap").write_bytes(b"")
-    found, start, processes = Recordings(tmp_path, tmp_path), asyncio.create_subprocess_exec, list[Any]()
-
-    async def kept(*words: str, **settings: Any) -> Any:
-        processes.append(await start(*words, **settings))
-        return processes[-1]
-
-    with monkeypatch.context() as patched:
-        patched.setattr(asyncio, "create_subprocess_exec", kept)
-        with pytest.raises(OmnidError, match=r"not ready within 0\.001 s"):
-            asyncio.run(found.report(found.list()[0].key))
-    assert processes[0].returncode == -signal.SIGKILL
-
-
-def test_the_reason_is_the_last_line_where_the_user_can_correct_it() -> None:
-    assert _reason(2, "one\na half\nomnid: two\x1b\n", "a") == r"omnid: two\x1b"
-    for code, messages in ((2, ""), (1, "a traceback"), (-9, "x"), (None, "x")):
-        assert _reason(code, messages, "a\x1b") == (
-            rf"omnid: the report about a\x1b failed (exit code {code}): run `omnid report` on it to see why"
-        )
