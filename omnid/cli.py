@@ -8,50 +8,113 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from importlib import import_module
-from typing import Any, NoReturn
+from itertools import dropwhile, takewhile
+from operator import methodcaller
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, NoReturn
 
-from omnid.commands.examples import add_examples
 from omnid.version import __version__
 
-COMMANDS = (
-    "run",
-    "simulate",
-    "replay",
-    "demo",
-    "eval",
-    "accept",
-    "calibrate",
-    "cameras",
-    "arm",
-    "stop",
-    "drive",
-    "goto",
-    "route",
-    "listen",
-    "view",
-    "web",
-    "batch",
-    "record",
-    "report",
-    "log",
-    "map",
-    "diff",
-    "doctor",
-    "motor",
-    "config",
-    "install-service",
+if TYPE_CHECKING:
+    from omnid.commands.options import Command
+
+
+class Entry(NamedTuple):
+    """Where a command is, and its line in the list of commands."""
+
+    place: str  # module of omnid.commands, with :NAME where the command is not called `run` in it
+    help: str
+
+
+# Words of each command that has no subcommands -> its entry. A module is imported when its command is named.
+COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
+    {
+        "run": Entry("run", "the daemon: live cameras in, poses on the bus, commands to the wheels"),
+        "simulate": Entry("simulate", "the daemon with a simulated robot in a simulated world"),
+        "replay": Entry("replay", "run a recorded log through the stages of the daemon"),
+        "demo": Entry("demo", "replay a sample in real time: files, bus and a simulated motor"),
+        "eval": Entry("evaluate", "compare a trajectory with the truth, both in the TUM format"),
+        "accept": Entry("accept", "the acceptance drive between two marks on the floor: its errors"),
+        "calibrate board": Entry("calibrate_board", "a board to print, true to scale, with a ruler to check the print"),
+        "calibrate live": Entry("calibrate_live", "images of a board, with its coverage so far and what is missing"),
+        "calibrate camera": Entry("calibrate_camera", "a camera.toml from images of a board"),
+        "calibrate rig": Entry("calibrate_rig", "a rig.toml from images of a board that both cameras saw at once"),
+        "calibrate check": Entry("calibrate_check", "compare a rig with its file, without a board"),
+        "calibrate drive": Entry(
+            "calibrate_drive", "a better rig.toml from ordinary drives with turns, without a board"
+        ),
+        "calibrate height": Entry(
+            "calibrate_height", "the height of the cameras above the floor, and their tilt, from a log"
+        ),
+        "calibrate mask": Entry(
+            "calibrate_mask", "masks of what is fixed to the cameras, such as reflections of lenses"
+        ),
+        "calibrate import": Entry(
+            "calibrate_files:import_rig",
+            "a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras",
+        ),
+        "calibrate export": Entry("calibrate_files:export_rig", "Kalibr or OCamCalib files from a rig.toml"),
+        "cameras": Entry("cameras", "list cameras and the udev rule to copy, or show what they see"),
+        "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
+        "stop": Entry("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
+        "drive": Entry("robot:drive", "drive a robot by the keyboard"),
+        "goto": Entry("robot:goto", "drive a robot to a pose, around obstacles"),
+        "route teach": Entry("robot:teach", "record a route while somebody drives (`omnid drive`, a joystick)"),
+        "route finish": Entry("robot:finish", "end the recording and write the route and the map"),
+        "route repeat": Entry("robot:repeat", "drive a route, from where the robot is on it"),
+        "route stop": Entry("robot:end_route", "end the repetition, or the recording without a file"),
+        "route list": Entry("robot:list_routes", "the routes in navigation.routes, here"),
+        "route show": Entry("robot:show_route", "length, map and points of a route"),
+        "route delete": Entry("robot:delete_route", "delete a route"),
+        "listen": Entry("listen", "show pose, state, rates and latencies of a robot, and record them"),
+        "view": Entry("view", "show a log or a robot: path, map, depth, plots (needs rerun)"),
+        "web": Entry("web", "a page with state, path, warnings, stop and arm"),
+        "batch": Entry("batch", "replay many logs into one table; goes on where it was interrupted"),
+        "record": Entry("record", "record both cameras to MCAP files until Ctrl-C"),
+        "report": Entry("report", "one HTML page about a recording: path, events, statistics"),
+        "log info": Entry("log:info", "topics, types, counts, times, attachments, and whether the log is whole"),
+        "map build": Entry("map_build", "build a map from logs, of one drive or of several in the same place"),
+        "map info": Entry("map:info", "keyframes, sessions, loops, size, and the rig that made the map"),
+        "map show": Entry("map:show", "a page with keyframes, loops, and the paths with and without the loops"),
+        "map merge": Entry("map:merge", "join maps of one building, made by the same rig"),
+        "map tags": Entry(
+            "map_tags:tags", "AprilTags (36h11) as landmarks with names: those of a map, or those that a log shows"
+        ),
+        "map align": Entry("map_tags:align", "move a map into the axes of a plan of the building, by known AprilTags"),
+        "map export": Entry("map:export", "write a map for other programs"),
+        "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
+        "diff": Entry("diff", "compare two recorded runs over the same images; exit code 1 where they differ"),
+        "doctor": Entry("doctor", "check cameras, USB, motor, rig, clock, rights, bus and disk"),
+        "motor test": Entry("motor", "turn each wheel, ask what moved, print the settings for that"),
+        "config": Entry("config", "print or check settings"),
+        "install-service": Entry("install_service", "install omnid as a systemd service"),
+    }
 )
-MODULES = {"eval": "evaluate", "install-service": "install_service"}  # eval is a name of Python itself
-# Commands and options of earlier versions, and what to use in their place.
-REMOVED = {
-    "listen --all": "one program for each robot, with --robot NAME; many robots: Grafana on /metrics of `omnid web`",
-    "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command line",
-    "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
-    "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
-}
+# First word of commands with subcommands -> its line in the list of commands.
+GROUPS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "calibrate": "make a camera.toml or a rig.toml, or other programs' files",
+        "route": "teach a route by driving it, and repeat it",
+        "log": "show the content of logs",
+        "map": "build, show, merge and export maps of places (.omap)",
+        "motor": "test the wiring of the motors: sides, directions, scale",
+    }
+)
+# Commands that earlier versions had, and options as "COMMAND --OPTION" -> what to use instead.
+REMOVED: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "config migrate": "`omnid config check FILE` names each setting that this version does not know",
+        "listen --all": "one program for each robot, with --robot NAME; many robots: Grafana on /metrics of `omnid "
+        "web`",
+        "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command "
+        "line",
+        "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
+        "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
+    }
+)
 WRONG_INPUT = 2
 # What argparse says of a word that is not among the choices; Python 3.12 and later do not quote them.
 _CHOICE = re.compile(r"argument (?P<name>.*): invalid choice: '(?P<found>.*)' \(choose from (?P<all>.*)\)", re.DOTALL)
@@ -94,14 +157,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     bound_image_size()
     limit_blas_threads()
     words = list(sys.argv[1:] if argv is None else argv)
-    for removed, instead in REMOVED.items():
-        command, _, option = removed.partition(" --")
-        given = {word.partition("=")[0] for word in words}
-        if words[: len(command.split())] == command.split() and (not option or f"--{option}" in given):
-            print(f"omnid: `omnid {removed}` was removed: {instead}", file=sys.stderr)
-            return WRONG_INPUT
-    args = _parser(words).parse_args(words)
-    return _guarded(args)
+    if _completes():
+        words = os.environ["COMP_LINE"].split()[1:]
+    _refuse_removed(words)
+    return _guarded(parser_of(words).parse_args(words))
 
 
 def _open_closed_streams() -> None:
@@ -129,28 +188,53 @@ def limit_blas_threads() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
-def _parser(words: Sequence[str]) -> Parser:
-    """Return a parser of the named command only, because the import of some takes a second; else of all."""
+def _refuse_removed(words: Sequence[str]) -> None:
+    """End the program where the words name a command or an option that earlier versions had."""
+    leading = _leading(words)
+    options = [word.partition("=")[0] for word in words if word.startswith("--")]
+    names = [leading[:1], leading[:2], *([*leading[:depth], option] for option in options for depth in (1, 2))]
+    for name in map(" ".join, names):
+        if name in REMOVED:
+            print(f"omnid: `omnid {name}` was removed: {REMOVED[name]}", file=sys.stderr)
+            raise SystemExit(WRONG_INPUT)
+
+
+def _leading(words: Sequence[str]) -> list[str]:
+    """Return the words before the options, of which the first ones name the command."""
+    is_option = methodcaller("startswith", "-")
+    return list(takewhile(lambda word: not is_option(word), dropwhile(is_option, words)))
+
+
+def parser_of(words: Sequence[str]) -> Parser:
+    """Return the parser of the command that the words name, whose module alone is imported; else of all names."""
     parser = Parser(prog="omnid", description="Odometry, map and guidance from two stacked omnidirectional cameras.")
     parser.add_argument("--version", action="version", version=f"omnid {__version__}")
-    subparsers = parser.add_subparsers(required=True, metavar="command", parser_class=Parser)
-    named = next((word for word in words if not word.startswith("-")), "")
-    if named in COMMANDS and not _completes():
-        names: Sequence[str] = (named,)
-    else:
-        names = () if "--version" in words else COMMANDS
-    for name in names:
-        module = import_module(f"omnid.commands.{MODULES.get(name, name)}")
-        listed = len(names) > 1 and not {"-h", "--help"}.isdisjoint(words)  # the help of all commands
-        add = getattr(module, "add_listed", module.add_parser) if listed else module.add_parser
-        add(subparsers)
-    add_examples(parser)
+    parents = {"": parser.add_subparsers(required=True, metavar="command", parser_class=Parser)}
+    leading = _leading(words)
+    named = next((name for name in (" ".join(leading[:2]), *leading[:1]) if name in COMMANDS), None)
+    for name in COMMANDS if named is None or _completes() else (named,):
+        first, _, second = name.partition(" ")
+        if second and first not in parents:
+            about = GROUPS[first]
+            below = parents[""].add_parser(first, help=about, description=f"{about[:1].upper()}{about[1:]}.")
+            parents[first] = below.add_subparsers(required=True, metavar="action", parser_class=Parser)
+        entry = COMMANDS[name]
+        leaf = parents[first if second else ""].add_parser(second or first, help=entry.help)
+        if name == named:
+            command_at(entry).add_to(leaf, entry.help)
     if _completes():
         with suppress(ImportError):  # the extra `completion`
             import argcomplete
 
             argcomplete.autocomplete(parser)  # prints what fits and ends the program
     return parser
+
+
+def command_at(entry: Entry) -> Command:
+    """Import a command."""
+    module, _, name = entry.place.partition(":")
+    found: Command = getattr(import_module(f"omnid.commands.{module}"), name or "run")
+    return found
 
 
 def _completes() -> bool:
@@ -166,7 +250,7 @@ def _guarded(args: argparse.Namespace) -> int:
 
     configure_logging()
     try:
-        code = int(args.run(args))
+        code = int(args.command.run(args))
         sys.stdout.flush()
         return code
     except (OmnidError, DriverError, CalibError) as error:

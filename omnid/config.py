@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from types import MappingProxyType
 from typing import Final
 
 from drivers.logs.log_folder import RotationSettings
@@ -21,7 +20,6 @@ from omnid.core.places.limits import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
 from omnid.settings import knob, load
-from omnid.settings_migration import load_renamed
 from omnid.transport.bus_config import BusConfig
 
 
@@ -227,45 +225,12 @@ class Config:
         return self.stereo
 
 
-# Keys of earlier versions: old dotted path of a key or section -> its new path, or what to do where there is none.
-RENAMED: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "guidance": "controller.setpoint",
-        "guidance.limits": "controller.heading",
-        "helm": "controller",
-        "service.hung_s": "service.stall_timeout_s",
-        "motor.stale_s": "controller.deadlines.command_s",
-        "stereo.matching.rival": "stereo.matching.runner_up_ratio",
-        "stereo.matching.rival_difference": "stereo.matching.runner_up_difference",
-        "odometry.limits.min_share": "odometry.limits.min_inlier_ratio",
-        "odometry.limits.sure_inliers": "odometry.limits.good_inliers",
-        "odometry.limits.sure_share": "odometry.limits.good_inlier_ratio",
-        "odometry.limits.sparse_every": "odometry.limits.sparse_s says it in seconds, 0.45 for 5 frames at 10 Hz",
-        "odometry.limits.lost_after": "odometry.limits.lost_s says it in seconds, 0.15 for 3 frames at 10 Hz",
-        "odometry.limits.restart_after": "odometry.limits.restart_s says it in seconds, 0.85 for 10 frames at 10 Hz",
-        "stereo.rig_check": "rig.check",
-        "live.check_s": "rig.check_s",
-        "navigation.blocked_s": "a blocked base gives way (navigation.give_way_s) and goes on by itself",
-        **dict.fromkeys(
-            ("rig.refine", "rig.refined_file", "rig.refine_keyframes", "rig.refine_s"),
-            "a run does not refine its rig: `omnid calibrate drive` does, on a recording",
-        ),
-        "mapping.heights_m": "obstacles.ring.heights_m, which are above the floor",
-    }
-)
-
-
 def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str] = ()) -> Config:
     """Return the configuration of a TOML file, or the defaults, changed by overrides such as "motor.rate_hz=50".
 
-    Raises OmnidError, also for keys of earlier versions: it names the new one.
+    Raises OmnidError.
     """
-    return load(Config, path, overrides, renamed=RENAMED)
-
-
-def migrated_config(path: str | PathLike[str]) -> tuple[Config, list[str]]:
-    """Return the configuration of a file of an earlier version, and a line for each key that was renamed."""
-    return load_renamed(Config, path, RENAMED)
+    return load(Config, path, overrides)
 
 
 # The settings that a new robot needs, in `omnid config --minimal`.

@@ -1,1 +1,1 @@
-"""The subcommands of the command line, one module each: add_parser and run."""
+"""The commands of the command line; `omnid/cli.py` lists them."""

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TextIO
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.json_output import add_json, print_json
+from omnid.commands.json_output import print_json
+from omnid.commands.options import JSON, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help does not load these
@@ -34,39 +34,41 @@ Where the robot cannot stand: run `omnid accept --keys marks.txt` on the robot w
 the point is over a mark, and give the times as `--marks marks.txt`."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `accept` to the command line."""
-    parser = subparsers.add_parser("accept", help="the acceptance drive between two marks on the floor: its errors")
-    parser.add_argument(
+@command(
+    option(
         "log",
         type=Path,
         nargs="?",
         metavar="LOG|TUM",
         help="a log with images, which is replayed, or a trajectory T_odom_rig (.txt, .tum); none: print what to do",
-    )
-    parser.add_argument("--distance-m", type=float, metavar="M", help="the distance of the marks by tape measure")
-    parser.add_argument(
+    ),
+    option("--distance-m", type=float, metavar="M", help="the distance of the marks by tape measure"),
+    option(
         "--marks",
         nargs="+",
         metavar="T",
         help="times on A, B, A ... in s since the first pose or of Unix, or the file of --keys; default: the times at "
         "which the robot stands",
-    )
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="write the time of each Enter, until Ctrl-D")
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    parser.add_argument(
+    ),
+    option("--keys", type=Path, metavar="FILE", help="write the time of each Enter, until Ctrl-D"),
+    option("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log"),
+    option(
         "--within-percent",
         type=float,
         default=0.5,
         metavar="P",
         help="accepted error of lengths, and of the end of a round against its way; default %(default)s",
-    )
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="the page to write")
-    add_settings(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
+    ),
+    option("-o", "--output", type=Path, metavar="FILE", help="the page to write"),
+    *SETTINGS,
+    JSON,
+    examples=(
+        "accept",
+        "accept drive.mcap --rig rig.toml --distance-m 12.34 -o accept.html",
+        "accept est.txt --distance-m 12.34 --marks 12.5 60 110",
+        "accept --keys marks.txt",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Print the errors and write the page; 1 where the drive is not accepted."""
     from omnid.sinks.files import check_outputs

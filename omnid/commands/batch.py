@@ -13,9 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import settings_of
-from omnid.commands.log_options import add_cameras
-from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
+from omnid.commands.options import CONFIG, SET, cameras, command, option, settings_of
+from omnid.commands.worker_options import end_by_sigterm, program_options, workers
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
@@ -27,46 +26,40 @@ MOST_S = 1e6
 TABLES_S = 5.0  # shortest time from one writing of the tables to the next, before the end
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `batch` to the command line."""
-    parser = subparsers.add_parser("batch", help="replay many logs into one table; goes on where it was interrupted")
-    parser.add_argument(
+@command(
+    option(
         "logs",
         nargs="+",
         metavar="LOG",
         help="files, folders, patterns in quotes, or addresses such as s3://bucket/*.mcap (extra `fleet`)",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--out",
         type=Path,
         required=True,
         metavar="DIR",
         help="a folder for each log, and results.csv, index.html, and results.parquet where pyarrow is installed, of "
         "the logs of the last batch",
-    )
-    parser.add_argument("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each")
-    add_cameras(parser)
-    parser.add_argument("--config", type=Path, metavar="FILE", help="configuration (TOML) of all replays")
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="SECTION.KEY=VALUE",
-        help="change one setting; may be repeated",
-    )
-    parser.add_argument(
+    ),
+    option("--rig", type=Path, help="the rig.toml of all logs; default: that attached to each"),
+    *cameras(),
+    CONFIG,
+    SET,
+    option(
         "--truth",
         default="truth.txt",
         metavar="NAME",
         help="trajectory beside each log, which is compared where it exists; default %(default)s",
-    )
-    parser.add_argument("--record", action="store_true", help="keep a recording and a report of each log")
-    add_workers(parser, "logs at a time on this machine", os.cpu_count() or 1)
-    parser.add_argument("--timeout-s", type=float, default=3600.0, metavar="S", help="for one log; default %(default)g")
-    parser.set_defaults(run=run)
-
-
+    ),
+    option("--record", action="store_true", help="keep a recording and a report of each log"),
+    *workers("logs at a time on this machine", os.cpu_count() or 1),
+    option("--timeout-s", type=float, default=3600.0, metavar="S", help="for one log; default %(default)g"),
+    examples=(
+        "batch logs/ --out results --rig rig.toml",
+        "batch 'logs/2026-*/*.mcap' --out results --jobs 2 --record",
+        "batch s3://bucket/*.mcap --out results --dask tcp://scheduler:8786",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Run the jobs that have no result yet; return 1 where a log failed."""
     from omnid.batch.job_runner import OK, JobTask, remove_attempts, stored_result

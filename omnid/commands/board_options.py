@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
+from typing import Final
 
 from calib.boards.board import Board
 from calib.boards.marker_board import AprilGrid, CharucoBoard
 from omnid.calibration.board_search import AnyBoard
+from omnid.commands.options import group, option
 from omnid.errors import OmnidError
 
 # Options (attribute, name) that each kind of board needs, and those that it may have besides.
@@ -20,48 +22,46 @@ OPTIONAL = {"charuco": ("legacy_charuco",)}
 ALL = ("corners", "square_mm", "marker_mm", "dictionary", "legacy_charuco", "tags", "tag_mm", "tag_spacing")
 
 
-def add_board_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the board."""
-    board = parser.add_argument_group("board")
-    board.add_argument(
-        "--board",
-        choices=sorted(NEEDED),
-        default="checkerboard",
-        help="checkerboard (default); charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. "
-        "Boards with markers may be half hidden",
-    )
-    board.add_argument(
-        "--corners",
-        type=two_sides,
-        metavar="6x7",
-        help="inner corners (points where four squares meet) along both sides; for charuco along its columns and rows",
-    )
-    board.add_argument("--square-mm", type=float, metavar="MM", help="side of one square")
-    board.add_argument("--marker-mm", type=float, metavar="MM", help="charuco: side of one marker")
-    board.add_argument("--dictionary", metavar="NAME", help="charuco: the markers' dictionary, like 5X5_100")
-    board.add_argument(
-        "--legacy-charuco",
-        action="store_true",
-        help="charuco: printed by OpenCV before 4.6 with an even number of rows of squares, a light square first",
-    )
-    board.add_argument(
-        "--tags", type=two_sides, metavar="6x6", help="aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)"
-    )
-    board.add_argument("--tag-mm", type=float, metavar="MM", help="aprilgrid: side of one tag (tagSize)")
-    board.add_argument(
-        "--tag-spacing",
-        type=float,
-        metavar="RATIO",
-        help="aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)",
-    )
-
-
 def two_sides(text: str) -> tuple[int, int]:
     """Parse the numbers along both sides, like 6x7."""
     sides = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", text)
     if sides is None:
         raise argparse.ArgumentTypeError(f"expected two numbers like 6x7, found {text!r}")
     return int(sides[1]), int(sides[2])
+
+
+BOARD: Final = group(
+    "board",
+    option(
+        "--board",
+        choices=sorted(NEEDED),
+        default="checkerboard",
+        help="checkerboard (default); charuco: a checkerboard with ArUco markers; aprilgrid: Kalibr's AprilTags 36h11. "
+        "Boards with markers may be half hidden",
+    ),
+    option(
+        "--corners",
+        type=two_sides,
+        metavar="6x7",
+        help="inner corners (points where four squares meet) along both sides; for charuco along its columns and rows",
+    ),
+    option("--square-mm", type=float, metavar="MM", help="side of one square"),
+    option("--marker-mm", type=float, metavar="MM", help="charuco: side of one marker"),
+    option("--dictionary", metavar="NAME", help="charuco: the markers' dictionary, like 5X5_100"),
+    option(
+        "--legacy-charuco",
+        action="store_true",
+        help="charuco: printed by OpenCV before 4.6 with an even number of rows of squares, a light square first",
+    ),
+    option("--tags", type=two_sides, metavar="6x6", help="aprilgrid: tags along x and y (Kalibr's tagCols x tagRows)"),
+    option("--tag-mm", type=float, metavar="MM", help="aprilgrid: side of one tag (tagSize)"),
+    option(
+        "--tag-spacing",
+        type=float,
+        metavar="RATIO",
+        help="aprilgrid: space between tags in parts of a tag's side, like 0.3 (tagSpacing)",
+    ),
+)
 
 
 def board_of(args: argparse.Namespace) -> AnyBoard:

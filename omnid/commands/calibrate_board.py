@@ -6,23 +6,21 @@ import argparse
 import shlex
 from pathlib import Path
 
-from omnid.commands.board_options import add_board_options, board_of, options_of
+from omnid.calibration.printable_board import PAPERS_MM
+from omnid.commands.board_options import BOARD, board_of, options_of
+from omnid.commands.options import command, option
 from omnid.errors import OmnidError
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `board` to the actions of `calibrate`."""
-    from omnid.calibration.printable_board import PAPERS_MM
-
-    parser = subparsers.add_parser("board", help="a board to print, true to scale, with a ruler to check the print")
-    add_board_options(parser)
-    parser.add_argument(
-        "--paper", choices=sorted(PAPERS_MM), default="a4", help="default %(default)s, either way round"
-    )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.pdf")
-    parser.set_defaults(run=run)
-
-
+@command(
+    BOARD,
+    option("--paper", choices=sorted(PAPERS_MM), default="a4", help="default %(default)s, either way round"),
+    option("-o", "--output", type=Path, required=True, metavar="FILE.pdf"),
+    examples=(
+        "calibrate board --corners 6x7 --square-mm 25 -o board.pdf",
+        "calibrate board --board charuco --corners 5x7 --square-mm 30 --marker-mm 22 --dictionary 5X5_100 -o board.pdf",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Write the PDF."""
     from calib.boards.board_pose import ambiguous_orders

@@ -11,7 +11,8 @@ from calib.fit.boards.camera_selection import MODEL_CHOICES
 from omnid.calibration.camera import CameraResult, calibrate_camera
 from omnid.calibration.progress import Progress, silent
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
-from omnid.commands.board_options import add_board_options, board_of
+from omnid.commands.board_options import BOARD, board_of
+from omnid.commands.options import command, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -24,27 +25,24 @@ MODEL_HELP = (
 )
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `camera` to `omnid calibrate`."""
-    parser = actions.add_parser("camera", help="a camera.toml from images of a board")
-    parser.add_argument("images", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap")
-    add_board_options(parser)
-    parser.add_argument("--topic", help="the camera's topic in a log")
-    parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
-    parser.add_argument("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP)
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and coverage")
-    parser.add_argument(
+@command(
+    option("images", nargs="+", metavar="IMAGES|LOG", help="files, folders or patterns, or one .mcap"),
+    BOARD,
+    option("--topic", help="the camera's topic in a log"),
+    option("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP),
+    option("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP),
+    option("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and coverage"),
+    option(
         "--mask",
         type=Path,
         metavar="FILE",
         help="also find rim, hub and struts, and write them to "
         "this PNG in the folder of the camera's file; it may be edited",
-    )
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="the camera.toml to write")
-    parser.set_defaults(run=run)
-
-
+    ),
+    option("--quiet", action="store_true", help="no progress"),
+    option("-o", "--output", type=Path, required=True, help="the camera.toml to write"),
+    examples=("calibrate camera boards/*.png --corners 6x7 --square-mm 30 -o camera.toml",),
+)
 def run(args: argparse.Namespace) -> int:
     """Calibrate the camera, write the files and print one line."""
     board = board_of(args)

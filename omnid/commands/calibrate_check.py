@@ -16,7 +16,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.image_pairs import SIDES, open_log
 from omnid.calibration.rig_check import RigCheckResult, check_rig, moving_rig_finding, read_rig_pairs
-from omnid.commands.log_options import add_cameras
+from omnid.commands.options import cameras, command, option
 from omnid.config import Config
 from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding
 from omnid.core.rig.rig_state import RigState
@@ -39,19 +39,14 @@ NOT_OBSERVABLE = (
 )
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `check` to `omnid calibrate`."""
-    parser = actions.add_parser("check", help="compare a rig with its file, without a board")
-    parser.add_argument("log", type=Path, metavar="LOG", help="a log of ordinary driving")
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log")
-    add_cameras(parser, "the {camera} camera's topic")
-    parser.add_argument(
-        "--refine", action="store_true", help="also correct the upper camera's pose, and write that rig"
-    )
-    parser.add_argument("-o", "--output", type=Path, help="with --refine: the rig.toml to write")
-    parser.set_defaults(run=run)
-
-
+@command(
+    option("log", type=Path, metavar="LOG", help="a log of ordinary driving"),
+    option("--rig", type=Path, metavar="FILE", help="the rig.toml; default: the one attached to the log"),
+    *cameras("the {camera} camera's topic"),
+    option("--refine", action="store_true", help="also correct the upper camera's pose, and write that rig"),
+    option("-o", "--output", type=Path, help="with --refine: the rig.toml to write"),
+    examples=("calibrate check drive.mcap --rig rig.toml",),
+)
 def run(args: argparse.Namespace) -> int:
     """Check the rig; return 0 if it fits, 1 if it has drifted or is broken."""
     if args.refine != (args.output is not None):

@@ -13,8 +13,8 @@ import numpy as np
 
 from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig_file import read_rig, write_rig
-from omnid.commands.height_option import add_height, height_of, with_height
-from omnid.commands.log_options import add_cameras
+from omnid.commands.height_option import HEIGHT, height_of, with_height
+from omnid.commands.options import cameras, command, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -27,30 +27,27 @@ if TYPE_CHECKING:
 SMALL_GAIN = 0.95
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `drive` to `omnid calibrate`."""
-    parser = actions.add_parser("drive", help="a better rig.toml from ordinary drives with turns, without a board")
-    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="drives with turns; 100 to 350 pairs")
-    parser.add_argument(
+@command(
+    option("logs", type=Path, nargs="+", metavar="LOG", help="drives with turns; 100 to 350 pairs"),
+    option(
         "--rig",
         type=Path,
         metavar="FILE",
         help="the rig.toml to start from; a nominal one will do: mirror data sheet, centre of the images, baseline by "
         "ruler; default: the one attached to the first log",
-    )
-    add_cameras(parser, "the {camera} camera's topic")
-    parser.add_argument(
+    ),
+    *cameras("the {camera} camera's topic"),
+    option(
         "--distance-m",
         type=float,
         metavar="M",
         help="straight distance from the first to the last "
         "image of a single log: sets the baseline's length, which is kept otherwise",
-    )
-    add_height(parser)
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="the rig.toml to write")
-    parser.set_defaults(run=run)
-
-
+    ),
+    HEIGHT,
+    option("-o", "--output", type=Path, required=True, metavar="FILE", help="the rig.toml to write"),
+    examples=("calibrate drive drive.mcap --rig rig.toml -o better.toml",),
+)
 def run(args: argparse.Namespace) -> int:
     """Return 0 if a rig was written, and 1 if none fits the drives better than the one to start from."""
     from omnid.calibration.drive import calibrate_drive

@@ -20,78 +20,75 @@ from calib.ocam_file import export_ocam, import_ocam
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_file import read_rig, write_file, write_rig
 from calib.transform_file import read_transform, straight_up, transform_toml
-from omnid.commands.height_option import add_height, height_of, with_height
+from omnid.commands.height_option import HEIGHT, height_of, with_height
+from omnid.commands.options import command, exclusive, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `import` and `export` to the actions of `calibrate`."""
-    importing = actions.add_parser(
-        "import", help="a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras"
-    )
-    exporting = actions.add_parser("export", help="Kalibr or OCamCalib files from a rig.toml")
-    _add_import(importing)
-    _add_export(exporting)
-    for action in (importing, exporting):
-        action.set_defaults(run=run)
-
-
-def _add_import(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml, or Helvipad's calibration.json")
-    parser.add_argument(
+@command(
+    option("camchain", nargs="?", type=Path, help="Kalibr's camchain.yaml, or Helvipad's calibration.json"),
+    option(
         "--lower",
         default="",
         help="the lower camera: its name in the camchain (cam0), its "
         "calib_results.txt, or with a calibration.json a folder of its images",
-    )
-    parser.add_argument("--upper", default="", help="the same for the upper camera")
-    between = parser.add_mutually_exclusive_group()
-    between.add_argument("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers")
-    between.add_argument(
-        "--baseline",
-        type=float,
-        metavar="M",
-        help="metres from the lower viewpoint straight up to "
-        "the upper one; both cameras look up and are equally oriented",
-    )
-    parser.add_argument(
+    ),
+    option("--upper", default="", help="the same for the upper camera"),
+    exclusive(
+        option("--transform", type=Path, help="file with T_lower_upper, 4x4: TOML, YAML or 16 numbers"),
+        option(
+            "--baseline",
+            type=float,
+            metavar="M",
+            help="metres from the lower viewpoint straight up to "
+            "the upper one; both cameras look up and are equally oriented",
+        ),
+    ),
+    option(
         "--equirectangular",
         metavar="WIDTHxHEIGHT",
         help="two 360-degree cameras one above the other, with stitched images of this size; with --baseline",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--view", choices=VIEWS, help="OCamCalib: the world is seen in a mirror (default) or directly through a lens"
-    )
-    add_height(parser)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
+    ),
+    HEIGHT,
+    option("-o", "--output", type=Path, required=True, help="the rig.toml to write"),
+    examples=(
+        "calibrate import camchain.yaml -o rig.toml",
+        "calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml",
+    ),
+)
+def import_rig(args: argparse.Namespace) -> int:
+    """Write the rig of another program, and print one line about it."""
+    _must_be_writable(args.output)
+    rig = with_height(_imported(args), args)
+    write_rig(args.output, rig)
+    print(f"{args.output}: {describe(rig)}")
+    return 0
 
 
-def _add_export(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", type=Path, help="the rig.toml to read")
-    parser.add_argument("--format", choices=("kalibr", "ocam"), required=True)
-    parser.add_argument(
+@command(
+    option("rig", type=Path, help="the rig.toml to read"),
+    option("--format", choices=("kalibr", "ocam"), required=True),
+    option(
         "-o",
         "--output",
         type=Path,
         required=True,
         help="kalibr: the file to write; ocam: a folder, "
         "or PATH for PATH.lower.txt, PATH.upper.txt and PATH.transform.toml",
-    )
-
-
-def run(args: argparse.Namespace) -> int:
-    """Import or export a rig, and print one line about it."""
+    ),
+    examples=("calibrate export rig.toml --format kalibr -o camchain.yaml",),
+)
+def export_rig(args: argparse.Namespace) -> int:
+    """Write a rig for another program, and print one line about it."""
     _must_be_writable(args.output)
-    if args.action == "import":
-        rig = with_height(_imported(args), args)
-        write_rig(args.output, rig)
-        print(f"{args.output}: {describe(rig)}")
-    else:
-        rig = read_rig(args.rig)
-        check_outputs([("--output", args.output)] * (args.format == "kalibr"), [("the rig that is read", args.rig)])
-        written = _export_kalibr(rig, args.output) if args.format == "kalibr" else _export_ocam(rig, args.output)
-        print(f"{', '.join(map(str, written))}: {describe(rig)}{_left_out(rig)}")
+    rig = read_rig(args.rig)
+    check_outputs([("--output", args.output)] * (args.format == "kalibr"), [("the rig that is read", args.rig)])
+    written = _export_kalibr(rig, args.output) if args.format == "kalibr" else _export_ocam(rig, args.output)
+    print(f"{', '.join(map(str, written))}: {describe(rig)}{_left_out(rig)}")
     return 0
 
 

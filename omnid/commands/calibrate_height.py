@@ -7,21 +7,18 @@ import sys
 from pathlib import Path
 
 from omnid.commands.height_option import height, height_of
-from omnid.commands.log_options import add_log_with_rig, rig_of
+from omnid.commands.options import command, log_with_rig, option, rig_of
 from omnid.sinks.files import check_outputs
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `height` to `omnid calibrate`."""
-    parser = actions.add_parser("height", help="the height of the cameras above the floor, and their tilt, from a log")
-    add_log_with_rig(parser, "a log in which the floor is seen all around")
-    parser.add_argument("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check")
-    parser.add_argument(
+@command(
+    *log_with_rig("a log in which the floor is seen all around"),
+    option("--ruler-m", type=height, metavar="M", help="the same height by ruler, as a check"),
+    option(
         "-o", "--output", type=Path, metavar="FILE", help="write the rig with that height; may be the file of --rig"
-    )
-    parser.set_defaults(run=run)
-
-
+    ),
+    examples=("calibrate height drive.mcap --rig rig.toml --ruler-m 0.92 -o rig.toml",),
+)
 def run(args: argparse.Namespace) -> int:
     """Print the height; return 1, and write nothing, where the ruler contradicts it."""
     from omnid.calibration.height import calibrate_height

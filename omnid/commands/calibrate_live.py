@@ -13,9 +13,8 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from omnid.commands.board_options import add_board_options, board_of, options_of
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.log_options import add_cameras
+from omnid.commands.board_options import BOARD, board_of, options_of
+from omnid.commands.options import SETTINGS, cameras, command, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -27,36 +26,31 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 PUBLISH_S: Final = 0.5
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `live` to `omnid calibrate`."""
-    parser = actions.add_parser(
-        "live",
-        help="images of a board, with its coverage so far and what is missing",
-        description="Search the board in the images of both cameras as they come. Pairs in which it stands still at a "
-        "new place are written to DIR; the terminal and the page (`omnid web`) show where it has been, what is "
-        "missing, and when it is enough. Stop the daemon first: it holds the cameras. Exit code 1: not enough yet.",
-    )
-    parser.add_argument(
+@command(
+    option(
         "images",
         type=Path,
         nargs="?",
         metavar="DIR",
         help="folder of the images, lower_*.png and "
         "upper_*.png; what is there counts, so that it goes on where it ended",
-    )
-    add_board_options(parser)
-    parser.add_argument(
-        "--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are only judged"
-    )
-    text = (
+    ),
+    BOARD,
+    option("--log", type=Path, metavar="LOG", help="take the pairs of a log instead; without DIR they are only judged"),
+    *cameras(
         "device of the {camera} camera; default: cameras.{camera} of the settings; of --log the topic, default: found "
-        "by name"
-    )
-    add_cameras(parser, text, "DEVICE|TOPIC")
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+        "by name",
+        "DEVICE|TOPIC",
+    ),
+    *SETTINGS,
+    examples=(
+        "calibrate live boards/ --corners 6x7 --square-mm 30 --config /etc/omnid/omnid.toml",
+        "calibrate live --log boards.mcap --corners 6x7 --square-mm 30",
+    ),
+    description="Search the board in the images of both cameras as they come. Pairs in which it stands still at a "
+    "new place are written to DIR; the terminal and the page (`omnid web`) show where it has been, what is "
+    "missing, and when it is enough. Stop the daemon first: it holds the cameras. Exit code 1: not enough yet.",
+)
 def run(args: argparse.Namespace) -> int:
     """Search until Ctrl-C, or until the end of the log; return 0 if there is enough for a calibration."""
     from omnid.calibration.live_boards import LiveBoards

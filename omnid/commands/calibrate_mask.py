@@ -5,20 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from omnid.commands.log_options import add_log_with_rig, rig_of
+from omnid.commands.options import command, log_with_rig, option, rig_of
 from omnid.sinks.files import check_outputs
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `mask` to `omnid calibrate`."""
-    parser = actions.add_parser("mask", help="masks of what is fixed to the cameras, such as reflections of lenses")
-    add_log_with_rig(parser, "a log in which the robot turns once on the spot")
-    parser.add_argument(
+@command(
+    *log_with_rig("a log in which the robot turns once on the spot"),
+    option(
         "-o", "--output", type=Path, metavar="FILE", help="write the rig with these masks; may be the file of --rig"
-    )
-    parser.set_defaults(run=run)
-
-
+    ),
+    examples=("calibrate mask turn.mcap --rig rig.toml -o rig.toml",),
+)
 def run(args: argparse.Namespace) -> int:
     """Print how much of the panorama is fixed to a camera, and write the rig whose masks hide it."""
     from omnid.calibration.mask import calibrate_mask

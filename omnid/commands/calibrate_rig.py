@@ -10,51 +10,49 @@ from calib.camera_file import read_camera
 from calib.fit.boards.camera_selection import MODEL_CHOICES
 from omnid.calibration.rig import GivenCameras, calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
-from omnid.commands.board_options import add_board_options, board_of
+from omnid.commands.board_options import BOARD, board_of
 from omnid.commands.calibrate_camera import MODEL_HELP, print_result, progress_of
-from omnid.commands.height_option import add_height, height_of, with_height
-from omnid.commands.log_options import add_cameras
+from omnid.commands.height_option import HEIGHT, height_of, with_height
+from omnid.commands.options import cameras, command, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 
-def add_parser(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `rig` to `omnid calibrate`."""
-    parser = actions.add_parser("rig", help="a rig.toml from images of a board that both cameras saw at once")
-    parser.add_argument(
+@command(
+    option(
         "images",
         type=Path,
         metavar="LOG|DIR",
         help="a log of both cameras, or a folder with lower_*.png, upper_*.png of the same names",
-    )
-    add_board_options(parser)
-    parser.add_argument(
+    ),
+    BOARD,
+    option(
         "--expected-baseline-mm",
         type=float,
         metavar="MM",
         help="the measured distance of the mirrors: a result that differs by more than a tenth is refused",
-    )
-    parser.add_argument(
-        "--lower-camera", type=Path, metavar="FILE", help="camera.toml of the lower camera, which is not changed"
-    )
-    parser.add_argument("--upper-camera", type=Path, metavar="FILE", help="the same for the upper camera")
-    parser.add_argument("--refine-cameras", action="store_true", help="adjust the given cameras as well")
-    add_cameras(parser, "a log's topic of the {camera} camera")
-    parser.add_argument("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP)
-    parser.add_argument("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP)
-    parser.add_argument(
+    ),
+    option("--lower-camera", type=Path, metavar="FILE", help="camera.toml of the lower camera, which is not changed"),
+    option("--upper-camera", type=Path, metavar="FILE", help="the same for the upper camera"),
+    option("--refine-cameras", action="store_true", help="adjust the given cameras as well"),
+    *cameras("a log's topic of the {camera} camera"),
+    option("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP),
+    option("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP),
+    option(
         "--mask",
         action="store_true",
         help="also find hub and struts, and write the masks to PNGs in "
         "the folder of the rig's file; they may be edited",
-    )
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and panoramas")
-    add_height(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="the rig.toml to write")
-    parser.set_defaults(run=run)
-
-
+    ),
+    option("--report", type=Path, metavar="FILE", help="write an HTML report with residuals and panoramas"),
+    HEIGHT,
+    option("--quiet", action="store_true", help="no progress"),
+    option("-o", "--output", type=Path, required=True, help="the rig.toml to write"),
+    examples=(
+        "calibrate rig boards.mcap --corners 6x7 --square-mm 30 -o rig.toml",
+        "calibrate rig DIR --board aprilgrid --tags 6x6 --tag-mm 88 --tag-spacing 0.3 -o rig.toml",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Calibrate the rig, write the files and print one line."""
     board = board_of(args)

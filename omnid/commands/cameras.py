@@ -9,8 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.log_options import add_cameras
+from omnid.commands.options import SETTINGS, cameras, command, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the list loads none of these
@@ -28,29 +27,27 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
 """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `cameras` to the command line."""
-    parser = subparsers.add_parser(
+@command(
+    option("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png"),
+    option("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log"),
+    *cameras("of --log: images of the {camera} camera; default: by name"),
+    *SETTINGS,
+    examples=(
         "cameras",
-        help="list cameras and the udev rule to copy, or show what they see",
-        description="List cameras, their modes and the udev rule to copy. With --snapshot "
-        "write an image of each configured camera with the mirror's rim, and print a "
-        "measure of its focus, which is highest where the lens is set best.",
-    )
-    parser.add_argument("--snapshot", type=Path, metavar="DIR", help="write DIR/lower.png and DIR/upper.png")
-    parser.add_argument("--log", type=Path, metavar="LOG", help="of --snapshot: take the images of a log")
-    add_cameras(parser, "of --log: images of the {camera} camera; default: by name")
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+        "cameras --snapshot views --config /etc/omnid/omnid.toml",
+        "cameras --snapshot views --log drive.mcap",
+    ),
+    description="List cameras, their modes and the udev rule to copy. With --snapshot write an image of each "
+    "configured camera with the mirror's rim, and print a measure of its focus, which is highest where "
+    "the lens is set best.",
+)
 def run(args: argparse.Namespace) -> int:
     """Print the list, or write the snapshots; return 1 if there is no camera, or something to correct."""
     if args.snapshot is not None:
         return _snapshot(args)
-    for option in ("log", "lower", "upper"):
-        if getattr(args, option) is not None:
-            raise OmnidError(f"--{option} belongs to --snapshot DIR: name the folder for the images as well")
+    for name in ("log", "lower", "upper"):
+        if getattr(args, name) is not None:
+            raise OmnidError(f"--{name} belongs to --snapshot DIR: name the folder for the images as well")
     return _list()
 
 

@@ -6,43 +6,37 @@ import argparse
 from importlib.resources import as_file, files
 from pathlib import Path
 
-from omnid.commands.config import add_settings, settings_of
+from omnid.commands.options import QUIET, SETTINGS, command, option, settings_of
 from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
 DRIVE_S = 90.0  # Longest drive in simulated time.
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `demo` to the command line."""
-    parser = subparsers.add_parser("demo", help="replay a sample in real time: files, bus and a simulated motor")
-    parser.add_argument(
+@command(
+    option(
         "--output",
         type=Path,
         default=Path("omnid-demo"),
         metavar="FOLDER",
         help="folder of the output files; default %(default)s",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--drive",
         action="store_true",
-        help="a simulated robot is taught a route of 6 m and repeats "
-        "it; takes a minute or two, and writes drive.png with both true paths",
-    )
-    parser.add_argument(
-        "--seed", type=int, default=1, help="with --drive: of the world and its noise; default %(default)s"
-    )
-    parser.add_argument("--verbose", action="store_true", help="print all counters, and the times of all stages")
-    parser.add_argument("--quiet", action="store_true", help="do not show the progress")
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+        help="a simulated robot is taught a route of 6 m and repeats it; takes a minute or two, and writes drive.png "
+        "with both true paths",
+    ),
+    option("--seed", type=int, default=1, help="with --drive: of the world and its noise; default %(default)s"),
+    option("--verbose", action="store_true", help="print all counters, and the times of all stages"),
+    QUIET,
+    *SETTINGS,
+    examples=("demo", "demo --drive", "demo --output /tmp/demo --quiet"),
+)
 def run(args: argparse.Namespace) -> int:
     """Replay the sample and print its errors against the truth; or drive."""
     if args.drive:
         return _drive(args)
-    from omnid.config import load_config
     from omnid.formats.tum import read_tum
     from omnid.recordings.evaluation import evaluate
     from omnid.runs.replay import ReplayOptions
@@ -59,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
         paced=True,
         settings=args.config,
     )
-    config = load_config(args.config, ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.overrides])
+    args.overrides = ["motor.port=simulated", "controller.setpoint.velocity_mps=0.3", *args.overrides]
+    config = settings_of(args)
     sample = files("omnid.sample")
     with as_file(sample / "log.mcap") as log, as_file(sample / "truth.txt") as truth:
         code = replay_and_print(log, config, options, Output(args.quiet, args.verbose))

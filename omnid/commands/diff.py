@@ -7,51 +7,45 @@ import logging
 import math
 from pathlib import Path
 
-from omnid.commands.json_output import add_json, print_json
+from omnid.commands.json_output import print_json
+from omnid.commands.options import JSON, command, option
 from omnid.errors import OmnidError
 
 AGREE, DIFFER = 0, 1
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `diff` to the command line."""
-    parser = subparsers.add_parser(
-        "diff", help="compare two recorded runs over the same images; exit code 1 where they differ"
-    )
-    parser.add_argument(
+@command(
+    option(
         "a",
         type=Path,
         metavar="A.mcap",
         help="what `omnid run`, replay --record or listen --mcap wrote, or any log with nav_msgs/msg/Odometry",
-    )
-    parser.add_argument("b", type=Path, metavar="B.mcap", help="likewise; poses of the same stamp are compared")
-    parser.add_argument(
+    ),
+    option("b", type=Path, metavar="B.mcap", help="likewise; poses of the same stamp are compared"),
+    option(
         "--tolerance-mm",
         type=float,
         default=5.0,
         metavar="MM",
         help="closer poses count as the same, and commands that differ by less per second; default %(default)s",
-    )
-    parser.add_argument(
-        "--tolerance-deg", type=float, default=0.1, metavar="DEG", help="likewise, of angles; default %(default)s"
-    )
-    parser.add_argument(
+    ),
+    option("--tolerance-deg", type=float, default=0.1, metavar="DEG", help="likewise, of angles; default %(default)s"),
+    option(
         "--shared",
         type=float,
         default=90.0,
         metavar="PERCENT",
         help="smallest share of the longer run's poses that the other must have; default %(default)s",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--align",
         action="store_true",
         help="align B with A at their first common pose: for runs that began at different images",
-    )
-    parser.add_argument("--topic", metavar="TOPIC", help="the odometry topic of both, where there are several")
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
+    ),
+    option("--topic", metavar="TOPIC", help="the odometry topic of both, where there are several"),
+    JSON,
+    examples=("diff yesterday.mcap today.mcap",),
+)
 def run(args: argparse.Namespace) -> int:
     """Print the comparison; return 0 where the runs agree, 1 where they differ."""
     from omnid.engine.logging_setup import log_unlimited

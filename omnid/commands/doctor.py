@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.json_output import add_json, print_json
+from omnid.commands.json_output import print_json
+from omnid.commands.options import JSON, SETTINGS, command, settings_of
 
 if TYPE_CHECKING:
     from omnid.config import Config
@@ -18,14 +18,7 @@ ROOT = Path("/")  # folder of sys, dev and proc
 BYTES_PER_PIXEL = 0.3  # upper bound for a JPEG of a textured image
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `doctor` to the command line."""
-    parser = subparsers.add_parser("doctor", help="check cameras, USB, motor, rig, clock, rights, bus and disk")
-    add_settings(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
+@command(*SETTINGS, JSON, examples=("doctor --config /etc/omnid/omnid.toml",))
 def run(args: argparse.Namespace) -> int:
     """Print a line for each check; return 1 if something is wrong."""
     from omnid.doctor.finding import summary

@@ -8,50 +8,51 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Final
 
-from omnid.commands.json_output import add_json, print_json
+from omnid.commands.json_output import print_json
+from omnid.commands.options import JSON, command, option
 
 # Position error (ATE), as a share of the true length, above which the trajectories hardly are of one drive: odometry
 # that is lost half of the way is below.
 ANOTHER_DRIVE: Final = 0.25
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `eval` to the command line."""
-    parser = subparsers.add_parser("eval", help="compare a trajectory with the truth, both in the TUM format")
-    parser.add_argument("estimate", type=Path, metavar="EST", help="t x y z qx qy qz qw, T_odom_rig")
-    parser.add_argument(
-        "truth", type=Path, metavar="TRUTH", help="the same format, of the same rig frame in any world frame"
-    )
-    parser.add_argument(
+@command(
+    option("estimate", type=Path, metavar="EST", help="t x y z qx qy qz qw, T_odom_rig"),
+    option("truth", type=Path, metavar="TRUTH", help="the same format, of the same rig frame in any world frame"),
+    option(
         "--tolerance-ms",
         type=float,
         default=10.0,
         metavar="MS",
         help="largest difference between the stamps of two poses; default %(default)s",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--align",
         choices=("origin", "rigid", "scale"),
         help="the first pose (default), as evo's --align_origin; rigid: all positions, as its --align; scale: these "
         "and the estimate's scale, which is printed, as its --align --correct_scale",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--score",
         choices=("hilti", "kitti"),
         help="a score by which others compare. hilti: 100 exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree "
         "cameras, 0 where more than 1 %% of the truth's poses are missing, with --align rigid unless another one is "
         "given; kitti: drift over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--live",
         type=Path,
         metavar="FILE",
         help="the poses as they were known while driving (replay --map-live-tum), whose errors are printed beside",
-    )
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
+    ),
+    JSON,
+    examples=(
+        "eval est.txt truth.txt",
+        "eval est.txt truth.txt --align rigid --json",
+        "eval est.txt truth.txt --score hilti",
+        "eval map.txt truth.txt --live live.txt",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from omnid.formats.tum import read_tum

@@ -3,19 +3,10 @@
 from __future__ import annotations
 
 import argparse
+from typing import Final
 
 from calib.rig import LEAST_HEIGHT_M, MAX_HEIGHT_M, Rig
-
-
-def add_height(parser: argparse.ArgumentParser) -> None:
-    """Add --height-m."""
-    parser.add_argument(
-        "--height-m",
-        type=height,
-        metavar="M",
-        help="height of the lower viewpoint (the focus of the "
-        "lower mirror) above the floor; without it `omnid calibrate height` finds it by the floor",
-    )
+from omnid.commands.options import option
 
 
 def height(text: str) -> float:
@@ -27,6 +18,15 @@ def height(text: str) -> float:
     if not LEAST_HEIGHT_M <= value <= MAX_HEIGHT_M:
         raise argparse.ArgumentTypeError(f"expected {LEAST_HEIGHT_M:g} to {MAX_HEIGHT_M:g} m, found {text}")
     return value
+
+
+HEIGHT: Final = option(
+    "--height-m",
+    type=height,
+    metavar="M",
+    help="height of the lower viewpoint (the focus of the lower mirror) above the floor; without it `omnid calibrate "
+    "height` finds it by the floor",
+)
 
 
 def with_height(rig: Rig, args: argparse.Namespace) -> Rig:

@@ -6,28 +6,19 @@ import argparse
 import sys
 from pathlib import Path
 
+from omnid.commands.options import command, option
 from omnid.commands.web import require_packages
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `install-service` to the command line."""
-    parser = subparsers.add_parser(
-        "install-service",
-        help="install omnid as a systemd service",
-        description="Install the systemd unit for this program, example udev rules, a minimal configuration and the "
-        "user that it runs as. Files that people edit are kept where they exist.",
-    )
-    parser.add_argument(
-        "--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine only"
-    )
-    parser.add_argument("--dry-run", action="store_true", help="list what would be done, change nothing")
-    parser.add_argument("--yes", action="store_true", help="do not ask")
-    parser.add_argument(
-        "--root", type=Path, default=Path("/"), metavar="DIR", help="install into the system below DIR; default: /"
-    )
-    parser.set_defaults(run=run)
-
-
+@command(
+    option("--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine only"),
+    option("--dry-run", action="store_true", help="list what would be done, change nothing"),
+    option("--yes", action="store_true", help="do not ask"),
+    option("--root", type=Path, default=Path("/"), metavar="DIR", help="install into the system below DIR; default: /"),
+    examples=("install-service --dry-run", "install-service --page"),
+    description="Install the systemd unit for this program, example udev rules, a minimal configuration and the user "
+    "that it runs as. Files that people edit are kept where they exist.",
+)
 def run(args: argparse.Namespace) -> int:
     """List the steps, ask, and take them; return 1 where the answer is no."""
     from omnid.service.install import Installation

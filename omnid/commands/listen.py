@@ -3,46 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
+from omnid.commands.options import ROBOT, SECONDS, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
-
-if TYPE_CHECKING:
-    from omnid.config import Config
-
-
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `listen` to the command line."""
-    parser = subparsers.add_parser("listen", help="show pose, state, rates and latencies of a robot, and record them")
-    add_robot(parser)
-    parser.add_argument("--load", action="store_true", help="the share of a core that each thread of the robot takes")
-    parser.add_argument("--tum", type=Path, metavar="FILE", help="write the poses in the TUM format")
-    parser.add_argument("--mcap", type=Path, metavar="FILE", help="record all received messages to a log")
-    parser.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
-def add_robot(parser: argparse._ActionsContainer, more: str = "") -> None:
-    """Add the options --robot and --connect. more: the end of the help of --robot."""
-    parser.add_argument("--robot", metavar="NAME", help=f"its name; default: bus.robot of the settings{more}")
-    parser.add_argument(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help="the robot or a router, such as "
-        "tcp/robot:7447; default: bus.connect of the settings, without them this machine",
-    )
-
-
-def config_of(args: argparse.Namespace) -> Config:
-    """Return the configuration with the robot's name and endpoints of --robot and --connect."""
-    config = settings_of(args)
-    robot, connect = args.robot or config.bus.robot, tuple(args.connect or config.bus.connect)
-    return replace(config, bus=replace(config.bus, robot=robot, connect=connect))
 
 
 def check_seconds(seconds: float | None) -> None:
@@ -51,9 +15,21 @@ def check_seconds(seconds: float | None) -> None:
         raise OmnidError(f"--seconds {seconds} is not a duration: expected seconds above 0")
 
 
+@command(
+    *ROBOT,
+    option("--load", action="store_true", help="the share of a core that each thread of the robot takes"),
+    option("--tum", type=Path, metavar="FILE", help="write the poses in the TUM format"),
+    option("--mcap", type=Path, metavar="FILE", help="record all received messages to a log"),
+    SECONDS,
+    *SETTINGS,
+    examples=(
+        "listen",
+        "listen --robot rover --connect tcp/robot:7447 --tum path.txt --mcap received.mcap",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Show the robot until the end; return 1 if no pose was received."""
     from omnid.monitor.follow import listen
 
     check_seconds(args.seconds)
-    return listen(config_of(args).bus, args.tum, args.mcap, args.seconds, shows_load=args.load)
+    return listen(settings_of(args).bus, args.tum, args.mcap, args.seconds, shows_load=args.load)

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.json_output import add_json, print_json
+from omnid.commands.json_output import print_json
+from omnid.commands.options import JSON, command, option
 from omnid.utc import utc
 
 if TYPE_CHECKING:
@@ -19,23 +20,18 @@ _MEND = "`mcap recover`, of mcap's own command line"
 MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `log` to the command line."""
-    parser = subparsers.add_parser("log", help="show the content of logs")
-    actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
-    info = actions.add_parser("info", help="topics, types, counts, times, attachments, and whether the log is whole")
-    info.add_argument(
+@command(
+    option(
         "logs",
         type=Path,
         nargs="+",
         metavar="LOG",
         help=".mcap, .mcap.part, .db3, .bag, or a folder of these or of images",
-    )
-    add_json(info)
-    info.set_defaults(run=run_info)
-
-
-def run_info(args: argparse.Namespace) -> int:
+    ),
+    JSON,
+    examples=("log info recordings/*.mcap",),
+)
+def info(args: argparse.Namespace) -> int:
     """Print the content of each log; return 1 if one is broken, 2 if one is no log."""
     from drivers.errors import DriverError
     from drivers.logs.log_formats import log_info

@@ -7,63 +7,17 @@ import sys
 from dataclasses import asdict
 from pathlib import Path
 
-from omnid.commands.config import add_settings
-from omnid.commands.json_output import add_json, print_json
-from omnid.commands.listen import add_robot, config_of
-from omnid.commands.map_build import add_build
-from omnid.commands.map_option import add_replace, require_replace
+from omnid.commands.json_output import print_json
+from omnid.commands.map_option import require_replace
 from omnid.commands.map_summary import described
-from omnid.commands.map_tags import add_align, add_tags
+from omnid.commands.options import JSON, REPLACE, ROBOT, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
 CELL_M = 0.05
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `map` to the command line."""
-    parser = subparsers.add_parser("map", help="build, show, merge and export maps of places (.omap)")
-    actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
-    add_build(actions)
-    info = actions.add_parser("info", help="keyframes, sessions, loops, size, and the rig that made the map")
-    info.add_argument("maps", type=Path, nargs="+", metavar="FILE.omap")
-    add_json(info)
-    info.set_defaults(run=run_info)
-    show = actions.add_parser("show", help="a page with keyframes, loops, and the paths with and without the loops")
-    show.add_argument("map", type=Path, metavar="FILE.omap")
-    show.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.html")
-    show.set_defaults(run=run_show)
-    merge = actions.add_parser("merge", help="join maps of one building, made by the same rig")
-    merge.add_argument(
-        "maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first stays"
-    )
-    merge.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
-    add_replace(merge)
-    merge.set_defaults(run=run_merge)
-    add_tags(actions)
-    add_align(actions)
-    _add_export(actions)
-    save = actions.add_parser("save", help="ask a robot to save its map now, before it is switched off")
-    add_robot(save)
-    add_settings(save)
-    save.set_defaults(run=run_save)
-
-
-def _add_export(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    export = actions.add_parser("export", help="write a map for other programs")
-    export.add_argument("map", type=Path, metavar="FILE.omap")
-    export.add_argument("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age")
-    export.add_argument("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths")
-    export.add_argument(
-        "--grid",
-        type=Path,
-        metavar="FILE.yaml",
-        help="occupancy grid for nav2 and map_server; the image beside it is FILE.pgm",
-    )
-    export.add_argument("--cell", type=float, default=CELL_M, metavar="M", help="edge of a cell; default %(default)s m")
-    export.set_defaults(run=run_export)
-
-
-def run_info(args: argparse.Namespace) -> int:
+@command(option("maps", type=Path, nargs="+", metavar="FILE.omap"), JSON, examples=("map info place.omap",))
+def info(args: argparse.Namespace) -> int:
     """Print the content of each map; return 2 if a file is not a map."""
     from omnid.core.places.place_views import summary
     from omnid.formats.place_file import read_places
@@ -85,7 +39,12 @@ def run_info(args: argparse.Namespace) -> int:
     return code
 
 
-def run_show(args: argparse.Namespace) -> int:
+@command(
+    option("map", type=Path, metavar="FILE.omap"),
+    option("-o", "--output", type=Path, required=True, metavar="OUT.html"),
+    examples=("map show place.omap -o place.html",),
+)
+def show(args: argparse.Namespace) -> int:
     """Write the page."""
     from calib.rig_file import write_file
     from omnid.core.places.place_views import summary
@@ -102,18 +61,26 @@ def run_show(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_save(args: argparse.Namespace) -> int:
+@command(*ROBOT, *SETTINGS, examples=("map save", "map save --robot rover --connect tcp/robot:7447"))
+def save(args: argparse.Namespace) -> int:
     """Ask the robot to save its map, and print what became of it."""
     from omnid.monitor.navigation import connected, granted
 
-    with connected(config_of(args).bus) as robot:
+    with connected(settings_of(args).bus) as robot:
         print(granted(robot, robot.driver().save_map()))
     return 0
 
 
-def run_merge(args: argparse.Namespace) -> int:
+@command(
+    option("maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first stays"),
+    option("-o", "--output", type=Path, required=True, metavar="OUT.omap"),
+    REPLACE,
+    examples=("map merge east.omap west.omap -o place.omap",),
+)
+def merge(args: argparse.Namespace) -> int:
     """Join the maps, each to those before."""
-    from omnid.core.places.merge import NO_COMMON_PLACE, merge
+    from omnid.core.places.merge import NO_COMMON_PLACE
+    from omnid.core.places.merge import merge as merge_maps
     from omnid.core.places.place_rig import seen_by
     from omnid.core.places.place_views import summary
     from omnid.core.types.stereo_model import StereoModel
@@ -136,7 +103,7 @@ def run_merge(args: argparse.Namespace) -> int:
         seen_by(other, other_rig, rig)
         prepare_kernels()
         try:
-            recognised = merge(places, other, StereoModel(rig.cylinder, rig.baseline_m))
+            recognised = merge_maps(places, other, StereoModel(rig.cylinder, rig.baseline_m))
         except ValueError as error:
             raise OmnidError(
                 f"map merge: {path}: {error}: measure it, and build the map with the wrong size again by "
@@ -152,7 +119,20 @@ def run_merge(args: argparse.Namespace) -> int:
     return 0
 
 
-def run_export(args: argparse.Namespace) -> int:
+@command(
+    option("map", type=Path, metavar="FILE.omap"),
+    option("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age"),
+    option("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths"),
+    option(
+        "--grid",
+        type=Path,
+        metavar="FILE.yaml",
+        help="occupancy grid for nav2 and map_server; the image beside it is FILE.pgm",
+    ),
+    option("--cell", type=float, default=CELL_M, metavar="M", help="edge of a cell; default %(default)s m"),
+    examples=("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
+)
+def export(args: argparse.Namespace) -> int:
     """Write the files that are asked for."""
 
     from omnid.core.places import place_views

@@ -9,10 +9,20 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.map_option import add_replace, add_tags_option
 from omnid.commands.map_summary import described
-from omnid.commands.worker_options import add_workers, end_by_sigterm, program_options
+from omnid.commands.options import (
+    PROFILES,
+    QUIET,
+    REPLACE,
+    RIG,
+    SETTINGS,
+    TAGS,
+    command,
+    exclusive,
+    option,
+    settings_of,
+)
+from omnid.commands.worker_options import end_by_sigterm, program_options, workers
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
@@ -20,29 +30,29 @@ if TYPE_CHECKING:
     from omnid.runs.place_maps import RigPlaces
 
 
-def add_build(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    build = actions.add_parser("build", help="build a map from logs, of one drive or of several in the same place")
-    build.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first")
-    build.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
-    known = build.add_mutually_exclusive_group()
-    known.add_argument("--extend", action="store_true", help="extend the map OUT.omap")
-    add_replace(known)
-    add_tags_option(build)
-    build.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    add_workers(build, "logs at a time, whose maps are then joined; 1: each in the map of those before", 1)
-    build.add_argument("--quiet", action="store_true", help="do not show the progress")
-    add_settings(build)
-    build.set_defaults(run=run_build)
-
-
-def run_build(args: argparse.Namespace) -> int:
+@command(
+    option("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first"),
+    option("-o", "--output", type=Path, required=True, metavar="OUT.omap"),
+    exclusive(option("--extend", action="store_true", help="extend the map OUT.omap"), REPLACE),
+    TAGS,
+    RIG,
+    *workers("logs at a time, whose maps are then joined; 1: each in the map of those before", 1),
+    QUIET,
+    *SETTINGS,
+    examples=(
+        "map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
+        "map build wednesday.mcap -o place.omap --extend",
+        "map build logs/*.mcap -o site.omap --jobs 4",
+    ),
+)
+def run(args: argparse.Namespace) -> int:
     """Replay the logs one after the other, each in the map of those before, or side by side; write the map."""
     from omnid.config_use import unused_settings
     from omnid.core.places.place_views import summary
     from omnid.formats.place_file import write_places
     from omnid.sinks.files import check_outputs
 
-    config = settings_of(args, {"places.tags": args.tags})
+    config = settings_of(args)
     warnings = unused_settings(config, "replay", args.overrides)
     if not config.places.enabled or config.places.map:
         raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
@@ -97,7 +107,7 @@ def _side_by_side(args: argparse.Namespace, config: Config) -> RigPlaces | None:
             print(line, file=sys.stderr)
 
     paths = {"--rig": args.rig, "--config": args.config, "--tags": args.tags}
-    options = program_options(paths, {}, args.overrides)
+    options = program_options(paths, {}, [*PROFILES.get(args.profile, ()), *args.overrides])
     end_by_sigterm()
     # Beside the output: workers on other machines reach it there.
     output = args.output.absolute()

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.json_output import add_json, print_json
-from omnid.commands.map_option import add_map, add_replace, map_settings, require_replace
+from omnid.commands.json_output import print_json
+from omnid.commands.map_option import require_replace
+from omnid.commands.options import JSON, MAP, REPLACE, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:
@@ -27,52 +27,26 @@ Found: TypeAlias = "tuple[dict[int, MapTag], dict[int, TagEstimate], int]"
 LARGEST_M = 0.3  # A larger error at a landmark means that a number was mistyped.
 
 
-def add_tags(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `map tags`."""
-    tags = actions.add_parser(
-        "tags", help="AprilTags (36h11) as landmarks with names: those of a map, or those that a log shows"
-    )
-    tags.add_argument("source", type=Path, metavar="FILE.omap|LOG", help="a map, or a log as of `omnid replay`")
-    tags.add_argument(
+@command(
+    option("source", type=Path, metavar="FILE.omap|LOG", help="a map, or a log as of `omnid replay`"),
+    option(
         "--tag",
         action="append",
         default=[],
         metavar="ID=SIZE",
         help="of a log: number of a tag and the edge of its black square, m; may be repeated",
-    )
-    tags.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    tags.add_argument("--write", type=Path, metavar="TAGS.toml", help="write them as landmarks, for `omnid map align`")
-    add_map(tags)
-    add_settings(tags)
-    add_json(tags)
-    tags.set_defaults(run=run_tags)
-
-
-def add_align(actions: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `map align`."""
-    parser = actions.add_parser("align", help="move a map into the axes of a plan of the building, by known AprilTags")
-    parser.add_argument("map", type=Path, metavar="FILE.omap")
-    parser.add_argument(
-        "--seen",
-        type=Path,
-        metavar="TAGS.toml",
-        help="the tags in the map, as written by `omnid map "
-        "tags LOG --map FILE.omap --localize-only --write TAGS.toml`; default: those of the map",
-    )
-    parser.add_argument(
-        "--known",
-        type=Path,
-        required=True,
-        metavar="PLAN.toml",
-        help="the same tags on the plan: x, "
-        "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one",
-    )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.omap")
-    add_replace(parser)
-    parser.set_defaults(run=run_align)
-
-
-def run_tags(args: argparse.Namespace) -> int:
+    ),
+    option("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log"),
+    option("--write", type=Path, metavar="TAGS.toml", help="write them as landmarks, for `omnid map align`"),
+    MAP,
+    *SETTINGS,
+    JSON,
+    examples=(
+        "map tags place.omap",
+        "map tags drive.mcap --tag 5=0.16 --tag 6=0.16 --map place.omap --localize-only --write tags.toml",
+    ),
+)
+def tags(args: argparse.Namespace) -> int:
     """Print the poses of the tags; return 1 if one was not found."""
     from omnid.core.places.alignment import landmark
     from omnid.formats.landmark_file import write_landmarks
@@ -135,7 +109,7 @@ def _of_log(args: argparse.Namespace) -> Found:
             f"map tags {args.source}: expected --tag ID=SIZE for each tag that a log shows, such as "
             "--tag 5=0.16, or --tags TAGS.toml, or a map FILE.omap"
         )
-    config = settings_of(args, map_settings(args))
+    config = settings_of(args)
     collectors: list[TagCollector] = []  # one, which the run makes once it knows its rig
 
     def observer(front_end: FrontEnd, _: Telemetry) -> TagCollector:
@@ -168,9 +142,31 @@ def _row(tag: MapTag, found: TagEstimate) -> dict[str, Any]:
     }
 
 
-def run_align(args: argparse.Namespace) -> int:
+@command(
+    option("map", type=Path, metavar="FILE.omap"),
+    option(
+        "--seen",
+        type=Path,
+        metavar="TAGS.toml",
+        help="the tags in the map, as written by `omnid map "
+        "tags LOG --map FILE.omap --localize-only --write TAGS.toml`; default: those of the map",
+    ),
+    option(
+        "--known",
+        type=Path,
+        required=True,
+        metavar="PLAN.toml",
+        help="the same tags on the plan: x, "
+        "y, z, and the direction that they face; omnid/formats/landmark_file.py shows one",
+    ),
+    option("-o", "--output", type=Path, required=True, metavar="OUT.omap"),
+    REPLACE,
+    examples=("map align place.omap --known plan.toml -o building.omap",),
+)
+def align(args: argparse.Namespace) -> int:
     """Write the map in the axes of the plan."""
-    from omnid.core.places.alignment import align, fit, landmark
+    from omnid.core.places.alignment import align as align_map
+    from omnid.core.places.alignment import fit, landmark
     from omnid.formats.landmark_file import read_landmarks
     from omnid.formats.place_file import read_places, write_places
     from omnid.sinks.files import check_outputs
@@ -197,7 +193,7 @@ def run_align(args: argparse.Namespace) -> int:
             f"map align: tag {worst} ({known[worst].name}) is {left_m[worst]:.2f} m from its place on the "
             f"plan, expected at most {LARGEST_M} m: correct its place in {args.known}, or leave it out"
         )
-    align(places, rig, T_plan_map)
+    align_map(places, rig, T_plan_map)
     write_places(args.output, places, rig)
     for id, metres in left_m.items():
         print(f"tag {id} ({known[id].name}): {1e3 * metres:.0f} mm from its place on the plan")

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
+from omnid.commands.options import SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -18,45 +18,41 @@ _BEFORE = """The wheels will turn. Raise the robot so that none of them touches 
 from them, and have the emergency stop at hand. The daemon must not run. Ctrl-C stops the wheels. Type yes to begin: """
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `motor` to the command line."""
-    parser = subparsers.add_parser("motor", help="test the wiring of the motors: sides, directions, scale")
-    actions = parser.add_subparsers(required=True, metavar="action", parser_class=type(parser))
-    test = actions.add_parser(
-        "test",
-        help="turn each wheel, ask what moved, print the settings for that",
-        description="Turn each motor forwards and back, ask which wheel moved and which way, "
-        "then turn both wheels a number of times and ask for the true number. It prints the "
-        "lines of the configuration that make the wheels turn as commanded.",
-    )
-    test.add_argument(
+@command(
+    option(
         "--motor",
         metavar="PORT",
+        setting="motor.port",
         help="serial port of the controller, or 'simulated'; default: motor.port of the settings",
-    )
-    test.add_argument("--speed", type=float, default=0.1, metavar="MPS", help="of a wheel, m/s; default %(default)s")
-    test.add_argument(
+    ),
+    option("--speed", type=float, default=0.1, metavar="MPS", help="of a wheel, m/s; default %(default)s"),
+    option(
         "--turns",
         type=float,
         default=3.0,
         metavar="N",
         help="of the wheels for the scale, 0: do not test it; default %(default)s",
-    )
-    test.add_argument(
+    ),
+    option(
         "--write",
         type=Path,
         metavar="FILE",
         help="set the lines in this configuration file; its other lines stay as they are",
-    )
-    add_settings(test)
-    test.set_defaults(run=run)
-
-
+    ),
+    *SETTINGS,
+    examples=(
+        "motor test --motor /dev/omnid/motor --config /etc/omnid/omnid.toml",
+        "motor test --motor simulated --set motor.protocol=roboteq --write omnid.toml",
+    ),
+    description="Turn each motor forwards and back, ask which wheel moved and which way, then turn both wheels a "
+    "number of times and ask for the true number. It prints the lines of the configuration that make the wheels turn "
+    "as commanded.",
+)
 def run(args: argparse.Namespace) -> int:
     """Test the wiring and print the settings."""
     from omnid.doctor.wheel_wiring import WiringTest
 
-    config = settings_of(args, {"motor.port": args.motor}).motor
+    config = settings_of(args).motor
     if not config.port:
         raise OmnidError("no motor controller is configured: name its port by --motor, or set motor.port")
     text = _text_of(args.write)

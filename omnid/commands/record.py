@@ -8,40 +8,37 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.log_options import add_cameras
+from omnid.commands.options import SETTINGS, cameras, command, option, settings_of
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.config import Config
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `record` to the command line."""
-    parser = subparsers.add_parser("record", help="record both cameras to MCAP files until Ctrl-C")
-    parser.add_argument(
-        "folder", type=Path, nargs="?", help="folder of the files; default: record.folder of the settings"
-    )
-    parser.add_argument(
-        "--rig", type=Path, help="a rig.toml to attach; default: cameras.rig of the settings, if it exists"
-    )
-    add_cameras(parser, "the {camera} camera; default: cameras.{camera} of the settings", "DEVICE")
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+@command(
+    option(
+        "folder",
+        type=Path,
+        nargs="?",
+        setting="record.folder",
+        help="folder of the files; default: record.folder of the settings",
+    ),
+    option(
+        "--rig",
+        type=Path,
+        setting="cameras.rig",
+        help="a rig.toml to attach; default: cameras.rig of the settings, if it exists",
+    ),
+    *cameras("the {camera} camera; default: cameras.{camera} of the settings", "DEVICE", are_settings=True),
+    *SETTINGS,
+    examples=("record recordings/ --rig rig.toml", "record boards/ --lower /dev/video0 --upper /dev/video2"),
+)
 def run(args: argparse.Namespace) -> int:
     """Record until a signal comes; return 1 if nothing was recorded."""
     from drivers.cameras.v4l2_camera import V4l2Camera
     from drivers.frame import Camera
     from omnid.runs.record import record
 
-    named = {
-        "record.folder": args.folder,
-        "cameras.rig": args.rig,
-        "cameras.lower": args.lower,
-        "cameras.upper": args.upper,
-    }
-    config = settings_of(args, named)
+    config = settings_of(args)
     rig = _rig(config, wanted=args.rig is not None)
     cameras: tuple[Camera, ...] = ("lower", "upper")
     config.cameras.require_two_devices()

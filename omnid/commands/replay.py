@@ -8,10 +8,8 @@ from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, NamedTuple
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.json_output import add_json, print_json
-from omnid.commands.log_options import add_cameras
-from omnid.commands.map_option import add_map, map_settings
+from omnid.commands.json_output import print_json
+from omnid.commands.options import JSON, MAP, QUIET, RIG, SETTINGS, cameras, command, group, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -20,74 +18,78 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.runs.run_result import RunResult
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `replay` to the command line."""
-    parser = subparsers.add_parser("replay", help="run a recorded log through the stages of the daemon")
-    parser.add_argument(
+@command(
+    option(
         "log",
         type=Path,
         metavar="LOG",
-        help="an .mcap, .db3 or .bag file, a folder with "
-        "one or with its parts, or a folder with a folder of stamped images for each camera",
-    )
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    add_cameras(parser)
-    parser.add_argument("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds")
-    parser.add_argument("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end")
-    _add_outputs(parser)
-    _add_computation(parser)
-    add_map(parser)
-    add_settings(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_outputs(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("outputs")
-    group.add_argument("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair")
-    group.add_argument(
-        "--map-tum",
-        type=Path,
-        metavar="FILE",
-        help="trajectory in the map, T_map_rig: places that are recognised correct all poses before them",
-    )
-    group.add_argument(
-        "--map-live-tum",
-        type=Path,
-        metavar="FILE",
-        help="the same as it was known at each pose, which is what a controller gets: later places correct nothing",
-    )
-    group.add_argument("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age")
-    group.add_argument("--plan", type=Path, metavar="FILE.png", help="the map from above with the path")
-    group.add_argument("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map")
-    group.add_argument(
-        "--publish",
-        action="store_true",
-        help="publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon publishes there",
-    )
-    group.add_argument(
-        "--motor",
-        metavar="PORT",
-        help="send commands to the motor controller on a serial port (the wheels will turn!), or to a 'simulated' one",
-    )
-
-
-def _add_computation(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("computation")
-    group.add_argument(
-        "--method",
-        choices=("default", "paper"),
-        help="paper: the odometry of the paper on its enhanced SAD, for comparison",
-    )
-    group.add_argument("--tracker", choices=("improved", "klt"), help="feature tracker of the paper's method")
-    group.add_argument("--inline", action="store_true", help="one thread, one pair after the other; same results")
-    group.add_argument(
-        "--realtime", action="store_true", help="at the speed of the recording; late messages are dropped"
-    )
-    group.add_argument("--verbose", action="store_true", help="print all counters, and the times of all stages")
-    group.add_argument("--quiet", action="store_true", help="do not show the progress")
-
-
+        help="an .mcap, .db3 or .bag file, a folder with one or with its parts, or a folder with a folder of stamped "
+        "images for each camera",
+    ),
+    RIG,
+    *cameras(),
+    option("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds"),
+    option("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end"),
+    group(
+        "outputs",
+        option("--tum", type=Path, metavar="FILE", help="trajectory, T_odom_rig, one row for every pair"),
+        option(
+            "--map-tum",
+            type=Path,
+            metavar="FILE",
+            help="trajectory in the map, T_map_rig: places that are recognised correct all poses before them",
+        ),
+        option(
+            "--map-live-tum",
+            type=Path,
+            metavar="FILE",
+            help="the same as it was known at each pose, which is what a controller gets: later places correct nothing",
+        ),
+        option("--cloud", type=Path, metavar="FILE.ply", help="the map's points with confidence and age"),
+        option("--plan", type=Path, metavar="FILE.png", help="the map from above with the path"),
+        option("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map"),
+        option(
+            "--publish",
+            action="store_true",
+            help="publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon publishes "
+            "there",
+        ),
+        option(
+            "--motor",
+            metavar="PORT",
+            setting="motor.port",
+            help="send commands to the motor controller on a serial port (the wheels will turn!), or to a 'simulated' "
+            "one",
+        ),
+    ),
+    group(
+        "computation",
+        option(
+            "--method",
+            choices=("default", "paper"),
+            setting="odometry.method",
+            help="paper: the odometry of the paper on its enhanced SAD, for comparison",
+        ),
+        option(
+            "--tracker",
+            choices=("improved", "klt"),
+            setting="odometry.tracker",
+            help="feature tracker of the paper's method",
+        ),
+        option("--inline", action="store_true", help="one thread, one pair after the other; same results"),
+        option("--realtime", action="store_true", help="at the speed of the recording; late messages are dropped"),
+        option("--verbose", action="store_true", help="print all counters, and the times of all stages"),
+        QUIET,
+    ),
+    MAP,
+    *SETTINGS,
+    JSON,
+    examples=(
+        "replay drive.mcap --rig rig.toml --tum est.txt --cloud map.ply --plan plan.png",
+        "replay drive.mcap --record out.mcap --method paper",
+        "replay drive.mcap --start-s 60 --seconds 20",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print its summary; return 1 where no pose was found."""
     from omnid.config_use import unused_settings
@@ -109,8 +111,7 @@ def run(args: argparse.Namespace) -> int:
         drops=args.realtime,
         settings=args.config,
     )
-    shortcuts = {"odometry.method": args.method, "odometry.tracker": args.tracker, "motor.port": args.motor}
-    config = settings_of(args, shortcuts | map_settings(args))
+    config = settings_of(args)
     for warning in unused_settings(config, "replay", args.overrides):
         print(f"omnid: warning: {warning}", file=sys.stderr)
     return replay_and_print(args.log, config, options, Output(args.quiet, args.verbose, args.json))

@@ -6,25 +6,22 @@ import argparse
 import sys
 from pathlib import Path
 
+from omnid.commands.options import command, option
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `report` to the command line."""
-    parser = subparsers.add_parser("report", help="one HTML page about a recording: path, events, statistics")
-    parser.add_argument(
+
+@command(
+    option(
         "log",
         type=Path,
         metavar="LOG",
-        help="what `omnid replay --record` or `omnid run` with "
-        "record.enabled wrote, or any MCAP with nav_msgs/msg/Odometry",
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="FILE", default=Path("report.html"), help="default: report.html"
-    )
-    parser.add_argument("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
-    parser.add_argument("--topic", metavar="TOPIC", help="the odometry topic, where there are several")
-    parser.set_defaults(run=run)
-
-
+        help="what `omnid replay --record` or `omnid run` with record.enabled wrote, or any MCAP with "
+        "nav_msgs/msg/Odometry",
+    ),
+    option("-o", "--output", type=Path, metavar="FILE", default=Path("report.html"), help="default: report.html"),
+    option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format"),
+    option("--topic", metavar="TOPIC", help="the odometry topic, where there are several"),
+    examples=("report out.mcap -o report.html",),
+)
 def run(args: argparse.Namespace) -> int:
     """Write the page."""
     from calib.rig_file import write_file

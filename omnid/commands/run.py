@@ -10,9 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.log_options import add_cameras, attached_rig_of
-from omnid.commands.map_option import add_map, map_settings
+from omnid.commands.options import MAP, SETTINGS, attached_rig_of, cameras, command, option, settings_of
 from omnid.errors import OmnidError
 
 RUNNING = 2  # time that the cameras are opened: first for the masks, then for the run
@@ -24,37 +22,37 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.runs.live_robot import OpenCamera
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `run` to the command line."""
-    parser = subparsers.add_parser("run", help="the daemon: live cameras in, poses on the bus, commands to the wheels")
-    parser.add_argument(
+@command(
+    option(
         "--rig",
         type=Path,
-        help="the rig.toml of the cameras; default: that attached to the log, or "
-        "without --log cameras.rig of the settings",
-    )
-    parser.add_argument("--motor", metavar="PORT", help="serial port of the controller, or 'simulated'")
-    parser.add_argument(
+        setting="cameras.rig",
+        help="the rig.toml of the cameras; default: that attached to the log, or without --log cameras.rig of the "
+        "settings",
+    ),
+    option("--motor", metavar="PORT", setting="motor.port", help="serial port of the controller, or 'simulated'"),
+    option(
         "--log",
         type=Path,
         metavar="LOG",
-        help="use the images of a log instead of cameras, for a "
-        "trial: in real time, forwards and backwards until it is stopped",
-    )
-    text = (
+        help="use the images of a log instead of cameras, for a trial: in real time, forwards and backwards until it "
+        "is stopped",
+    ),
+    *cameras(
         "device of the {camera} camera; default: cameras.{camera} of the settings; with --log the topic of its images, "
-        "default: found by name"
-    )
-    add_cameras(parser, text, "DEVICE|TOPIC")
-    parser.add_argument(
-        "--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"
-    )
-    parser.add_argument("--once", action="store_true", help="stop at the end of the log")
-    add_map(parser)
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+        "default: found by name",
+        "DEVICE|TOPIC",
+    ),
+    option("--pace", type=float, default=1.0, help="speed of the log relative to its recording; default %(default)s"),
+    option("--once", action="store_true", help="stop at the end of the log"),
+    MAP,
+    *SETTINGS,
+    examples=(
+        "run --config /etc/omnid/omnid.toml",
+        "run --log drive.mcap --rig rig.toml --motor simulated",
+        "run --lower /dev/video0 --upper /dev/video2 --rig rig.toml",
+    ),
+)
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
     from omnid.engine.malloc_settings import use_one_malloc_arena
@@ -65,10 +63,8 @@ def run(args: argparse.Namespace) -> int:
     from omnid.runs.live import LiveRun
     from omnid.runs.live_robot import ConnectedRobot
 
-    named = {"cameras.rig": args.rig, "motor.port": args.motor}
-    if args.log is None:
-        named |= {"cameras.lower": args.lower, "cameras.upper": args.upper}
-    config = settings_of(args, named | map_settings(args))
+    devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
+    config = settings_of(args, devices if args.log is None else {})
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     show = HANDLER.show if sys.stderr.isatty() else None

@@ -12,8 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.map_option import add_map, map_settings
+from omnid.commands.options import MAP, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
 AUTO, REAL_TIME = "auto", "1.0"
@@ -26,45 +25,35 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.simulation.robot import SimulatedRobot
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `simulate` to the command line."""
-    parser = subparsers.add_parser(
-        "simulate",
-        help="the daemon with a simulated robot in a simulated world",
-        description="Run the daemon with a simulated robot: cameras, motor controller and gyro (motion.imu=off: none) "
-        "are simulated. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid "
-        "web`. Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.",
-    )
-    parser.add_argument("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)")
-    parser.add_argument(
+@command(
+    option("world", help="room, corridor, building, hall, or a file *.toml (omnid/simulation/WORLDS.md)"),
+    option(
         "--speed",
         choices=(AUTO, REAL_TIME),
         default=AUTO,
         help="auto: simulated time waits for the daemon, and is never faster than real time; 1.0: real time, as on a "
         "robot: what the computer cannot do in time is dropped; default %(default)s",
-    )
-    parser.add_argument("--seed", type=int, default=1, help="of textures and noise; default %(default)s")
-    parser.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig")
-    parser.add_argument(
-        "--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"
-    )
-    parser.add_argument("--no-people", action="store_true", help="leave the people of the world out")
-    parser.add_argument("--light", type=float, default=1.0, help="factor on the light; default %(default)s")
-    parser.add_argument(
+    ),
+    option("--seed", type=int, default=1, help="of textures and noise; default %(default)s"),
+    option("--rig", type=Path, help="the rig.toml of the cameras; default: a straight rig"),
+    option("--size", type=int, default=512, metavar="PX", help="of the images without --rig; default %(default)s"),
+    option("--no-people", action="store_true", help="leave the people of the world out"),
+    option("--light", type=float, default=1.0, help="factor on the light; default %(default)s"),
+    option(
         "--other-posters",
         type=float,
         default=0.0,
         metavar="SHARE",
         help="share of the posters that is exchanged, 0 to 1; default %(default)s",
-    )
-    parser.add_argument(
-        "--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, at the end"
-    )
-    add_map(parser)
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+    ),
+    option("--truth", type=Path, metavar="FILE", help="write the true poses in odom, in the TUM format, at the end"),
+    MAP,
+    *SETTINGS,
+    examples=("simulate room", "simulate corridor --light 0.5 --map corridor.omap --set bus.robot=rover"),
+    description="Run the daemon with a simulated robot: cameras, motor controller and gyro (motion.imu=off: none) are "
+    "simulated. Everything else is as in `omnid run`: then `omnid arm`, `omnid drive`, `omnid goto`, `omnid web`. "
+    "Simulated time waits for the daemon: a busy computer slows it down, and loses nothing.",
+)
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
     from omnid.engine.malloc_settings import use_one_malloc_arena
@@ -80,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.sinks.files import check_outputs
 
     check_outputs([("--truth", args.truth)] if args.truth else [], [])
-    config = settings_of(args, map_settings(args))
+    config = settings_of(args)
     for warning in unused_settings(config, "run", args.overrides):
         log(logging.WARNING, warning)
     if args.seed < 0:

@@ -7,9 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from omnid.commands.config import add_settings, settings_of
-from omnid.commands.listen import add_robot, check_seconds, config_of
-from omnid.commands.log_options import add_cameras
+from omnid.commands.listen import check_seconds
+from omnid.commands.options import QUIET, RIG, ROBOT, SECONDS, SETTINGS, cameras, command, group, option, settings_of
 from omnid.commands.replay import Output, replay_and_print
 from omnid.errors import OmnidError
 
@@ -18,61 +17,52 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from omnid.viewer.targets import ViewerTarget
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `view` to the command line."""
-    parser = subparsers.add_parser("view", help="show a log or a robot: path, map, depth, plots (needs rerun)")
-    parser.add_argument(
+@command(
+    option(
         "log",
         type=Path,
         nargs="?",
         metavar="LOG",
-        help="a recording, which is shown as it stands, or "
-        "a log of images, which goes through the stages; without one, a robot is listened to",
-    )
-    where = parser.add_argument_group("output; default: a window")
-    where.add_argument(
-        "-o",
-        "--output",
-        type=Path,
-        metavar="FILE.rrd",
-        help="a file that `rerun FILE.rrd` opens, here or elsewhere; needs no display",
-    )
-    where.add_argument("--web", action="store_true", help="a browser of this machine")
-    where.add_argument(
-        "--port",
-        type=int,
-        default=0,
-        metavar="N",
-        help="of --web: serve the page at port N and its data at N + 1, for ssh -L; default: any free ones",
-    )
-    _add_log(parser)
-    _add_live(parser)
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
-def _add_log(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("a log")
-    group.add_argument("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several")
-    group.add_argument("--replay", action="store_true", help="compute again from the images of a recording")
-    group.add_argument("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
-    add_cameras(group)
-    group.add_argument("--quiet", action="store_true", help="do not show the progress")
-
-
-def _add_live(parser: argparse.ArgumentParser) -> None:
-    group = parser.add_argument_group("a robot")
-    add_robot(group, ", in a recording the only one")
-    group.add_argument("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
-
-
+        help="a recording, which is shown as it stands, or a log of images, which goes through the stages; without "
+        "one, a robot is listened to",
+    ),
+    group(
+        "output; default: a window",
+        option(
+            "-o",
+            "--output",
+            type=Path,
+            metavar="FILE.rrd",
+            help="a file that `rerun FILE.rrd` opens, here or elsewhere; needs no display",
+        ),
+        option("--web", action="store_true", help="a browser of this machine"),
+        option(
+            "--port",
+            type=int,
+            default=0,
+            metavar="N",
+            help="of --web: serve the page at port N and its data at N + 1, for ssh -L; default: any free ones",
+        ),
+    ),
+    group(
+        "a log",
+        option("--topic", metavar="TOPIC", help="the odometry topic of a recording, where there are several"),
+        option("--replay", action="store_true", help="compute again from the images of a recording"),
+        RIG,
+        *cameras(),
+        QUIET,
+    ),
+    group("a robot", *ROBOT, SECONDS),
+    *SETTINGS,
+    examples=("view out.mcap", "view out.mcap -o out.rrd", "view out.mcap --web --port 9090"),
+)
 def run(args: argparse.Namespace) -> int:
     """Show the log or the robot; return 1 if there was no pose to show."""
     _refuse_contradictions(args)
     _require_rerun()
     from omnid.viewer.view import check_file, show_robot, target_for
 
-    config = config_of(args) if args.log is None else settings_of(args)
+    config = settings_of(args)
     check_file(
         args.output,
         ("the log that is read", args.log),

@@ -5,55 +5,51 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from omnid.commands.config import add_settings
-from omnid.commands.listen import add_robot, config_of
+from omnid.commands.options import ROBOT, SETTINGS, command, option, settings_of
 from omnid.errors import OmnidError
 
 PACKAGES = ("starlette", "uvicorn", "websockets")
 
 
-def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    """Add `web` to the command line."""
-    parser = subparsers.add_parser(
-        "web",
-        help="a page with state, path, warnings, stop and arm",
-        description="Serve a page about a robot: state, path, map, warnings with their "
-        "remedy, a stop and an arm button; /metrics for Prometheus. It prints "
-        "the address with a token: who knows it may stop and arm the robot.",
-    )
-    add_robot(parser)
-    parser.add_argument(
+@command(
+    *ROBOT,
+    option(
         "--listen",
         default="127.0.0.1:8447",
         metavar="HOST:PORT",
         help="where browsers connect; default %(default)s, this machine only; 0.0.0.0:8447 for its network",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--token-file",
         type=Path,
         metavar="FILE",
         help="the token; the file is made if it is missing; default: a new token at each start",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--stop-token-file",
         type=Path,
         metavar="FILE",
         help="a second token, which may see and stop, not arm; the file is made if it is missing; default: none",
-    )
-    parser.add_argument(
+    ),
+    option(
         "--host",
         action="append",
         default=[],
         metavar="NAME",
-        help="a further name of this machine, "
-        "in addresses of browsers; without --listen on the network: localhost only",
-    )
-    parser.add_argument("--tls-certificate", type=Path, metavar="FILE", help="serve over TLS; PEM")
-    parser.add_argument("--tls-key", type=Path, metavar="FILE", help="the private key of the certificate, PEM")
-    add_settings(parser)
-    parser.set_defaults(run=run)
-
-
+        help="a further name of this machine, in addresses of browsers; without --listen on the network: "
+        "localhost only",
+    ),
+    option("--tls-certificate", type=Path, metavar="FILE", help="serve over TLS; PEM"),
+    option("--tls-key", type=Path, metavar="FILE", help="the private key of the certificate, PEM"),
+    *SETTINGS,
+    examples=(
+        "web",
+        "web --connect tcp/robot:7447",
+        "web --listen 0.0.0.0:8447 --token-file /etc/omnid/web-token --config /etc/omnid/omnid.toml",
+    ),
+    description="Serve a page about a robot: state, path, map, warnings with their remedy, a stop and an "
+    "arm button; /metrics for Prometheus. It prints the address with a token: who knows it may stop and arm the robot.",
+)
 def run(args: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
     require_packages()
@@ -61,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 
     if (args.tls_certificate is None) != (args.tls_key is None):
         raise OmnidError("--tls-certificate and --tls-key belong together: name both")
-    config = config_of(args)
+    config = settings_of(args)
     tls = (args.tls_certificate, args.tls_key) if args.tls_key else None
     serve(config.bus, WebSettings(args.listen, args.token_file, args.stop_token_file, tuple(args.host), tls))
     return 0

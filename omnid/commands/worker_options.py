@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
 import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
+from omnid.commands.options import Option, option
 
-def add_workers(parser: argparse.ArgumentParser, what: str, default: int) -> None:
-    """Add --jobs and --dask."""
-    parser.add_argument("--jobs", type=int, default=default, metavar="N", help=f"{what}; default: %(default)s")
-    parser.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        help="run on the workers of this dask scheduler, such as "
-        "tcp://HOST:8786; they need the same paths (extra `fleet`)",
+
+def workers(what: str, default: int) -> tuple[Option, Option]:
+    """Declare --jobs and --dask."""
+    return (
+        option("--jobs", type=int, default=default, metavar="N", help=f"{what}; default: %(default)s"),
+        option(
+            "--dask",
+            metavar="ADDRESS",
+            help="run on the workers of this dask scheduler, such as tcp://HOST:8786; they need the same paths (extra "
+            "`fleet`)",
+        ),
     )
 
 

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 from unittest.mock import patch
 
-from omnid.commands.config import PROFILES
+from omnid.commands.options import PROFILES
 from omnid.config import load_config
 from omnid.engine.graph import Graph
 from omnid.engine.inbox import StageInbox

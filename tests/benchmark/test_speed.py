@@ -17,7 +17,7 @@ from calib.kalibr import import_kalibr
 from calib.rig import Rig
 from calib.rig_file import parse_rig
 from drivers.logs.log_reader import LogReader
-from omnid.commands.config import PROFILES
+from omnid.commands.options import PROFILES
 from omnid.config import load_config
 from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
 from omnid.diagnostics.run_summary import run_summary

@@ -22,7 +22,6 @@ nearest known one.
 ```
 omnid config --minimal > omnid.toml                      # a file to start from; without --minimal: all settings
 omnid config check omnid.toml                            # is it right, and what differs from the defaults
-omnid config migrate old.toml                            # a file of an earlier version with the names of today
 omnid replay log.mcap --config omnid.toml --set stereo.min_range_m=0.5
 ```
 """

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from omnid.cli import _parser
+from omnid import cli
 from tests.omnid.batch.test_job_runner import rows, short_log
-from tests.omnid.test_cli import leaves
 
 ROOT = Path(__file__).parents[2]
 # Modules of the program, of its packages and of Python that a file in the working directory may pretend to be.
@@ -115,7 +114,7 @@ def run(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def test_no_command_runs_it(hostile: Path) -> None:
-    assert set(COMMANDS) == {words for words, _ in leaves(_parser([]))}
+    assert set(COMMANDS) == set(cli.COMMANDS)
     calls = [[*words.split(), *arguments] for words, (arguments, _) in COMMANDS.items()]
     done = run(hostile, "-c", IN_ONE_PROCESS, json.dumps(calls))
     answers = [json.loads(line) for line in done.stdout.splitlines()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,15 +15,13 @@ from calib.models.lens import DoubleSphereCamera
 from calib.ocam_file import export_ocam
 from calib.rig import Rig, ShutterTimes
 from calib.rig_file import read_rig, write_rig
-from omnid.commands import calibrate
+from omnid.cli import parser_of
 from omnid.errors import OmnidError
 
 
 def omnid(*words: object) -> int:
-    parser = argparse.ArgumentParser("omnid")
-    calibrate.add_parser(parser.add_subparsers(required=True))
-    args = parser.parse_args(["calibrate", *map(str, words)])
-    status: int = args.run(args)
+    args = parser_of(given := ["calibrate", *map(str, words)]).parse_args(given)
+    status: int = args.command.run(args)
     return status
 
 

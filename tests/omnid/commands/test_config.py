@@ -1,4 +1,4 @@
-"""`omnid config`: files to start from, to check, and of an earlier version."""
+"""`omnid config`: files to start from, or to check."""
 
 from __future__ import annotations
 
@@ -47,27 +47,6 @@ def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
     assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
 
 
-def test_migrate_moves_renamed_keys(omnid: Command, tmp_path: Path) -> None:
-    old, new = tmp_path / "old.toml", tmp_path / "new.toml"
-    old.write_text(
-        "[guidance]\nvelocity_mps = 0.3\n[guidance.limits]\ngain_hz = 2.0\n[service]\nhung_s = 5.0\n"
-        "[bus]\nrobot = 'rover'\n"
-    )
-    done = omnid("config", "migrate", old)
-    new.write_text(done.out)
-    assert load_config(new) == load_config(
-        None,
-        [
-            "controller.setpoint.velocity_mps=0.3",
-            "bus.robot=rover",
-            "controller.heading.gain_hz=2",
-            "service.stall_timeout_s=5",
-        ],
-    )
-    assert "service.hung_s is now called service.stall_timeout_s" in done.err and "guidance.limits" in done.err
-    assert omnid("config", "migrate", new).out == done.out, "a file of this version stays as it is"
-
-
-@pytest.mark.parametrize("words", [("check",), ("migrate",), ("print", "x.toml"), ("check", "none.toml")])
+@pytest.mark.parametrize("words", [("check",), ("print", "x.toml"), ("check", "none.toml")])
 def test_refuses_a_missing_or_superfluous_file(omnid: Command, words: tuple[str, ...]) -> None:
     assert omnid.refused("config", *words)

@@ -1,0 +1,261 @@
+"""Commands and options of the command line: each option is declared once, and a command lists those that it takes.
+
+    @command(LOG, RIG, option("--seconds", type=float, help="read so many seconds only"), examples=("replay a.mcap",))
+    def run(args: argparse.Namespace) -> int: ...
+
+`omnid/cli.py` names the module of each command. An option with `setting="motor.port"` stands for that setting:
+`settings_of(args)` returns the configuration with all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
+
+if TYPE_CHECKING:  # the help and other commands do not load these
+    from calib.rig import Rig
+    from omnid.config import Config
+
+PROFILES: Final = {
+    "small": ("panorama.scale=0.5", "odometry.limits.features=250"),
+}
+_NO_SETTINGS: Final[Mapping[str, object]] = MappingProxyType({})
+_EXAMPLES: Final = "examples:"  # the first line of an epilog
+
+
+@dataclass(frozen=True, slots=True)
+class Option:
+    """One option or positional argument."""
+
+    names: tuple[str, ...]
+    setting: str | None  # dotted path of the setting that the option stands for
+    keywords: Mapping[str, Any]  # of argparse's add_argument
+
+    def add_to(self, parser: argparse._ActionsContainer) -> None:
+        """Add the option to a parser or a group of one."""
+        parser.add_argument(*self.names, **self.keywords)
+
+    def settings(self) -> Iterator[tuple[str, str]]:
+        """Yield the attribute of the parsed arguments and the setting that it stands for."""
+        if self.setting is not None:
+            yield self.keywords.get("dest") or self.names[-1].lstrip("-").replace("-", "_"), self.setting
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Options under a title of their own in the help, or such that exclude each other (title None)."""
+
+    title: str | None
+    options: tuple[Option, ...]
+
+    def add_to(self, parser: argparse._ActionsContainer) -> None:
+        """Add the options to a parser."""
+        group: argparse._ActionsContainer
+        group = parser.add_mutually_exclusive_group() if self.title is None else parser.add_argument_group(self.title)
+        for entry in self.options:
+            entry.add_to(group)
+
+    def settings(self) -> Iterator[tuple[str, str]]:
+        """Yield the attributes and settings of all options."""
+        for entry in self.options:
+            yield from entry.settings()
+
+
+Run: TypeAlias = Callable[[argparse.Namespace], int]
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command without subcommands: what it takes and what it does."""
+
+    run: Run
+    options: tuple[Option | Group, ...]
+    examples: tuple[str, ...]  # without `omnid`; a test parses them all
+    description: str  # "": its line in the list of commands
+
+    def add_to(self, parser: argparse.ArgumentParser, help: str) -> None:
+        """Give a parser the options and the help of this command. help: its line in the list of commands."""
+        for entry in self.options:
+            entry.add_to(parser)
+        parser.formatter_class = _ExamplesFormatter
+        parser.description = self.description or f"{help[:1].upper()}{help[1:]}."
+        parser.epilog = "\n".join((_EXAMPLES, *(f"  omnid {example}" for example in self.examples)))
+        parser.set_defaults(command=self)
+
+
+class _ExamplesFormatter(argparse.HelpFormatter):
+    """Leaves the lines of the examples as they are, so that they can be copied; wraps all other text."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        if text.startswith(_EXAMPLES):
+            return "".join(indent + line for line in text.splitlines(keepends=True))
+        return super()._fill_text(text, width, indent)
+
+
+def option(*names: str, setting: str | None = None, **keywords: Any) -> Option:
+    """Declare an option or a positional argument; the keywords are those of argparse's add_argument."""
+    return Option(names, setting, keywords)
+
+
+def group(title: str, *options: Option) -> Group:
+    """Declare options that stand under a title of their own in the help."""
+    return Group(title, options)
+
+
+def exclusive(*options: Option) -> Group:
+    """Declare options of which at most one may be given."""
+    return Group(None, options)
+
+
+def command(*options: Option | Group, examples: tuple[str, ...], description: str = "") -> Callable[[Run], Command]:
+    """Make a command of a function from parsed arguments to the exit code."""
+    return lambda run: Command(run, options, examples, description)
+
+
+def settings_of(args: argparse.Namespace, more: Mapping[str, object] = _NO_SETTINGS) -> Config:
+    """Return the configuration of --config, --profile, --set, and of the options that stand for a setting.
+
+    more: further settings by their names, None: not given; they win over the options.
+    """
+    from omnid.config import load_config
+
+    named = {path: getattr(args, name) for entry in args.command.options for name, path in entry.settings()}
+    given = [
+        f"{path}={_text(value)}"
+        for path, value in (named | dict(more)).items()
+        if not (value is None or value is False)
+    ]
+    profile = PROFILES[args.profile] if getattr(args, "profile", None) else ()
+    return load_config(args.config, [*profile, *args.overrides, *given])
+
+
+def _text(value: object) -> str:
+    """Return the value of an option as --set takes it."""
+    return json.dumps(value) if isinstance(value, bool | list) else str(value)
+
+
+# Settings of any command.
+CONFIG: Final = option(
+    "--config", type=Path, metavar="FILE", help="TOML file of settings; `omnid config` prints the defaults"
+)
+SET: Final = option(
+    "--set",
+    action="append",
+    default=[],
+    metavar="SECTION.KEY=VALUE",
+    dest="overrides",
+    help="a setting that replaces that of the file; may be repeated",
+)
+SETTINGS: Final = (
+    CONFIG,
+    option(
+        "--profile",
+        choices=tuple(PROFILES),
+        help="settings that replace those of the file; small: half-size panoramas and half the landmarks, for a small "
+        "computer",
+    ),
+    SET,
+)
+JSON: Final = option("--json", action="store_true", help="print the result as JSON")
+QUIET: Final = option("--quiet", action="store_true", help="do not show the progress")
+
+# A robot on the bus.
+ROBOT: Final = (
+    option("--robot", metavar="NAME", setting="bus.robot", help="its name; default: bus.robot of the settings"),
+    option(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        setting="bus.connect",
+        help="the robot or a router, such as tcp/robot:7447; default: bus.connect of the settings, without them this "
+        "machine",
+    ),
+)
+SECONDS: Final = option("--seconds", type=float, metavar="N", help="end after N seconds; default: on Ctrl-C")
+
+# A log, its cameras and its rig.
+RIG: Final = option("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
+TRUTH: Final = option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
+
+
+def cameras(
+    text: str = "images of the {camera} camera; default: found by name",
+    metavar: str = "TOPIC",
+    *,
+    are_settings: bool = False,
+) -> tuple[Option, Option]:
+    """Declare --lower and --upper.
+
+    text: the help of each. metavar: what they name. are_settings: they stand for cameras.lower and cameras.upper.
+    """
+    lower, upper = (
+        option(
+            f"--{camera}",
+            metavar=metavar,
+            setting=f"cameras.{camera}" if are_settings else None,
+            help=text.format(camera=camera),
+        )
+        for camera in ("lower", "upper")
+    )
+    return lower, upper
+
+
+def log_with_rig(text: str) -> tuple[Option, ...]:
+    """Declare LOG, --rig, --lower and --upper. text: the help of LOG."""
+    return (option("log", type=Path, metavar="LOG", help=text), RIG, *cameras("the {camera} camera's topic"))
+
+
+def rig_of(args: argparse.Namespace) -> Rig:
+    """Return the rig of args.rig, or the one that is attached to args.log. Raise OmnidError if there is none."""
+    from calib.rig_file import read_rig
+
+    return read_rig(args.rig) if args.rig else attached_rig_of(args)
+
+
+def attached_rig_of(args: argparse.Namespace) -> Rig:
+    """Return the rig that is attached to args.log. Raise OmnidError if there is none."""
+    from drivers.logs.log_reader import LogReader
+    from omnid.runs.log_rig import attached_rig
+
+    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+        return attached_rig(reader, args.log)
+
+
+# Maps of places.
+def map_file(text: str) -> Path:
+    """Return the map of places of an option; ArgumentTypeError for the name of another kind of map."""
+    if text.endswith(".ply"):
+        raise argparse.ArgumentTypeError(
+            f"{text}: expected a map of places (.omap) to localise in; the points of the 3-D map are written by "
+            "--cloud FILE.ply"
+        )
+    return Path(text)
+
+
+TAGS: Final = option(
+    "--tags",
+    type=Path,
+    metavar="TAGS.toml",
+    setting="places.tags",
+    help="AprilTags (36h11) that are to be landmarks of the map, with names, numbers and sizes; the map keeps them",
+)
+MAP: Final = group(
+    "map of places",
+    option(
+        "--map",
+        type=map_file,
+        metavar="FILE.omap",
+        setting="places.map",
+        help="localise in a map of places and extend it at the end; a file that does not exist is made; the points of "
+        "the 3-D map are written by `omnid replay --cloud FILE.ply`",
+    ),
+    option("--localize-only", action="store_true", setting="places.localize_only", help="leave the map as it is"),
+    TAGS,
+)
+REPLACE: Final = option("--replace", action="store_true", help="replace it, with all places that routes refer to")
