@@ -183,7 +183,7 @@ def limit_blas_threads() -> None:
     """Let BLAS work with one thread, unless the user wants more; it reads the variable when numpy is loaded.
 
     The matrices are small, and its threads wait for the next one without sleeping: see the row `libraries` of
-    `OPENBLAS_NUM_THREADS=2 python -m tests.benchmark.daemon`.
+    `OPENBLAS_NUM_THREADS=2 python -m tests.bench.daemon`.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

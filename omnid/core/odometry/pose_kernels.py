@@ -27,7 +27,7 @@ SMALL_RAD = 1e-4  # For smaller angles the series of exp is as exact as the form
 def robust_weight(squared: float) -> float:
     """Return the weight of a view with a squared Mahalanobis distance: that of the Cauchy kernel.
 
-    Compared with a mixture of two Gaussian distributions in tests/experiments/mixture_noise.py.
+    Compared with a mixture of two Gaussian distributions in tests/bench/paper/mixture_noise.py.
     """
     return 1 / (1 + squared / KERNEL_WIDTH**2)
 

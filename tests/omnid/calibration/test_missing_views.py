@@ -7,7 +7,7 @@ from calib.boards.board import BoardView
 from calib.fit.boards.rig_problem import PairView
 from calib.models.camera import Array
 from omnid.calibration.missing_views import missing_views
-from tests.benchmark.boards_chain import BOARD, board_poses, board_rig
+from tests.bench.boards_chain import BOARD, board_poses, board_rig
 
 RIG = board_rig(21, 0.0)[0]
 

@@ -13,7 +13,7 @@ from calib import se3
 from calib.rig_file import read_rig, write_rig
 from omnid import replay
 from omnid.formats.tum import read_tum
-from tests.benchmark.honesty import too_fast
+from tests.bench.honesty import too_fast
 from tests.conftest import PAIRS
 from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image_message, write_log
 from tests.replay.command import Command

@@ -29,7 +29,7 @@ from omnid.formats.place_file import (
 )
 from omnid.formats.place_rows import checksum, features_row, keyframe_row
 from omnid.formats.ply import write_ply
-from tests.faults.mutation import mutated
+from tests.bench.faults.mutation import mutated
 from tests.omnid.formats.place_maps import RIG, some_places
 from tests.omnid.formats.test_ply import some_points
 

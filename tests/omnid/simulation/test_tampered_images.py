@@ -14,8 +14,8 @@ from omnid.simulation.lockstep import Fault, SimulatedRun, Tamper, simulate
 from omnid.simulation.robot import make_robot
 from omnid.simulation.world import World
 from omnid.simulation.world_file import load_world
-from tests.benchmark.obstacle_stops import ahead
-from tests.faults.images import Frozen, sector
+from tests.bench.faults.images import Frozen, sector
+from tests.bench.obstacle_stops import ahead
 
 SIZE_PX = 256
 STARTS_S = 1.5

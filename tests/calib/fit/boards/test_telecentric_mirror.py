@@ -20,8 +20,8 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.models.wavefront import TERMS, WAVEFRONT_NAMES
 from calib.rig import Rig
-from tests.benchmark.boards_chain import board_rig
-from tests.benchmark.rig_sigmas import projected_views
+from tests.bench.boards_chain import board_rig
+from tests.bench.rig_sigmas import projected_views
 from tests.simulation.mirrors import MirrorCamera
 
 RADIUS_M = 0.03

@@ -1,0 +1,219 @@
+"""Closed-loop drives in lock-step against the truth at the wheels: `python -m tests.bench.drive CASE --seeds 1 2`.
+
+Every case is a script: it arms the robot and sends goals as a person would. A row for each seed:
+what the navigation said at the end, true distance and heading error to the last goal, largest distance of the true
+path to the straight legs, contacts, least clearance; of a time in the dark the way and the error that it added to
+the pose; when slip was noticed, after it began, and how many pairs noticed it at other times. The building is driven
+around by map and path (tests/bench/building_round.py).
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from calib import se3
+from omnid.core.control.heading_controller import wrap_angle
+from omnid.core.navigation.requests import GoalRequest, NavigationFrame
+from omnid.navigation_state import NavigationState
+from omnid.simulation.lockstep import Fault, Moment, Request, SimulatedRun, simulate
+from omnid.simulation.robot import Slip, WheelErrors, make_robot
+from omnid.simulation.vehicle import START_NS
+from omnid.simulation.world import World
+from omnid.simulation.world_file import load_world
+from tests.bench.building_round import building_round
+from tests.bench.results import Cell, Column, ResultTable
+
+Goal = tuple[float, float, float]  # x [m], y [m], heading [deg] in odom
+NOTICED_LATE_S = 0.5  # after its end, within which slip may be noticed
+
+
+@dataclass
+class Goals:
+    """Arms the robot, and sends each goal when the one before is reached."""
+
+    goals: list[Goal]
+    sent: int = 0
+    sent_s: float = 0.0
+
+    def __call__(self, moment: Moment) -> Iterator[Request]:
+        if moment.odometry is None:
+            return
+        if not moment.controller.armed and moment.time_s < 2.0:
+            yield "arm"
+            return
+        state = None if moment.navigation is None else moment.navigation.state
+        ended = state is not None and state.is_end and moment.time_s > self.sent_s + 1.0
+        if self.sent == len(self.goals) and ended:
+            yield "end"
+        ready = self.sent == 0 or (state is NavigationState.REACHED and ended)
+        if moment.controller.armed and ready and self.sent < len(self.goals):
+            x_m, y_m, heading_deg = self.goals[self.sent]
+            self.sent += 1
+            self.sent_s = moment.time_s
+            yield GoalRequest(NavigationFrame.ODOM, x_m, y_m, math.radians(heading_deg))
+
+
+@dataclass
+class Case:
+    """A drive: world of a seed, script, duration, goals, faults, slips."""
+
+    world: Callable[[int], World]
+    drive: Callable[[], Goals]
+    seconds: float
+    goals: list[Goal] = field(default_factory=list)
+    faults: tuple[Fault, ...] = ()
+    slips: tuple[Slip, ...] = ()
+    sensors: bool = True  # odometry of the wheels, and a gyro
+
+
+STRAIGHT: list[Goal] = [(10.0, 0.0, 0.0)]
+SQUARE: list[Goal] = [(2.5, 0.0, 90.0), (2.5, 2.5, 180.0), (0.0, 2.5, -90.0), (0.0, 0.0, 0.0)]
+DARK = Fault("dark", 10.0, 13.0)
+SLIP = Slip(10.0, 11.0, 0.2)
+BUILDING = "building"
+
+
+def corridor(seed: int) -> World:
+    """Return the corridor without its person."""
+    world = load_world("corridor", seed)
+    return World(world.name, world.standing, (), world.start)
+
+
+CASES: dict[str, Case] = {
+    "straight": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT),
+    "square": Case(lambda seed: load_world("room", seed), lambda: Goals(SQUARE), 120.0, SQUARE),
+    "dark": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (DARK,)),
+    "dark without": Case(corridor, lambda: Goals(STRAIGHT), 20.0, STRAIGHT, (DARK,), (), sensors=False),
+    "slip": Case(corridor, lambda: Goals(STRAIGHT), 90.0, STRAIGHT, (), (SLIP,)),
+}
+
+
+def legs_offset_m(truth: np.ndarray, goals: list[Goal]) -> float:
+    """Return the largest distance [m] of true positions (N, 4, 4) from the straight legs between goals."""
+    corners = np.array([(0.0, 0.0), *((x, y) for x, y, _ in goals)])
+    a, along = corners[:-1], np.diff(corners, axis=0)
+    to = truth[:, None, :2, 3] - a
+    share = np.clip((to * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+    return float(np.linalg.norm(to - share[..., None] * along, axis=2).min(axis=1).max())
+
+
+def row(case: Case, run: SimulatedRun) -> list[Cell]:
+    """Return the figures of a drive."""
+    x_m, y_m, heading_rad = run.ticks[-1].pose
+    end = se3.inverse(run.T_world_base[0]) @ se3.transform(se3.rotation_exp([0, 0, heading_rad]), [x_m, y_m, 0.0])
+    ends: list[Cell] = [None, None, None]
+    if case.goals:
+        goal = case.goals[-1]
+        error_deg = math.degrees(wrap_angle(float(se3.yaw(end)) - math.radians(goal[2])))
+        ends = [
+            100 * math.dist(end[:2, 3], goal[:2]),
+            abs(error_deg),
+            100 * legs_offset_m(run.truth_in_odom, case.goals),
+        ]
+    state = f"{run.navigation[-1].state} {run.navigation[-1].reason}".strip() if case.goals and run.navigation else ""
+    moved = np.diff([tick.pose[:2] for tick in run.ticks], axis=0)
+    stops = [line for _, line in run.lines if line.startswith("the wheels stop")]
+    return [
+        state,
+        *ends,
+        float(np.linalg.norm(moved, axis=1).sum()),
+        len(run.contacts),
+        run.clearance_m,
+        dark(case, run),
+        slip(case, run),
+        "; ".join(dict.fromkeys(stops))[:120],
+    ]
+
+
+def dark(case: Case, run: SimulatedRun) -> str:
+    """Return way [m] and error [cm] of the poses of the time in the dark, from the last pair before it on."""
+    times_s = (run.stamps_ns - START_NS) * 1e-9
+    texts = []
+    for fault in case.faults:
+        first, last = np.searchsorted(times_s, (fault.start_s, fault.end_s)) - 1
+        truth, estimate = (se3.inverse(poses[first]) @ poses[last] for poses in (run.T_world_base, run.T_odom_base))
+        way_m = np.linalg.norm(np.diff(run.T_world_base[first : last + 1, :2, 3], axis=0), axis=1).sum()
+        error_m = np.linalg.norm((se3.inverse(truth) @ estimate)[:2, 3])
+        texts.append(f"{way_m:.2f} m, {100 * error_m:.1f} cm")
+    return "; ".join(texts)
+
+
+def slip(case: Case, run: SimulatedRun) -> str:
+    """Return when slip was noticed after it began [s], and how many pairs noticed it at other times."""
+    times_s = (run.stamps_ns - START_NS) * 1e-9
+    at_slips, texts = np.zeros(len(times_s), bool), []
+    for slipped in case.slips:
+        within = (times_s >= slipped.start_s) & (times_s < slipped.end_s + NOTICED_LATE_S)
+        noticed_s = times_s[within & run.slipping]
+        texts.append(f"{noticed_s[0] - slipped.start_s:.1f} s" if len(noticed_s) else "not noticed")
+        at_slips |= within
+    return "; ".join([*texts, str(int((run.slipping & ~at_slips).sum()))])
+
+
+def main() -> None:
+    """Print a table."""
+    parser = argparse.ArgumentParser(prog="python -m tests.bench.drive")
+    parser.add_argument("cases", nargs="+", choices=[*CASES, BUILDING, "all"], metavar="CASE")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--size", type=int, default=512)
+    arguments = parser.parse_args()
+    columns = (
+        Column("case"),
+        Column("seed"),
+        Column("end"),
+        Column("end error", "cm", 1),
+        Column("heading", "deg", 2),
+        Column("off the legs", "cm", 1),
+        Column("way", "m", 2),
+        Column("contacts"),
+        Column("clearance", "m", 2),
+        Column("in the dark"),
+        Column("slip noticed"),
+        Column("stops"),
+        Column("processor time a pair", "s", 2),
+    )
+    table = ResultTable("drive", "A simulated robot in a closed loop", columns)
+    for name in [*CASES, BUILDING] if "all" in arguments.cases else arguments.cases:
+        for seed in arguments.seeds:
+            size = arguments.size
+            cells = round_row(seed, size) if name == BUILDING else drive_row(CASES[name], seed, size)
+            table.add(name, seed, *cells, seed=(f"drive {name}", seed))
+
+
+def drive_row(case: Case, seed: int, size_px: int) -> list[Cell]:
+    """Drive; return the figures."""
+    wheels = WheelErrors(slips=case.slips)
+    robot = replace(make_robot(size_px), wheels=wheels, has_odometry=case.sensors, has_gyro=case.sensors)
+    started_s = time.process_time()
+    run = simulate(case.world(seed), robot, case.drive(), seconds=case.seconds, seed=seed, faults=case.faults)
+    return [*row(case, run), (time.process_time() - started_s) / max(1, len(run.stamps_ns))]
+
+
+def round_row(seed: int, size_px: int) -> list[Cell]:
+    """Drive around the building in its map; return the figures."""
+    started_s = time.process_time()
+    end = building_round(seed, size_px)
+    way_m = np.linalg.norm(np.diff([tick.pose[:2] for tick in end.run.ticks], axis=0), axis=1).sum()
+    return [
+        end.words,
+        100 * end.error_m,
+        math.degrees(end.error_rad),
+        100 * end.off_path_m,
+        float(way_m),
+        len(end.run.contacts),
+        end.run.clearance_m,
+        None,
+        None,
+        end.stops,
+        (time.process_time() - started_s) / end.pairs,
+    ]
+
+
+if __name__ == "__main__":
+    main()

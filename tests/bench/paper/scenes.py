@@ -1,0 +1,152 @@
+"""The scenes of the paper's experiments by name: rig, path and world from one seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.rig import Rig
+from omnid.simulation.rendering.rigs import RIM, make_rig
+from omnid.simulation.rendering.shapes import CEILING_M
+from omnid.simulation.rendering.surfaces import Rectangle, Scene
+from omnid.simulation.rendering.textures import PAINTERS, value_noise
+from tests.bench.paper.building import building, round_trip
+from tests.simulation import paths
+from tests.simulation.builders import corridor
+from tests.simulation.builders import wall as upright
+from tests.simulation.recipes import TURN_DEG, SimulatedRun
+
+WALL_M = 2.0  # section V.B: distance from the cameras to the wall
+WALL_SIZE_M = (9.0, CEILING_M)
+SMOOTH_PX_PER_M = 200.0  # resolution of the smooth wall's texture
+SMOOTH_GREY = (140.0, 30.0)  # mean and standard deviation of the smooth wall
+SMOOTH_SCALE_M = 0.5  # size of the clouds of the smooth wall
+SMOOTH_PERSISTENCE = 0.3  # amplitude of each octave over that of the next coarser one: hardly any fine detail
+TURNS_DEG = tuple(range(0, 181, 9))  # yaw of the pairs after the first, relative to the first pair
+MOVED_TURNS_DEG = (18, 45, 90, 135, 180)  # yaw of the last pairs, which are translated as well
+MOVED_M = (0.05, 0.03)  # their translation, x and y
+
+
+@dataclass(frozen=True, slots=True)
+class RigOptions:
+    """Properties of a rig; the seed decides those that are None."""
+
+    scale: float | None = None  # radius of the horizon in the image, 1 = 27 % of its width
+    baseline_m: float | None = None
+    misaligned: float | None = None  # misalignment: 0 none, 1 up to 1.2 deg and 4 mm
+    xi: float = 1.0  # 1: parabolic mirrors; below: hyperbolic ones under perspective cameras
+
+
+def seeded_rig(seed: int, size: int, options: RigOptions) -> Rig:
+    """Return a rig whose mirror scale, baseline and misalignment are random where the options are None."""
+    rng = np.random.default_rng([seed, 23])
+    scale, baseline, tilt = rng.uniform((0.9, 0.17, 0.3), (1.05, 0.24, 1.2))
+    axis, yaw, x, y = rng.uniform(0, 2 * np.pi), *rng.uniform((-1, -3, -3), (1, 3, 3))
+    misaligned = 1.0 if options.misaligned is None else options.misaligned
+    turned = misaligned * np.array([tilt * np.cos(axis), tilt * np.sin(axis), yaw])
+    # A hyperbolic mirror shows less above the horizon in an image of the same size: a smaller rim keeps all rays valid.
+    rim = RIM if options.xi == 1 else min(RIM, 0.45)
+    return make_rig(
+        size=size,
+        scale=options.scale or scale,
+        baseline_m=options.baseline_m or baseline,
+        rim=rim,
+        xi=options.xi,
+        misaligned_deg=tuple(turned),
+        offset_mm=(misaligned * x, misaligned * y),
+    )
+
+
+def _paper_rig(seed: int, size: int, options: RigOptions) -> Rig:
+    """Return the paper's rig where the options are None: viewpoints at 1.2 m and 1.4 m, no misalignment."""
+    misaligned = 0.0 if options.misaligned is None else options.misaligned
+    return seeded_rig(
+        seed,
+        size,
+        replace(options, scale=options.scale or 1.0, baseline_m=options.baseline_m or 0.2, misaligned=misaligned),
+    )
+
+
+def brick(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return a run before a wall of identical bricks (section V.B)."""
+    return _facing(seed, size, pairs, options, "brick")
+
+
+def control(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return the run of `brick` with a wall texture that does not repeat."""
+    return _facing(seed, size, pairs, options, "granite")
+
+
+def smooth(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return the run of `brick` with a smooth wall: soft clouds without edges, the weakness named in section III.C."""
+    run = _facing(seed, size, pairs, options, "plain")
+    rng = np.random.default_rng([seed, 25])
+    mean, sigma = SMOOTH_GREY
+    texture_size = (round(WALL_SIZE_M[0] * SMOOTH_PX_PER_M), round(WALL_SIZE_M[1] * SMOOTH_PX_PER_M))
+    clouds = value_noise(rng, texture_size, SMOOTH_SCALE_M * SMOOTH_PX_PER_M, SMOOTH_PERSISTENCE)
+    texture = np.clip(np.rint(mean + sigma * clouds), 0, 255).astype(np.uint8)
+    front, *others = run.scene.rectangles
+    return replace(run, scene=Scene((replace(front, texture=texture), *others)))
+
+
+def _facing(seed: int, size: int, pairs: int, options: RigOptions, kind: str) -> SimulatedRun:
+    """Return a run WALL_M before a wall named 'wall'; other walls are plaster. The pairs are 7 cm apart, sideways."""
+    rng = np.random.default_rng([seed, 24])
+    half = WALL_SIZE_M[0] / 2
+    front = upright(rng, kind, (WALL_M, half), (WALL_M, -half))
+    ends = (((-2.5, half), (WALL_M, half)), ((WALL_M, -half), (-2.5, -half)), ((-2.5, -half), (-2.5, half)))
+    others = [upright(rng, "plaster", a, b) for a, b in ends]
+    floor = Rectangle(
+        np.array([-2.5, half, 0]),
+        np.array([WALL_M + 2.5, 0, 0]),
+        np.array([0, -2 * half, 0.0]),
+        PAINTERS["tiles"](rng, (900, 1800), 200.0),
+        "floor",
+    )
+    scene = Scene((replace(front, name="wall"), *others, floor))
+    aside = np.column_stack([np.zeros(pairs), 0.07 * (np.arange(pairs) - (pairs - 1) / 2)])
+    return SimulatedRun(_paper_rig(seed, size, options), paths.planar_poses(aside, np.zeros(pairs)), scene)
+
+
+def two_walls(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return 5 cm steps along a spline between two walls, with a turn of 94 degrees just before the end (V.C)."""
+    poses = paths.spline_path(seed, pairs, 0.05, turn=(max(1, pairs - 2), TURN_DEG))
+    return SimulatedRun(seeded_rig(seed, size, options), poses, corridor(seed, max(8.0, 0.05 * pairs + 3.2)))
+
+
+def turns(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return a first pair with yaw 0, pairs turned left by TURNS_DEG, and pairs turned by MOVED_TURNS_DEG and moved.
+
+    Section IV.F. Tracking from the first pair to another is a turn to the left, the other way a turn to the right.
+    """
+    angles = np.deg2rad([0, *TURNS_DEG, *MOVED_TURNS_DEG])
+    xy = np.zeros((len(angles), 2))
+    xy[-len(MOVED_TURNS_DEG) :] = MOVED_M
+    return SimulatedRun(seeded_rig(seed, size, options), paths.planar_poses(xy, angles)[:pairs], corridor(seed))
+
+
+def building_run(seed: int, size: int, pairs: int, options: RigOptions) -> SimulatedRun:
+    """Return one round through the corridor of a building, back to its start (section V.D)."""
+    plan, scene = building(seed)
+    return SimulatedRun(seeded_rig(seed, size, options), round_trip(seed, plan, pairs), scene)
+
+
+Recipe = Callable[[int, int, int, RigOptions], SimulatedRun]
+EXPERIMENTS: dict[str, tuple[Recipe, int]] = {  # recipe and number of pairs
+    "brick": (brick, 3),
+    "control": (control, 3),
+    "smooth": (smooth, 3),
+    "two_walls": (two_walls, 99),
+    "turns": (turns, 1 + len(TURNS_DEG) + len(MOVED_TURNS_DEG)),
+    "building": (building_run, 349),
+}
+
+
+def build(
+    name: str, seed: int, size: int = 768, pairs: int | None = None, options: RigOptions | None = None
+) -> SimulatedRun:
+    """Return the run of a name; pairs None: as many as the paper has."""
+    recipe, default_pairs = EXPERIMENTS[name]
+    return recipe(seed, size, pairs or default_pairs, options or RigOptions())

@@ -1,1 +1,0 @@
-"""The experiments of Dang et al. 2012, section V, rendered by POV-Ray and measured: `python -m tests.experiments`."""

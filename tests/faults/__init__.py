@@ -1,1 +1,0 @@
-"""The campaign of attacks and faults against the daemon: `python -m tests.faults --help`."""
