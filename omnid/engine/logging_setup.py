@@ -1,8 +1,8 @@
 """Logging of the programs: one line per record on stderr, with the priorities of journald where it reads them.
 
-Modules log by `log(level, text)` or a logger of `logging`; a program calls `configure_logging` once. Lines that differ
-in their numbers only are written a few times a minute and then counted: a fault that repeats at the rate of the images
-does not fill the disk.
+Modules log by `log(level, text)` or a logger of `logging`; a program calls `configure_logging` once. Of lines that
+differ in their numbers only, a few a minute are written: a fault that repeats at the rate of the images does not fill
+the disk.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import os
 import re
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Final, TextIO, TypeAlias
 
 from omnid.plain_text import one_line
@@ -24,13 +24,10 @@ LOGGER: Final = logging.getLogger("omnid")
 Report: TypeAlias = Callable[[int, str], None]  # level of `logging` and one line
 
 # Levels of logging and the priorities of syslog and journald (RFC 5424, section 6.2.1).
-_PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-_DEBUG_PRIORITY: Final = 7
-
+_PRIORITIES: Final = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (0, 7))
 _BURST: Final = 5  # Most lines of a kind that are written within a period.
 _PERIOD_S: Final = 60.0
-_MAX_KINDS: Final = 256  # Most kinds of lines whose counts are kept; the kind not seen for longest is dropped.
-_COLUMNS: Final = 80  # Used for a terminal that does not report its size.
+_MAX_KINDS: Final = 256  # Most kinds of lines that are counted; the counts then begin again.
 _ERASE: Final = "\r\x1b[K"  # Erases the line of a terminal that the cursor is in.
 _MAX_LENGTH: Final = 4000  # Most characters of a line.
 _NUMBER = re.compile(r"\d+")
@@ -54,15 +51,6 @@ def configure_logging() -> None:
     LOGGER.setLevel(logging.INFO)
 
 
-@dataclass(slots=True)
-class _Kind:
-    """Count of the lines that differ in their numbers only."""
-
-    since_s: float
-    written: int = 0
-    suppressed: int = 0  # since the last line written
-
-
 class StderrHandler(logging.Handler):
     """Writes records as single lines with a rate limit per kind of line."""
 
@@ -70,68 +58,58 @@ class StderrHandler(logging.Handler):
         """stream: None for sys.stderr at the time of writing."""
         super().__init__()
         self._stream, self._clock_s = stream, clock_s
-        self._kinds: dict[str, _Kind] = {}  # by the line without its numbers; the kind seen last is the last one
+        self._kinds: Counter[str] = Counter()  # lines of this period, by the line without its numbers
+        self._since_s = -_PERIOD_S
+        self._suppressed = 0  # lines in this period
         self._shown = ""  # line that is shown below the others on a terminal
-        self.suppressed = 0  # lines in all
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record, unless too many of its kind were written within the period."""
-        text = record.getMessage()
-        if record.name != LOGGER.name:
-            text = f"{record.name}: {text}"
-        line = one_line(text, _MAX_LENGTH)
-        if getattr(record, "unlimited", False):
+        name = "" if record.name == LOGGER.name else f"{record.name}: "
+        line = one_line(f"{name}{record.getMessage()}", _MAX_LENGTH)
+        if getattr(record, "unlimited", False) or self._passes(_NUMBER.sub("#", line)):
             self._write(record.levelno, line)
-        else:
-            self._write_limited(record.levelno, line)
 
     def show(self, line: str) -> None:
         """Keep a line below the others of a terminal until it is replaced; "" removes it."""
         self.acquire()
         try:
             stream = self._stream or sys.stderr
-            with suppress(OSError, ValueError):
-                columns = os.get_terminal_size(stream.fileno()).columns or _COLUMNS
+            with suppress(OSError, ValueError):  # it is no terminal
+                columns = os.get_terminal_size(stream.fileno()).columns or 80  # 0: unknown
                 # A longer line would fill a second row, which _ERASE does not reach.
-                self._shown = _fitting(one_line(line, _MAX_LENGTH), max(0, columns - 1))
+                self._shown = one_line(line, _MAX_LENGTH)[: max(0, columns - 1)]
                 stream.write(f"{_ERASE}{self._shown}")
                 stream.flush()
         finally:
             self.release()
 
     def flush(self) -> None:
-        """Report how many lines of each kind were suppressed; `logging` calls this at the end of the program."""
+        """Report how many lines were left out; `logging` calls this at the end of the program."""
         self.acquire()
         try:
-            for key, kind in self._kinds.items():
-                if kind.suppressed:
-                    self._write(logging.INFO, f"{kind.suppressed} more of this kind: {key}")
-                    kind.suppressed = 0
+            if self._suppressed:
+                self._write(logging.INFO, f"{self._suppressed} more lines like the last ones were left out")
+                self._suppressed = 0
         finally:
             self.release()
 
-    def _write_limited(self, level: int, line: str) -> None:
-        kind = self._kind(_NUMBER.sub("#", line), self._clock_s())
-        if kind.written == _BURST:
-            kind.suppressed += 1
-            self.suppressed += 1
-            return
-        self._write(level, f"{line} (and {kind.suppressed} more of this kind)" if kind.suppressed else line)
-        kind.written, kind.suppressed = kind.written + 1, 0
-
-    def _kind(self, key: str, now_s: float) -> _Kind:
-        """Return the count of a kind of lines, within the present period."""
-        kind = self._kinds.pop(key, None) or _Kind(now_s)
-        if now_s - kind.since_s > _PERIOD_S:
-            kind.since_s, kind.written = now_s, 0
-        self._kinds[key] = kind
-        if len(self._kinds) > _MAX_KINDS:
-            del self._kinds[next(iter(self._kinds))]
-        return kind
+    def _passes(self, kind: str) -> bool:
+        now_s = self._clock_s()
+        if now_s - self._since_s > _PERIOD_S or len(self._kinds) >= _MAX_KINDS:
+            self.flush()
+            self._since_s = now_s
+            self._kinds.clear()
+        self._kinds[kind] += 1
+        self._suppressed += self._kinds[kind] > _BURST
+        return self._kinds[kind] <= _BURST
 
     def _write(self, level: int, line: str) -> None:
         stream = self._stream or sys.stderr
-        prefix = f"<{priority(level)}>" if is_journal(stream) else f"omnid: {_label(level)}"
+        if is_journal(stream):
+            prefix = f"<{priority(level)}>"
+        else:
+            prefix = "omnid: warning: " if level == logging.WARNING else "omnid: "
         with suppress(OSError, ValueError):  # a closed stream or a full disk must not end the program
             erase = _ERASE if self._shown else ""
             stream.write(f"{erase}{prefix}{line}\n{self._shown}")
@@ -140,18 +118,7 @@ class StderrHandler(logging.Handler):
 
 def priority(level: int) -> int:
     """Return the priority of syslog and journald for a level of `logging`."""
-    return next((number for least, number in _PRIORITIES if level >= least), _DEBUG_PRIORITY)
-
-
-def _fitting(line: str, columns: int) -> str:
-    """Return a line, without its last parts where they do not fit."""
-    if len(line) <= columns:
-        return line
-    return line[: columns + 1].rpartition(", ")[0] or line[:columns]
-
-
-def _label(level: int) -> str:
-    return "warning: " if level == logging.WARNING else ""
+    return next(number for least, number in _PRIORITIES if level >= least)
 
 
 def is_journal(stream: TextIO) -> bool:

@@ -16,8 +16,6 @@ from omnid.engine.logging_setup import Report
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.sensor_sources import SensorSources
 from omnid.runs.session import Session
-from omnid.sinks.command_log import command_recorder
-from omnid.sinks.recorder import Recorder
 from omnid.transport.bus import Bus
 from omnid.transport.commands import CommandReceiver
 from omnid.transport.navigation_commands import NavigationReceiver
@@ -60,18 +58,14 @@ class LiveCommands:
             )
             controller.statistics.take_arm_answer = self._answer_arm
 
-    def subscribe(self, recorder: Recorder | None, sensors: SensorSources, saver: MapSaver | None) -> None:
-        """Begin to receive; a command is recorded after it was passed on, because a stop must not wait."""
+    def subscribe(self, sensors: SensorSources, saver: MapSaver | None) -> None:
+        """Begin to receive."""
         sources = self._session.config.controller.sources.names
         topics = command_topics(sources) if self.commands else {**SENSOR_TOPICS, **MAP_TOPICS}
         table: dict[str, Receive] = {}
         if self.commands:
             navigate = self.navigation.receive if PLANNER in sources else _refusing(NO_PLANNER)
             table = {topic: self.commands.receive for topic in topics} | dict.fromkeys(NAVIGATION_TOPICS, navigate)
-            if recorder is not None:
-                record = command_recorder(recorder, self._session.now_ns, topics)
-                table = {topic: _recorded(receive, record) for topic, receive in table.items()}
-        # Samples are recorded with the poses.
         table |= {
             topic: lambda request: sensors.receiver.receive(request.topic, request.payload) for topic in SENSOR_TOPICS
         }
@@ -101,15 +95,6 @@ class LiveCommands:
         if not self._session.graph.telemetry.of("pair").processed:
             return "no images have come from the cameras (`omnid listen`, `omnid doctor`)"
         return "the first images are being processed: try again in a moment (`omnid listen` tells what they show)"
-
-
-def _recorded(receive: Receive, record: Callable[[str, bytes], None]) -> Receive:
-    def receive_and_record(request: Request) -> Answer | None:
-        answer = receive(request)
-        record(request.topic, request.payload)
-        return answer
-
-    return receive_and_record
 
 
 def _refusing(reason: str) -> Receive:

@@ -94,7 +94,7 @@ class LiveWiring:
             files.save_map = stages.places.want_copy
         # 4. From the bus: commands, requests, samples.
         received = LiveCommands(session, self._bus, self._controller, files.put, self._report)
-        received.subscribe(self._recorder, self._sensors, saver)
+        received.subscribe(self._sensors, saver)
         # 5. Status.
         self._add_status(stages, exposure, received, saver)
 

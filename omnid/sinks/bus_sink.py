@@ -9,9 +9,7 @@ import cv2
 from drivers.frame import Frame
 from drivers.motor import VelocityCommand
 from omnid.messages import OdometryUpdate, PlaceUpdate
-from omnid.sinks.driven_path import DrivenPath
-from omnid.sinks.encoder import Encoder, Outgoing, StateReports
-from omnid.sinks.static_frames import StaticFrames
+from omnid.sinks.encoder import Encoder, Outgoing, StateReports, static_frames
 from omnid.transport.bus import Bus
 from omnid.transport.codec import clock_cdr
 from omnid.transport.features_attachment import features_to_bytes
@@ -27,10 +25,10 @@ class BusSink:
         """clock: the kind of message, from one thread, by whose stamps /clock advances, where the bus has it."""
         self._clock, self._time_ns = clock, 0
         self._bus, self._encode, self._states = bus, encode, StateReports(encode.offset_ns)
-        self._static, self._path = StaticFrames(encode), DrivenPath(encode)
+        self._gave_frames = False
 
     def process(self, message: Outgoing) -> None:
-        """Publish a message; a pose with its attachment, and what has changed: states, static frames, the path."""
+        """Publish a message; a pose with its attachment, and what has changed: states and static frames."""
         # 1. The clock, before what is stamped by it.
         if self._clock is not None and isinstance(message, self._clock) and message.stamp_ns > self._time_ns:
             self._time_ns = message.stamp_ns
@@ -39,13 +37,13 @@ class BusSink:
         attachment = _attachment(message).to_bytes() if isinstance(message, OdometryUpdate) else None
         for topic, _, payload in self._encode(message):
             self._bus.publish(topic, payload, attachment if topic == "odom" else None)
-        # 3. What follows from it, where it has changed.
-        if isinstance(message, OdometryUpdate | PlaceUpdate):
-            for topic, _, payload in self._states(message):
-                self._bus.publish(topic, payload)
-        if isinstance(message, OdometryUpdate):
-            for topic, _, payload in (*self._static(message.stamp_ns), *self._path(message)):
-                self._bus.publish(topic, payload)
+        # 3. Where they have changed: the state, and once the static frames.
+        changed = [*self._states(message)] if isinstance(message, OdometryUpdate | PlaceUpdate) else []
+        if isinstance(message, OdometryUpdate) and not self._gave_frames:
+            self._gave_frames = True
+            changed.append(static_frames(self._encode, message.stamp_ns))
+        for topic, _, payload in changed:
+            self._bus.publish(topic, payload)
 
 
 def _attachment(odometry: OdometryUpdate) -> PoseAttachment:

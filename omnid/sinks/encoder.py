@@ -9,6 +9,7 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from calib import se3
 from calib.rig import Rig
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
@@ -153,6 +154,19 @@ class Encoder:
             yield OutgoingMessage("plan", navigation_codec.PATH_SCHEMA, payload)
 
 
+def static_frames(encode: Encoder, stamp_ns: int) -> OutgoingMessage:
+    """Return the frames that do not move on the robot, as /tf_static: base_link -> rig -> lower and upper camera.
+
+    stamp_ns: of a pose.
+    """
+    edges = [FrameTransform("base_link", "rig", encode.T_base_rig)]
+    if encode.rig is not None:
+        cameras = {"lower": encode.rig.lower, "upper": encode.rig.upper}
+        edges += [FrameTransform("rig", name, se3.inverse(camera.T_cam_rig)) for name, camera in cameras.items()]
+    payload = codec.transform_cdr(stamp_ns + encode.offset_ns, edges)
+    return OutgoingMessage("/tf_static", codec.TRANSFORM_SCHEMA, payload)
+
+
 class StateReports:
     """Yields a status when the state of the odometry, or of the pose in the map, changes; offset_ns: the Encoder's."""
 
@@ -163,32 +177,24 @@ class StateReports:
 
     def __call__(self, message: OdometryUpdate | PlaceUpdate) -> Iterator[OutgoingMessage]:
         """Yield the status of a pose if its state differs from the last one."""
-        yield from self._of_odometry(message) if isinstance(message, OdometryUpdate) else self._in_map(message)
-
-    def _in_map(self, update: PlaceUpdate) -> Iterator[OutgoingMessage]:
-        if update.state != self._last_in_map:
-            self._last_in_map = update.state
-            status = DiagnosticStatus(
-                PLACES,
-                codec.ERROR if update.state is MapState.LOST else codec.OK,
-                update.state,
-                {Key.STATE: update.state},
-            )
-            yield status_report(update.stamp_ns + self._offset_ns, [status])
-
-    def _of_odometry(self, odometry: OdometryUpdate) -> Iterator[OutgoingMessage]:
-        now = (odometry.state, odometry.reset_counter)
-        if now != self._last:
-            self._last = now
-            level = list(TrackingState).index(odometry.state)
+        if isinstance(message, PlaceUpdate):
+            if message.state == self._last_in_map:
+                return
+            self._last_in_map = message.state
+            level = ERROR if message.state is MapState.LOST else OK
+            status = DiagnosticStatus(PLACES, level, message.state, {Key.STATE: message.state})
+        else:
+            if (message.state, message.reset_counter) == self._last:
+                return
+            self._last = message.state, message.reset_counter
             values: dict[str, str] = {
-                Key.STATE: odometry.state,
-                Key.RESETS: str(odometry.reset_counter),
-                Key.INLIERS: str(odometry.inliers),
-                Key.TRACKED: str(odometry.tracks),
+                Key.STATE: message.state,
+                Key.RESETS: str(message.reset_counter),
+                Key.INLIERS: str(message.inliers),
+                Key.TRACKED: str(message.tracks),
             }
-            status = DiagnosticStatus(ODOMETRY, level, odometry.state, values)
-            yield status_report(odometry.stamp_ns + self._offset_ns, [status])
+            status = DiagnosticStatus(ODOMETRY, list(TrackingState).index(message.state), message.state, values)
+        yield status_report(message.stamp_ns + self._offset_ns, [status])
 
 
 def status_report(stamp_ns: int, statuses: Sequence[DiagnosticStatus]) -> OutgoingMessage:

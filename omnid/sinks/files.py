@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.logs.file_lock import is_locked, lock
-from drivers.logs.image_folder import IMAGE_SUFFIXES, STAMP_FILES
+from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
@@ -26,17 +26,12 @@ from omnid.messages import MapUpdate, OdometryUpdate
 
 Named: TypeAlias = Sequence[tuple[str, Path]]
 REPLACED: Final = ("--cloud", "--plan", "--ply", "--grid")  # options of files that are replaced at once
-# Options of files of one format, and how such a file is named.
-SUFFIXES: Final = {"--cloud": ".ply", "--ply": ".ply", "--plan": ".png", "--record": ".mcap", "--mcap": ".mcap"}
-# What is read of a folder: images, logs, lists of stamps. A plan is an image beside the folders of a log, not in them.
-READ_SUFFIXES: Final = IMAGE_SUFFIXES.union(LOG_SUFFIXES)
-FORMATS: Final = {*SUFFIXES.values(), ".txt", ".tum", ".csv", ".json", ".jpg", ".pdf", ".pcd", ".db3", ".bag", ".toml"}
 
 
 def check_outputs(outputs: Named, inputs: Named) -> None:
     """Check that all outputs (option, path) can be written, and none is another one, an input (name, path) or in use.
 
-    Of an input that is a folder, what is read in it and in its folders counts as well. Raises OmnidError.
+    Of an input that is a folder, logs and images in it are inputs as well. Raises OmnidError.
     """
     taken = {_identity(path): what for what, path in inputs}
     for option, path in outputs:
@@ -44,19 +39,11 @@ def check_outputs(outputs: Named, inputs: Named) -> None:
         other = taken.setdefault(_identity(path), option)
         if other != option and path.exists() == path.is_file():
             raise OmnidError(f"{option} {path}: this is {other} as well; name another file")
-        if folder := next((folder for _, folder in inputs if _is_read_in(folder, option, path)), None):
-            raise OmnidError(f"{option} {path}: this is a file of {folder}, which is read; name another file")
-        if path.suffix.lower() in FORMATS - {SUFFIXES.get(option, path.suffix.lower())}:
-            raise OmnidError(f"{option} {path}: expected a name that ends with {SUFFIXES[option]}")
-
-
-def _is_read_in(folder: Path, option: str, path: Path) -> bool:
-    """True if an output is a file that is there and that a run which reads the folder may read."""
-    if option == "--plan" or not (folder.is_dir() and path.is_file()):
-        return False
-    place = path.resolve()
-    is_near = folder.resolve() in (place.parent, place.parent.parent)
-    return is_near and (place.suffix.lower() in READ_SUFFIXES or place.name in STAMP_FILES)
+        folders = [folder for _, folder in inputs if folder.is_dir() and folder.resolve() in path.resolve().parents]
+        # A plan is an image beside the folders of a log, not in them.
+        is_read = path.suffix.lower() in LOG_SUFFIXES or (path.suffix.lower() in IMAGE_SUFFIXES and option != "--plan")
+        if folders and is_read and path.is_file():
+            raise OmnidError(f"{option} {path}: this is a file of {folders[0]}, which is read; name another file")
 
 
 def on_stdout(outputs: Named) -> bool:
@@ -78,35 +65,27 @@ def _identity(path: Path) -> tuple[int, int] | str:
 
 
 def _require_writable(option: str, path: Path) -> None:
+    """Raise OmnidError where a file cannot be written; leave no file behind."""
+    if str(path) == "-":
+        raise OmnidError(f"{option} -: expected the name of a file; use /dev/stdout for the standard output")
     try:
-        _require_file(option, path)
-        _try_to_open(path)
+        if path.is_dir():
+            raise OmnidError(f"{option} {path}: expected a file to write, found a folder")
+        if not path.parent.is_dir():
+            raise OmnidError(f"{option} {path}: there is no folder {path.parent}; make it first")
+        if path.exists() and not path.is_file():  # not opened: a pipe that is opened and closed would end its reader
+            if option in REPLACED:
+                raise OmnidError(f"{option} {path}: expected a file that can be replaced, found a device or a pipe")
+            return
+        is_new = not path.exists()
+        with path.open("ab"):
+            pass
+        if is_new:
+            os.unlink(os.path.realpath(path))  # where path is a link, it stays one
     except OSError as error:
         raise OmnidError(f"{option} {path}: cannot be written: {error.strerror or error}; name another file") from error
     if is_locked(path):
         raise OmnidError(f"{option} {path}: another program is writing it; name another file, or wait")
-
-
-def _require_file(option: str, path: Path) -> None:
-    if str(path) == "-":
-        raise OmnidError(f"{option} -: expected the name of a file; use /dev/stdout for the standard output")
-    if path.is_dir():
-        raise OmnidError(f"{option} {path}: expected a file to write, found a folder")
-    if not path.parent.is_dir():
-        raise OmnidError(f"{option} {path}: there is no folder {path.parent}; make it first")
-    if option in REPLACED and path.exists() and not path.is_file():
-        raise OmnidError(f"{option} {path}: expected a file that can be replaced, found a device or a pipe")
-
-
-def _try_to_open(path: Path) -> None:
-    """Raise OSError where the file cannot be opened for writing; leave no file behind."""
-    if path.exists() and not path.is_file():
-        return  # a pipe that is opened and closed would end its reader
-    fresh = not path.exists()
-    with path.open("ab"):
-        pass
-    if fresh:
-        os.unlink(os.path.realpath(path))  # where path is a link, it stays one
 
 
 class TrajectoryFile:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final, Protocol, TypeAlias
 
@@ -14,9 +13,7 @@ from drivers.logs.rotating_log import RotatingLogState
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate, PlaceUpdate
-from omnid.sinks.driven_path import DrivenPath
-from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, status_report
-from omnid.sinks.static_frames import StaticFrames
+from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, static_frames, status_report
 from omnid.transport.codec import ERROR, OK
 from omnid.transport.image_codec import image_cdr, image_topic
 from omnid.transport.records import DiagnosticStatus
@@ -26,9 +23,6 @@ Recorded: TypeAlias = Frame | Outgoing
 FinalStatus: TypeAlias = Callable[[RunStatistics], Sequence[DiagnosticStatus]]
 
 _PENDING: Final = 256  # messages of other threads that may wait
-_HELD: Final = 128  # more than these are written before their time: the clock may have been set
-_PATH_S_PER_POSE: Final = 0.02
-_POSE_AGE_NS: Final = 10**9  # a pose is recorded after it has been found, seldom later than that after its images
 
 
 class MessageLog(Protocol):
@@ -93,9 +87,7 @@ class Recorder:
         """offset_ns: from the stamps of the messages to Unix time; the encoder has the same."""
         self._log, self._robot, self._encode = log, robot, encode
         self._offset_ns, self._skip_invalid = offset_ns, skip_invalid
-        self._states = StateReports()
-        self._static: StaticFrames | None = None  # of the file that is written
-        self._path = DrivenPath(encode, _PATH_S_PER_POSE) if encode is not None else None
+        self._states = StateReports(offset_ns)
         self._added: deque[tuple[OutgoingMessage, int]] = deque(maxlen=_PENDING)
         self._files = 0
         self._newest_ns = 0
@@ -119,19 +111,15 @@ class Recorder:
         return DiagnosticStatus(RECORDING, level, state.problem or state.status, values)
 
     def process(self, message: Recorded) -> None:
-        """Record a message and, for a pose, the state of the odometry where it has changed."""
-        # 1. Messages of others that were stamped before.
+        """Record a message and, for a pose, its state where it has changed or a new file has begun."""
         stamp_ns = message.stamp_ns + self._offset_ns
-        is_pose = isinstance(message, OdometryUpdate)
-        self._write_added(stamp_ns if is_pose else stamp_ns - _POSE_AGE_NS)
-        # 2. The message, and for poses static frames, path and states where they have changed.
+        self._write_added()
         try:
             self._write(self._encoded(message, stamp_ns), stamp_ns)
             if isinstance(message, OdometryUpdate | PlaceUpdate) and self._encode is not None:
                 if isinstance(message, OdometryUpdate):
                     self._statistics.process(message)
-                    self._write(self._frames_and_path(message), stamp_ns)
-                self._write(self._state_reports(replace(message, stamp_ns=stamp_ns)), stamp_ns)
+                self._write(self._state(message, self._encode), stamp_ns)
             self._newest_ns = max(self._newest_ns, stamp_ns)
         except OmnidError:  # for example a stamp that is not a time
             if not self._skip_invalid:
@@ -139,16 +127,12 @@ class Recorder:
             self.invalid += 1
 
     def add(self, message: OutgoingMessage, stamp_ns: int) -> None:
-        """Record an encoded message at its Unix time, once the poses have reached that time; from any thread.
-
-        The state of the odometry is recorded at the time of its images: statuses in the log keep the order of time.
-        """
+        """Record an encoded message at its Unix time; from any thread."""
         self._added.append((message, stamp_ns))
 
     def finish(self) -> None:
         """Write the final status and complete the last file."""
-        if self._path is not None:
-            self._write(self._path.finish(), self._newest_ns)
+        self._write_added()
         if self.final_status is not None and self.state.messages:
             self._write([status_report(self._newest_ns, self.final_status(self._statistics))], self._newest_ns)
         self.close()
@@ -158,9 +142,8 @@ class Recorder:
         self._write_added()
         self._log.close()
 
-    def _write_added(self, until_ns: int | None = None) -> None:
-        """Write the messages that were added, up to a Unix time."""
-        while self._added and (until_ns is None or self._added[0][1] <= until_ns or len(self._added) > _HELD):
+    def _write_added(self) -> None:
+        while self._added:
             message, stamp_ns = self._added.popleft()
             self._write([message], stamp_ns)
 
@@ -169,20 +152,12 @@ class Recorder:
             return [OutgoingMessage(image_topic(message), *image_cdr(message, stamp_ns))]
         return self._encode(message) if self._encode is not None else []
 
-    def _state_reports(self, pose: OdometryUpdate | PlaceUpdate) -> Iterable[OutgoingMessage]:
-        """The state of the odometry or in the map when it changes, and once in every file."""
-        self._notice_new_file()
-        return self._states(pose)
-
-    def _frames_and_path(self, pose: OdometryUpdate) -> Iterable[OutgoingMessage]:
-        """The static frames, once in every file and when they change, and the driven path as it grows."""
-        self._notice_new_file()
-        assert self._static is not None and self._path is not None
-        return [*self._static(pose.stamp_ns), *self._path(pose)]
-
-    def _notice_new_file(self) -> None:
-        if self._files != self.state.files and self._encode is not None:
-            self._files, self._states, self._static = self.state.files, StateReports(), StaticFrames(self._encode)
+    def _state(self, pose: OdometryUpdate | PlaceUpdate, encode: Encoder) -> Iterator[OutgoingMessage]:
+        """Yield the state of a pose where it changes; in every file once, and there with the static frames."""
+        if isinstance(pose, OdometryUpdate) and self._files != self.state.files:
+            self._files, self._states = self.state.files, StateReports(self._offset_ns)
+            yield static_frames(encode, pose.stamp_ns)
+        yield from self._states(pose)
 
     def _write(self, messages: Iterable[OutgoingMessage], stamp_ns: int) -> None:
         for topic, schema, payload in messages:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from struct import pack
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -18,16 +17,6 @@ PATH_SCHEMA: Final = "nav_msgs/msg/Path"
 STRING_SCHEMA: Final = "std_msgs/msg/String"
 MAX_PATH_POSES: Final = 10_000
 _MOST_TILT: Final = 0.05  # Largest x and y of a quaternion that counts as a turn about z: a tilt of 6 degrees.
-_PATH_FRAME: Final = "odom"
-# A PoseStamped of this frame: 17 bytes of header, padded to the 8 bytes of doubles, and 7 doubles.
-_POSE: Final = np.dtype(
-    {
-        "names": ["sec", "nanosec", "length", "frame", "pose"],
-        "formats": ["<i4", "<u4", "<u4", "S5", ("<f8", 7)],
-        "offsets": [0, 4, 8, 12, 24],
-        "itemsize": 80,
-    }
-)
 
 
 class PlanarGoal(NamedTuple):
@@ -123,15 +112,3 @@ def _heading(pose: ros.geometry_msgs__msg__Pose) -> float | None:
     if not abs(math.hypot(*q) - 1.0) < codec.QUATERNION_TOLERANCE or max(abs(q[0]), abs(q[1])) > _MOST_TILT:
         raise OmnidError(f"orientation {q}: expected a unit quaternion about z, or all zeros; check the sender")
     return float(se3.yaw(se3.transform(se3.rotation(q), (0.0, 0.0, 0.0))))
-
-
-def driven_path_cdr(stamp_ns: int, stamps_ns: NDArray[np.int64], poses: NDArray[np.float64]) -> bytes:
-    """Encode poses (N, 7), x y z [m] and quaternion x y z w, with their stamps (N,), in odom.
-
-    Raise OmnidError where stamp_ns does not fit a ROS time.
-    """
-    head = codec.message_cdr(ros.nav_msgs__msg__Path(codec.header_message(stamp_ns, _PATH_FRAME), []), PATH_SCHEMA)
-    entries = np.zeros(len(poses), _POSE)
-    entries["sec"], entries["nanosec"] = np.divmod(stamps_ns, codec.NS_PER_S)
-    entries["length"], entries["frame"], entries["pose"] = len(_PATH_FRAME) + 1, _PATH_FRAME.encode(), poses
-    return b"".join((head[:-4], pack("<I", len(poses)), entries.tobytes()))

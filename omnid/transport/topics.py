@@ -31,7 +31,6 @@ PUBLISHED: Final = {
     MAP_POSE: Topic(codec.MAP_POSE_SCHEMA, latched=True),
     "/tf": Topic(codec.TRANSFORM_SCHEMA, realtime=True),
     "/tf_static": Topic(codec.TRANSFORM_SCHEMA, latched=True, transient_local=True),
-    "path": Topic(navigation_codec.PATH_SCHEMA, latched=True),
     "status": Topic(codec.DIAGNOSTICS_SCHEMA, latched=True),
     "cloud": Topic(codec.POINT_CLOUD_SCHEMA, latched=True),
     "map": Topic(codec.GRID_SCHEMA, latched=True, transient_local=True),

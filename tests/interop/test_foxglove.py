@@ -23,7 +23,6 @@ TOPICS = {
     "map": "RosOccupancyGrid",
     "cloud": "PointCloud",
     "odom": "Pose",
-    "path": "Poses",
     "plan": "Poses",
     "scan": "LaserScan",
 }

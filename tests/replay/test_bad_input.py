@@ -172,20 +172,6 @@ def test_refuses_an_unwritable_output_before_the_run(omnid: Command, tmp_path: P
     assert kept.read_text() == "previous result" and list(tmp_path.iterdir()) == [kept]
 
 
-@pytest.mark.parametrize(("option", "suffix"), [("--cloud", ".ply"), ("--plan", ".png"), ("--record", ".mcap")])
-def test_a_file_is_not_named_as_one_of_another_format(
-    omnid: Command, tmp_path: Path, scene: Path, option: str, suffix: str
-) -> None:
-    error = omnid.refused("replay", scene / "log.mcap", option, tmp_path / "out.txt")
-    assert f"{option} {tmp_path / 'out.txt'}: expected a name that ends with {suffix}" in error
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["drive_1.5mps", "run.2026-10-07", "out.MCAP", "out"])
-def test_other_names_are_the_users(tmp_path: Path, name: str) -> None:
-    check_outputs([("--record", tmp_path / name)], [])
-
-
 def test_a_refused_run_leaves_no_files(omnid: Command, tmp_path: Path, scene: Path) -> None:
     omnid.refused("replay", scene / "log.mcap", "--tum", tmp_path / "fresh", "--record", tmp_path / "absent" / "x")
     assert list(tmp_path.iterdir()) == []
@@ -237,10 +223,8 @@ def test_does_not_overwrite_its_inputs(omnid: Command, tmp_path: Path, scene: Pa
     assert {path: path.read_bytes() for path in before} == before
 
 
-@pytest.mark.parametrize("name", ["timestamps.txt", "lower/1.5.png", "bag_0.db3"])
-def test_what_is_read_of_a_folder_is_no_output(omnid: Command, tmp_path: Path, name: str) -> None:
-    read = tmp_path / name
-    read.parent.mkdir(exist_ok=True)
+def test_a_log_of_a_folder_that_is_read_is_no_output(omnid: Command, tmp_path: Path) -> None:
+    read = tmp_path / "bag_0.db3"
     read.write_text("0.1")
     assert f"this is a file of {tmp_path}, which is read" in omnid.refused("replay", tmp_path, "--tum", read)
     assert read.read_text() == "0.1"

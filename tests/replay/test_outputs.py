@@ -145,7 +145,6 @@ def test_record_is_whole_with_rig_configuration_and_summary(omnid: Command, tmp_
         "/rover/scan": counts["/rover/scan"],
         "/rover/moving": counts["/rover/scan"],
         "/tf_static": 1,
-        "/rover/path": counts["/rover/path"],
     }
     assert counts["/rover/scan"] == FEW_PAIRS  # ten a second, as the pairs are
     assert last.value(SUMMARY, "poses") == last.value(stage_name("odometry"), "processed") == str(FEW_PAIRS)

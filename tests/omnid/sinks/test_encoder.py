@@ -1,27 +1,33 @@
-"""The encoder: which messages are made of an update, and the state of the navigation as a status entry."""
+"""Which ROS 2 messages are made of an update, and the poses of a run in arrays."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from calib import se3
 from drivers.motor import VelocityCommand
 from omnid.core.mapping.voxel_map import MapPoints
-from omnid.messages import MapUpdate, NavigationUpdate, RequestAnswer
+from omnid.messages import MapUpdate, NavigationUpdate, OdometryUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
-from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, navigation_status
+from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, navigation_status, static_frames
+from omnid.sinks.pose_collector import PoseCollector
+from omnid.tracking_state import TrackingState
 from omnid.transport.codec import ERROR, OK, WARN
+from tests.simulation import make_rig
 
 OFFSET_NS = 10**18
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def decoded(message: Outgoing, points: int = 10) -> list[tuple[str, Any]]:
     """Return topics and messages of ROS 2."""
-    store, encode = get_typestore(Stores.ROS2_HUMBLE), Encoder(np.eye(4), MapEncoding(points), OFFSET_NS)
-    return [(sent.topic, store.deserialize_cdr(sent.payload, sent.schema)) for sent in encode(message)]
+    encode = Encoder(np.eye(4), MapEncoding(points), OFFSET_NS)
+    return [(sent.topic, STORE.deserialize_cdr(sent.payload, sent.schema)) for sent in encode(message)]
 
 
 def test_a_command_is_in_unix_time_and_in_the_frame_of_the_base() -> None:
@@ -37,6 +43,20 @@ def test_a_cloud_has_the_most_confident_points_in_their_order() -> None:
     [(topic, cloud)] = decoded(MapUpdate(1, 1, points, np.zeros((0, 2))), points=2)
     shown = np.frombuffer(cloud.data.tobytes(), np.float32).reshape(cloud.width, -1)[:, :3]
     assert topic == "cloud" and shown.tolist() == xyz[[0, 3]].tolist()
+
+
+def test_the_static_frames_lead_from_the_base_to_the_cameras() -> None:
+    rig = replace(make_rig(size=256), T_base_rig=se3.exp([0.1, 0.0, 0.4, 0.0, 0.1, 0.5]))
+    sent = static_frames(Encoder(rig.T_base_rig, MapEncoding(1), OFFSET_NS, rig), 5)
+    found = {}
+    for edge in cast("Any", STORE.deserialize_cdr(sent.payload, sent.schema)).transforms:
+        t, q = edge.transform.translation, edge.transform.rotation
+        T = se3.transform(se3.rotation([q.x, q.y, q.z, q.w]), [t.x, t.y, t.z])
+        found[edge.header.frame_id, edge.child_frame_id] = T
+    assert sent.topic == "/tf_static"
+    assert list(found) == [("base_link", "rig"), ("rig", "lower"), ("rig", "upper")]
+    np.testing.assert_allclose(found["base_link", "rig"], rig.T_base_rig, atol=1e-12)
+    np.testing.assert_allclose(found["rig", "upper"] @ rig.upper.T_cam_rig, np.eye(4), atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -67,3 +87,18 @@ def test_the_entry_has_what_is_known() -> None:
         "request": "b",
         "refusal": "no map",
     }
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_poses_of_a_run_are_kept_in_arrays(count: int) -> None:
+    collector, depth = PoseCollector(), cast("Any", None)
+    for seq in range(count):
+        collector.process(
+            OdometryUpdate(
+                seq, 10**9 + seq, np.eye(4) * seq, np.eye(6) * seq, np.zeros(6), np.eye(6), "lost", 0, 5, 9, depth
+            )
+        )
+    assert collector.stamps_ns.tolist() == list(range(10**9, 10**9 + count))
+    assert collector.T_odom_rig.shape == (count, 4, 4) and collector.covariances.shape == (count, 6, 6)
+    assert collector.T_odom_rig[:, 0, 0].tolist() == collector.covariances[:, 5, 5].tolist() == list(range(count))
+    assert collector.states == (TrackingState.LOST,) * count

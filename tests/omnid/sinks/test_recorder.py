@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -87,6 +87,11 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
     (path,) = recorded(tmp_path / "log")
     counts: dict[str, int] = {}
     with AnyReader([path]) as bag:
+        (frames,) = [found for found in bag.connections if found.topic == "/tf_static"]
+        # A player publishes them for late subscribers, as the quality says that is stored with the topic.
+        (stored,) = cast("Any", frames.ext).offered_qos_profiles
+        assert (stored.history.name, stored.depth, stored.reliability.name) == ("KEEP_LAST", 1, "RELIABLE")
+        assert stored.durability.name == "TRANSIENT_LOCAL"
         for connection, stamp_ns, data in bag.messages():
             counts[connection.topic] = counts.get(connection.topic, 0) + 1
             message: Any = bag.deserialize(data, connection.msgtype)
@@ -101,30 +106,8 @@ def test_all_messages_are_recorded_in_unix_time(tmp_path: Path) -> None:
         "/omnid/status": 3,
         "/omnid/cloud": 1,
         "/tf_static": 1,
-        "/omnid/path": 1,
     }
     assert set(attached(path)) == {"omnid.toml", "rig.toml"}
-
-
-def test_statuses_are_recorded_in_the_order_of_time(tmp_path: Path) -> None:
-    """The state of a pose has the time of its images, which may be before statuses that were made earlier."""
-    encode = Encoder(np.eye(4), MapEncoding(9), OFFSET_NS)
-    recorder = open_recorder(settings(tmp_path / "log"), "", lambda *_: None, encode=encode, offset_ns=OFFSET_NS)
-    report = status_report(START_NS + 2, [DiagnosticStatus("omnid: test", 0, "fine", {})])
-    recorder.process(frame(-1, "lower"))
-    recorder.add(report, START_NS + 2)
-    for n, state in enumerate(("tracking", "lost", "tracking", "lost")):
-        recorder.process(odometry(n, state))
-    for n in range(300):  # the clock was set: they are held back, but none is lost
-        recorder.add(report, START_NS * 2 + n)
-        recorder.process(frame(n, "lower"))
-    recorder.finish()
-    times_ns = []
-    for path in recorded(tmp_path / "log"):
-        with path.open("rb") as file:
-            found = make_reader(file).iter_messages(topics=["/omnid/status"], log_time_order=False)
-            times_ns += [message.log_time - START_NS for _, _, message in found]
-    assert times_ns[:5] == [0, 1, 2, 2, 3] and len(times_ns) == 305
 
 
 def attached(path: Path) -> list[str]:
@@ -151,4 +134,4 @@ def test_an_invalid_message_does_not_end_the_run(tmp_path: Path) -> None:
         recorder.process(replace(frame(0, "lower"), stamp_ns=stamp_ns))
         recorder.process(replace(odometry(0), stamp_ns=stamp_ns))
     recorder.finish()
-    assert recorder.invalid == 6 and recorder.state.messages == 7 and recorder.state.lost == 0
+    assert recorder.invalid == 6 and recorder.state.messages == 6 and recorder.state.lost == 0

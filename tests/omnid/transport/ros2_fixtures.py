@@ -46,7 +46,6 @@ TOPICS = {
     "/omnid/status": "diagnostic_msgs/msg/DiagnosticArray",
     "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
-    "/omnid/path": "nav_msgs/msg/Path",
     "/omnid/cmd/twist": "geometry_msgs/msg/TwistStamped",
     "/omnid/cmd/heading": "geometry_msgs/msg/Vector3Stamped",
     "/omnid/cmd/stop": "std_msgs/msg/Empty",
