@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import cv2
 import numpy as np
+import simplejpeg  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
-from drivers.jpeg import JpegHeader, Steps, read_header, restart_fault
+from drivers.jpeg import Steps, quantisation_steps
 
 Camera = Literal["lower", "upper"]
 CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
@@ -19,10 +21,12 @@ CAMERAS: tuple[Camera, Camera] = ("lower", "upper")
 MAX_PIXELS = 64 * 2**20
 # Pixels times channels of a compressed image: decoders of progressive and interlaced ones store all samples at once.
 MAX_SAMPLES = 64 * 2**20
-_TAIL_BLOCK_BYTES = 4096  # the padding is searched backwards in blocks of this size
-_TAIL_BYTES = 16  # before the padding; longer than any end marker
 _START_MARKER = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}  # ITU T.81, B.1.1.3; PNG 1.2, 3.1
-_END_MARKER = {"jpeg": b"\xff\xd9", "png": b"IEND\xaeB`\x82"}
+_JPEG_CHANNELS = {"Gray": 1, "YCbCr": 3, "RGB": 3}
+# Some webcams write zeros before the end of image, which libjpeg reports as a fault. A zero after 0xFF is none of them.
+_ZEROS_BEFORE_END = re.compile(rb"(?<!\xff)\0+(?=\xff\xd9)")
+_EXTRANEOUS_AT_END = "extraneous bytes before marker 0xd9"
+_PNG_END = b"IEND\xaeB`\x82"
 _PNG_HEADER = slice(12, 26)  # chunk IHDR: name, width, height, bit depth, colour type (PNG 1.2, 4.1.1)
 _PNG_DEPTH = slice(24, 25)
 _PNG_FIRST_CHUNK = 8
@@ -73,8 +77,8 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
 
     Colours are converted with OpenCV's weights; of mono16 the upper byte is kept, of yuyv, uyvy and nv12 the luma.
     An EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises FrameDecodeError for
-    an image that is truncated, malformed or of an unknown encoding, or of whose restart markers some were lost;
-    a JPEG without such markers that has lost a part in its middle passes, as decoders fill it up.
+    an image that is truncated, malformed or of an unknown encoding, and for a JPEG of which libjpeg notices that a part
+    was lost: with restart markers nearly any, without them what leaves the rest of the image undecodable.
     """
     try:
         image = _decompress(frame) if frame.encoding in _START_MARKER else _unpack(frame)
@@ -85,8 +89,8 @@ def gray(frame: Frame) -> NDArray[np.uint8]:
 
 
 def coding_steps(frame: Frame) -> Steps:
-    """Return the steps of a JPEG's quantisation (JpegHeader.steps), () of another image."""
-    return read_header(np.frombuffer(frame.data, np.uint8)).steps if frame.encoding == "jpeg" else ()
+    """Return the steps of a JPEG's quantisation, in zigzag order, () of another image."""
+    return quantisation_steps(np.frombuffer(frame.data, np.uint8).data) if frame.encoding == "jpeg" else ()
 
 
 def deep_samples(frame: Frame) -> NDArray[np.uint16] | None:
@@ -129,32 +133,37 @@ def _decompress(frame: Frame, depth: int = 0) -> NDArray[Any]:
     head = data[: len(_START_MARKER[frame.encoding])].tobytes()
     if head != _START_MARKER[frame.encoding]:
         raise _decode_error(frame, f"it starts with {head.hex() or 'nothing'}")
-    # libjpeg fills the missing part of a truncated image with grey and reports success, so the end is checked first
-    if not _unpadded_tail(data).endswith(_END_MARKER[frame.encoding]):
+    return _decoded_jpeg(frame, data) if frame.encoding == "jpeg" else _decoded_png(frame, data, depth)
+
+
+def _decoded_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the grey image (H, W); what follows the end of image does not count. Raise ValueError with the reason."""
+    height, width, colours, _ = simplejpeg.decode_jpeg_header(data)
+    _require_samples(frame, width, height, _JPEG_CHANNELS.get(colours, 4))
+    try:
+        image = simplejpeg.decode_jpeg(data, "GRAY")
+    except ValueError as error:
+        if _EXTRANEOUS_AT_END not in str(error):
+            raise
+        image = simplejpeg.decode_jpeg(_ZEROS_BEFORE_END.sub(b"", data.tobytes()), "GRAY")
+    return np.asarray(image[..., 0])
+
+
+def _decoded_png(frame: Frame, data: NDArray[np.uint8], depth: int) -> NDArray[Any]:
+    if not data.tobytes().rstrip(b"\0").endswith(_PNG_END):
         raise _decode_error(frame, f"its end is missing after {data.size} bytes")
-    header = read_header(data) if frame.encoding == "jpeg" else JpegHeader(*_png_size(data))
-    width, height, channels = header.width, header.height, header.channels
-    _require_size(frame, width, height)
-    if width * height * channels > MAX_SAMPLES:
-        raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
-    if fault := restart_fault(data, header):
-        raise _decode_error(frame, fault)
+    _require_samples(frame, *_png_size(data))
     image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | depth)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise _decode_error(frame, "its content is corrupt")
     return np.ascontiguousarray(image)
 
 
-def _unpadded_tail(data: NDArray[np.uint8]) -> bytes:
-    """Return the last 16 bytes before the zeros with which cameras fill their buffers."""
-    end = data.size
-    while end:
-        block = data[max(0, end - _TAIL_BLOCK_BYTES) : end].tobytes()
-        start = end - len(block)
-        if used := len(block.rstrip(b"\0")):
-            return data[max(0, start + used - _TAIL_BYTES) : start + used].tobytes()
-        end = start
-    return b""
+def _require_samples(frame: Frame, width: int, height: int, channels: int) -> None:
+    """Raise FrameDecodeError for an empty or excessive compressed image, before it is decoded."""
+    _require_size(frame, width, height)
+    if width * height * channels > MAX_SAMPLES:
+        raise _decode_error(frame, f"{width} x {height} px of {channels} channels exceed {MAX_SAMPLES} samples")
 
 
 def _png_size(data: NDArray[np.uint8]) -> tuple[int, int, int]:

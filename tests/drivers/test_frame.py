@@ -1,7 +1,10 @@
+"""Frames to grey pixels: raw encodings, JPEG and PNG, whole, damaged and hostile; steps of a JPEG."""
+
 from __future__ import annotations
 
 import os
 import random
+import re
 import struct
 from typing import Any
 
@@ -11,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.errors import FrameDecodeError
-from drivers.frame import MAX_PIXELS, MAX_SAMPLES, Frame, gray
+from drivers.frame import MAX_PIXELS, MAX_SAMPLES, Frame, coding_steps, gray
+from drivers.jpeg import coding_sigma
 from omnid import cli
 from tests.limited import run_limited
 
@@ -25,6 +29,15 @@ def frame(encoding: str, data: object, **fields: object) -> Frame:
     return Frame(7, 1, "lower", encoding, data, **layout)  # type: ignore[arg-type]
 
 
+def jpeg(data: bytes) -> Frame:
+    return frame("jpeg", data)
+
+
+def coded(quality: int) -> bytes:
+    noise = np.random.default_rng(2).integers(0, 256, (64, 96, 3), np.uint8)
+    return cv2.imencode(".jpg", noise, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
 def encoded(suffix: str, image: NDArray[Any] = SMOOTH[..., :3]) -> bytes:
     return cv2.imencode(suffix, image)[1].tobytes()
 
@@ -34,33 +47,29 @@ def padded_rows(pixels: NDArray[Any], padding: int) -> tuple[bytes, int]:
     return np.pad(rows, ((0, 0), (0, padding)), constant_values=99).tobytes(), rows.shape[1] + padding
 
 
-@pytest.mark.parametrize(
-    ("encoding", "channels", "code"),
-    [
-        ("bgr8", 3, cv2.COLOR_BGR2GRAY),
-        ("rgb8", 3, cv2.COLOR_RGB2GRAY),
-        ("bgra8", 4, cv2.COLOR_BGRA2GRAY),
-        ("rgba8", 4, cv2.COLOR_RGBA2GRAY),
-    ],
-)
-@pytest.mark.parametrize("padding", [0, 5])
-def test_converts_colours_with_opencvs_weights(encoding: str, channels: int, code: int, padding: int) -> None:
+RAW = {  # encoding -> channels of COLOURS, and the grey image of them
+    "mono8": (1, lambda pixels: pixels[..., 0]),
+    "bgr8": (3, lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)),
+    "rgb8": (3, lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY)),
+    "bgra8": (4, lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_BGRA2GRAY)),
+    "rgba8": (4, lambda pixels: cv2.cvtColor(pixels, cv2.COLOR_RGBA2GRAY)),
+    "yuyv": (2, lambda pixels: pixels[..., 0]),
+    "uyvy": (2, lambda pixels: pixels[..., 1]),
+    "nv12": (1, lambda pixels: pixels[..., 0]),
+}
+
+
+@pytest.mark.parametrize("encoding", RAW)
+@pytest.mark.parametrize("padding", [0, 6])
+def test_raw_images_with_and_without_padding_of_rows(encoding: str, padding: int) -> None:
+    channels, expected = RAW[encoding]
     pixels = np.ascontiguousarray(COLOURS[..., :channels])
     data, step = padded_rows(pixels, padding)
-    np.testing.assert_array_equal(gray(frame(encoding, data, step=step)), cv2.cvtColor(pixels, code))
-
-
-@pytest.mark.parametrize("padding", [0, 3])
-def test_does_not_change_mono8(padding: int) -> None:
-    data, step = padded_rows(COLOURS[..., 0], padding)
-    np.testing.assert_array_equal(gray(frame("mono8", memoryview(data), step=step)), COLOURS[..., 0])
-
-
-@pytest.mark.parametrize(("encoding", "luma"), [("yuyv", 0), ("uyvy", 1)])
-@pytest.mark.parametrize("padding", [0, 6])
-def test_luma_of_packed_colours_is_every_second_byte(encoding: str, luma: int, padding: int) -> None:
-    data, step = padded_rows(np.ascontiguousarray(COLOURS[..., :2]), padding)
-    np.testing.assert_array_equal(gray(frame(encoding, data, step=step)), COLOURS[..., luma])
+    if encoding == "nv12":
+        data += bytes(step * (HEIGHT + 1) // 2)  # the plane of chroma
+    else:
+        data = data[: len(data) - padding]  # the last row needs no padding
+    np.testing.assert_array_equal(gray(frame(encoding, memoryview(data), step=step)), expected(pixels))
 
 
 def test_packed_colours_agree_with_opencv() -> None:
@@ -69,11 +78,12 @@ def test_packed_colours_agree_with_opencv() -> None:
         np.testing.assert_array_equal(gray(frame(encoding, even.tobytes(), width=36)), cv2.cvtColor(even, code))
 
 
+@pytest.mark.parametrize(("order", "bigendian"), [("<u2", False), (">u2", True)])
 @pytest.mark.parametrize("padding", [0, 3])
-def test_luma_of_nv12_is_its_first_plane(padding: int) -> None:
-    data, step = padded_rows(COLOURS[..., 0], padding)
-    chroma = bytes(step * (HEIGHT + 1) // 2)
-    np.testing.assert_array_equal(gray(frame("nv12", data + chroma, step=step)), COLOURS[..., 0])
+def test_mono16_keeps_its_upper_byte(order: str, bigendian: bool, padding: int) -> None:
+    values = (COLOURS[..., 0].astype(np.uint16) << 8) | COLOURS[..., 1]
+    data, step = padded_rows(values.astype(order), padding)
+    np.testing.assert_array_equal(gray(frame("mono16", data, step=step, bigendian=bigendian)), COLOURS[..., 0])
 
 
 def test_decodes_jpeg_without_huffman_tables() -> None:
@@ -88,17 +98,93 @@ def test_decodes_jpeg_without_huffman_tables() -> None:
     np.testing.assert_array_equal(gray(frame("jpeg", bare)), gray(frame("jpeg", data)))
 
 
-@pytest.mark.parametrize(("order", "bigendian"), [("<u2", False), (">u2", True)])
-@pytest.mark.parametrize("padding", [0, 3])
-def test_mono16_keeps_its_upper_byte(order: str, bigendian: bool, padding: int) -> None:
-    values = (COLOURS[..., 0].astype(np.uint16) << 8) | COLOURS[..., 1]
-    data, step = padded_rows(values.astype(order), padding)
-    np.testing.assert_array_equal(gray(frame("mono16", data, step=step, bigendian=bigendian)), COLOURS[..., 0])
+def interrupted(sampling: int) -> tuple[bytes, list[int]]:
+    """Return a colour JPEG of 96 x 256 px with a restart marker after each row of blocks, and their offsets."""
+    noise = np.random.default_rng(2).integers(0, 256, (256, 96, 3), np.uint8)
+    across = {cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422: 16, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444: 8}[sampling]
+    words = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling, cv2.IMWRITE_JPEG_RST_INTERVAL, 96 // across]
+    data = cv2.imencode(".jpg", cv2.GaussianBlur(noise, (0, 0), 3), words)[1].tobytes()
+    return data, [found.start() for found in re.finditer(rb"\xff[\xd0-\xd7]", data)]
 
 
-def test_the_last_row_needs_no_padding() -> None:
-    data, step = padded_rows(COLOURS[..., 0], 6)
-    np.testing.assert_array_equal(gray(frame("mono8", data[:-6], step=step)), COLOURS[..., 0])
+@pytest.mark.parametrize("sampling", [cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444])
+@pytest.mark.parametrize("lost", [1, 3, 8, 16])
+def test_refuses_a_jpeg_of_which_rows_of_blocks_were_lost(sampling: int, lost: int) -> None:
+    """OpenCV reports success, and shows what follows a gap of three rows 24 px higher up."""
+    whole, markers = interrupted(sampling)
+    broken = whole[: markers[9]] + whole[markers[9 + lost] :]
+    assert cv2.imdecode(np.frombuffer(broken, np.uint8), cv2.IMREAD_GRAYSCALE).shape == gray(jpeg(whole)).shape
+    with pytest.raises(FrameDecodeError, match=r"found marker 0xd. instead of RST"):
+        gray(jpeg(broken))
+
+
+def test_refuses_restart_markers_in_another_order_and_where_none_belong() -> None:
+    whole, markers = interrupted(cv2.IMWRITE_JPEG_SAMPLING_FACTOR_422)
+    at, interval = markers[5] + 1, whole.index(b"\xff\xdd")
+    for broken in (whole[:at] + b"\xd0" + whole[at + 1 :], whole[:interval] + whole[interval + 6 :]):
+        with pytest.raises(FrameDecodeError, match="Corrupt JPEG data"):
+            gray(jpeg(broken))
+
+
+@pytest.mark.parametrize("size", [(96, 250), (90, 9), (16, 8)])
+@pytest.mark.parametrize("interval", [0, 1, 5, 1000])
+@pytest.mark.parametrize("mode", ["grey", "420", "422", "440", "444", "progressive"])
+def test_pixels_of_jpegs_are_those_of_opencv(size: tuple[int, int], interval: int, mode: str) -> None:
+    pixels = np.random.default_rng(3).integers(0, 256, (size[1], size[0], 3), np.uint8)
+    words = [cv2.IMWRITE_JPEG_RST_INTERVAL, interval]
+    if mode == "progressive":
+        words += [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    elif mode != "grey":
+        words += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, getattr(cv2, f"IMWRITE_JPEG_SAMPLING_FACTOR_{mode}")]
+    data = cv2.imencode(".jpg", pixels[..., 0] if mode == "grey" else pixels, words)[1]
+    expected = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(gray(jpeg(data.tobytes() + bytes(7))), expected)
+
+
+@pytest.mark.parametrize("after", [b"", bytes(5000), b"\xff\xd8 a thumbnail \xff\xd9"])
+@pytest.mark.parametrize("zeros", [0, 1, 20])
+def test_bytes_about_the_end_of_a_jpeg_do_not_matter(after: bytes, zeros: int) -> None:
+    """Webcams write zeros before the end of image, and fill their buffers after it; telephones add other images."""
+    whole = encoded(".jpg")
+    found = gray(jpeg(whole[:-2] + bytes(zeros) + whole[-2:] + after))
+    np.testing.assert_array_equal(found, gray(jpeg(whole)))
+
+
+def test_other_bytes_before_the_end_of_a_jpeg_are_a_loss() -> None:
+    whole = encoded(".jpg")
+    with pytest.raises(FrameDecodeError, match="extraneous bytes"):
+        gray(jpeg(whole[:-2] + bytes(range(1, 30)) + bytes(9) + whole[-2:]))
+
+
+def test_the_steps_of_the_luminance_are_read_in_zigzag_order() -> None:
+    """Quality 50 has the tables of annex K.1, of which the steps of a higher quality are a part."""
+    assert coding_steps(jpeg(coded(50)))[:10] == (16, 11, 12, 14, 12, 10, 16, 14, 13, 14)
+    assert coding_steps(jpeg(coded(75)))[:6] == (8, 6, 6, 7, 6, 5)
+    assert coding_steps(frame("mono8", COLOURS[..., 0].tobytes())) == ()
+
+
+def test_a_cut_table_has_no_steps() -> None:
+    whole = coded(75)
+    at = whole.index(b"\xff\xdb")
+    assert coding_steps(jpeg(whole[: at + 30])) == ()
+    # The length says that the segment ends within the table, and the rest of it is no marker.
+    assert coding_steps(jpeg(whole[: at + 2] + b"\x00\x20" + whole[at + 4 :])) == ()
+    # Steps of 16 bits would need twice the bytes.
+    assert coding_steps(jpeg(whole[: at + 4] + b"\x10" + whole[at + 5 :])) == ()
+
+
+@pytest.mark.parametrize("quality", [50, 75, 90])
+@pytest.mark.parametrize("highest", [2, 3, 8])
+def test_images_differ_from_their_jpegs_by_the_stated_error(quality: int, highest: int) -> None:
+    """Of noise, whose coefficients exceed the steps, each frequency is off by a twelfth of the step's square."""
+    grey = np.clip(np.rint(np.random.default_rng(8).normal(128.0, 40.0, (256, 256))), 0, 255).astype(np.uint8)
+    data = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+    error = gray(jpeg(data)).astype(np.float32) - grey
+    blocks = [cv2.dct(error[v : v + 8, u : u + 8].copy()) for v in range(0, 256, 8) for u in range(0, 256, 8)]
+    squares = np.mean(np.square(blocks), axis=0)[:highest, :highest]
+    found = np.sqrt((squares.sum() - squares[0, 0]) / 64)
+    # Pixels are rounded as well, and coefficients below half a step are lost with an error as large as themselves.
+    assert found == pytest.approx(coding_sigma(coding_steps(jpeg(data)), highest), rel=0.15 if highest < 8 else 0.25)
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
@@ -133,13 +219,9 @@ def test_the_image_is_read_only_and_independent_of_the_buffer(encoding: str) -> 
 def test_detects_truncation_at_any_byte(suffix: str) -> None:
     data, encoding = encoded(suffix), {".jpg": "jpeg", ".png": "png"}[suffix]
     for size in range(len(data)):
-        with pytest.raises(FrameDecodeError):
-            gray(frame(encoding, data[:size]))
-
-
-def test_detects_truncation_before_padding() -> None:
-    with pytest.raises(FrameDecodeError, match="end is missing"):
-        gray(frame("jpeg", encoded(".jpg")[:-40] + bytes(9000)))
+        for padding in (0, 300):
+            with pytest.raises(FrameDecodeError):
+                gray(frame(encoding, data[:size] + bytes(padding)))
 
 
 @pytest.mark.parametrize(
@@ -155,6 +237,7 @@ def test_detects_truncation_before_padding() -> None:
         (frame("mono8", bytes(100), width=2**31, height=2**31), "size"),
         (frame("mono8", bytes(10**4), step=2**62), "bytes"),
         (frame("bayer_rggb8", bytes(10**4)), "known encodings"),
+        (frame("jpeg", encoded(".jpg")[:-40] + bytes(9000)), "Premature end"),
         (frame("jpeg", b""), "nothing"),
         (frame("jpeg", b"BM" + bytes(100)), "starts with"),
         (frame("png", encoded(".jpg")), "starts with"),
@@ -201,34 +284,32 @@ def with_size(data: bytes, width: int, height: int, marker: bytes = b"\xff\xc0")
 
 
 @pytest.mark.parametrize("marker", [b"\xff\x01", b"\xff\xd0", b"\xff\xe0\0\0", b"\xff\xe0\0\1"])
-def test_refuses_markers_that_hide_the_size_from_a_walk_over_the_segments(marker: bytes) -> None:
-    """libjpeg goes on right after such a marker; a walk that adds a length arrives at a second, small header."""
-    data = encoded(".jpg")
-    before, large, after = with_size(data, 30_000, 30_000)
-    small = with_size(data, WIDTH, HEIGHT)[1]
+def test_refuses_a_jpeg_whose_size_is_hidden_behind_a_marker_without_length(marker: bytes) -> None:
+    before, large, after = with_size(encoded(".jpg"), 30_000, 30_000)
+    small = with_size(encoded(".jpg"), WIDTH, HEIGHT)[1]
     hidden = before[:2] + marker + before[2:] + large + after[:-2]
     for jump in (2, 2 + int.from_bytes(hidden[4:6], "big")):
-        tail = bytes(max(0, 2 + jump - len(hidden))) + small + after
-        with pytest.raises(FrameDecodeError, match="its size is"):
-            gray(frame("jpeg", hidden + tail))
+        with pytest.raises(FrameDecodeError):
+            gray(jpeg(hidden + bytes(max(0, 2 + jump - len(hidden))) + small + after))
 
 
 def test_refuses_a_second_frame_header() -> None:
     before, small, after = with_size(encoded(".jpg"), WIDTH, HEIGHT)
-    with pytest.raises(FrameDecodeError, match="its size is 0 x 0"):
-        gray(frame("jpeg", before + small + small + after))
+    with pytest.raises(FrameDecodeError):
+        gray(jpeg(before + small + small + after))
 
 
-def test_refuses_an_animated_png() -> None:
+@pytest.mark.parametrize(
+    ("at", "chunks"),
+    [
+        (33, b"\0\0\0\x04tEXtIDAT\0\0\0\0" + b"\0\0\0\x08acTL" + bytes(12)),  # an animation
+        (8, b"\0\0\0\0tIME\0\0\0\0"),  # a chunk before the header
+    ],
+)
+def test_refuses_a_png_whose_size_is_not_that_of_its_pixels(at: int, chunks: bytes) -> None:
     data = encoded(".png")
     with pytest.raises(FrameDecodeError, match="its size is 0 x 0"):
-        gray(frame("png", data[:33] + b"\0\0\0\x04tEXtIDAT\0\0\0\0" + b"\0\0\0\x08acTL" + bytes(12) + data[33:]))
-
-
-def test_refuses_a_png_whose_first_chunk_is_no_header() -> None:
-    data = encoded(".png")
-    with pytest.raises(FrameDecodeError, match="its size is 0 x 0"):
-        gray(frame("png", data[:8] + b"\0\0\0\0tIME\0\0\0\0" + data[8:]))
+        gray(frame("png", data[:at] + chunks + data[at:]))
 
 
 @pytest.mark.parametrize(("suffix", "encoding"), [(".jpg", "jpeg"), (".png", "png")])
