@@ -107,6 +107,7 @@ GROUPS: Final[Mapping[str, str]] = MappingProxyType(
 REMOVED: Final[Mapping[str, str]] = MappingProxyType(
     {
         "config migrate": "`omnid config check FILE` names each setting that this version does not know",
+        "install-service --root": "install in the system itself, for example in a chroot or a container of that folder",
         "listen --all": "one program for each robot, with --robot NAME; many robots: Grafana on /metrics of `omnid "
         "web`",
         "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command "

@@ -14,19 +14,18 @@ from omnid.commands.web import require_packages
     option("--page", action="store_true", help="also the unit of the page (`omnid web`), for this machine only"),
     option("--dry-run", action="store_true", help="list what would be done, change nothing"),
     option("--yes", action="store_true", help="do not ask"),
-    option("--root", type=Path, default=Path("/"), metavar="DIR", help="install into the system below DIR; default: /"),
     examples=("install-service --dry-run", "install-service --page"),
     description="Install the systemd unit for this program, example udev rules, a minimal configuration and the user "
     "that it runs as. Files that people edit are kept where they exist.",
 )
 def run(args: argparse.Namespace) -> int:
     """List the steps, ask, and take them; return 1 where the answer is no."""
-    from omnid.service.install import Installation
+    from omnid.service import install
 
     if args.page:
         require_packages()
-    installation = Installation(args.root, Path(sys.prefix) / "bin" / "omnid", page=args.page)
-    steps = installation.steps()
+    program = Path(sys.prefix) / "bin" / "omnid"
+    steps = install.steps(program, page=args.page)
     for step in steps:
         print(step.description)
     if args.dry_run:
@@ -39,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         return 1
     for step in steps:
         step.act()
-    print(installation.next_steps)
+    print(install.next_steps(program, page=args.page))
     return 0
 
 

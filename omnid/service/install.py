@@ -1,4 +1,4 @@
-"""Steps that install omnid as a service; each has a description that is printed before it is taken."""
+"""Installation of omnid as a service, as steps with a description each."""
 
 from __future__ import annotations
 
@@ -6,25 +6,29 @@ import pwd
 import re
 import shlex
 import subprocess
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
+from omnid.formats.whole_file import write_whole
 from omnid.plain_text import plain
-from omnid.service.file_below import text_below, write_below
 from omnid.settings_dump import dump_minimal
 
-USER: Final = "omnid"
-SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # The path of omnid in the shipped unit.
-# Folders that the unit does not see: ProtectHome=, PrivateTmp=.
+ROOT: Final = Path("/")
+SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # The path of omnid in the shipped units.
+# Folders that the units do not see: ProtectHome=, PrivateTmp=.
 HIDDEN: Final = ("/home", "/root", "/tmp", "/run/user")
-ADD_USER: Final = ("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", USER)
-_REFUSED: Final = frozenset("\"'\\")
-_PLAIN: Final = re.compile(r"[\w./+-]+")  # a path that needs no quotes
+ADD_USER: Final = ("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", "omnid")
+NEXT_STEPS: Final = """\
+Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints them), copy rig.toml to /etc/omnid,
+describe the hardware in /etc/omnid/omnid.toml, and run
+  sudo udevadm control --reload && sudo udevadm trigger
+  sudo {program} doctor --config /etc/omnid/omnid.toml
+  sudo systemctl daemon-reload && sudo systemctl enable --now {units}"""
 
 
 class Step(NamedTuple):
@@ -37,83 +41,72 @@ class Step(NamedTuple):
 def service_file(name: str) -> str:
     """Return the text of a file of the folder systemd/, from the installed package or from a clone."""
     packaged = files("omnid.service") / "systemd" / name
-    if packaged.is_file():
-        return packaged.read_text()
-    return (Path(__file__).parents[2] / "systemd" / name).read_text()
+    return packaged.read_text() if packaged.is_file() else (Path(__file__).parents[2] / "systemd" / name).read_text()
 
 
-@dataclass(frozen=True, slots=True)
-class Installation:
-    """The service below `root`, run by `program`."""
+def steps(program: Path, *, page: bool = False, root: Path = ROOT) -> list[Step]:
+    """Return the steps that are still to be taken; OmnidError for a program that the units cannot start.
 
-    root: Path
-    program: Path
-    page: bool = False  # the page's unit as well
-
-    def steps(self) -> list[Step]:
-        """Return the steps that are still to be taken; OmnidError for a program that the unit cannot start."""
-        if any(self.program.is_relative_to(folder) for folder in HIDDEN):
-            raise OmnidError(
-                f"{self.program} is in a folder that the service cannot see: install omnid elsewhere, "
-                "such as `sudo python3 -m venv /opt/omnid && sudo /opt/omnid/bin/pip install .`"
-            )
-        return list(self._steps())
-
-    @property
-    def next_steps(self) -> str:
-        """Instructions for what only the user knows."""
-        units = "omnid omnid-web" if self.page else "omnid"
-        return (
-            "Now enter your ports in /etc/udev/rules.d/90-omnid.rules (`omnid cameras` prints the lines), copy "
-            "rig.toml to /etc/omnid, describe the hardware in /etc/omnid/omnid.toml, and run\n"
-            "  sudo udevadm control --reload && sudo udevadm trigger\n"
-            f"  sudo {shlex.quote(str(self.program))} doctor --config /etc/omnid/omnid.toml\n"
-            f"  sudo systemctl daemon-reload && sudo systemctl enable --now {units}"
-        )
-
-    def _steps(self) -> Iterator[Step]:
-        program = exec_word(self.program)
-        unit = service_file("omnid.service").replace(SHIPPED_PROGRAM, program)
-        yield from self._file("etc/systemd/system/omnid.service", unit, replace=True)
-        if self.page:
-            page = service_file("omnid-web.service").replace(SHIPPED_PROGRAM, program)
-            yield from self._file("etc/systemd/system/omnid-web.service", page, replace=True)
-        yield from self._file("etc/udev/rules.d/90-omnid.rules", service_file("90-omnid.rules"), replace=False)
-        yield from self._file("etc/omnid/omnid.toml", dump_minimal(Config(), FIRST_SETTINGS), replace=False)
-        if self.root == Path("/") and not _user_exists():
-            yield Step(f"add the system user {USER}", _add_user)
-
-    def _file(self, name: str, text: str, *, replace: bool) -> Iterator[Step]:
-        found = text_below(self.root, name)
-        if found is not None and (not replace or found == text):
-            return
-        verb = "write" if found is None else "replace"
-        yield Step(f"{verb} {self.root / name}", lambda: write_below(self.root, name, text))
-
-
-def exec_word(program: Path) -> str:
-    """Return a program's path as the first word of ExecStart=; OmnidError for one that no unit can contain.
-
-    systemd.service(5), "Command lines", and systemd.unit(5), "Specifiers": a path with blanks is written in double
-    quotes, and a percent sign is doubled. A line ends at its line feed, whatever the quotes. Quotes and backslashes are
-    refused: systemd 252 does not start a program whose name has them.
+    page: install the unit of the page as well. root: the folder that stands for the system.
     """
-    path = str(program)
-    if not path.isprintable() or not _REFUSED.isdisjoint(path):
+    if any(program.is_relative_to(folder) for folder in HIDDEN):
         raise OmnidError(
-            f"{plain(path)}: the path has characters that a systemd unit cannot name: install omnid "
-            f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}"
+            f"{program} is in a folder that the service cannot see: install omnid elsewhere, "
+            "such as `sudo python3 -m venv /opt/omnid && sudo /opt/omnid/bin/pip install .`"
         )
-    escaped = path.replace("%", "%%")
-    return escaped if _PLAIN.fullmatch(path) else f'"{escaped}"'
+    # 1. The units follow the program; the files that people edit are kept.
+    units = ["omnid.service", "omnid-web.service"] if page else ["omnid.service"]
+    texts = {
+        f"etc/systemd/system/{unit}": service_file(unit).replace(SHIPPED_PROGRAM, exec_word(program)) for unit in units
+    }
+    kept = {
+        "etc/udev/rules.d/90-omnid.rules": service_file("90-omnid.rules"),
+        "etc/omnid/omnid.toml": dump_minimal(Config(), FIRST_SETTINGS),
+    }
+    found = []
+    for name, text in {**texts, **kept}.items():
+        path = root / name
+        if not path.exists() or (name in texts and path.read_text("utf-8", "replace") != text):
+            verb = "replace" if path.exists() else "write"
+            found.append(Step(f"{verb} {path}", partial(_write, path, text)))
+    # 2. The user that the units run as.
+    if all(entry.pw_name != "omnid" for entry in pwd.getpwall()):
+        found.append(Step("add the system user omnid", _add_user))
+    return found
 
 
-def _user_exists() -> bool:
-    return any(entry.pw_name == USER for entry in pwd.getpwall())
+def _write(path: Path, text: str) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, text.encode())
+    except (OSError, OmnidError) as error:
+        raise OmnidError(f"{path} cannot be written: {error}; run this command with sudo") from error
 
 
 def _add_user() -> None:
     done = subprocess.run(ADD_USER, capture_output=True, text=True, check=False)
     if done.returncode:
         reason = " ".join(done.stderr.split())
-        raise OmnidError(f"the user {USER} cannot be added: {reason}; run this command with sudo")
+        raise OmnidError(f"the user omnid cannot be added: {reason}; run this command with sudo")
+
+
+def exec_word(program: Path) -> str:
+    """Return a program's path as the first word of ExecStart=; OmnidError for one that no unit can contain.
+
+    systemd.service(5), "Command lines", and systemd.unit(5), "Specifiers": a path with blanks is written in double
+    quotes, and a percent sign is doubled. Quotes and backslashes are refused: systemd 252 does not start such programs.
+    """
+    path = str(program)
+    if not path.isprintable() or re.search(r"[\"'\\]", path):
+        raise OmnidError(
+            f"{plain(path)}: the path has characters that a systemd unit cannot name: install omnid "
+            f"elsewhere, such as in {Path(SHIPPED_PROGRAM).parents[1]}"
+        )
+    escaped = path.replace("%", "%%")
+    return escaped if re.fullmatch(r"[\w./+-]+", path) else f'"{escaped}"'
+
+
+def next_steps(program: Path, *, page: bool = False) -> str:
+    """Return instructions for what only the user knows."""
+    units = "omnid omnid-web" if page else "omnid"
+    return NEXT_STEPS.format(program=shlex.quote(str(program)), units=units)

@@ -12,57 +12,76 @@ import pytest
 
 from omnid.config import Config, load_config
 from omnid.errors import OmnidError
-from omnid.service.install import SHIPPED_PROGRAM, Installation, exec_word, service_file
+from omnid.service import install
+from omnid.service.install import SHIPPED_PROGRAM, exec_word, service_file, steps
 from tests.replay.command import Command
 
 ROOT = Path(__file__).parents[3]
+PROGRAM = Path("/srv/robot/bin/omnid")
 FILES = ("etc/systemd/system/omnid.service", "etc/udev/rules.d/90-omnid.rules", "etc/omnid/omnid.toml")
 
 
-def test_writes_the_unit_of_this_program_and_keeps_edited_files(omnid: Command, tmp_path: Path) -> None:
-    listed = omnid("install-service", "--root", tmp_path, "--dry-run").out
-    assert [str(tmp_path / name) for name in FILES] == [line.split()[1] for line in listed.splitlines()]
-    assert list(tmp_path.iterdir()) == []
-    done = omnid("install-service", "--root", tmp_path, "--yes")
-    assert done.code == 0 and "doctor" in done.out
+def done(tmp_path: Path, page: bool = False) -> list[str]:
+    """Take the steps that write files, and return what they say."""
+    taken = [step for step in steps(PROGRAM, page=page, root=tmp_path) if str(tmp_path) in step.description]
+    for step in taken:
+        step.act()
+    return [step.description for step in taken]
+
+
+def test_writes_the_unit_of_this_program_and_keeps_edited_files(tmp_path: Path) -> None:
+    assert done(tmp_path) == [f"write {tmp_path / name}" for name in FILES]
     unit, rules, config = (tmp_path / name for name in FILES)
     assert "ExecStart=/srv/robot/bin/omnid run --config /etc/omnid/omnid.toml\n" in unit.read_text()
     assert "/opt/omnid" not in unit.read_text()
     assert rules.read_text() == (ROOT / "systemd" / rules.name).read_text()
     assert load_config(config) == Config()
-    assert omnid("install-service", "--root", tmp_path).out == "nothing to do\n"
+    assert done(tmp_path) == []
     rules.write_text("mine")
     unit.write_text("older")
-    assert omnid("install-service", "--root", tmp_path, "--yes").out.startswith(f"replace {unit}\n")
-    assert rules.read_text() == "mine" and "ExecStart" in unit.read_text()
+    assert done(tmp_path) == [f"replace {unit}"] and rules.read_text() == "mine" and "ExecStart" in unit.read_text()
+    assert done(tmp_path, page=True) == [f"write {tmp_path / 'etc/systemd/system/omnid-web.service'}"]
+    page = (tmp_path / "etc/systemd/system/omnid-web.service").read_text()
+    assert "ExecStart=/srv/robot/bin/omnid web --config /etc/omnid/omnid.toml" in page and "/opt/omnid" not in page
 
 
-def test_the_page_is_a_unit_of_its_own(omnid: Command, tmp_path: Path) -> None:
-    done = omnid("install-service", "--root", tmp_path, "--yes", "--page")
-    assert done.code == 0 and "enable --now omnid omnid-web" in done.out
-    unit = (tmp_path / "etc/systemd/system/omnid-web.service").read_text()
-    assert "ExecStart=/srv/robot/bin/omnid web --config /etc/omnid/omnid.toml" in unit and "/opt/omnid" not in unit
-    assert omnid("install-service", "--root", tmp_path, "--page").out == "nothing to do\n"
+def test_the_command_asks_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def files_only(program: Path, *, page: bool) -> list[install.Step]:
+        return [step for step in steps(program, page=page, root=tmp_path) if str(tmp_path) in step.description]
 
-
-def test_asks_first(omnid: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("builtins.input", lambda _: "n")
-    done = omnid("install-service", "--root", tmp_path)
-    assert done.code == 1 and done.out.endswith("nothing was changed\n") and list(tmp_path.iterdir()) == []
-    monkeypatch.setattr("builtins.input", lambda _: "y")
-    assert omnid("install-service", "--root", tmp_path).code == 0 and (tmp_path / FILES[0]).exists()
-
-
-def test_a_folder_that_cannot_be_written_is_one_line(omnid: Command, tmp_path: Path) -> None:
+    omnid, answers = Command(capsys), iter("ny")
+    monkeypatch.setattr(sys, "prefix", "/srv/robot")
+    monkeypatch.setattr(install, "steps", files_only)
+    monkeypatch.setattr("builtins.input", lambda _: next(answers))
+    listed = omnid("install-service", "--dry-run").out
+    assert [str(tmp_path / name) for name in FILES] == [line.split()[1] for line in listed.splitlines()]
+    refused = omnid("install-service")
+    assert refused.code == 1 and refused.out.endswith("nothing was changed\n") and list(tmp_path.iterdir()) == []
+    agreed = omnid("install-service", "--page")
+    assert agreed.code == 0 and "enable --now omnid omnid-web" in agreed.out and (tmp_path / FILES[0]).exists()
+    assert omnid("install-service", "--page").out == "nothing to do\n"
+    shutil.rmtree(tmp_path / "etc")
     (tmp_path / "etc").write_text("a file")
-    done = omnid("install-service", "--root", tmp_path, "--yes")
-    assert done.code == 2 and done.err.count("\n") == 1 and "sudo" in done.err
+    failed = omnid("install-service", "--yes")
+    assert failed.code == 2 and failed.err.count("\n") == 1 and "sudo" in failed.err
+    assert "a chroot" in omnid.refused("install-service", "--root", tmp_path)
 
 
-@pytest.mark.parametrize("program", ["/home/me/.venv/bin/omnid", "/root/omnid/bin/omnid", "/tmp/v/bin/omnid"])
-def test_refuses_a_program_that_the_unit_cannot_see(tmp_path: Path, program: str) -> None:
-    with pytest.raises(OmnidError, match="/opt/omnid"):
-        Installation(tmp_path, Path(program)).steps()
+@pytest.mark.parametrize(
+    ("program", "message"),
+    [
+        *((path, "a folder that the service cannot see") for path in ("/home/me/v/omnid", "/root/omnid", "/tmp/omnid")),
+        *(
+            (f"/srv/{name}", "characters that a systemd unit cannot name")
+            for name in ("two\nExecStartPre=/bin/evil", "tab\t", "\udcff", "\x1b[2J", 'a "b"', "a 'b'", "a\\x41")
+        ),
+    ],
+)
+def test_refuses_a_program_that_the_unit_cannot_start(program: str, message: str) -> None:
+    with pytest.raises(OmnidError, match=message):
+        steps(Path(program))
 
 
 @pytest.mark.parametrize(
@@ -81,23 +100,8 @@ def test_systemd_starts_a_program_of_any_name(tmp_path: Path, name: str, unit: s
     program.parent.mkdir(parents=True)
     program.write_text("#!/bin/sh\n")
     program.chmod(0o755)
-    done = subprocess.run(verify, capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout + done.stderr) == (0, "")
-
-
-@pytest.mark.parametrize(
-    "name", ["two\nExecStartPre=/bin/evil", "tab\t", "\udcff", "\x1b[2J", 'a "b"', "a 'b'", "a\\x41"]
-)
-def test_refuses_a_program_that_no_unit_can_name(
-    omnid: Command, tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "prefix", f"/srv/{name}")
-    assert "characters that a systemd unit cannot name" in omnid.refused("install-service", "--root", tmp_path, "--yes")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_files_are_found_in_a_clone() -> None:
-    assert service_file("omnid.service") == (ROOT / "systemd" / "omnid.service").read_text()
+    found = subprocess.run(verify, capture_output=True, text=True, timeout=60)
+    assert (found.returncode, found.stdout + found.stderr) == (0, "")
 
 
 @pytest.mark.slow
