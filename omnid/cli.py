@@ -37,7 +37,6 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "replay": Entry("replay", "run a recorded log through the stages of the daemon"),
         "demo": Entry("demo", "replay a sample in real time: files, bus and a simulated motor"),
         "eval": Entry("evaluate", "compare a trajectory with the truth, both in the TUM format"),
-        "accept": Entry("accept", "the acceptance drive between two marks on the floor: its errors"),
         "calibrate board": Entry("calibrate_board", "a board to print, true to scale, with a ruler to check the print"),
         "calibrate live": Entry("calibrate_live", "images of a board, with its coverage so far and what is missing"),
         "calibrate camera": Entry("calibrate_camera", "a camera.toml from images of a board"),
@@ -72,7 +71,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "listen": Entry("listen", "show pose, state, rates and latencies of a robot, and record them"),
         "view": Entry("view", "show a log or a robot: path, map, depth, plots (needs rerun)"),
         "web": Entry("web", "a page with state, path, warnings, stop and arm"),
-        "batch": Entry("batch", "replay many logs into one table; goes on where it was interrupted"),
+        "batch": Entry("batch", "replay many logs; goes on where it was interrupted (extra `fleet`)"),
         "record": Entry("record", "record both cameras to MCAP files until Ctrl-C"),
         "report": Entry("report", "one HTML page about a recording: path, events, statistics"),
         "log info": Entry("log:info", "topics, types, counts, times, attachments, and whether the log is whole"),
@@ -86,7 +85,6 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "map align": Entry("map_tags:align", "move a map into the axes of a plan of the building, by known AprilTags"),
         "map export": Entry("map:export", "write a map for other programs"),
         "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
-        "diff": Entry("diff", "compare two recorded runs over the same images; exit code 1 where they differ"),
         "doctor": Entry("doctor", "check cameras, USB, motor, rig, clock, rights, bus and disk"),
         "motor test": Entry("motor", "turn each wheel, ask what moved, print the settings for that"),
         "config": Entry("config", "print or check settings"),
@@ -106,12 +104,18 @@ GROUPS: Final[Mapping[str, str]] = MappingProxyType(
 # Commands that earlier versions had, and options as "COMMAND --OPTION" -> what to use instead.
 REMOVED: Final[Mapping[str, str]] = MappingProxyType(
     {
+        "accept": "`python -m omnid.examples.acceptance LOG DISTANCE_M` judges a drive between two marks",
+        "batch --dask": "--scheduler ADDRESS",
         "config migrate": "`omnid config check FILE` names each setting that this version does not know",
         "install-service --root": "install in the system itself, for example in a chroot or a container of that folder",
+        "diff": "`cmp` compares files, `omnid eval` and `evo_traj` trajectories",
+        "eval --score": "KITTI's drift: `evo_rpe`; the score of Hilti 2026 is 100 exp(-0.46 ate_rmse_m)",
         "listen --all": "one program for each robot, with --robot NAME; many robots: Grafana on /metrics of `omnid "
         "web`",
         "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command "
         "line",
+        "map build --dask": "each log is replayed in the map of those before",
+        "map build --jobs": "each log is replayed in the map of those before",
         "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
         "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
     }

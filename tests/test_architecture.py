@@ -32,8 +32,7 @@ TIERS: Mapping[str, str] = {
     "messages, formats, bus": "omnid.messages omnid.camera_config omnid.config omnid.config_use omnid.formats "
     "omnid.transport",
     "parts of a run": "omnid.stages omnid.recordings omnid.service",
-    "what watches and writes a run": "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration "
-    "omnid.batch",
+    "what watches and writes a run": "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration",
     "runs and clients": "omnid.runs omnid.simulation omnid.client omnid.monitor omnid.doctor",
     "interfaces": "omnid omnid.api omnid.web omnid.viewer omnid.examples omnid.commands omnid.cli omnid.__main__",
 }

@@ -29,15 +29,9 @@ ANOTHER_DRIVE: Final = 0.25
     option(
         "--align",
         choices=("origin", "rigid", "scale"),
+        default="origin",
         help="the first pose (default), as evo's --align_origin; rigid: all positions, as its --align; scale: these "
         "and the estimate's scale, which is printed, as its --align --correct_scale",
-    ),
-    option(
-        "--score",
-        choices=("hilti", "kitti"),
-        help="a score by which others compare. hilti: 100 exp(-0.46 ATE/m) of the challenge of 2026 for 360-degree "
-        "cameras, 0 where more than 1 %% of the truth's poses are missing, with --align rigid unless another one is "
-        "given; kitti: drift over segments of 100 to 800 m, of a tenth to eight tenths of a way shorter than 1000 m",
     ),
     option(
         "--live",
@@ -49,40 +43,27 @@ ANOTHER_DRIVE: Final = 0.25
     examples=(
         "eval est.txt truth.txt",
         "eval est.txt truth.txt --align rigid --json",
-        "eval est.txt truth.txt --score hilti",
         "eval map.txt truth.txt --live live.txt",
     ),
 )
 def run(args: argparse.Namespace) -> int:
     """Print the errors."""
     from omnid.formats.tum import read_tum
-    from omnid.recordings.evaluation import associated, evaluate
-    from omnid.recordings.scores import drift_text, hilti_score, hilti_text, kitti_drift
+    from omnid.recordings.evaluation import evaluate
 
-    estimate, truth, tolerance_s = read_tum(args.estimate), read_tum(args.truth), args.tolerance_ms * 1e-3
-    alignment = args.align or ("rigid" if args.score == "hilti" else "origin")
-    metrics = evaluate(estimate, truth, tolerance_s, alignment)
-    live = evaluate(read_tum(args.live), truth, tolerance_s, alignment) if args.live else None
+    truth, tolerance_s = read_tum(args.truth), args.tolerance_ms * 1e-3
+    metrics = evaluate(read_tum(args.estimate), truth, tolerance_s, args.align)
+    live = evaluate(read_tum(args.live), truth, tolerance_s, args.align) if args.live else None
     if metrics.ate_rmse_m > ANOTHER_DRIVE * metrics.length_truth_m:
         print(
             f"omnid: warning: the estimate is off by {metrics.ate_rmse_m:.2f} m on a way of "
             f"{metrics.length_truth_m:.2f} m: is this the truth of the same drive, in the same frame of the robot?",
             file=sys.stderr,
         )
-    drift = kitti_drift(*associated(estimate, truth, tolerance_s)) if args.score == "kitti" else []
     if args.json:
-        scores: dict[str, dict[str, object]] = {
-            "hilti": {"hilti_score": hilti_score(metrics)},
-            "kitti": {"drift": drift},
-        }
-        causal = {} if live is None else {"live": asdict(live)}
-        print_json(asdict(metrics) | scores.get(args.score, {}) | causal)
+        print_json(asdict(metrics) | ({} if live is None else {"live": asdict(live)}))
         return 0
     print(metrics)
     if live is not None:
         print(f"as known while driving, of {args.live}\n{live}")
-    if args.score == "hilti":
-        print(hilti_text(metrics))
-    elif args.score == "kitti":
-        print(drift_text(drift))
     return 0

@@ -1,1 +1,1 @@
-"""Recorded runs: reading them, comparing two of them, evaluating a trajectory against the truth."""
+"""Recorded runs: reading them, and evaluating a trajectory against the truth."""

@@ -67,21 +67,14 @@ def evaluate(estimate: Trajectory, truth: Trajectory, tolerance_s: float = 0.01,
     """
     if alignment not in ALIGNMENTS:
         raise OmnidError(f"an alignment {', '.join(ALIGNMENTS)} was expected, {alignment!r} found")
-    T_estimate, T_true = associated(estimate, truth, tolerance_s)
-    return _metrics(*aligned(T_estimate, T_true, alignment), T_true, len(T_true) / truth.stamps_ns.size)
-
-
-def associated(
-    estimate: Trajectory, truth: Trajectory, tolerance_s: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the associated poses (N, 4, 4) of both, each in its world; OmnidError for fewer than two."""
     of_estimate, of_truth = _associate(estimate.stamps_ns, truth.stamps_ns, _tolerance_ns(tolerance_s))
     if of_estimate.size < 2:
         raise OmnidError(
             f"2 poses at the same times (within {tolerance_s:g} s) were expected, {of_estimate.size} found:"
             f" estimate {_span(estimate)}, truth {_span(truth)}: do both use the same clock?"
         )
-    return estimate.T[of_estimate], truth.T[of_truth]
+    T_true = truth.T[of_truth]
+    return _metrics(*aligned(estimate.T[of_estimate], T_true, alignment), T_true, len(T_true) / truth.stamps_ns.size)
 
 
 def _mm(distance_m: float) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from omnid import cli
-from tests.omnid.batch.test_job_runner import rows, short_log
+from tests.omnid.commands.test_batch import short_log
 
 ROOT = Path(__file__).parents[2]
 # Modules of the program, of its packages and of Python that a file in the working directory may pretend to be.
@@ -31,7 +30,6 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "replay": (("none.mcap",), "none.mcap"),
     "demo": (("--output", "/dev/null/demo"), "/dev/null/demo"),
     "eval": (("none.txt", "none.txt"), NO_FILE),
-    "accept": (("none.mcap", "--distance-m", "10"), "none.mcap"),
     "calibrate board": (("--corners", "6x7", "--square-mm", "25", "-o", "board.pdf"), "board of 6x7 inner corners"),
     "calibrate live": (("--log", "none.mcap", "--corners", "6x7", "--square-mm", "30"), "none.mcap"),
     "calibrate camera": (("none.png", "--corners", "6x7", "--square-mm", "30", "-o", "c.toml"), "none.png"),
@@ -57,7 +55,7 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "listen": (NOWHERE, NO_ROUTE),
     "view": (("none.mcap", "-o", "view.rrd"), "none.mcap" if find_spec("rerun") else "rerun, which is not installed"),
     "web": (("--listen", "127.0.0.1:99999"), "expected HOST:PORT"),
-    "batch": (("none.mcap", "--out", "out"), "no log 'none.mcap'"),
+    "batch": (("none.mcap", "--out", "out"), "none.mcap"),
     "record": (("rec", "--lower", "/dev/null", "--upper", "/dev/zero"), "not a video device"),
     "report": (("none.mcap", "-o", "report.html"), "none.mcap"),
     "log info": (("none.mcap",), "none.mcap"),
@@ -69,7 +67,6 @@ COMMANDS: dict[str, tuple[tuple[str, ...], str]] = {
     "map align": (("none.omap", "--known", "none.toml", "-o", "place.omap"), NO_FILE),
     "map export": (("none.omap", "--ply", "place.ply"), NO_FILE),
     "map save": (NOWHERE, NO_ROUTE),
-    "diff": (("none.mcap", "none.mcap"), "none.mcap"),
     "doctor": (("--config", "none.toml"), NO_FILE),
     "motor test": (("--motor", "simulated"), "motor.protocol is 'line'"),
     "config": (("--minimal",), "[motor"),
@@ -141,19 +138,6 @@ def test_the_viewer_does_not_run_it(hostile: Path) -> None:
         "print(subprocess.run(_rerun(['--version']), capture_output=True, text=True).stdout)"
     )
     assert "rerun" in run(hostile, "-c", ask).stdout
-
-
-def test_a_batch_runs_no_object_that_it_fetches(hostile: Path, tmp_path: Path) -> None:
-    """The objects of an address have names that strangers chose; programs run in the folder they are fetched to."""
-    pytest.importorskip("fsspec")
-    bucket = tmp_path / "bucket"
-    short_log(bucket / "drive.mcap")
-    shutil.copy(hostile / "numpy.py", bucket)
-    done = run(hostile, "-m", "omnid", "batch", f"file://{bucket}/*", "--out", tmp_path / "out", "--record")
-    assert "1 ok" in done.stdout, done
-    found = rows(tmp_path / "out")
-    assert found["drive"]["status"] == "ok" and (tmp_path / "out" / "drive" / "report.html").is_file()
-    assert found["numpy"]["status"] == "failed" and "fetched.mcap' is not an MCAP log" in found["numpy"]["error"]
 
 
 def test_each_program_is_started_by_one_function() -> None:

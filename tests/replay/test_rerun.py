@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
 from calib.rig_file import parse_rig, rig_toml
 from drivers.logs.log_reader import LogReader
-from omnid.recordings.run_series import read_run_series
 from omnid.transport.status_names import ODOMETRY, WHEELS, camera_name, stage_name
 from tests.replay.command import Command
 from tests.replay.recorded import recorded_run
 
 POSES = 18
+ODOM = "/omnid/odom"
 IMAGES = ("/omnid/lower/image_raw/compressed", "/omnid/upper/image_raw/compressed")
 PUBLISHED = {
     "/omnid/odom",
@@ -30,10 +30,6 @@ PUBLISHED = {
     "/omnid/drive",
     *IMAGES,
 }
-AGREE = "the runs agree: no difference is larger than 20 mm or 0.5 deg"
-# Where a busy computer has dropped a pair of the recording.
-AGREE_IN_PART = AGREE.replace("agree:", "agree in what could be compared:")
-COMPARABLE = ("--tolerance-mm", 20, "--tolerance-deg", 0.5, "--shared", 25)  # the live run may drop most of its pairs
 
 
 class Message(NamedTuple):
@@ -118,22 +114,26 @@ def test_all_messages_of_a_pose_agree(messages: list[Message]) -> None:
         assert odom.pose.pose.orientation == edge.transform.rotation
 
 
-def test_a_replay_gives_a_comparable_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:
+def poses_of(log: Path) -> dict[int, np.ndarray]:
+    """Return the positions by the stamps of their poses."""
+    with AnyReader([log]) as bag:
+        odometry = [bag.deserialize(data, place.msgtype) for place, _, data in bag.messages() if place.topic == ODOM]
+    stamps = [int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec) for message in odometry]
+    places = [message.pose.pose.position for message in odometry]
+    return {stamp: np.array([place.x, place.y, place.z]) for stamp, place in zip(stamps, places, strict=True)}
+
+
+def test_a_replay_gives_the_same_trajectory(omnid: Command, tmp_path: Path, recording: Path) -> None:
     """The replay uses only the images, rig and attachments of the recording."""
-    again = tmp_path / "again.mcap"
+    again, paper = tmp_path / "again.mcap", tmp_path / "paper.mcap"
     assert omnid.replay(recording, "--record", again).code == 0
-    code, out, err = omnid("diff", recording, again, *COMPARABLE)
-    assert "rig        the same" in out and "record.enabled: A True, B False" in out
-    stamps = [read_run_series(run).poses.stamps_ns.tolist() for run in (recording, again)]
-    if stamps[0] == stamps[1]:
-        assert code == 0 and "bit-identical" in out, out + err
-    else:  # A busy computer dropped pairs: odometry may say `degraded` after a gap that the replay does not have.
-        assert out.splitlines()[-1] in {AGREE, AGREE_IN_PART, "the runs differ: states"}, out + err
+    ours, theirs = poses_of(recording), poses_of(again)
+    common = ours.keys() & theirs.keys()
+    assert len(common) > POSES // 4
+    # Where a busy computer dropped pairs of the live run, the replay sees other pairs than it.
+    limit_m = 0.0 if ours.keys() == theirs.keys() else 0.02
+    assert max(float(np.linalg.norm(ours[stamp] - theirs[stamp])) for stamp in common) <= limit_m
 
-
-def test_diff_finds_a_setting_that_matters(omnid: Command, tmp_path: Path, recording: Path) -> None:
-    other = tmp_path / "other.mcap"
-    assert omnid.replay(recording, "--record", other, "--method", "paper").code == 0
-    code, out, _ = omnid("diff", recording, other, "--tolerance-mm", 0.1)
-    assert code == 1 and "odometry.method: A 'default', B 'paper'" in out
-    assert re.search(r"more than 0\.1 mm or 0\.1 deg first at \d+\.\d{9} \(\d+\.\d{3} s\): ", out)
+    assert omnid.replay(recording, "--record", paper, "--method", "paper").code == 0
+    others = poses_of(paper)
+    assert max(float(np.linalg.norm(others[stamp] - theirs[stamp])) for stamp in others.keys() & theirs) > 1e-4

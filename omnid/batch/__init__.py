@@ -1,1 +1,0 @@
-"""Many logs: each is replayed by a program of its own, on this machine or on others, into one folder and one table."""
