@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
+from drivers.backoff import Backoff
 from drivers.cameras import v4l2_ioctl as v4l2
 from drivers.cameras.camera_exposure import CameraExposure
 from drivers.cameras.camera_state import CameraState
@@ -53,7 +54,7 @@ class V4l2Camera:
     def frames(self) -> Iterator[Frame]:
         """Yield the frames as they arrive, until `close`; those captured before the first call are discarded."""
         self._reading = True
-        retry_s = _FIRST_RETRY_S
+        reopening = Backoff(_FIRST_RETRY_S, self._settings.retry_s)
         try:
             self._discard()
             while not self._closing:
@@ -62,9 +63,9 @@ class V4l2Camera:
                     yield from self._images()
                 except (OSError, DriverError) as error:
                     self._lose(error)
-                    settled = self.state.frames - delivered > _SETTLED_FRAMES
-                    retry_s = _FIRST_RETRY_S if settled else min(2 * retry_s, self._settings.retry_s)
-                    self._wake.wait(retry_s)
+                    if self.state.frames - delivered > _SETTLED_FRAMES:
+                        reopening.reset()
+                    self._wake.wait(reopening.next_s())
         finally:
             self._reading = False
             self._end()

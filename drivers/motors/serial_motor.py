@@ -14,20 +14,19 @@ from typing import Final
 
 import serial  # type: ignore[import-untyped]
 
+from drivers.backoff import Backoff
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand, is_stop, stop_command
 from drivers.motors.protocols.differential_drive import DifferentialDrive
 from drivers.motors.protocols.line_protocol import LineProtocol
 from drivers.motors.protocols.motor_protocol import MotorProtocol, T, Transaction
-from drivers.pseudo_terminal import TerminalCheck
 
 CONNECT_TRY_S: Final = 0.2
 STOPS_AT_CLOSE: Final = 3  # tries
 READ_LIMIT_BYTES: Final = 4096
 POLL_PERIOD_S: Final = 0.001  # Received bytes are read with this period while an answer is awaited.
 FRESH_SHARE: Final = 0.5  # After a pause of this share of the watchdog's time it may expire before a command arrives.
-FIRST_WAIT_S: Final = 0.2  # First wait between two attempts to open the port; it doubles with each.
-LONGEST_WAIT_S: Final = 5.0
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.2, 5.0  # between two attempts to open the port
 _REASONS = {
     errno.ENOENT: "there is no such port; plug it in, or choose one of `ls /dev/serial/by-id/*`",
     errno.EACCES: "no permission; add the user to group dialout: `sudo usermod -aG dialout $USER`, and log in again",
@@ -56,7 +55,7 @@ class SerialMotor:
     status with watchdog_expired; the command after it drives. After a missing reply and a pause the controller is
     set up again once a stop has got a reply, because it may have been switched off and on, and another stop
     follows. A port that is gone is opened again by a later `send`, with growing waits, during which `send` fails at
-    once. A pseudo-terminal that another program has since is not opened.
+    once.
     """
 
     def __init__(
@@ -82,7 +81,6 @@ class SerialMotor:
         self._protocol = protocol or LineProtocol(DifferentialDrive())
         self._framer = self._protocol.framer()
         self._name, self._baud = port, baud or self._protocol.baud
-        self._terminal = TerminalCheck(port)
         self._timeout_s, self._watchdog_ms = timeout_s, watchdog_ms
         self._port: serial.Serial | None = None
         self._closed = self._armed = False
@@ -91,7 +89,7 @@ class SerialMotor:
         self._set_up_again = False
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
-        self._wait_s, self._next_open_s = FIRST_WAIT_S, -math.inf
+        self._reopening, self._next_open_s = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), -math.inf
         self._connect(connect_s)
 
     @property
@@ -182,7 +180,8 @@ class SerialMotor:
         self._stop_first = True
         in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
         self._fresh_s = FRESH_SHARE * in_force_ms / 1000
-        self._armed, self._set_up_again, self._wait_s = True, False, FIRST_WAIT_S
+        self._armed, self._set_up_again = True, False
+        self._reopening.reset()
         self.connections += 1
 
     def _stopped(self) -> bool:
@@ -198,9 +197,7 @@ class SerialMotor:
         wait_s = self._next_open_s - time.monotonic()
         if wait_s > 0:
             raise DriverError(f"motor on {self._name} is gone; plug it in, it is tried again in {wait_s:.1f} s")
-        self._next_open_s = time.monotonic() + self._wait_s
-        self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
-        self._terminal.require_same()
+        self._next_open_s = time.monotonic() + self._reopening.next_s()
         self._port = _opened(self._name, self._baud)
 
     def _release(self) -> None:
