@@ -13,7 +13,7 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from omnid.calibration.image_pairs import SIDES
 
-# Six pairs, spread over the azimuth, lower the error of lengths to a third or less (docs/notes/calibration.md).
+# Six pairs, spread over the azimuth, lower the error of lengths to a third or less.
 MORE_PAIRS = 6
 # Corners and rays are counted up to this percentile: the last ones are those of one slanted board.
 HIGHEST_PERCENT = 98.0

@@ -30,13 +30,13 @@ def test_code_is_included_as_a_block() -> None:
     ("line", "shown"),
     [
         ("[Safety](omnid/controller/SAFETY.md#arming)", "[Safety](safety.md#arming)"),
-        ("[results](docs/results/README.md)", "[results](results/README.md)"),
+        ("[results](docs/RESULTS.md)", "[results](RESULTS.md)"),
         ("![plan](omnid/sample/plan.png)", "![plan](included/omnid/sample/plan.png)"),
         ("![drive](docs/images/drive.gif)", "![drive](images/drive.gif)"),
         ("[a module](omnid/api.py)", "a module"),
         ("[zenoh](https://zenoh.io)", "[zenoh](https://zenoh.io)"),
         ("see `omnid/core/README.md`", "see [`omnid/core/README.md`](method.md)"),
-        ("see `docs/results`", "see [`docs/results`](results/README.md)"),
+        ("see `docs/RESULTS.md`", "see [`docs/RESULTS.md`](RESULTS.md)"),
         ("see `omnid/api.py`", "see `omnid/api.py`"),
         ("write `[x](docs/maps.md)`", "write `[x](docs/maps.md)`"),
     ],
@@ -46,8 +46,8 @@ def test_links_and_paths_lead_to_pages(line: str, shown: str) -> None:
 
 
 def test_links_start_from_the_page_and_not_from_the_file() -> None:
-    assert linked("`SITE.md`, [x](../core/README.md)", "omnid/transport/SITE.md", "results/a.md") == (
-        "[`SITE.md`](../bus.md), [x](../method.md)"
+    assert linked("`SITE.md`, [x](../core/README.md)", "omnid/transport/SITE.md", "maps.md") == (
+        "[`SITE.md`](bus.md), [x](method.md)"
     )
 
 

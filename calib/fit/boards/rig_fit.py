@@ -35,7 +35,7 @@ MIN_PAIRS = 4
 # A bound for the loop. Each round rejects at most a third of the views, so it ends earlier for lack of pairs.
 MAX_REJECTIONS = 10
 # Larger mean errors mean that the images do not show one board at one time, or that the cameras are wrong, because
-# corners of right ones err by 0.05 to 0.15 px (docs/notes/calibration.md).
+# corners of right ones err by 0.05 to 0.15 px.
 MAX_MEAN_PX = 3.0
 MOTION_NAMES = ("t_x", "t_y", "t_z", "r_x", "r_y", "r_z")
 Images = Mapping[str, NDArray[np.uint8]]

@@ -45,7 +45,7 @@ MOVING_STOP_S: Final = 0.5  # nearer in time than this, the base stops at once; 
 # Speed of a person who walks towards the base, and the time until it brakes, because two pairs at 10 Hz show the
 # person, and images and commands are 0.2 s on their way.
 WALK_MPS, TURN_S = 1.6, 0.4
-MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded (docs/results/speed.md).
+MOST_MOVING: Final = 16  # Most moving obstacles, so that the time of a tick is bounded.
 
 BLOCKED: Final = "an obstacle is in the way"
 NEAR: Final = "an obstacle is near"

@@ -34,7 +34,7 @@ UNSEEN_RUN: Final = 20
 NEAREST_M: Final = 0.5  # Least range at which surfaces are searched. By judgement; not measured.
 # Rows of panoramas in a radian; by trial: with 104 all of 4 goals were reached, with 87 not.
 FLOOR_FOCAL_PX: Final = 100.0
-# Share of the rows of a patch that must be in view. Measured: 0.34 to 0.75 are alike (docs/results/obstacles.md).
+# Share of the rows of a patch that must be in view. Measured: 0.34 to 0.75 are alike.
 LEAST_SEEN: Final = 0.5
 OUTLIER: Final = np.uint8(48)  # Most units by which a pixel differs, because more than four sigmas are no noise.
 DIFFERENCE_RATIO: Final = 0.5  # log-likelihood by a sigma of difference: 1 would be that of independent pixels

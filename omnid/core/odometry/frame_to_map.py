@@ -46,7 +46,7 @@ ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search; as in sectio
 # M and rad; a smaller step of the coarse pose is the last one, because it moves no track by 0.05 px.
 COARSE_CONVERGED = 1e-4
 # Standard deviation of a track whose patch was not yet warped to the new viewpoint. Measured: with 0.67 and 1.5 times
-# as much the odometry errs 0.95 to 1.09 times as much (docs/results/accuracy.md).
+# as much the odometry errs 0.95 to 1.09 times as much.
 COARSE_SIGMA_PX = 0.3
 # Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
 # errors are correlated.

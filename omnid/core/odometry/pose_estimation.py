@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 # Largest error of a view in the consensus set. Measured: with 1.34 and 3 px the odometry's error is 0.96 and 1.01 times
-# as large (docs/results/accuracy.md).
+# as large.
 RANSAC_THRESHOLD_PX = 2.0
 GAUSS_NEWTON_STEPS = 6  # enough: 305 of 306 fits of test_pose_estimation.py converge in 5
 CONVERGED = 1e-5  # m and rad: a smaller step is the last one, because it moves no view by a hundredth of a pixel

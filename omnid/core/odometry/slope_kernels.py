@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 # Half the side of the window. Slopes err by the third power of it, but a large window leaves the plane. 8
-# was tried as well, on thirteen logs of development (docs/notes/odometry.md): set by trial.
+# was tried as well, on thirteen logs of development: set by trial.
 HALF_PX = 10
 SIDE_PX = 2 * HALF_PX + 1
 PIXELS = SIDE_PX * SIDE_PX

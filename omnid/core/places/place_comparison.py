@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 # Least inliers, and sectors of azimuth that hold them, where odometry agrees; by trial on development seeds.
 NEAR_INLIERS, NEAR_SECTORS = 20, 4
-# The same where it gives no pose, because other worlds gave 10 inliers in 600 queries: docs/notes/places.md.
+# The same where it gives no pose, because other worlds gave 10 inliers in 600 queries.
 FAR_INLIERS, FAR_SECTORS = 24, 5
 # At most PER_PLACE of the compared keyframes lie within SAME_PLACE_M of each other; by trial on development seeds.
 PER_PLACE, SAME_PLACE_M = 3, 1.5

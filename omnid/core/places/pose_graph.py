@@ -24,7 +24,7 @@ Indices = NDArray[np.intp]
 # Squared Mahalanobis distance of a right loop, because 99 % are below it (chi-squared, 6 dimensions).
 LARGEST_SQUARED: Final = 16.8
 STEEPER: Final = 2.0  # factor of mu from step to step; Yang et al. take 1.4; by trial on development seeds
-MAX_STEPS: Final = 60  # Gauss-Newton steps; enough: 24 for 2,000 nodes, 200 loops (docs/results/places.md).
+MAX_STEPS: Final = 60  # Gauss-Newton steps; enough: 24 for 2,000 nodes, 200 loops.
 # M and rad: a smaller step is the last one, once all weights are 0 or 1, because no map is so exact.
 CONVERGED: Final = 1e-5
 UNDECIDED: Final = 1e-3  # distance of a weight from 0 and 1; by trial on development seeds
