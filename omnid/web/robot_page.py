@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 
 from starlette.requests import Request
 from starlette.responses import JSONResponse, Response
@@ -10,7 +10,6 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from omnid.client import Answer
 from omnid.web.feed import RobotFeed
-from omnid.web.guard import Guard
 from omnid.web.metrics import metrics
 from omnid.web.robot_requests import RobotRequests
 from omnid.web.stick import StickCommands
@@ -37,10 +36,10 @@ class RobotPage:
             command_route("/goal", self._requests.goal),
         ]
 
-    def metrics(self, guard: Guard) -> str:
-        """Return the metrics of the robot and of this server."""
+    def metrics(self, refused: Mapping[str, int]) -> str:
+        """Return the metrics of the robot and of this server; refused: requests by reason."""
         counts = {"dropped": self.feed.inbox.dropped, "stops": self.wheels.stops, "arms": self._requests.arms}
-        return metrics(self.feed.state, self.feed.browsers, guard.refused, counts)
+        return metrics(self.feed.state, self.feed.browsers, refused, counts)
 
     async def _arm(self, request: Request) -> Answer:
         if self.wheels.is_stopping:

@@ -130,15 +130,15 @@ def stamp_of(text: str) -> int:
     return int(text)
 
 
-async def text_of(request: Request) -> str:
-    """Return the body of a request. Raise OmnidError if it is too long or does not arrive within BODY_S."""
+async def text_of(request: Request, longest: int = LONGEST_BODY) -> str:
+    """Return the body of a request. Raise OmnidError above `longest` bytes, or if it does not arrive within BODY_S."""
     body = bytearray()
     try:
         async with asyncio.timeout(BODY_S):
             async for chunk in request.stream():
                 body += chunk
-                if len(body) > LONGEST_BODY:
-                    raise OmnidError(f"a request of at most {LONGEST_BODY} bytes was expected")
+                if len(body) > longest:
+                    raise OmnidError(f"a request of at most {longest} bytes was expected")
     except TimeoutError:
         raise OmnidError("the request did not come") from None
     return body.decode("utf-8", "replace")

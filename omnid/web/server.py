@@ -1,4 +1,4 @@
-"""The server: its socket, the names by which it may be called, its start and its end."""
+"""The server: the names by which it may be called, the form for the token, its start and its end."""
 
 from __future__ import annotations
 
@@ -10,34 +10,41 @@ import re
 import signal
 import socket
 import sys
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
+from urllib.parse import parse_qs
 
 import uvicorn
-from uvicorn.protocols.http.h11_impl import H11Protocol
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
 
 from omnid.engine.logging_setup import is_journal, log_unlimited
 from omnid.engine.realtime import raise_file_limit
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
-from omnid.web.access import Access, token_of
+from omnid.web.access import Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
-from omnid.web.guard import Guard
-from omnid.web.places import BACKLOG, Acceptor, ConnectionPlaces
+from omnid.web.metrics import CONTENT_TYPE
 from omnid.web.robot_page import RobotPage
-from omnid.web.site import Site
+from omnid.web.robot_requests import text_of
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
-SILENCE_S: Final = 5  # a connection on which nothing has come within that is accepted nevertheless
-REQUEST_S: Final = 5.0  # a connection that has not sent a whole request within that is closed
-END_S: Final = 2  # Time that browsers have to finish at the end.
+STATIC: Final = Path(__file__).with_name("static")
+COOKIE_S: Final = 30 * 86_400  # A browser keeps the cookie for this time.
+LONGEST_FORM: Final = 1024  # bytes
 LONGEST_MESSAGE: Final = 256  # bytes, of a browser's websocket
+BACKLOG: Final = 2048  # connections that wait for the event loop
+END_S: Final = 2  # Time that browsers have to finish at the end.
+# A link of another site brings no cookie along (SameSite=Strict); a page that loads itself again does.
+_AGAIN: Final = '<!DOCTYPE html><title>omnid</title><meta http-equiv="refresh" content="0">'
 _LISTEN: Final = re.compile(r"(\[[0-9A-Fa-f:.%]+\]|[A-Za-z0-9._-]+):(\d{1,5})")
 _NAME: Final = re.compile(r"[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]")
-Follow = Callable[[], Coroutine[Any, Any, None]]
 _ELSEWHERE: Final = "192.0.2.1"  # an address of documentation (RFC 5737); nothing is sent there
 
 
@@ -54,8 +61,11 @@ class WebSettings:
 
 def serve(bus: BusConfig, settings: WebSettings) -> None:
     """Serve the page until SIGINT or SIGTERM. Raise OmnidError for settings that cannot be used."""
+    # 1. Check the settings, and read the tokens.
     checked(bus)
-    _check_names(settings.names)
+    for name in settings.names:
+        if not _NAME.fullmatch(name):
+            raise OmnidError(f"--host {name}: expected a name without scheme and port, such as robot.example.org")
     token = token_of(settings.token_file)
     stop_token = token_of(settings.stop_token_file, "--stop-token-file") if settings.stop_token_file else ""
     if token == stop_token:
@@ -63,99 +73,109 @@ def serve(bus: BusConfig, settings: WebSettings) -> None:
     if settings.token_file is None and is_journal(sys.stdout):
         raise OmnidError("omnid web prints its token, and the journal would keep it: name a --token-file")
     with _listening(settings.listen) as listener:
+        # 2. Build the page.
         host, port = listener.getsockname()[:2]
         local = ipaddress.ip_address(host).is_loopback
-        own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", *_names_of_machine())
-        access = Access(
-            token, frozenset(name.lower() for name in (*own, *settings.names)), not local, f"omnid_{port}", stop_token
-        )
+        name = socket.gethostname()
+        own = ("localhost", "127.0.0.1", "[::1]") if local else ("localhost", name, f"{name}.local")
+        hosts = frozenset(name.lower() for name in (*own, *settings.names))
+        access = Access(token, hosts, not local, f"omnid_{port}", stop_token)
         page = RobotPage(RobotFeed(bus))
-        guard = Site(page.routes(), page.metrics, access, settings.tls is not None).guard
-        server = _Server(_uvicorn_config(guard, settings), guard.places)
+        server = _Server(_uvicorn_config(site(page, access, secure=settings.tls is not None), settings))
         raise_file_limit()
-        scheme = "http" if settings.tls is None else "https"
-        _print_addresses(f"{scheme}://{_address(host)}:{port}/", token, stop_token)
+        # 3. Print where it is; with the tokens, unless the journal would keep them.
+        url = f"{'https' if settings.tls else 'http'}://{_address(host)}:{port}/"
+        if is_journal(sys.stdout):
+            print(f"{url} (the token is in the file of --token-file)", flush=True)
+        else:
+            print(f"{url}?token={token}", flush=True)
+            if stop_token:
+                print(f"{url}?token={stop_token} (may see and stop, not arm)", flush=True)
         if not local and settings.tls is None:
             log_unlimited(
                 logging.WARNING,
                 "the page can be reached from the network without encryption: everyone who can listen there learns the "
                 "token, and may arm the robot; use --tls-certificate and --tls-key, or a network that you trust",
             )
-        asyncio.run(_run(server, page.feed.run, listener))
+        # 4. Serve.
+        asyncio.run(_run(server, page.feed, listener))
 
 
-def _print_addresses(url: str, token: str, stop_token: str) -> None:
-    """Print where the page is; with the tokens, unless the journal would keep them."""
-    if is_journal(sys.stdout):
-        print(f"{url} (the token is in the file of --token-file)", flush=True)
-        return
-    print(f"{url}?token={token}", flush=True)
-    if stop_token:
-        print(f"{url}?token={stop_token} (may see and stop, not arm)", flush=True)
+def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
+    """Return the server's application. secure: it speaks TLS, so that browsers send the cookie over TLS only."""
 
+    async def index(request: Request) -> Response:
+        """Return the page, or the form for the token; let a browser in that names the token."""
+        if "token" in request.query_params:
+            return let_in(request.query_params["token"])
+        if access.role(request) is not None:
+            return FileResponse(STATIC / "index.html")
+        if is_of_other_site(request):
+            return HTMLResponse(_AGAIN)
+        return FileResponse(STATIC / "login.html", status_code=401)
 
-async def _run(server: _Server, follow: Follow, listener: socket.socket) -> None:
-    """Serve until a signal, or until following the robots fails."""
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            loop.add_signal_handler(number, server.end)
-    following = asyncio.create_task(follow())
-    following.add_done_callback(lambda _: server.end())
-    await server.serve([listener])
-    following.cancel()
-    with suppress(asyncio.CancelledError):
-        await following
+    async def login(request: Request) -> Response:
+        """Let a browser in that sends the token in a form."""
+        try:
+            fields = parse_qs(await text_of(request, LONGEST_FORM), max_num_fields=4)
+        except (OmnidError, ValueError):  # too long, too slow, or more fields
+            return PlainTextResponse("omnid web: this is no token\n", 413)
+        return let_in(fields.get("token", [""])[0])
+
+    def let_in(token: str) -> Response:
+        role = access.role_of(token)
+        if role is None:
+            guard.refused["wrong token"] += 1
+            return FileResponse(STATIC / "login.html", status_code=401)
+        response = RedirectResponse("/", 303)
+        value = access.new_cookie(role)
+        response.set_cookie(access.cookie, value, COOKIE_S, httponly=True, samesite="strict", secure=secure)
+        return response
+
+    async def logout(_: Request) -> Response:
+        """Let the browser forget the cookie."""
+        response = RedirectResponse("/", 303)
+        response.delete_cookie(access.cookie, httponly=True, samesite="strict", secure=secure)
+        return response
+
+    async def metrics(_: Request) -> Response:
+        return PlainTextResponse(page.metrics(guard.refused), media_type=CONTENT_TYPE)
+
+    outer = [
+        Route("/", index),
+        Route("/login", login, methods=["POST"]),
+        Route("/logout", logout, methods=["POST"]),
+        Route("/metrics", metrics),
+        Mount("/static", StaticFiles(directory=STATIC)),
+    ]
+    guard = Guard(Starlette(routes=[*outer, *page.routes()]), access)
+    return guard
 
 
 class _Server(uvicorn.Server):
-    """A server whose signals are handled by its caller, and whose connections have places."""
-
-    def __init__(self, config: uvicorn.Config, places: ConnectionPlaces) -> None:
-        super().__init__(config)
-        self._places = places
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to accept connections."""
-        assert sockets is not None
-
-        def protocol() -> asyncio.Protocol:
-            return _Protocol(config=self.config, server_state=self.server_state, app_state=self.lifespan.state)
-
-        acceptors = [Acceptor(listener, protocol, self.config.ssl, self._places) for listener in sockets]
-        self.servers = cast("list[asyncio.base_events.Server]", acceptors)  # uvicorn only closes them
-        self.started = True
-
-    def end(self) -> None:
-        """Close all connections and end."""
-        self.should_exit = True
+    """A server whose signals are handled by its caller."""
 
     def capture_signals(self) -> Any:
         """Leave the signals alone."""
         return nullcontext()
 
 
-class _Protocol(H11Protocol):
-    """HTTP that closes connections on which no whole request comes in time: they would keep browsers out."""
+async def _run(server: _Server, feed: RobotFeed, listener: socket.socket) -> None:
+    """Serve until a signal, or until following the robot fails."""
 
-    def connection_made(self, transport: Any) -> None:
-        """Begin to wait for the first request."""
-        super().connection_made(transport)
-        self._wait_for_request()
+    def end() -> None:
+        server.should_exit = True
 
-    def data_received(self, data: bytes) -> None:
-        """Take a part of a request; begin to wait where the last one is answered."""
-        super().data_received(data)
-        if self.cycle is not None and self.cycle.response_complete and self.timeout_keep_alive_task is None:
-            self._wait_for_request()
-
-    def _wait_for_request(self) -> None:
-        self.loop.call_later(REQUEST_S, self._close_silent, self.cycle)
-
-    def _close_silent(self, before: object) -> None:
-        """Close the connection if no request has come since then, unless it has become a websocket."""
-        if self.cycle is before and self.transport.get_protocol() is self:
-            self.transport.close()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            loop.add_signal_handler(number, end)
+    following = asyncio.create_task(feed.run())
+    following.add_done_callback(lambda _: end())
+    await server.serve([listener])
+    following.cancel()
+    with suppress(asyncio.CancelledError):
+        await following
 
 
 def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
@@ -166,10 +186,11 @@ def _uvicorn_config(guard: Guard, settings: WebSettings) -> uvicorn.Config:
     config = uvicorn.Config(
         guard,
         loop="asyncio",
-        http=_Protocol,
+        http="h11",
         ws="websockets-sansio",
         interface="asgi3",
         lifespan="off",
+        backlog=BACKLOG,
         ws_max_size=LONGEST_MESSAGE,
         ws_ping_interval=None,
         ws_per_message_deflate=False,
@@ -202,25 +223,14 @@ def _listening(listen: str) -> Iterator[socket.socket]:
     try:
         family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listener = socket.create_server(address[:2], family=family, backlog=BACKLOG)
-        # A browser speaks first, with TLS too. The system keeps connections on which nothing has come to itself.
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, SILENCE_S)
     except OSError as error:
         raise OmnidError(
             f"--listen {listen}: {error.strerror or error}; stop the other program there, or name another address"
         ) from error
     with listener:
+        # Connections of phones that have left the network end at some time; accepted sockets inherit it.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         yield listener
-
-
-def _check_names(names: tuple[str, ...]) -> None:
-    for name in names:
-        if not _NAME.fullmatch(name):
-            raise OmnidError(f"--host {name}: expected a name without scheme and port, such as robot.example.org")
-
-
-def _names_of_machine() -> tuple[str, str]:
-    name = socket.gethostname()
-    return name, f"{name}.local"
 
 
 def _address(host: str) -> str:
@@ -229,5 +239,5 @@ def _address(host: str) -> str:
         with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect((_ELSEWHERE, 9))  # chooses the interface, sends nothing
             return str(probe.getsockname()[0])
-        return _names_of_machine()[0]
+        return socket.gethostname()
     return f"[{host}]" if ":" in host else host

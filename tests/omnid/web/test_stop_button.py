@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from omnid.web.site import STATIC
+from omnid.web.server import STATIC
 
 NODE = shutil.which("node")
 PATIENCE_S = 30.0
