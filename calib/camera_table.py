@@ -1,4 +1,4 @@
-"""The table of one camera in a `rig.toml` or `camera.toml`, read and written: model, size, intrinsics and mask."""
+"""The table of one camera in a `rig.toml`, read and written: model, size, intrinsics and mask."""
 
 from __future__ import annotations
 

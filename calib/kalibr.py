@@ -6,7 +6,6 @@ are [xi, fu, fv, pu, pv].
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -21,7 +20,7 @@ from calib.bounded_yaml import MAX_BYTES, parse_yaml
 from calib.errors import CalibError
 from calib.models.camera import Array, OmniCamera
 from calib.models.lens import lens_camera
-from calib.models.names import model_name, sees_directly
+from calib.models.names import sees_directly
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig, ShutterTimes
 from calib.rig_frame import rig_between
@@ -223,43 +222,3 @@ def _camera(table: ValidatedTable) -> OmniCamera:
         if str(error).startswith(table.file):
             raise
         raise CalibError(f"{table.file}: {table.path}: {error}") from error
-
-
-def export_kalibr(rig: Rig) -> str:
-    """Return the rig as the text of a `camchain.yaml`, the lower camera as cam0; without masks and T_base_rig."""
-    topics = [rig.topics[0] or "/lower/image_raw", rig.topics[1] or "/upper/image_raw"]
-    T_upper_lower = rig.upper.T_cam_rig @ se3.inverse(rig.lower.T_cam_rig)
-    lower = _camera_text(rig.lower, topics[0])
-    upper = _camera_text(rig.upper, topics[1])
-    return f"cam0:\n{lower}cam1:\n{upper}  T_cn_cnm1:\n{_matrix(T_upper_lower)}"
-
-
-def _camera_text(mounted: MountedCamera, topic: str) -> str:
-    camera = mounted.camera
-    if not isinstance(camera, UnifiedCamera):
-        raise CalibError(
-            "export: Kalibr's camchain.yaml holds omni cameras, "
-            f"found one of the model {model_name(camera)}; use --format ocam for an ocam camera"
-        )
-    has_distortion = any(camera.distortion)
-    return (
-        f"  camera_model: omni\n  intrinsics: {_row((camera.xi, *camera.focal, *camera.center))}\n"
-        f"  distortion_model: {'radtan' if has_distortion else 'none'}\n"
-        f"  distortion_coeffs: {_row(camera.distortion) if has_distortion else '[]'}\n"
-        f"  resolution: [{int(camera.size[0])}, {int(camera.size[1])}]\n"
-        f"  rostopic: {json.dumps(topic)}\n  T_cam_imu:\n{_matrix(mounted.T_cam_rig)}"
-    )
-
-
-def _matrix(T: Array) -> str:
-    return "".join(f"  - {_row(row)}\n" for row in T)
-
-
-def _row(values: Array | tuple[float, ...]) -> str:
-    return "[" + ", ".join(map(_float, values)) + "]"
-
-
-def _float(value: float) -> str:
-    """Return the number with a decimal point, which YAML 1.1 requires: 1e-07 would be read as a string."""
-    text = repr(float(value) + 0.0)
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text

@@ -1,4 +1,4 @@
-"""OCamCalib's `calib_results.txt`, read and written: one file per camera, without the transform between them."""
+"""OCamCalib's `calib_results.txt`: one file per camera, without the transform between them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import NoReturn
 import numpy as np
 
 from calib.errors import CalibError
-from calib.models.camera import Array, OmniCamera
-from calib.models.names import model_name
+from calib.models.camera import Array
 from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
 from calib.rig import Rig
 from calib.rig_frame import rig_between
@@ -18,10 +17,6 @@ from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, rea
 
 # More than any file needs: one of the toolbox has about 2 kB.
 MAX_BYTES = 1 << 16
-# The degree of the inverse polynomial is raised until it reaches this error, because that is the toolbox's own goal and
-# bound.
-INVERSE_GOAL_PX = 0.01
-INVERSE_DEGREES = range(4, 26)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,49 +84,3 @@ def _size(line: _Line) -> tuple[int, int]:
     if not is_image_size(width, height) or (height, width) != (int(height), int(width)):
         line.fail(f"the image's height and width in whole pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all")
     return int(width), int(height)
-
-
-def export_ocam(camera: OmniCamera) -> str:
-    """Return the text of a calib_results.txt, with an inverse polynomial for programs that need one."""
-    if not isinstance(camera, OcamCamera):
-        raise CalibError(
-            f"export: calib_results.txt holds ocam cameras, found one of the model {model_name(camera)}; "
-            "use --format kalibr for an omni camera"
-        )
-    if any(camera.tangential) or any(camera.astigmatism) or any(camera.wavefront):
-        raise CalibError(
-            "export: calib_results.txt cannot hold the terms p1, p2, s1, s2, wavefront of this camera; "
-            "calibrate with --model ocam"
-        )
-    width, height = camera.size
-    sections = (
-        ("polynomial coefficients for the direct mapping: f(rho), constant first", _counted(camera.polynomial)),
-        (
-            "polynomial coefficients for the inverse mapping: rho of the angle, constant first",
-            _counted(inverse_polynomial(camera)),
-        ),
-        ('center: "row" and "column", starting from 0 (C convention)', _row(camera.center_row_column)),
-        ('affine parameters "c", "d", "e"', _row(camera.affine)),
-        ('image size: "height" and "width"', f"{int(height)} {int(width)}"),
-    )
-    return "".join(f"#{title}\n\n{numbers}\n\n" for title, numbers in sections)
-
-
-def inverse_polynomial(camera: OcamCamera) -> tuple[float, ...]:
-    """Fit rho [px] as a polynomial of atan(f(rho)/rho) [rad] over the radii of the image, as in the toolbox's files."""
-    corners = np.hypot(*(np.maximum(camera.center, np.subtract(camera.size, camera.center))))
-    radii = np.linspace(0, min(float(corners), camera.radius_limit_px), 1000)
-    angles = np.arctan2(camera.height(radii), radii)
-    for degree in INVERSE_DEGREES:
-        fit = np.polynomial.Polynomial.fit(angles, radii, degree)
-        if np.abs(fit(angles) - radii).max() < INVERSE_GOAL_PX:
-            break
-    return tuple(float(a) for a in fit.convert().coef)
-
-
-def _counted(values: tuple[float, ...]) -> str:
-    return f"{len(values)} {_row(values)}"
-
-
-def _row(values: tuple[float, ...]) -> str:
-    return " ".join(repr(float(value) + 0.0) for value in values)

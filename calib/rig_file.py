@@ -54,11 +54,6 @@ def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.to
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
     table = toml_table(text, name)
     require_schema(table, SCHEMA)
-    if table.has("camera"):
-        raise CalibError(
-            f"{name}: a camera.toml, the file of one camera; a rig.toml was expected: `omnid calibrate rig` makes one, "
-            "also of two such files by --lower-camera and --upper-camera"
-        )
     table.allow_only(("schema", "T_base_rig", "covariance", "times", "refined", *SIDES))
     lower, upper = (table.table(side) for side in SIDES)
     T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)

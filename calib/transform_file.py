@@ -34,12 +34,6 @@ def read_transform(path: Path) -> Array:
     return ValidatedTable({KEY: rows}, str(path)).transform(KEY)
 
 
-def transform_toml(T_lower_upper: Array) -> str:
-    """Return the text of a transform file: p_lower = T_lower_upper @ p_upper."""
-    rows = "".join(f"    {[float(value) for value in row]},\n" for row in T_lower_upper)
-    return f"{KEY} = [\n{rows}]\n"
-
-
 def straight_up(baseline_m: float) -> Array:
     """Return T_lower_upper of an upper camera straight above the lower one, equally oriented, both looking up.
 

@@ -8,7 +8,7 @@
     odometry = omnid.Odometry("rig.toml")                 # images in, poses out
     pose = odometry.process(stamp_ns, lower, upper)       # grey images (H, W) uint8 -> OdometryUpdate
 
-    found = omnid.calibrate_rig("boards/", omnid.Board(6, 7, 0.03))   # also calibrate_camera, calibrate_drive
+    found = omnid.calibrate_rig("boards/", omnid.Board(6, 7, 0.03))   # also calibrate_drive
     print(found)
     found.save("rig.toml")
 
@@ -23,7 +23,6 @@ from omnid.version import __version__
 if TYPE_CHECKING:
     from calib.boards.board import Board
     from omnid.api import Odometry, replay
-    from omnid.calibration.camera import calibrate_camera
     from omnid.calibration.drive import calibrate_drive
     from omnid.calibration.height import calibrate_height
     from omnid.calibration.mask import calibrate_mask
@@ -43,7 +42,6 @@ __all__ = [
     "RunResult",
     "TrackingState",
     "__version__",
-    "calibrate_camera",
     "calibrate_drive",
     "calibrate_height",
     "calibrate_mask",
@@ -59,7 +57,6 @@ _MODULES = {
     "OmnidError": "omnid.errors",
     "RunResult": "omnid.runs.run_result",
     "TrackingState": "omnid.tracking_state",
-    "calibrate_camera": "omnid.calibration.camera",
     "calibrate_drive": "omnid.calibration.drive",
     "calibrate_height": "omnid.calibration.height",
     "calibrate_mask": "omnid.calibration.mask",

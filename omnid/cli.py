@@ -37,9 +37,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "replay": Entry("replay", "run a recorded log through the stages of the daemon"),
         "demo": Entry("demo", "replay a sample in real time: files, bus and a simulated motor"),
         "eval": Entry("evaluate", "compare a trajectory with the truth, both in the TUM format"),
-        "calibrate board": Entry("calibrate_board", "a board to print, true to scale, with a ruler to check the print"),
         "calibrate live": Entry("calibrate_live", "images of a board, with its coverage so far and what is missing"),
-        "calibrate camera": Entry("calibrate_camera", "a camera.toml from images of a board"),
         "calibrate rig": Entry("calibrate_rig", "a rig.toml from images of a board that both cameras saw at once"),
         "calibrate check": Entry("calibrate_check", "compare a rig with its file, without a board"),
         "calibrate drive": Entry(
@@ -52,10 +50,9 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
             "calibrate_mask", "masks of what is fixed to the cameras, such as reflections of lenses"
         ),
         "calibrate import": Entry(
-            "calibrate_files:import_rig",
+            "calibrate_import",
             "a rig.toml from a Kalibr file, from two OCamCalib files, or of two 360-degree cameras",
         ),
-        "calibrate export": Entry("calibrate_files:export_rig", "Kalibr or OCamCalib files from a rig.toml"),
         "cameras": Entry("cameras", "list cameras and the udev rule to copy, or show what they see"),
         "arm": Entry("robot:arm", "let the wheels turn, after the robot's start, a stop or a fault"),
         "stop": Entry("robot:stop", "stop the wheels until `omnid arm`; everyone who can connect may"),
@@ -94,7 +91,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
 # First word of commands with subcommands -> its line in the list of commands.
 GROUPS: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "calibrate": "make a camera.toml or a rig.toml, or other programs' files",
+        "calibrate": "make a rig.toml",
         "route": "teach a route by driving it, and repeat it",
         "log": "show the content of logs",
         "map": "build, show, merge and export maps of places (.omap)",
@@ -106,6 +103,14 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
     {
         "accept": "`python -m omnid.examples.acceptance LOG DISTANCE_M` judges a drive between two marks",
         "batch --dask": "--scheduler ADDRESS",
+        "calibrate board": "print docs/board.pdf (6x7 corners, squares of 25 mm); others: https://calib.io or Kalibr",
+        "calibrate camera": "`omnid calibrate rig` fits both cameras",
+        "calibrate export": "calibrate with that program, and `omnid calibrate import` its file",
+        "calibrate rig --lower-camera": "`omnid calibrate rig` fits both cameras",
+        "calibrate rig --upper-camera": "`omnid calibrate rig` fits both cameras",
+        "calibrate rig --refine-cameras": "`omnid calibrate rig` fits both cameras",
+        "calibrate rig --lower-area": "omnid is for two cameras: split the images into lower_*.png and upper_*.png",
+        "calibrate rig --upper-area": "omnid is for two cameras: split the images into lower_*.png and upper_*.png",
         "config migrate": "`omnid config check FILE` names each setting that this version does not know",
         "install-service --root": "install in the system itself, for example in a chroot or a container of that folder",
         "diff": "`cmp` compares files, `omnid eval` and `evo_traj` trajectories",

@@ -31,8 +31,6 @@ class CameraParameterisation:
 
     def camera_at(self, steps: Array) -> OmniCamera:
         """Return the camera at the steps; raises CalibError if its parameters are not those of a camera."""
-        if not self.names:
-            return self.base
         values = dict(zip(self.names, self.plain_values(steps).tolist(), strict=True))
         if isinstance(self.base, UnifiedCamera):
             return _omni_camera(self.base, values)
@@ -45,11 +43,6 @@ class CameraParameterisation:
     def plain_by_steps(self, steps: Array) -> Array:
         """Return the derivatives (P, P) of the plain values by the steps."""
         return np.diag(self.units)
-
-
-def fixed_camera(camera: OmniCamera) -> CameraParameterisation:
-    """Return the parameterisation of a camera of any model that stays as it is: it has no parameters."""
-    return CameraParameterisation(camera, (), np.zeros(0), np.zeros(0))
 
 
 def parameterise(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -15,14 +15,18 @@ from calib.boards.marker_board import AprilGrid, CharucoBoard
 from calib.boards.marker_finder import find_marker_board
 from calib.boards.marker_reading import seen_dictionary
 from omnid.calibration.images import Image, Images
-from omnid.calibration.progress import Progress, silent
 from omnid.errors import OmnidError
 
 AnyBoard = Board | CharucoBoard | AprilGrid
+Progress = Callable[[str], None]  # receives the lines that a long calibration reports while it runs
 # A log shows similar views many times: this number of diverse views is as good as all, in a fraction of the time.
 MAX_LOG_VIEWS = 40
 # Images in which markers of other dictionaries are searched if no board is found.
 HINT_IMAGES = 3
+
+
+def silent(line: str) -> None:
+    """Report nothing."""
 
 
 def search_board(image: Image, board: AnyBoard, name: str = "", *, thorough: bool) -> BoardSearch:

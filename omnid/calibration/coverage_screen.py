@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.boards.board import BoardView
 from omnid.calibration.coverage import HOURS, NEEDED_PAIRS, RINGS, CameraCoverage, finite_corners
-from omnid.calibration.image_pairs import SIDES
+from omnid.calibration.images import SIDES
 from omnid.calibration.live_boards import LiveBoards, PairOutcome
 from omnid.transport.codec import OK
 from omnid.transport.records import DiagnosticStatus

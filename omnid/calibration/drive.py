@@ -27,10 +27,10 @@ from calib.models.ocam import has_wavefront
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import RigCovariance
 from calib.rig_file import read_rig
+from omnid.calibration.board_search import Progress, silent
 from omnid.calibration.drive_observations import Drives, Topics, collect
 from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
 from omnid.calibration.drive_start import straightened, with_masks
-from omnid.calibration.progress import Progress, silent
 from omnid.calibration.same_rig import require_same_rig
 from omnid.config import Config
 from omnid.errors import OmnidError

@@ -16,7 +16,7 @@ from calib.fit.drive.observations import DriveObservations, DriveState, Keyframe
 from calib.rig import Rig
 from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.image_pairs import open_log
+from omnid.calibration.images import open_log
 from omnid.config import Config
 from omnid.core.rig.column_matches import match
 from omnid.core.rig.drive_landmarks import LANDMARKS, DriveLandmarks, PanoramaObservations, View, image_pixels

@@ -14,9 +14,9 @@ from calib.fit.drive.rig_parameters import RigParameters
 from calib.fit.drive.rig_prior import prior_information
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
+from omnid.calibration.board_search import Progress
 from omnid.calibration.drive_observations import Topics, observe_pairs
-from omnid.calibration.image_pairs import open_log
-from omnid.calibration.progress import Progress
+from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import check_rig, read_rig_pairs
 from omnid.config import Config
 from omnid.errors import OmnidError

@@ -14,7 +14,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from omnid.calibration.drive_observations import Topics
 from omnid.calibration.drive_start import with_masks
-from omnid.calibration.image_pairs import open_log
+from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import read_rig_pairs
 from omnid.config import Config
 from omnid.core.floor import MOST_PAIRS, Floor, FloorEstimator

@@ -1,4 +1,4 @@
-"""Images of one camera: from files, folders and patterns, or from one topic of a log.
+"""Images of two cameras for a calibration: lower_*, upper_* of a folder, or the pairs of a log.
 
 Files of 16 bits a sample may hold the 10 or 12 bits of a camera: where none of the images has a larger sample, all are
 read by the upper eight of these bits.
@@ -6,10 +6,10 @@ read by the upper eight of these bits.
 
 from __future__ import annotations
 
-import glob
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,48 +17,72 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import FrameDecodeError
-from drivers.frame import FILE_BITS, MAX_PIXELS, bits_of_camera, gray, upper_eight_bits
+from calib.rig import Rig
+from drivers.errors import DriverError, FrameDecodeError
+from drivers.frame import FILE_BITS, MAX_PIXELS, Frame, bits_of_camera, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES
-from drivers.logs.image_log import ImageLog, LoggedImage, images_of
-from drivers.logs.log_formats import LOG_SUFFIXES, open_image_log
-from drivers.logs.mcap_records import RecordError
-from drivers.logs.ros_image import IMAGE_TYPES
-from drivers.logs.sample_bits import SampleBits
+from drivers.logs.log_formats import LOG_SUFFIXES
+from drivers.logs.log_reader import LogReader
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]
 # By name, all of one size.
 Images = dict[str, Image]
+SIDES = ("lower", "upper")
+# Largest difference between the stamps of a pair: boards are held still, so that 10 ms show the same instant.
+TOLERANCE_NS = 10_000_000
+# Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.
+LOG_PAIRS = 100
 MAX_IMAGES = 400
-# Number of frames of a log that are used, evenly spread: a board held by hand moves little between two of them.
-LOG_FRAMES = 120
 
 
-def read_images(sources: Sequence[str], topic: str | None = None) -> Images:
-    """Read grey images of files, folders and patterns, or of a log's topic; raises OmnidError unless all are readable
-    and of one size."""
-    logs = [source for source in sources if is_log(Path(source))]
-    if logs and len(sources) > 1:
-        raise OmnidError(f"{logs[0]}: expected images, or one log alone; found {len(sources)} names")
-    if topic and not logs:
-        raise OmnidError(f"--topic {topic}: only a log has topics; found images")
-    images = _of_log(Path(logs[0]), topic) if logs else _of_files(sources)
-    one_size(images)
-    return images
+@dataclass(frozen=True, slots=True)
+class PairedImages:
+    """Images of the lower and the upper camera by the name of the instant; some instants have one camera only."""
+
+    sides: tuple[Images, Images]
+    topics: tuple[str, str] = ("", "")
+    notes: tuple[str, ...] = ()  # about images that were left out
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of all instants, sorted."""
+        return sorted({**self.sides[0], **self.sides[1]})
 
 
-def is_log(source: Path) -> bool:
-    """True if a source of images is a log by its name."""
+def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedImages:
+    """Read the images of a folder or a log; lower and upper: a log's topics. Raises OmnidError without any pair.
+
+    An instant whose images have all pixels of those of an earlier one is left out: it is no further view of a board,
+    and would count the same errors again.
+    """
+    # 1. Read the images of both cameras.
+    of_log = _is_log(source) or (source.is_dir() and any(map(_is_log, source.iterdir())))
+    if not of_log and (lower or upper):
+        raise OmnidError(f"{source}: only a log has topics; found a folder of images")
+    if of_log:
+        sides, topics = _of_log(source, lower, upper)
+    else:
+        sides, topics = _of_folder(source), ("", "")
+    if not sides[0].keys() & sides[1].keys():
+        counted = ", ".join(f"{len(side)} of the {name} camera" for name, side in zip(SIDES, sides, strict=True))
+        raise OmnidError(
+            f"{source}: no pair of images: found {counted}; expected pairs like lower_001.png "
+            "and upper_001.png in a folder, or images with nearly equal stamps in a log"
+        )
+    # 2. Leave out those that repeat an earlier instant.
+    repeated = _repeats(sides)
+    kept = [{name: image for name, image in side.items() if name not in repeated} for side in sides]
+    notes = tuple(f"left out {name}: the same image as {earlier}" for name, earlier in repeated.items())
+    return PairedImages((kept[0], kept[1]), topics, notes)
+
+
+def _is_log(source: Path) -> bool:
     return source.suffix in LOG_SUFFIXES
 
 
-def repeats(sides: Sequence[Images]) -> dict[str, str]:
-    """Return the names of images, or of images of several cameras of one instant, that have all pixels of earlier ones.
-
-    sides: the images of each camera by the name of the instant. A repeated image is no further view of a board: it
-    would count the same errors again. Return name -> the earlier name.
-    """
+def _repeats(sides: Sequence[Images]) -> dict[str, str]:
+    """Return the instants whose images have all pixels of those of an earlier one: name -> the earlier name."""
     first, found = dict[tuple[bytes, ...], str](), dict[str, str]()
     for name in sorted({name for side in sides for name in side}):
         key = tuple(hashlib.sha256(side[name].tobytes()).digest() if name in side else b"" for side in sides)
@@ -68,31 +92,32 @@ def repeats(sides: Sequence[Images]) -> dict[str, str]:
     return found
 
 
-def repeat_notes(repeated: Mapping[str, str]) -> tuple[str, ...]:
-    """Return a line for each image that is left out because it repeats another one."""
-    return tuple(f"left out {name}: the same image as {earlier}" for name, earlier in repeated.items())
+def _of_folder(folder: Path) -> tuple[Images, Images]:
+    if not folder.is_dir():
+        raise OmnidError(
+            f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
+            f"found {'a file' if folder.exists() else 'no such file or folder'}"
+        )
+    lower, upper = (_of_side(folder, side) for side in SIDES)
+    return lower, upper
 
 
-def brightest(images: Iterable[Image]) -> Image:
-    """Return the maximum (H, W) of images of one size: of a mirror it shows the rim best."""
-    return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
-
-
-def middle_px(image: Image) -> tuple[float, float]:
-    """Return the middle (u, v) of an image, px."""
-    height, width = image.shape
-    return (width - 1) / 2, (height - 1) / 2
-
-
-def _of_files(sources: Sequence[str]) -> Images:
-    paths = list(dict.fromkeys(path for source in sources for path in _expanded(source)))
+def _of_side(folder: Path, side: str) -> Images:
+    """Return the images of one camera by the name of their instant: lower_001.png is that of 001."""
+    paths = dict[str, Path]()
+    for path in sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in IMAGE_SUFFIXES):
+        if (other := paths.setdefault(path.stem.removeprefix(f"{side}_"), path)) != path:
+            raise OmnidError(f"{folder}: {other.name} and {path.name} have one name; remove or rename one of them")
+    if not paths:
+        raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
     if len(paths) > MAX_IMAGES:
         raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
-    images = [np.asarray(_read(path), np.uint8) for path in paths]
+    images = [np.asarray(_read(path), np.uint8) for path in paths.values()]
     # The upper eight of 16 bits show which images hold fewer bits: only these are read again.
     if bits_of_camera(256 * max(int(image.max()) for image in images) + 255) < FILE_BITS:
-        images = _by_the_bits_of_the_camera(paths, images)
-    return dict(zip(_short_names(paths), images, strict=True))
+        images = _by_the_bits_of_the_camera(list(paths.values()), images)
+    _require_one_size({path.name: image for path, image in zip(paths.values(), images, strict=True)})
+    return dict(zip(paths, images, strict=True))
 
 
 def _by_the_bits_of_the_camera(paths: Sequence[Path], images: Sequence[Image]) -> list[Image]:
@@ -103,25 +128,6 @@ def _by_the_bits_of_the_camera(paths: Sequence[Path], images: Sequence[Image]) -
         upper_eight_bits(samples, bits) if samples.dtype == np.uint16 else image
         for samples, image in zip(deep, images, strict=True)
     ]
-
-
-def _expanded(source: str) -> list[Path]:
-    """Return the files of a name, a folder or a pattern."""
-    path = Path(source)
-    if path.is_dir():
-        found = sorted(file for file in path.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
-    else:
-        found = [path] if path.exists() else sorted(map(Path, glob.glob(source)))
-    if not found:
-        what = f"no image ({' '.join(sorted(IMAGE_SUFFIXES))}) in this folder" if path.is_dir() else "no such file"
-        raise OmnidError(f"{source}: {what}; give files, a folder or a pattern like 'calib/*.png'")
-    return found
-
-
-def _short_names(paths: Sequence[Path]) -> list[str]:
-    """Return the file names, or the whole paths if two files have the same name."""
-    short = [path.name for path in paths]
-    return short if len(set(short)) == len(short) else [str(path) for path in paths]
 
 
 def _read(path: Path, depth: int = 0) -> NDArray[Any]:
@@ -141,7 +147,7 @@ def _read(path: Path, depth: int = 0) -> NDArray[Any]:
     return np.ascontiguousarray(image)
 
 
-def one_size(images: Images) -> None:
+def _require_one_size(images: Images) -> None:
     """Raise OmnidError unless all images are of one size."""
     sizes: dict[tuple[int, ...], str] = {}
     for name, image in images.items():
@@ -151,41 +157,51 @@ def one_size(images: Images) -> None:
         raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {shown}")
 
 
-def _of_log(path: Path, topic: str | None) -> Images:
-    with closing(open_image_log(path)) as log:
-        chosen = _topic(path, log, topic)
-        stride = max(1, sum(1 for _ in _images(log, chosen)) // LOG_FRAMES)
-        return dict(_frames(log, chosen, stride))
+def _of_log(log: Path, lower: str | None, upper: str | None) -> tuple[tuple[Images, Images], tuple[str, str]]:
+    """Return LOG_PAIRS pairs of a log, without those that cannot be decoded, and its topics."""
+    sides: tuple[Images, Images] = ({}, {})
+    with closing(LogReader(log, lower, upper)) as reader:
+        stride = max(1, sum(1 for _ in paired(reader.frames())) // LOG_PAIRS)
+        for number, pair in enumerate(paired(reader.frames())):
+            if number % stride:
+                continue
+            with suppress(FrameDecodeError):
+                images = [gray(frame) for frame in pair]
+                for side, image in zip(sides, images, strict=True):
+                    side[f"pair{number:05d}"] = image
+        topics = reader.topics
+    for side in sides:
+        _require_one_size(side)
+    return sides, (topics["lower"], topics["upper"])
 
 
-def image_topic(path: Path, topic: str | None) -> str:
-    """Return the requested topic of a log, or the only one with images."""
-    with closing(open_image_log(path)) as log:
-        return _topic(path, log, topic)
+def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Iterator[tuple[Frame, Frame]]:
+    """Yield pairs of lower and upper frames with nearly equal stamps, from frames in order of stamps, undecoded."""
+    waiting: Frame | None = None
+    for frame in frames:
+        if waiting and waiting.camera != frame.camera and frame.stamp_ns - waiting.stamp_ns <= tolerance_ns:
+            yield (waiting, frame) if frame.camera == "upper" else (frame, waiting)
+            waiting = None
+        else:
+            waiting = frame
 
 
-def _topic(path: Path, log: ImageLog, topic: str | None) -> str:
-    """Return the requested topic, or the only one with images."""
-    images = sorted(name for name, kind in log.topics().items() if kind in IMAGE_TYPES)
-    if topic in images:
-        return str(topic)
-    if topic is None and len(images) == 1:
-        return images[0]
-    wanted = f"topic {topic}" if topic else "--topic, to select the camera"
-    raise OmnidError(f"{path}: expected {wanted}, found image topics {', '.join(images) or '(none)'}")
+def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) -> LogReader:
+    """Open the log's two cameras: by the requested topics, by the rig's if the log has them, or by their names."""
+    rig_topics = rig.topics if rig else ("", "")
+    named = [requested or known or None for requested, known in zip(topics, rig_topics, strict=True)]
+    if rig and not any(topics):
+        with suppress(DriverError):
+            return LogReader(log, *named)
+    return LogReader(log, *topics)
 
 
-def _images(log: ImageLog, topic: str) -> Iterator[LoggedImage]:
-    return (image for image in images_of(log) if image.topic == topic)
+def brightest(images: Iterable[Image]) -> Image:
+    """Return the maximum (H, W) of images of one size: of a mirror it shows the rim best."""
+    return np.asarray(np.max(np.stack(list(images)), axis=0), np.uint8)
 
 
-def _frames(log: ImageLog, topic: str, stride: int) -> Iterator[tuple[str, Image]]:
-    """Yield every stride-th image, named by its number, without those that cannot be decoded."""
-    bits = SampleBits()
-    for number, logged in enumerate(_images(log, topic)):
-        if number % stride:
-            continue
-        try:
-            yield f"frame{number:06d}", gray(bits.applied(topic, logged.read()).frame(seq=number))
-        except (FrameDecodeError, RecordError):
-            continue
+def middle_px(image: Image) -> tuple[float, float]:
+    """Return the middle (u, v) of an image, px."""
+    height, width = image.shape
+    return (width - 1) / 2, (height - 1) / 2

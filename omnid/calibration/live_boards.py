@@ -14,8 +14,7 @@ from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 from omnid.calibration.board_search import AnyBoard, search_board
 from omnid.calibration.coverage import NEEDED_PAIRS, NEW_VIEW_PART, STILL_PART, CameraCoverage, moved
-from omnid.calibration.image_pairs import SIDES
-from omnid.calibration.images import Image, middle_px
+from omnid.calibration.images import SIDES, Image, middle_px
 from omnid.errors import OmnidError
 
 MOST_PAIRS: Final = 200

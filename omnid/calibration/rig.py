@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from os import PathLike
 from pathlib import Path
 
@@ -14,26 +13,24 @@ from calib import se3
 from calib.boards.board import BoardView
 from calib.boards.marker_board import AprilGrid
 from calib.boards.print_shape import AS_DRAWN, PrintShape
-from calib.camera_file import CameraFile
 from calib.fit.boards.camera_fit import RejectedView
-from calib.fit.boards.camera_selection import ModelChoice
+from calib.fit.boards.camera_selection import ModelChoice, SelectedCalibration, refine_selection, select_calibration
 from calib.fit.boards.rig_covariance import rig_covariance
-from calib.fit.boards.rig_fit import RigCalibration, fit_rig, refine_rig_calibration, rig_print_shape
+from calib.fit.boards.rig_fit import RigCalibration, refine_rig_calibration, rig_print_shape
 from calib.fit.boards.rig_problem import PairView
 from calib.fit.boards.rig_selection import select_rig
 from calib.fit.rig_uncertainty import DriveUncertainty, drive_uncertainty
+from calib.masks.rim import find_rim
+from calib.masks.stack_mask import find_mask
+from calib.models.camera import Mask
 from calib.models.names import sees_directly
+from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
-from calib.rig_frame import is_turned_over
-from omnid.calibration.accuracy_notes import GOOD_PART, MISFIT_PART, accuracy_warnings
-from omnid.calibration.board_search import AnyBoard, find_boards, select_diverse_views
-from omnid.calibration.image_pairs import SIDES, PairedImages, read_pairs
-from omnid.calibration.images import Image, Images
-from omnid.calibration.missing_views import missing_views
-from omnid.calibration.progress import Progress, silent
-from omnid.calibration.rig_cameras import FittedCameras, fit_cameras
-from omnid.calibration.rig_masks import masked_rig
+from calib.rig_frame import is_turned_over, rig_between
+from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent
+from omnid.calibration.images import SIDES, Image, Images, PairedImages, brightest, read_pairs
+from omnid.calibration.rig_notes import GOOD_PART, MISFIT_PART, accuracy_warnings, missing_views
 from omnid.calibration.rig_report import rig_report_html
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
@@ -43,8 +40,6 @@ from omnid.errors import OmnidError
 BASELINE_RANGE_M = (0.01, 3.0)
 # Relative difference from the baseline by ruler. A tenth is no error of a ruler; 2 % are 4 mm of 200 mm.
 REFUSED_PART, WARNING_PART = 0.1, 0.02
-GivenCameras = tuple[CameraFile, CameraFile]
-FitEach = Callable[[list[PairView], PrintShape], FittedCameras]  # Each camera by its views of a board of that shape.
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +50,7 @@ class RigResult:
     calibration: RigCalibration
     images: PairedImages
     notes: tuple[str, ...]  # about repeated images, baseline, view, order of the cameras, and masks that are missing
-    drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras were given
+    drives: DriveUncertainty | None  # errors of drives by the covariance; None if the cameras see too little in common
     missing: str  # which pairs to add
 
     @property
@@ -103,8 +98,6 @@ def calibrate_rig(
     board: AnyBoard,
     *,
     topics: tuple[str | None, str | None] = (None, None),
-    cameras: GivenCameras | None = None,
-    refine_cameras: bool = False,
     model: ModelChoice = "auto",
     view: ViewChoice = "auto",
     with_struts: bool = False,
@@ -114,139 +107,48 @@ def calibrate_rig(
     """Calibrate two cameras and the transform between them by images of a board.
 
     source: a log of both cameras with the topics of the lower and the upper one, or a folder with images lower_*,
-    upper_*. cameras: known cameras, which stay as they are unless refine_cameras. model, view, progress: as in
-    `calibrate_camera`. with_struts: masks with hub and struts, not only the rim. expected_baseline_m: by ruler; a
-    result that differs by a tenth is refused. Raises OmnidError or CalibError where the images do not suffice.
+    upper_*. model: "auto" fits every model and selects by cross-validation. view: the world is seen in a mirror or
+    directly; "auto": as the images show, see `view_guess`. with_struts: masks with hub and struts, not only the rim.
+    expected_baseline_m: by ruler; a result that differs by a tenth is refused. progress receives one line for each
+    image and each model. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images, each once.
-    images = _read(Path(source), topics, cameras)
+    images = read_pairs(Path(source), *topics)
     for line in images.notes:
         progress(line)
     # 2. Find the board in all of them.
     views = _find_views(images, board, progress)
-    # 3. Find the view of the cameras, that of a mirror or of a lens, unless the cameras are known.
-    fit_each: FitEach
-    if cameras is None:
-        direction, shown = view_of_images(view, _by_camera(images, views), board, progress)
-        fit_each = partial(fit_cameras, images, board, model, direction, progress)
-    else:
-        fit_each, shown = (lambda seen, _: FittedCameras.known(cameras, seen)), []
+    # 3. Find the view of the cameras, that of a mirror or of a lens.
+    direction, shown = view_of_images(view, _by_camera(images, views), board, progress)
     # 4. Fit the cameras, and the transform between them.
-    refined = cameras is None or refine_cameras
-    found = _fit(views, images, board, fit_each, refined, progress)
+    found = _fit(views, images, board, (model, direction), progress)
     # 5. Compare the baseline with what it can be.
-    notes = [*images.notes, *_check_baseline(found, board, expected_baseline_m), *shown]
+    baseline_notes = _check_baseline(found, board, expected_baseline_m)
     # 6. Build the rig with masks and covariance, and predict the errors of drives.
-    return _result(found, images, cameras, notes, with_struts=with_struts, refined=refined)
-
-
-def _fit(
-    views: list[PairView],
-    images: PairedImages,
-    board: AnyBoard,
-    fit_each: FitEach,
-    refined: bool,
-    progress: Progress,
-) -> RigCalibration:
-    """Fit each camera and the transform between them; where refined, the cameras once more with the transform."""
-    # 1. Fit each camera to all its views.
-    single = fit_each(views, AS_DRAWN)
-    rejected = [] if refined else _views_of_one_camera(views)
-    # 2. Fit the transform between the cameras, and the cameras with it.
-    found = _fit_rig(single, board, refined, AS_DRAWN, progress)
-    # 3. Refine the corners with the cameras, and fit the rig again.
-    found = refine_rig_calibration(found, images.sides, refined)
-    rejected += [*single.rejected, *found.rejected]
-    # 4. If the print differs from its drawing, fit the cameras and the rig again with its shape.
-    shape = rig_print_shape(found, refined)
-    if not shape.is_as_drawn:
-        progress("the board is not as drawn: once more with its shape")
-        single = fit_each(list(found.views), shape)
-        found = _fit_rig(single, board, refined, shape, progress)
-        rejected += [*single.rejected, *found.rejected]
-    return replace(found, rejected=tuple(rejected))
-
-
-def _result(
-    found: RigCalibration,
-    images: PairedImages,
-    cameras: GivenCameras | None,
-    notes: Sequence[str],
-    *,
-    with_struts: bool,
-    refined: bool,
-) -> RigResult:
-    """Return the result with the rig of a calibration: its masks, its covariance, and the errors of drives with it."""
-    rig, unmasked = masked_rig(found, images, cameras, with_struts=with_struts)
+    rig, unmasked = _masked_rig(found, images, with_struts=with_struts)
     rig = replace(rig, covariance=rig_covariance(found, rig))
-    drives = drive_uncertainty(rig) if refined else None
+    drives = drive_uncertainty(rig)
     missing = missing_views(found.views, rig) if drives else ""
-    return RigResult(rig, found, images, (*notes, *_order_notes(rig), *unmasked), drives, missing)
-
-
-def _read(
-    source: Path,
-    topics: tuple[str | None, str | None],
-    cameras: GivenCameras | None,
-) -> PairedImages:
-    """Return the images of both cameras; OmnidError if the given cameras do not fit them."""
-    images = read_pairs(source, *topics)
-    return images if cameras is None else _of_sizes(images, cameras)
-
-
-def _fit_rig(
-    single: FittedCameras, board: AnyBoard, refined: bool, shape: PrintShape, progress: Progress
-) -> RigCalibration:
-    """Fit the transform between the cameras to their views, and the cameras with it if refined."""
-    if not refined:
-        return fit_rig(single.views, board, single.cameras, refined, shape)
-    selected = select_rig(single.views, board, single.cameras, single.polynomials, shape)
-    for number, score in enumerate(selected.scores):
-        progress(f"rig: {'compared' if number else 'selected'} {score}")
-    return selected.calibration
-
-
-def _of_sizes(images: PairedImages, cameras: GivenCameras) -> PairedImages:
-    """Return the images; raise OmnidError if known cameras are not those of them."""
-    if sees_directly(cameras[0].camera) != sees_directly(cameras[1].camera):
-        raise OmnidError(
-            "calibrate rig: expected cameras of the same view, found one of a mirror and one of a lens; "
-            "calibrate both with the same --view"
-        )
-    for name, side, file in zip(SIDES, images.sides, cameras, strict=True):
-        height, width = next(iter(side.values())).shape
-        if (width, height) != tuple(file.camera.size):
-            raise OmnidError(
-                f"--{name}-camera: expected a camera of {width}x{height} px like the {name} images, found "
-                f"{file.camera.size[0]}x{file.camera.size[1]} px; give the file of this camera"
-            )
-    return images
+    notes = (*images.notes, *baseline_notes, *shown, *_order_notes(rig), *unmasked)
+    return RigResult(rig, found, images, notes, drives, missing)
 
 
 def _find_views(images: PairedImages, board: AnyBoard, progress: Progress) -> list[PairView]:
     """Find the board in the images of both cameras; of a log's many pairs the most diverse ones are selected."""
     of_log = bool(images.topics[0])
-    found = [
-        _find_side(side, board, name, progress, thorough=not of_log)
-        for name, side in zip(SIDES, images.sides, strict=True)
-    ]
+    found = list[dict[str, BoardView]]()
+    for name, side in zip(SIDES, images.sides, strict=True):
+        try:
+            views = find_boards(side, board, thorough=not of_log, progress=progress)
+        except OmnidError as error:
+            raise OmnidError(f"{name} camera: {error}") from error
+        found.append({view.name: view for view in views})
     both = [found[0][name] for name in images.names if name in found[0] and name in found[1]]
     selected = set(images.names)
     if of_log and both:
         selected = {view.name for view in select_diverse_views(both)}
     seen = [PairView(name, (found[0].get(name), found[1].get(name))) for name in images.names if name in selected]
     return [view for view in seen if any(view.seen)]
-
-
-def _find_side(
-    images: Images, board: AnyBoard, name: str, progress: Progress, *, thorough: bool
-) -> dict[str, BoardView]:
-    """Return the views of the board by the camera of that name, by the names of the images."""
-    try:
-        views = find_boards(images, board, thorough=thorough, progress=progress)
-    except OmnidError as error:
-        raise OmnidError(f"{name} camera: {error}") from error
-    return {view.name: view for view in views}
 
 
 def _by_camera(images: PairedImages, views: Sequence[PairView]) -> list[tuple[Iterable[Image], list[BoardView]]]:
@@ -257,14 +159,82 @@ def _by_camera(images: PairedImages, views: Sequence[PairView]) -> list[tuple[It
     ]
 
 
-def _views_of_one_camera(views: list[PairView]) -> list[RejectedView]:
-    """Return the views that a fit of known cameras cannot use."""
-    return [
-        RejectedView(view.name, f"only the {name} camera saw the board; with given cameras pairs are needed")
+def _fit(
+    views: list[PairView],
+    images: PairedImages,
+    board: AnyBoard,
+    chosen: tuple[ModelChoice, View],
+    progress: Progress,
+) -> RigCalibration:
+    """Fit each camera, then both cameras with the transform between them."""
+    # 1. Fit the rig to a board as drawn.
+    found, rejected = _fit_board(views, images, board, AS_DRAWN, chosen, progress)
+    # 2. Refine the corners with the cameras, and fit the rig again.
+    found = refine_rig_calibration(found, images.sides)
+    rejected += found.rejected
+    # 3. If the print differs from its drawing, fit the cameras and the rig again with its shape.
+    shape = rig_print_shape(found)
+    if not shape.is_as_drawn:
+        progress("the board is not as drawn: once more with its shape")
+        found, again = _fit_board(list(found.views), images, board, shape, chosen, progress)
+        rejected += [*again, *found.rejected]
+    return replace(found, rejected=tuple(rejected))
+
+
+def _fit_board(
+    views: list[PairView],
+    images: PairedImages,
+    board: AnyBoard,
+    shape: PrintShape,
+    chosen: tuple[ModelChoice, View],
+    progress: Progress,
+) -> tuple[RigCalibration, list[RejectedView]]:
+    """Fit each camera to its own views of a board of that shape, then the rig to the views that fit their cameras.
+
+    Return the views that do not fit one camera as well. Where the print is taken to be as drawn, which is the first
+    time, the corners are refined with each camera.
+    """
+    model, direction = chosen
+    cameras, rejected = list[SelectedCalibration](), list[RejectedView]()
+    for side, name in enumerate(SIDES):
+        # 1. Fit the models to the camera's views, and select one.
+        seen = [own for view in views if (own := view.seen[side]) is not None]
+        height, width = images.sides[side][seen[0].name].shape if seen else (0, 0)
+        selected = select_calibration(seen, board, (width, height), model, direction, shape)
+        for camera_score in selected.scores:
+            word = "selected" if camera_score.model == selected.model else "compared"
+            progress(f"{name} camera: {word} {camera_score}")
+        if shape.is_as_drawn:
+            selected = refine_selection(selected, images.sides[side], direction)
+        cameras.append(selected)
+        # 2. Leave out this camera's views that do not fit it; the other camera's stay.
+        bad = selected.calibration.rejected
+        rejected += [RejectedView(view.name, f"{name} camera: {view.reason}") for view in bad]
+        views = _without(views, side, {view.name for view in bad})
+    # 3. Fit the transform between the cameras, and the cameras with it.
+    lower, upper = (camera.calibration.camera for camera in cameras)
+    polynomials = _polynomials(cameras) if model == "auto" else None
+    selection = select_rig(views, board, (lower, upper), polynomials, shape)
+    for number, score in enumerate(selection.scores):
+        progress(f"rig: {'compared' if number else 'selected'} {score}")
+    return selection.calibration, rejected
+
+
+def _polynomials(cameras: Sequence[SelectedCalibration]) -> tuple[OcamCamera, OcamCamera] | None:
+    """Return the polynomial cameras from which the terms of real mirrors are fitted; None unless both have one."""
+    lower, upper = (camera.polynomial for camera in cameras)
+    return None if lower is None or upper is None else (lower, upper)
+
+
+def _without(views: list[PairView], side: int, names: set[str]) -> list[PairView]:
+    """Remove one camera's views of the named instants; the other camera's views are kept."""
+    kept = [
+        view
+        if view.name not in names
+        else replace(view, seen=(None, view.seen[1]) if side == 0 else (view.seen[0], None))
         for view in views
-        for name, other in zip(SIDES, view.seen[::-1], strict=True)
-        if other is None
     ]
+    return [view for view in kept if any(view.seen)]
 
 
 def _check_baseline(found: RigCalibration, board: AnyBoard, expected_m: float | None) -> list[str]:
@@ -302,3 +272,25 @@ def _order_notes(rig: Rig) -> list[str]:
         f"the upper camera is found below the lower one: exchange their images, unless the cameras {mounted}; "
         "the rig's z would point down"
     ]
+
+
+def _masked_rig(found: RigCalibration, images: PairedImages, *, with_struts: bool) -> tuple[Rig, list[str]]:
+    """Return the rig with its masks, and warnings about mirrors without a rim in the images."""
+    rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower), images.topics)
+    warnings, mounted = list[str](), []
+    for name, camera, side in zip(SIDES, (rig.lower, rig.upper), images.sides, strict=True):
+        mask = _mask(camera.camera.center, side, with_struts=with_struts)
+        mounted.append(replace(camera, mask=mask))
+        if mask is None and not sees_directly(camera.camera):
+            warnings.append(
+                f"no rim of a mirror was found in the {name} camera's images: the daemon searches for it at start, or "
+                f"add [{name}.mask] by hand"
+            )
+    return replace(rig, lower=mounted[0], upper=mounted[1]), warnings
+
+
+def _mask(center: tuple[float, float], images: Images, *, with_struts: bool) -> Mask | None:
+    """Return the mask with hub and struts, or the rim in the maximum of all images."""
+    if with_struts:
+        return find_mask(list(images.values()), center)
+    return find_rim(brightest(images.values()), center)

@@ -14,8 +14,7 @@ from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.drive_observations import Topics, tracked_updates
-from omnid.calibration.image_pairs import SIDES, TOLERANCE_NS, open_log, paired
-from omnid.calibration.images import brightest
+from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import RigFinding, judge
 from omnid.core.rig.column_matches import Matches, is_motion_unknown, match, together

@@ -30,8 +30,8 @@ from calib.fit.boards.ocam_linear import powers, solve_linear
 from calib.masks.rim import find_rim
 from calib.models.camera import Array
 from calib.models.ocam import VIEWS, View
+from omnid.calibration.board_search import Progress
 from omnid.calibration.images import Image, brightest, middle_px
-from omnid.calibration.progress import Progress
 from omnid.errors import OmnidError
 
 ViewChoice = Literal["auto", "mirror", "direct"]

@@ -1,4 +1,4 @@
-"""Options of `omnid calibrate camera` and `rig` that describe the board."""
+"""Options of `omnid calibrate live` and `rig` that describe the board."""
 
 from __future__ import annotations
 

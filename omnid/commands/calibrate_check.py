@@ -14,7 +14,7 @@ from calib.fit.rig_drift import apply_drift
 from calib.masks.rim_check import RimShift
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.image_pairs import SIDES, open_log
+from omnid.calibration.images import SIDES, open_log
 from omnid.calibration.rig_check import RigCheckResult, check_rig, moving_rig_finding, read_rig_pairs
 from omnid.commands.options import cameras, command, option
 from omnid.config import Config

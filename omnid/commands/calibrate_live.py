@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     """Take the pairs that are in the folder, which is made if it is missing; return the highest number of an image."""
-    from omnid.calibration.image_pairs import SIDES, read_pairs
+    from omnid.calibration.images import SIDES, read_pairs
 
     if folder is None:
         return 0
@@ -96,7 +96,7 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
 
 
 def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
-    from omnid.calibration.image_pairs import read_pairs
+    from omnid.calibration.images import read_pairs
 
     pairs = read_pairs(args.log, args.lower, args.upper)
     return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 
-from calib.camera_file import read_camera
 from calib.fit.boards.camera_selection import MODEL_CHOICES
-from omnid.calibration.rig import GivenCameras, calibrate_rig
+from omnid.calibration.board_search import silent
+from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.board_options import BOARD, board_of
-from omnid.commands.calibrate_camera import MODEL_HELP, print_result, progress_of
 from omnid.commands.height_option import HEIGHT, height_of, with_height
 from omnid.commands.options import cameras, command, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
+
+MODEL_HELP = (
+    "auto (default): fit all models and select by cross-validation; omni: unified model; ocam: polynomial; "
+    "ocam_tangential: polynomial with tangential terms"
+)
 
 
 @command(
@@ -32,9 +37,6 @@ from omnid.sinks.files import check_outputs
         metavar="MM",
         help="the measured distance of the mirrors: a result that differs by more than a tenth is refused",
     ),
-    option("--lower-camera", type=Path, metavar="FILE", help="camera.toml of the lower camera, which is not changed"),
-    option("--upper-camera", type=Path, metavar="FILE", help="the same for the upper camera"),
-    option("--refine-cameras", action="store_true", help="adjust the given cameras as well"),
     *cameras("a log's topic of the {camera} camera"),
     option("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP),
     option("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP),
@@ -54,52 +56,30 @@ from omnid.sinks.files import check_outputs
     ),
 )
 def run(args: argparse.Namespace) -> int:
-    """Calibrate the rig, write the files and print one line."""
+    """Calibrate the rig, write the files, and print the warnings on stderr and the result as one line."""
     board = board_of(args)
-    given = _given(args)
-    _check_outputs(args)
-    expected_m = None if args.expected_baseline_mm is None else args.expected_baseline_mm / 1e3
+    named = [("--output", args.output), ("--report", args.report)]
+    read = [("a file that is read", args.images)]
+    check_outputs([(name, path) for name, path in named if path is not None], read)
+    expected_mm = args.expected_baseline_mm
+    if expected_mm is not None and not expected_mm > 0:
+        raise OmnidError(f"--expected-baseline-mm {expected_mm:g}: expected a length above 0")
     found = calibrate_rig(
         args.images,
         board,
         topics=(args.lower, args.upper),
-        cameras=given,
-        refine_cameras=args.refine_cameras,
         model=args.model,
         view=args.view,
         with_struts=args.mask,
-        expected_baseline_m=expected_m,
-        progress=progress_of(args),
+        expected_baseline_m=None if expected_mm is None else expected_mm / 1e3,
+        progress=silent if args.quiet else lambda line: print(line, file=sys.stderr),
     )
     found = replace(found, rig=with_height(found.rig, args))
     found.save(args.output)
     if args.report:
         found.save_report(args.report)
-    print_result(args.output, found)
+    for line in found.warnings:
+        print(f"warning: {line}", file=sys.stderr)
+    print(f"{args.output}: {found}")
     print(f"{args.output}: {height_of(found.rig)}")
     return 0
-
-
-def _given(args: argparse.Namespace) -> GivenCameras | None:
-    """Read both cameras' files, if named; raises OmnidError if only one is."""
-    paths = [args.lower_camera, args.upper_camera]
-    if not any(paths):
-        if args.refine_cameras:
-            raise OmnidError("--refine-cameras: expected --lower-camera and --upper-camera to refine, found neither")
-        return None
-    if not all(paths):
-        raise OmnidError("calibrate rig: expected both --lower-camera and --upper-camera or neither, found one")
-    return read_camera(paths[0]), read_camera(paths[1])
-
-
-def _check_outputs(args: argparse.Namespace) -> None:
-    named = [("--output", args.output), ("--report", args.report)]
-    read = [
-        ("a file that is read", path)
-        for path in (args.images, args.lower_camera, args.upper_camera)
-        if path is not None
-    ]
-    check_outputs([(option, path) for option, path in named if path is not None], read)
-    expected = args.expected_baseline_mm
-    if expected is not None and not expected > 0:
-        raise OmnidError(f"--expected-baseline-mm {expected:g}: expected a length above 0")

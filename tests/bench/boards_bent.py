@@ -19,7 +19,7 @@ import numpy as np
 from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.fit.boards.rig_fit import RigCalibration, fit_rig
 from calib.rig import Rig
-from omnid.calibration.image_pairs import SIDES
+from omnid.calibration.images import SIDES
 from omnid.calibration.rig import calibrate_rig
 from omnid.simulation.rendering.sensor import Sensor
 from tests.bench.boards_truth import BOARD, random_rig

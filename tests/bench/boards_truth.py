@@ -24,7 +24,7 @@ from calib.models.camera import Array, Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig import MountedCamera, Rig
 from omnid.calibration.board_search import find_boards
-from omnid.calibration.image_pairs import PairedImages, read_pairs
+from omnid.calibration.images import PairedImages, read_pairs
 from omnid.simulation.rendering.sensor import Sensor
 from tests.simulation.boards import BoardRenderer, board_poses_around_rig
 

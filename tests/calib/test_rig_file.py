@@ -208,8 +208,3 @@ def test_times_of_exposure_are_kept_and_bounded(omni_rig: Rig) -> None:
         assert old in text
         with pytest.raises(CalibError, match=message):
             parse_rig(text.replace(old, new))
-
-
-def test_the_file_of_one_camera_is_named() -> None:
-    with pytest.raises(CalibError, match=r"c.toml: a camera.toml, the file of one camera; a rig.toml was expected"):
-        parse_rig("schema = 1\n[camera]\n", name="c.toml")

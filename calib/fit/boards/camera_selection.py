@@ -21,8 +21,6 @@ from calib.fit.boards.camera_fit import (
 )
 from calib.fit.boards.camera_models import MODELS, FittedModel, Model
 from calib.fit.boards.cross_validation import held_out_error_px
-from calib.fit.boards.print_shape_fit import find_print_shape
-from calib.fit.parameterisation import parameterise
 from calib.fit.residual_structure import ResidualStructure, residual_structure
 from calib.models.ocam import OcamCamera, View
 
@@ -108,21 +106,6 @@ def refine_selection(
     The scores of all models remain those of the selection, before the refinement.
     """
     return replace(found, calibration=refine_camera_calibration(found.calibration, images, found.model, view))
-
-
-def with_print_shape(found: SelectedCalibration, view: View) -> SelectedCalibration:
-    """Select and fit the models again if the print differs significantly from its drawing."""
-    flat = found.calibration
-    parameters = parameterise(flat.camera)
-    observed = observations(flat.views, flat.board)
-    shape = find_print_shape(parameters.camera_at, len(parameters.names), observed, flat.fit.T_cam_board)
-    if shape.is_as_drawn:
-        return found
-    models = [score.model for score in found.scores]
-    choice: ModelChoice = models[0] if len(models) == 1 else "auto"
-    again = select_calibration(flat.views, flat.board, flat.camera.size, choice, view, shape)
-    kept = replace(again.calibration, rejected=(*flat.rejected, *again.calibration.rejected))
-    return replace(again, calibration=kept)
 
 
 def camera_structure(found: CameraCalibration) -> ResidualStructure:

@@ -16,7 +16,7 @@ TWIST_STEP = 1e-6
 
 
 def rig_covariance(found: RigCalibration, rig: Rig) -> RigCovariance:
-    """Return the covariance of a calibration's parameters for its rig; of the transform alone if cameras are fixed."""
+    """Return the covariance of a calibration's parameters for its rig."""
     names = [
         f"{side} {name}"
         for side, values in zip(("lower", "upper"), found.parameters, strict=True)

@@ -54,7 +54,7 @@ class RigCalibration:
     parameters: tuple[tuple[tuple[str, float, float], ...], ...]  # of lower and upper: name, value, sigma
     motion_sigma: Array  # (6,) sigmas of T_upper_lower, translation [m] and rotation [rad], in the upper frame
     baseline_sigma_m: float
-    covariance: Array  # (P, P) of the cameras' parameters, if refined, and of T_upper_lower (as motion_sigma)
+    covariance: Array  # (P, P) of the cameras' parameters and of T_upper_lower (as motion_sigma)
     rejected: tuple[RejectedView, ...] = ()
     shape: PrintShape = AS_DRAWN
     telecentric: bool = False  # True if the cameras were fitted as mirrors below telecentric lenses
@@ -89,13 +89,12 @@ def fit_rig(
     views: Sequence[PairView],
     board: CalibrationBoard,
     cameras: Sides,
-    refined: bool = True,
     shape: PrintShape = AS_DRAWN,
     telecentric: bool = False,
 ) -> RigCalibration:
-    """Fit the transform between two cameras, and the cameras if refined, to all views; outlier views are rejected.
+    """Fit two cameras and the transform between them to all views; outlier views are rejected.
 
-    cameras: start values, or the fixed cameras if not refined. shape: start value of the print's shape, whose free
+    cameras: start values. shape: start value of the print's shape, whose free
     modes are fitted. The terms of real mirrors (MIRROR_NAMES) are fitted if a start value has a wavefront, each for
     itself or, if telecentric, as those of mirrors below telecentric lenses. Raises CalibError if fewer than MIN_PAIRS
     pairs are consistent, or if the order of the board's corners is ambiguous.
@@ -104,10 +103,10 @@ def fit_rig(
     _require(sum(_is_pair(view) for view in views), "instants at which both cameras saw the board")
     initial = initialise_relative_pose([view.seen for view in views], board, cameras)
     rejected = [RejectedView(views[k].name, reason) for k, reason in initial.rejected]
-    good, T_lower_board = _reordered_views(views, initial, refined)
+    good, T_lower_board = _reordered_views(views, initial)
     # 2. Bundle adjustment, repeated without the views that fit much worse than the others.
-    printed, fitted = (board, shape), {"refined": refined, "telecentric": telecentric}
-    fit, unknowns = _solve(good, printed, cameras, initial.T_upper_lower, T_lower_board, **fitted)
+    printed = (board, shape)
+    fit, unknowns = _solve(good, printed, cameras, initial.T_upper_lower, T_lower_board, telecentric)
     for _ in range(MAX_REJECTIONS):
         bad = outlier_views(fit)
         if not bad.any():
@@ -116,19 +115,17 @@ def fit_rig(
         good = [view for view, is_bad in zip(good, bad, strict=True) if not is_bad]
         _require(sum(map(_is_pair, good)), "consistent pairs of views", rejected)
         found = unknowns.camera(fit.parameters)
-        start = (found.lower, found.upper) if refined else cameras
-        fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], **fitted)
+        start = (found.lower, found.upper)
+        fit, unknowns = _solve(good, printed, start, found.T_upper_lower, fit.T_cam_board[~bad], telecentric)
     if fit.mean_px > MAX_MEAN_PX:
         raise CalibError(
             f"calibrate rig: the corners are {fit.mean_px:.1f} px off any rig, expected {MAX_MEAN_PX:.0f} "
-            "at most; did the cameras see the board at the same time, are their files the right ones?"
+            "at most; did the cameras see the board at the same time?"
         )
     return _rig_calibration(good, printed, fit, unknowns, rejected)
 
 
-def refine_rig_calibration(
-    found: RigCalibration, images: tuple[Images, Images], refined: bool = True
-) -> RigCalibration:
+def refine_rig_calibration(found: RigCalibration, images: tuple[Images, Images]) -> RigCalibration:
     """Refine the corners with the calibrated cameras, and calibrate the rig again; images by the views' names.
 
     An instant that only one camera saw needs no image of the other.
@@ -142,7 +139,7 @@ def refine_rig_calibration(
             for side, seen in enumerate(view.seen)
         )
         views.append(PairView(view.name, (lower, upper)))
-    again = fit_rig(views, found.board, cameras, refined, found.shape, found.telecentric)
+    again = fit_rig(views, found.board, cameras, found.shape, found.telecentric)
     return replace(again, rejected=found.rejected + again.rejected)
 
 
@@ -165,14 +162,9 @@ def _require(count: int, what: str, rejected: Sequence[RejectedView] = ()) -> No
         )
 
 
-def _reordered_views(
-    views: Sequence[PairView], initial: RelativePoseInitialisation, refined: bool
-) -> tuple[list[PairView], Array]:
-    """Return the consistent views, upper corners in the order of the lower ones, and the board poses (K, 4, 4).
-
-    Views by one camera alone are kept only if the cameras are refined: they do not depend on the relative pose.
-    """
-    kept = [k for k in initial.T_lower_board if refined or _is_pair(views[k])]
+def _reordered_views(views: Sequence[PairView], initial: RelativePoseInitialisation) -> tuple[list[PairView], Array]:
+    """Return the consistent views, upper corners in the order of the lower ones, and the board poses (K, 4, 4)."""
+    kept = list(initial.T_lower_board)
     good = [_with_reordered_upper(views[k], initial.orders.get(k)) for k in kept]
     _require(
         sum(map(_is_pair, good)),
@@ -195,27 +187,25 @@ def _solve(
     cameras: Sides,
     T_upper_lower: Array,
     T_lower_board: Array,
-    *,
-    refined: bool,
     telecentric: bool,
 ) -> tuple[BundleResult, RigParameterisation]:
-    """Adjust the cameras if refined, the transform between them, and a pose T_lower_board (K, 4, 4) for every view."""
-    unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, refined=refined, telecentric=telecentric)
+    """Adjust the cameras, the transform between them, and a pose T_lower_board (K, 4, 4) for every view."""
+    unknowns = rig_unknowns(printed[0], cameras, T_upper_lower, T_lower_board, telecentric=telecentric)
     observed = rig_observations(good, printed)
     fit = adjust_bundle(unknowns.camera, np.zeros(unknowns.ends[-1]), T_lower_board, observed, prior=unknowns.prior)
     return fit, unknowns
 
 
-def rig_print_shape(found: RigCalibration, refined: bool) -> PrintShape:
+def rig_print_shape(found: RigCalibration) -> PrintShape:
     """Return the significant part of the print's shape, of a rig that was fitted to a board as drawn."""
-    unknowns = _unknowns_about(found, refined=refined)
+    unknowns = _unknowns_about(found)
     observed = rig_observations(found.views, (found.board, AS_DRAWN))
     return find_print_shape(unknowns.camera, unknowns.ends[-1], observed, found.fit.T_cam_board, unknowns.prior)
 
 
 def rig_held_out_px(found: RigCalibration) -> float:
     """Return the mean error [px] of views that were left out of the fit of both cameras and the transform."""
-    unknowns = _unknowns_about(found, refined=True)
+    unknowns = _unknowns_about(found)
     return cross_validated_px(
         unknowns.camera,
         unknowns.ends[-1],
@@ -225,13 +215,12 @@ def rig_held_out_px(found: RigCalibration) -> float:
     )
 
 
-def _unknowns_about(found: RigCalibration, *, refined: bool) -> RigParameterisation:
+def _unknowns_about(found: RigCalibration) -> RigParameterisation:
     return rig_unknowns(
         found.board,
         (found.lower, found.upper),
         found.T_upper_lower,
         found.fit.T_cam_board,
-        refined=refined,
         telecentric=found.telecentric,
     )
 

@@ -14,7 +14,7 @@ from calib.boards.print_shape import PrintShape
 from calib.fit.boards.bundle import Observations, Prior
 from calib.fit.boards.relative_pose import ViewPair
 from calib.fit.boards.telecentric_mirror import RADIUS_NAME, TelecentricMirror
-from calib.fit.parameterisation import CameraParameterisation, fixed_camera, parameterise
+from calib.fit.parameterisation import CameraParameterisation, parameterise
 from calib.models.camera import Array, OmniCamera
 from calib.models.ocam import ASTIGMATISM_NAMES, has_wavefront, project_near
 from calib.models.wavefront import WAVEFRONT_NAMES
@@ -56,7 +56,7 @@ class PairCamera:
 
 @dataclass(frozen=True, slots=True)
 class RigParameterisation:
-    """Parameterisation of a rig: steps of both cameras, none of fixed ones, and of the transform between them."""
+    """Parameterisation of a rig: steps of both cameras and of the transform between them."""
 
     parameterisations: tuple[SideParameterisation, SideParameterisation]
     T_upper_lower: Array
@@ -89,7 +89,7 @@ class RigParameterisation:
         )
 
     def plain_values(self, steps: Array) -> list[tuple[tuple[str, float], ...]]:
-        """Return names and values of the parameters of the lower and the upper camera at the steps; none if fixed."""
+        """Return names and values of the parameters of the lower and the upper camera at the steps."""
         lower_end, upper_end, _ = self.ends
         parts = (steps[:lower_end], steps[lower_end:upper_end])
         return [
@@ -111,23 +111,20 @@ def rig_unknowns(
     T_upper_lower: Array,
     T_lower_board: Array,
     *,
-    refined: bool,
     telecentric: bool,
 ) -> RigParameterisation:
-    """Return the parameterisation about cameras, which stay as they are unless refined, and T_upper_lower.
+    """Return the parameterisation about cameras and T_upper_lower.
 
-    Cameras that stay may be of any model. telecentric: they are refined as mirrors below telecentric lenses.
-    T_lower_board (K, 4, 4): poses of the board, whose median distance gives the size of a step.
+    telecentric: the cameras are those of mirrors below telecentric lenses. T_lower_board (K, 4, 4): poses of the board,
+    whose median distance gives the size of a step.
     """
     reach = float(np.median(np.linalg.norm(T_lower_board[:, :3, 3], axis=1)))
     # One step of the transform moves the image by about a pixel: the focal length is about a quarter of the image.
     units = np.repeat([reach, 1.0], 3) / (min(cameras[0].size) / 4)
-    sides: list[SideParameterisation] = [fixed_camera(camera) for camera in cameras]
-    if refined:
-        sides = [
-            TelecentricMirror.about(camera) if telecentric else parameterise(camera, wavefront=has_wavefront(camera))
-            for camera in cameras
-        ]
+    sides: list[SideParameterisation] = [
+        TelecentricMirror.about(camera) if telecentric else parameterise(camera, wavefront=has_wavefront(camera))
+        for camera in cameras
+    ]
     return RigParameterisation((sides[0], sides[1]), T_upper_lower, units, len(board.points))
 
 

@@ -19,11 +19,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from calib.camera_file import CameraFile, camera_toml, parse_camera
 from calib.errors import CalibError
-from calib.kalibr import export_kalibr, parse_kalibr
+from calib.kalibr import parse_kalibr
 from calib.ocam_file import parse_ocam
-from calib.rig_file import parse_rig, read_rig
+from calib.rig_file import parse_rig
 from drivers.errors import DriverError
 from drivers.frame import gray
 from drivers.logs.log_reader import LogReader
@@ -38,6 +37,7 @@ from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
 from tests.bench.faults.mutation import mutated
 from tests.bench.results import Column, ResultTable
+from tests.calib.test_kalibr import BOTH, NAMED, T_UPPER_LOWER, chain
 from tests.drivers.logs.bags import write_bag, write_db3
 from tests.drivers.logs.mcap_logs import pairs
 from tests.omnid.formats.place_maps import RIG, some_places
@@ -98,17 +98,10 @@ def map_bytes(folder: Path) -> bytes:
     return (folder / "good.omap").read_bytes()
 
 
-def camera_text(folder: Path) -> bytes:
-    """Return a camera.toml."""
-    mounted = read_rig(folder / "rig.toml").lower
-    return camera_toml(CameraFile(mounted.camera, mounted.mask)).encode()
-
-
 FORMATS: Final = {
     "rig.toml": Format(lambda folder: (folder / "rig.toml").read_bytes(), lambda path: parse_rig(path.read_bytes())),
-    "camera.toml": Format(camera_text, lambda path: parse_camera(path.read_bytes())),
     "camchain.yaml": Format(
-        lambda folder: export_kalibr(read_rig(folder / "rig.toml")).encode(),
+        lambda _: chain(BOTH, T_UPPER_LOWER, NAMED).encode(),
         lambda path: parse_kalibr(path.read_bytes()),
     ),
     "calib_results.txt": Format(lambda _: OCAM, lambda path: parse_ocam(path.read_bytes())),

@@ -11,7 +11,7 @@ import pytest
 
 from calib.models.camera import Array
 from calib.models.ocam import View
-from calib.ocam_file import export_ocam, parse_ocam
+from calib.ocam_file import parse_ocam
 
 KEYS = ("ocam_std", "ocam_subpix")
 
@@ -48,22 +48,3 @@ def test_reproduces_the_toolbox_errors(shared_data: Path, key: str, view: View) 
         pixels = np.column_stack([image["col_1based"], image["row_1based"]]) - 1.0
         errors = np.linalg.norm(camera.project(board_in_camera(numbers, image, view)) - pixels, axis=1)
         assert errors.mean() == pytest.approx(stored, abs=1e-6)
-
-
-@pytest.mark.parametrize("key", KEYS)
-def test_exported_file_projects_like_the_toolbox_c_code(shared_data: Path, key: str) -> None:
-    """world2cam of the toolbox's C code: rho by the inverse polynomial of atan(z / r), then the affine."""
-    numbers = reference(shared_data, key)
-    camera = parse_ocam(text(numbers), "direct")
-    lines = [line.split() for line in export_ocam(camera).splitlines() if line and not line.startswith("#")]
-    polynomial, inverse, center, affine, size = (list(map(float, line)) for line in lines)
-    assert polynomial[1:] == list(numbers["ss"]) and size == [768, 1024]
-    assert center == pytest.approx([numbers["xc_row_1based"] - 1, numbers["yc_col_1based"] - 1], abs=1e-12)
-    for image in numbers["images"]:
-        points = board_in_camera(numbers, image, "direct")
-        r = np.hypot(points[:, 0], points[:, 1])
-        rho = np.polyval(inverse[:0:-1], np.arctan2(points[:, 2], r))
-        x, y = points[:, 0] / r * rho, points[:, 1] / r * rho
-        c, d, e = affine
-        row, column = x * c + y * d + center[0], x * e + y + center[1]
-        np.testing.assert_allclose(np.column_stack([column, row]), camera.project(points), atol=0.05)

@@ -15,7 +15,6 @@ from rosbags.highlevel import AnyReader
 from drivers.errors import DriverError
 from drivers.frame import Frame, gray
 from drivers.logs.log_reader import LogReader
-from omnid.calibration.images import read_images
 from tests.drivers.logs.mcap_logs import (
     BARE,
     COMPRESSED,
@@ -145,7 +144,6 @@ def test_samples_of_ten_or_twelve_bits_in_sixteen_are_as_bright_as_those_of_eigh
     path = deep_log(tmp_path, kind, images)
     expected = [(one >> (read_bits - 8)).tolist() for one in images]
     assert [gray(frame).tolist() for frame in read(path)[0] if frame.camera == "lower"] == expected
-    assert [one.tolist() for one in read_images([str(path)], topic=LOWER).values()] == expected
 
 
 def test_a_camera_of_twelve_bits_that_begins_in_the_dark_is_read_by_them_from_its_first_larger_sample_on(

@@ -13,11 +13,15 @@ from calib import se3
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.calibration.height import HeightCalibration, on_floor
+from omnid.cli import main
 from omnid.core.floor import Floor
 from omnid.simulation.rendering.rigs import make_rig
-from tests.omnid.commands.test_calibrate_files import omnid as command
 
 HEIGHT_M = 1.2  # of rendered rigs: tests/simulation/paths.py
+
+
+def command(*words: object) -> int:
+    return main(["calibrate", *map(str, words)])
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import omnid
 from calib.rig_file import read_rig
 from omnid.calibration.mask import MaskCalibration
-from tests.omnid.commands.test_calibrate_files import omnid as command
+from omnid.cli import main
 from tests.replay.edited import Image, images, save
 from tests.simulation.disturbances import REFLECTION_RADIUS
 from tests.simulation.logs import write_log
@@ -21,6 +21,10 @@ from tests.simulation.recipes import build
 
 SIZE_PX, PAIRS = 200, 24
 FROZEN_PX = 80  # whole blocks of a JPEG, so that they keep their pixels
+
+
+def command(*words: object) -> int:
+    return main(["calibrate", *map(str, words)])
 
 
 @pytest.fixture(scope="module")

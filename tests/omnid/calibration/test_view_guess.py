@@ -13,7 +13,7 @@ from calib.boards.marker_finder import find_marker_board
 from calib.models.camera import Mask, OmniCamera
 from calib.models.lens import EquidistantCamera
 from calib.models.unified import UnifiedCamera
-from omnid.calibration.progress import silent
+from omnid.calibration.board_search import silent
 from omnid.calibration.view_guess import ViewChoice, view_of_images
 from omnid.errors import OmnidError
 from tests.simulation.boards import board_pose, board_poses_around_camera

@@ -13,7 +13,7 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.image_pairs import open_log
+from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import RigCheckResult, check_rig, read_rig_pairs
 from omnid.cli import main
 from omnid.config import PanoramaConfig

@@ -8,7 +8,6 @@ import pytest
 from calib import se3
 from calib.boards.board import BoardView
 from calib.boards.print_shape import AS_DRAWN, PrintShape
-from calib.fit.boards.camera_selection import select_calibration, with_print_shape
 from calib.fit.boards.rig_fit import RigCalibration, fit_rig, rig_print_shape
 from calib.fit.boards.rig_problem import PairView
 from tests.calib.fit.boards.test_rig_fit import LOWER, ODD, RIG, UPPER, off
@@ -35,7 +34,7 @@ def views_of(shape: PrintShape, seed: int = 0, count: int = 14) -> list[PairView
 def fitted(shape: PrintShape) -> tuple[RigCalibration, RigCalibration]:
     """Return the rig fitted to a board as drawn, and to its shape."""
     flat = fit_rig(views_of(shape), ODD, (LOWER, UPPER))
-    return flat, fit_rig(flat.views, ODD, (flat.lower, flat.upper), shape=rig_print_shape(flat, refined=True))
+    return flat, fit_rig(flat.views, ODD, (flat.lower, flat.upper), shape=rig_print_shape(flat))
 
 
 @pytest.mark.parametrize("shape", [BENT, STRETCHED, PrintShape((3e-3, 0.0, 0.0, 0.003))])
@@ -50,19 +49,4 @@ def test_a_rig_finds_the_shape_and_fits_to_its_noise(shape: PrintShape) -> None:
 def test_flat_boards_stay_flat_and_their_rigs_the_same(seeds: range) -> None:
     for seed in seeds:
         flat = fit_rig(views_of(AS_DRAWN, seed), ODD, (LOWER, UPPER))
-        assert rig_print_shape(flat, refined=True) == AS_DRAWN == flat.shape
-
-
-def test_given_cameras_find_the_shape_too() -> None:
-    flat = fit_rig(views_of(BENT), ODD, (LOWER, UPPER), refined=False)
-    found = rig_print_shape(flat, refined=False)
-    np.testing.assert_allclose(found.bends_m, BENT.bends_m, atol=1e-4)
-
-
-@pytest.mark.slow
-def test_one_camera_finds_the_shape_and_selects_its_model_with_it() -> None:
-    seen = [lower for view in views_of(BENT, count=9) if (lower := view.seen[0])]
-    flat = select_calibration(seen, ODD, LOWER.size, "omni")
-    found = with_print_shape(flat, "mirror").calibration
-    np.testing.assert_allclose(found.shape.bends_m, BENT.bends_m, atol=2e-4)
-    assert found.fit.mean_px < flat.calibration.fit.mean_px
+        assert rig_print_shape(flat) == AS_DRAWN == flat.shape

@@ -1,4 +1,4 @@
-"""Boards that a calibration of a rig lacks: where a drive looks and none was."""
+"""What limits a calibrated rig: how wrong its errors make a drive, and which boards the calibration lacks."""
 
 from __future__ import annotations
 
@@ -8,15 +8,46 @@ import numpy as np
 
 from calib import se3
 from calib.fit.boards.rig_problem import PairView
-from calib.fit.rig_uncertainty import seen_points
+from calib.fit.residual_structure import ResidualStructure
+from calib.fit.rig_uncertainty import DriveUncertainty, seen_points
 from calib.models.camera import Array
 from calib.rig import Rig
-from omnid.calibration.image_pairs import SIDES
+from omnid.calibration.images import SIDES
 
+# Relative error of a drive's length. Up to GOOD_PART there is no warning. From MISFIT_PART on the warning advises
+# against the rig: that is a third of the error of wheels, about a per cent, which the cameras are to improve on.
+MISFIT_PART, GOOD_PART = 0.003, 0.001
 # Six pairs, spread over the azimuth, lower the error of lengths to a third or less.
 MORE_PAIRS = 6
 # Corners and rays are counted up to this percentile: the last ones are those of one slanted board.
 HIGHEST_PERCENT = 98.0
+
+
+def accuracy_warnings(
+    structures: Sequence[ResidualStructure], drives: DriveUncertainty | None, missing: str
+) -> list[str]:
+    """Return the warnings, none for a rig that is accurate enough.
+
+    A camera whose residuals are more than noise has a line; where both have noise only, one line asks for more pairs.
+    structures: those of the residuals of the lower and the upper camera. drives: the error of drives that follows from
+    the rig's covariance; None: it is not known. missing: which pairs to add.
+    """
+    misfits = [
+        f"{name} camera: the camera model does not describe this camera: {structure}"
+        for name, structure in zip(SIDES, structures, strict=True)
+        if structure.is_misfit
+    ]
+    if drives is None:
+        return [f"{line}; do not use it where accuracy matters" for line in misfits]
+    if drives.length_part <= GOOD_PART:
+        return []
+    cost = (
+        f"drives may be wrong by {100 * drives.length_part:.2g} % of their length and by {drives.heading_deg_m:.2g} "
+        "degree of heading per metre"
+    )
+    advice = ": do not use it where that matters" if drives.length_part >= MISFIT_PART else ""
+    lines = [f"{line}; {cost}{advice}" for line in misfits]
+    return lines or [f"the images leave something open: {cost}; {missing}"]
 
 
 def missing_views(views: Sequence[PairView], rig: Rig) -> str:

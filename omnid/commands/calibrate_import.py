@@ -1,4 +1,4 @@
-"""`omnid calibrate import` and `export`: the rigs of other programs."""
+"""`omnid calibrate import`: the rigs of other programs."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 
 from calib import se3
 from calib.equirectangular_file import import_helvipad, stacked_rig
-from calib.kalibr import export_kalibr, import_kalibr
+from calib.kalibr import import_kalibr
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
-from calib.ocam_file import export_ocam, import_ocam
-from calib.rig import MountedCamera, Rig, ShutterTimes
-from calib.rig_file import read_rig, write_file, write_rig
-from calib.transform_file import read_transform, straight_up, transform_toml
+from calib.ocam_file import import_ocam
+from calib.rig import MountedCamera, Rig
+from calib.rig_file import write_rig
+from calib.transform_file import read_transform, straight_up
 from omnid.commands.height_option import HEIGHT, height_of, with_height
 from omnid.commands.options import command, exclusive, option
 from omnid.errors import OmnidError
@@ -60,35 +60,12 @@ from omnid.sinks.files import check_outputs
         "calibrate import --equirectangular 3840x1920 --baseline 0.2 -o rig.toml",
     ),
 )
-def import_rig(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> int:
     """Write the rig of another program, and print one line about it."""
     _must_be_writable(args.output)
     rig = with_height(_imported(args), args)
     write_rig(args.output, rig)
     print(f"{args.output}: {describe(rig)}")
-    return 0
-
-
-@command(
-    option("rig", type=Path, help="the rig.toml to read"),
-    option("--format", choices=("kalibr", "ocam"), required=True),
-    option(
-        "-o",
-        "--output",
-        type=Path,
-        required=True,
-        help="kalibr: the file to write; ocam: a folder, "
-        "or PATH for PATH.lower.txt, PATH.upper.txt and PATH.transform.toml",
-    ),
-    examples=("calibrate export rig.toml --format kalibr -o camchain.yaml",),
-)
-def export_rig(args: argparse.Namespace) -> int:
-    """Write a rig for another program, and print one line about it."""
-    _must_be_writable(args.output)
-    rig = read_rig(args.rig)
-    check_outputs([("--output", args.output)] * (args.format == "kalibr"), [("the rig that is read", args.rig)])
-    written = _export_kalibr(rig, args.output) if args.format == "kalibr" else _export_ocam(rig, args.output)
-    print(f"{', '.join(map(str, written))}: {describe(rig)}{_left_out(rig)}")
     return 0
 
 
@@ -156,33 +133,6 @@ def _ocam(args: argparse.Namespace) -> Rig:
     check_outputs([("--output", args.output)], [("a file that is read", path) for path in read])
     T_lower_upper = read_transform(args.transform) if args.transform else straight_up(args.baseline)
     return import_ocam(Path(args.lower), Path(args.upper), T_lower_upper, args.view or "mirror")
-
-
-def _export_kalibr(rig: Rig, path: Path) -> list[Path]:
-    write_file(path, export_kalibr(rig).encode())
-    return [path]
-
-
-def _export_ocam(rig: Rig, path: Path) -> list[Path]:
-    base = path / "calib_results" if path.is_dir() else path
-    T_lower_upper = rig.lower.T_cam_rig @ se3.inverse(rig.upper.T_cam_rig)
-    texts = {
-        f"{base}.lower.txt": export_ocam(rig.lower.camera),
-        f"{base}.upper.txt": export_ocam(rig.upper.camera),
-        f"{base}.transform.toml": transform_toml(T_lower_upper),
-    }
-    for name, text in texts.items():
-        write_file(Path(name), text.encode())
-    return [Path(name) for name in texts]
-
-
-def _left_out(rig: Rig) -> str:
-    masks = rig.lower.mask is not None or rig.upper.mask is not None
-    left = ["masks"] * masks + ["T_base_rig"] * (not np.array_equal(rig.T_base_rig, np.eye(4)))
-    left += ["covariance"] * (rig.covariance is not None) + ["[times]"] * (rig.times != ShutterTimes())
-    if isinstance(rig.lower.camera, OcamCamera):
-        left.append(f"view (`calibrate import` with --view {rig.lower.camera.view})")
-    return f"; left out, because the format does not support it: {', '.join(left)}" if left else ""
 
 
 def describe(rig: Rig) -> str:

@@ -1,0 +1,90 @@
+"""`omnid calibrate import`: files, printed line, errors before files are written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from calib import se3
+from calib.rig_file import read_rig
+from omnid.cli import main
+from tests.calib.test_kalibr import BOTH, NAMED, T_UPPER_LOWER, chain
+from tests.calib.test_ocam_file import TEXT as OCAM
+
+
+def omnid(*words: object) -> int:
+    return main(["calibrate", "import", *map(str, words)])
+
+
+@pytest.fixture
+def kalibr(tmp_path: Path) -> Path:
+    """A camchain.yaml."""
+    (tmp_path / "k.yaml").write_text(chain(BOTH, T_UPPER_LOWER, NAMED))
+    return tmp_path / "k.yaml"
+
+
+def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert omnid(kalibr, "-o", tmp_path / "rig.toml") == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    assert "lower omni 768x770, 0 to 1" in line and "deg from its axis (/lower/image_raw), upper omni 768x770" in line
+    assert "baseline 201.2 mm, upper rotated by 17.4" in line and "no height of the cameras (--height-m" in line
+    assert omnid(kalibr, "--lower", "cam1", "-o", tmp_path / "swapped.toml", "--height-m", 0.8) == 0
+    swapped = read_rig(tmp_path / "swapped.toml")
+    assert swapped.topics == NAMED[::-1] and swapped.height_m() == pytest.approx(0.8)
+
+
+def test_says_what_an_import_takes_from_the_imu(
+    kalibr: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = kalibr.read_text().replace("cam0:", "cam0:\n  timeshift_cam_imu: 0.002")
+    text = text.replace("cam1:", "cam1:\n  timeshift_cam_imu: 0.005").replace("lower/", "a/").replace("upper/", "b/")
+    kalibr.write_text(text)
+    assert omnid(kalibr, "-o", tmp_path / "rig.toml") == 0
+    printed = capsys.readouterr()
+    assert "upper exposed +3.0 ms against its stamps" in printed.out
+    assert f"omnid: warning: {kalibr}: lower is cam0 by z of the IMU" in printed.err
+    assert read_rig(tmp_path / "rig.toml").times.upper_delay_s == pytest.approx(0.003)
+
+
+def test_imports_ocam_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "c.txt").write_text(OCAM)
+    (tmp_path / "T.toml").write_text(f"T_upper_lower = {T_UPPER_LOWER.tolist()}")
+    files = ["--lower", tmp_path / "c.txt", "--upper", tmp_path / "c.txt", "-o", tmp_path / "rig.toml"]
+    assert omnid(*files, "--transform", tmp_path / "T.toml") == 0
+    found = read_rig(tmp_path / "rig.toml")
+    assert se3.apply(found.upper.T_cam_rig @ se3.inverse(found.lower.T_cam_rig), [[0.0, 0, 0]])[0] == pytest.approx(
+        T_UPPER_LOWER[:3, 3], abs=1e-11
+    )
+    capsys.readouterr()
+    assert omnid(*files, "--baseline", 0.2, "--view", "direct") == 0
+    assert "upper ocam direct 640x480, 0 to " in (line := capsys.readouterr().out)
+    assert "baseline 200.0 mm, upper rotated by 0.00 deg" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("none.yaml", "-o", "no/rig.toml"), "there is no folder"),
+        (("k.yaml", "-o", "."), "expected a file to write, found a folder"),
+        (("none.yaml", "-o", "rig.toml"), "cannot be read"),
+        (("k.yaml", "-o", "k.yaml"), "that is read as well"),
+        (("k.yaml", "-o", "k.yaml/rig.toml"), "there is no folder"),
+        (("k.yaml", "--baseline", 0.2, "-o", "rig.toml"), "go with OCamCalib files"),
+        (("rig2.toml", "-o", "rig.toml"), "needs no import"),
+        (("-o", "rig.toml"), "expected a Kalibr camchain.yaml, or two OCamCalib files"),
+        (("--lower", "a", "--upper", "b", "-o", "rig.toml"), "give --transform FILE or"),
+        (("--equirectangular", "3840", "-o", "rig.toml"), "expected WIDTHxHEIGHT"),
+    ],
+)
+def test_invalid_requests_fail_before_files_are_written(
+    words: tuple[object, ...],
+    message: str,
+    kalibr: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(kalibr.parent)
+    before = sorted(kalibr.parent.iterdir())
+    assert omnid(*words) == 2
+    assert message in capsys.readouterr().err and sorted(kalibr.parent.iterdir()) == before
