@@ -37,11 +37,12 @@ class CamerasConfig:
     exposure_us: int = knob(0, "fixed exposure, us; 0: not fixed", low=0, high=10_000_000)
     auto_gain: str = knob("keep", "automatic gain", choices=SWITCH)
     gain: int = knob(-1, "fixed gain in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
-    auto_white_balance: str = knob("keep", "automatic white balance", choices=SWITCH)
-    auto_focus: str = knob("keep", "automatic focus; best off: each focus has another calibration", choices=SWITCH)
-    focus: int = knob(-1, "fixed focus in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
     power_line: str = knob("keep", "mains frequency against the flicker of lamps, Hz", choices=POWER_LINE)
-    controls: tuple[str, ...] = knob((), "other controls by their names in v4l2-ctl --list-ctrls: 'sharpness=2'")
+    controls: tuple[str, ...] = knob(
+        (),
+        "other controls by their names in v4l2-ctl --list-ctrls; best with a fixed focus, as each one has another "
+        "calibration: 'focus_automatic_continuous=0', 'focus_absolute=20'",
+    )
     buffers: int = knob(4, "image buffers of the kernel", low=2, high=32)
     timeout_s: float = knob(2.0, "a camera without an image for so long is opened again, s", low=0.05, high=60)
     retry_s: float = knob(2.0, "longest wait between two tries to open a lost camera, s", low=0.05, high=60)
