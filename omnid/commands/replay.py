@@ -98,7 +98,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 )
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print its summary; return 1 where no pose was found."""
-    from omnid.config_use import unused_settings
+    from omnid.config import unused_settings
     from omnid.runs.replay import ReplayOptions
 
     config = settings_of(args)
