@@ -72,17 +72,11 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "record": Entry("record", "record both cameras to MCAP files until Ctrl-C"),
         "report": Entry("report", "one HTML page about a recording: path, events, statistics"),
         "log info": Entry("log:info", "topics, types, counts, times, attachments, and whether the log is whole"),
-        "map build": Entry("map_build", "build a map from logs, of one drive or of several in the same place"),
-        "map info": Entry("map:info", "keyframes, sessions, loops, size, and the rig that made the map"),
-        "map show": Entry("map:show", "a page with keyframes, loops, and the paths with and without the loops"),
-        "map merge": Entry("map:merge", "join maps of one building, made by the same rig"),
-        "map tags": Entry(
-            "map_tags:tags", "AprilTags (36h11) as landmarks with names: those of a map, or those that a log shows"
-        ),
-        "map align": Entry("map_tags:align", "move a map into the axes of a plan of the building, by known AprilTags"),
+        "map build": Entry("map:build", "build a map from logs, of one drive or of several in the same place"),
+        "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map; plan and grid"),
         "map export": Entry("map:export", "write a map for other programs"),
         "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
-        "doctor": Entry("doctor", "check cameras, motor, rig, clock, rights, bus and disk"),
+        "doctor": Entry("doctor", "check cameras, USB, motor, rig, clock, rights, bus and disk"),
         "motor test": Entry("motor", "turn each wheel, ask what moved, print the settings for that"),
         "config": Entry("config", "print or check settings"),
         "install-service": Entry("install_service", "install omnid as a systemd service"),
@@ -94,7 +88,7 @@ GROUPS: Final[Mapping[str, str]] = MappingProxyType(
         "calibrate": "make a rig.toml",
         "route": "teach a route by driving it, and repeat it",
         "log": "show the content of logs",
-        "map": "build, show, merge and export maps of places (.omap)",
+        "map": "build, show and export maps of places (.omap)",
         "motor": "test the wiring of the motors: sides, directions, scale",
     }
 )
@@ -119,8 +113,16 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "web`",
         "log recover": "omnid reads cut logs as they are; for other programs: `mcap recover`, of mcap's own command "
         "line",
+        "map align": "a map keeps the axes of its first drive; nav2 takes the offset to a plan as a transform",
         "map build --dask": "each log is replayed in the map of those before",
         "map build --jobs": "each log is replayed in the map of those before",
+        "map build --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "map info": "`omnid map show FILE.omap`",
+        "map merge": "`omnid map build LOG ... -o FILE.omap --extend` adds the logs of one map to the other",
+        "map tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "replay --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "run --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "simulate --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
         "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
     }

@@ -1,63 +1,160 @@
-"""`omnid map`: show, merge and export maps of places."""
+"""`omnid map`: build maps of places from logs, show them, export them, and let a robot save its own."""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from omnid.commands.json_output import print_json
-from omnid.commands.map_option import require_replace
-from omnid.commands.map_summary import described
-from omnid.commands.options import JSON, REPLACE, ROBOT, SETTINGS, command, option, settings_of
+from omnid.commands.options import (
+    JSON,
+    QUIET,
+    REPLACE,
+    RIG,
+    ROBOT,
+    SETTINGS,
+    command,
+    exclusive,
+    option,
+    settings_of,
+)
 from omnid.errors import OmnidError
+from omnid.utc import utc
 
-CELL_M = 0.05
+if TYPE_CHECKING:
+    from omnid.config import Config
+    from omnid.core.places.place_map import PlaceMap
+    from omnid.core.places.place_rig import PlaceRig
+    from omnid.core.places.place_views import PlaceSummary
+    from omnid.runs.place_maps import RigPlaces
 
-
-@command(option("maps", type=Path, nargs="+", metavar="FILE.omap"), JSON, examples=("map info place.omap",))
-def info(args: argparse.Namespace) -> int:
-    """Print the content of each map; return 2 if a file is not a map."""
-    from omnid.core.places.place_views import summary
-    from omnid.formats.place_file import read_places
-
-    code, found = 0, []
-    for number, path in enumerate(args.maps):
-        try:
-            places, rig = read_places(path)
-        except OmnidError as error:
-            print(f"omnid: {error}", file=sys.stderr)
-            code = 2
-            continue
-        sizes = summary(places, rig)
-        found.append({"path": path, "size_bytes": path.stat().st_size, "rig_hash": rig.rig_hash, **asdict(sizes)})
-        if not args.json:
-            print(*[""] * bool(number), *described(path, sizes, rig), sep="\n")
-    if args.json:
-        print_json(found)
-    return code
+# Suffixes of `map show -o`, and the options of `map export` that write the same.
+KINDS = {".ply": "--ply", ".png": "--plan", ".yaml": "--grid", ".yml": "--grid"}
+MAP = option("map", type=Path, metavar="FILE.omap")
+CELL = option("--cell", type=float, default=0.05, metavar="M", help="edge of a cell of the grid; default %(default)s m")
 
 
 @command(
-    option("map", type=Path, metavar="FILE.omap"),
-    option("-o", "--output", type=Path, required=True, metavar="OUT.html"),
-    examples=("map show place.omap -o place.html",),
+    option("logs", type=Path, nargs="+", metavar="LOG", help="as of `omnid replay`, the longest first"),
+    option("-o", "--output", type=Path, required=True, metavar="OUT.omap"),
+    exclusive(option("--extend", action="store_true", help="extend the map OUT.omap"), REPLACE),
+    RIG,
+    QUIET,
+    *SETTINGS,
+    examples=(
+        "map build monday.mcap tuesday.mcap -o place.omap --rig rig.toml",
+        "map build wednesday.mcap -o place.omap --extend",
+    ),
 )
-def show(args: argparse.Namespace) -> int:
-    """Write the page."""
-    from calib.rig_file import write_file
+def build(args: argparse.Namespace) -> int:
+    """Replay the logs one after the other, each in the map of those before; write the map."""
+    from omnid.config_use import unused_settings
     from omnid.core.places.place_views import summary
-    from omnid.formats.place_file import read_places
-    from omnid.report.map_page import map_page
+    from omnid.formats.place_file import write_places
     from omnid.sinks.files import check_outputs
 
-    check_outputs([("-o", args.output)], [("the map that is read", args.map)])
-    places, rig = read_places(args.map)
-    lines = [(line[:13].strip(), line[13:]) for line in described(args.map, summary(places, rig), rig)]
-    html = map_page(args.map.name, lines, places, rig)
-    write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
-    print(f"written      {args.output}")
+    config = settings_of(args)
+    warnings = unused_settings(config, "replay", args.overrides)
+    if not config.places.enabled or config.places.map:
+        raise OmnidError("map build: places.enabled must be true, and places.map empty: change the configuration")
+    check_outputs([("-o", args.output)], [("the log that is read", log) for log in args.logs])
+    if args.output.exists() and not (args.extend or args.replace):
+        raise OmnidError(f"map build: {args.output} exists: --extend adds these logs to it, --replace makes a new one")
+    for warning in warnings:
+        print(f"omnid: warning: {warning}", file=sys.stderr)
+    built = _built(args, config)
+    if isinstance(built, int):
+        print(f"omnid: interrupted: {args.output} was not written", file=sys.stderr)
+        return 128 + built
+    if built is None or not built.places.keyframes:
+        print("omnid: no keyframe was found: no map was written", file=sys.stderr)
+        return 1
+    write_places(args.output, built.places, built.rig)
+    print(*_described(args.output, summary(built.places, built.rig), built.rig), sep="\n")
+    return 0
+
+
+def _built(args: argparse.Namespace, config: Config) -> RigPlaces | int | None:
+    """Return the map of the logs; None: they have no keyframe. A number is that of the signal that ended it."""
+    from omnid.diagnostics.progress import Progress
+    from omnid.formats.place_file import read_places
+    from omnid.runs.place_maps import RigPlaces, new_places
+    from omnid.runs.replay import ReplayOptions, run_log
+
+    built = RigPlaces(*read_places(args.output, new_places(config.places))) if args.extend else None
+    for log in args.logs:
+        options = ReplayOptions(
+            rig=args.rig, settings=args.config, build=True, rig_places=built, progress=None if args.quiet else Progress
+        )
+        result = run_log(log, config, options)
+        for warning in result.warnings:
+            print(f"omnid: warning: {log}: {warning}", file=sys.stderr)
+        if result.signal:
+            return result.signal
+        built = result.rig_places
+    return built
+
+
+@command(
+    MAP,
+    option(
+        "-o",
+        "--output",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="OUT.png|.yaml|.ply",
+        help="also write the map, as its suffix says: a plan with paths and loops, a grid for nav2, landmarks; may be "
+        "repeated",
+    ),
+    CELL,
+    JSON,
+    examples=("map show place.omap", "map show place.omap -o place.png -o place.yaml"),
+)
+def show(args: argparse.Namespace) -> int:
+    """Print keyframes, sessions, loops, size and the rig that made the map; write what is asked for."""
+    from omnid.core.places.place_views import summary
+
+    for path in args.output:
+        if path.suffix not in KINDS:
+            raise OmnidError(f"-o {path}: expected a name that ends in .png, .yaml or .ply")
+    places, rig, files = _exported(args, [("-o", KINDS[path.suffix], path) for path in args.output])
+    sizes = summary(places, rig)
+    if args.json:
+        size_bytes = args.map.stat().st_size
+        print_json({"path": args.map, "size_bytes": size_bytes, "rig_hash": rig.rig_hash, **asdict(sizes)})
+    else:
+        print(*_described(args.map, sizes, rig), sep="\n")
+        if files:
+            print("written     ", ", ".join(map(str, files)))
+    return 0
+
+
+@command(
+    MAP,
+    option("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age"),
+    option("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths and loops"),
+    option(
+        "--grid",
+        type=Path,
+        metavar="FILE.yaml",
+        help="occupancy grid for nav2 and map_server; the image beside it is FILE.pgm",
+    ),
+    CELL,
+    examples=("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
+)
+def export(args: argparse.Namespace) -> int:
+    """Write the files that are asked for."""
+    named = (("--ply", args.ply), ("--plan", args.plan), ("--grid", args.grid))
+    outputs = [(option, option, path) for option, path in named if path is not None]
+    if not outputs:
+        raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
+    _, _, files = _exported(args, outputs)
+    print("written     ", ", ".join(map(str, files)))
     return 0
 
 
@@ -71,70 +168,13 @@ def save(args: argparse.Namespace) -> int:
     return 0
 
 
-@command(
-    option("maps", type=Path, nargs="+", metavar="FILE.omap", help="two or more; the frame of the first stays"),
-    option("-o", "--output", type=Path, required=True, metavar="OUT.omap"),
-    REPLACE,
-    examples=("map merge east.omap west.omap -o place.omap",),
-)
-def merge(args: argparse.Namespace) -> int:
-    """Join the maps, each to those before."""
-    from omnid.core.places.merge import NO_COMMON_PLACE
-    from omnid.core.places.merge import merge as merge_maps
-    from omnid.core.places.place_rig import seen_by
-    from omnid.core.places.place_views import summary
-    from omnid.core.types.stereo_model import StereoModel
-    from omnid.engine.kernel_cache import prepare_kernels
-    from omnid.formats.place_file import read_places, write_places
-    from omnid.sinks.files import check_outputs
+def _exported(
+    args: argparse.Namespace, outputs: Sequence[tuple[str, str, Path]]
+) -> tuple[PlaceMap, PlaceRig, list[Path]]:
+    """Write a map to files; return it and all files that were written.
 
-    if len(args.maps) < 2:
-        raise OmnidError("map merge: expected two maps or more")
-    for number, path in enumerate(args.maps):
-        if path.exists() and any(other.exists() and path.samefile(other) for other in args.maps[:number]):
-            raise OmnidError(f"map merge: expected maps of several drives, found {path} twice: name each once")
-    check_outputs([("-o", args.output)], [])
-    require_replace("map merge", args, args.maps)
-    places, rig = read_places(args.maps[0])
-    for path in args.maps[1:]:
-        other, other_rig = read_places(path)
-        if difference := other_rig.difference(rig):
-            raise OmnidError(f"{path}: this map was made with {difference}: build one with the rig of {args.maps[0]}")
-        seen_by(other, other_rig, rig)
-        prepare_kernels()
-        try:
-            recognised = merge_maps(places, other, StereoModel(rig.cylinder, rig.baseline_m))
-        except ValueError as error:
-            raise OmnidError(
-                f"map merge: {path}: {error}: measure it, and build the map with the wrong size again by "
-                "`omnid map build LOG --tags TAGS.toml`"
-            ) from None
-        if not recognised:
-            raise OmnidError(
-                f"{path}: it {NO_COMMON_PLACE} with the maps before that is recognised: drive where both "
-                "have been, and add that log by `omnid map build LOG --extend`"
-            )
-    write_places(args.output, places, rig)
-    print(*described(args.output, summary(places, rig), rig), sep="\n")
-    return 0
-
-
-@command(
-    option("map", type=Path, metavar="FILE.omap"),
-    option("--ply", type=Path, metavar="FILE.ply", help="landmarks with confidence and age"),
-    option("--plan", type=Path, metavar="FILE.png", help="landmarks from above, with the paths"),
-    option(
-        "--grid",
-        type=Path,
-        metavar="FILE.yaml",
-        help="occupancy grid for nav2 and map_server; the image beside it is FILE.pgm",
-    ),
-    option("--cell", type=float, default=CELL_M, metavar="M", help="edge of a cell; default %(default)s m"),
-    examples=("map export place.omap --grid place.yaml --ply place.ply --plan place.png",),
-)
-def export(args: argparse.Namespace) -> int:
-    """Write the files that are asked for."""
-
+    outputs: for each file the option that names it, its kind (that of an option of `map export`), and its path.
+    """
     from omnid.core.places import place_views
     from omnid.formats.grid_map import write_grid
     from omnid.formats.place_file import read_places
@@ -143,34 +183,47 @@ def export(args: argparse.Namespace) -> int:
     from omnid.sinks.files import check_outputs, write_plan
     from omnid.stages.floor import ADVICE
 
-    named = (("--ply", args.ply), ("--plan", args.plan), ("--grid", args.grid))
-    outputs = [(option, path) for option, path in named if path is not None]
-    if not outputs:
-        raise OmnidError("map export: nothing to write: give --ply FILE.ply, --plan FILE.png or --grid FILE.yaml")
     if not 0.005 <= args.cell <= 10:
         raise OmnidError(f"--cell {args.cell:g}: expected an edge of 0.005 to 10 m")
     inputs = [("the map that is read", args.map)]
-    check_outputs(outputs, inputs)  # before the image of a grid is named: a folder, as ".", can have no other end
-    images = [("--grid's image", args.grid.with_suffix(".pgm"))] if args.grid else []
-    check_outputs([*outputs, *images], inputs)
+    named = [(option, path) for option, _, path in outputs]
+    check_outputs(named, inputs)  # before the image of a grid is named: a folder, as ".", can have no other end
+    named += [("the grid's image", path.with_suffix(".pgm")) for _, kind, path in outputs if kind == "--grid"]
+    check_outputs(named, inputs)
     places, rig = read_places(args.map)
-    if args.grid:
-        if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
-            print(
-                f"omnid: warning: {args.grid}: no cell is free: the map is of an earlier version, or was built "
-                f"without the height of the cameras above the floor: {ADVICE}, and build the map again",
-                file=sys.stderr,
-            )
-        write_grid(args.grid, place_views.grid(places, rig, args.cell))
-    if args.ply or args.plan:
-        points = place_views.landmarks(places, rig)
-        if args.ply:
-            write_ply(args.ply, points)
-        if args.plan:
+    for _, kind, path in outputs:
+        if kind == "--grid":
+            if not any(keyframe.free_m.any() for keyframe in places.keyframes.values()):
+                print(
+                    f"omnid: warning: {path}: no cell is free: the map was built without the height of the cameras "
+                    f"above the floor: {ADVICE}, and build the map again",
+                    file=sys.stderr,
+                )
+            write_grid(path, place_views.grid(places, rig, args.cell))
+        elif kind == "--ply":
+            write_ply(path, place_views.landmarks(places, rig))
+        else:
             # A map has the axes of the base, whose origin is on the floor where the rig states the cameras' height.
             height_m = float(rig.T_base_rect[2, 3])
-            low_m, high_m = drawn_heights(height_m)
-            paths_xy = place_views.paths_xy(places, rig)
-            write_plan(args.plan, points, paths_xy, (low_m + height_m, high_m + height_m))
-    print("written     ", ", ".join(str(path) for _, path in [*outputs, *images]))
-    return 0
+            low_m, high_m = (height_m + at_m for at_m in drawn_heights(height_m))
+            paths, loops = place_views.paths_xy(places, rig), place_views.loops_xy(places, rig)
+            write_plan(path, place_views.landmarks(places, rig), paths, (low_m, high_m), loops)
+    return places, rig, [path for _, path in named]
+
+
+def _described(path: Path, sizes: PlaceSummary, rig: PlaceRig) -> Iterator[str]:
+    """Yield a line for each property: its name, padded to 12 characters, and its value."""
+    per_keyframe = path.stat().st_size / max(1, sizes.keyframes)
+    yield f"map          {path}"
+    yield f"size         {path.stat().st_size / 1e6:.1f} MB, {per_keyframe / 1e3:.0f} kB a keyframe"
+    yield f"time         {utc(sizes.first_stamp_ns)} to {utc(sizes.last_stamp_ns)}"
+    yield f"sessions     {sizes.sessions}"
+    yield f"keyframes    {sizes.keyframes}, with {sizes.features} features; {sizes.dropped} were dropped"
+    yield f"loops        {sizes.loops}"
+    yield f"path         {sizes.path_m:.1f} m, within {sizes.extent_m[0]:.1f} x {sizes.extent_m[1]:.1f} m"
+    if sizes.parts > 1:
+        yield f"parts        {sizes.parts}, between which no pose is known"
+    yield (
+        f"rig          {rig.rig_hash[:12]}, baseline {rig.baseline_m:.4f} m, panoramas of "
+        f"{rig.cylinder.width} x {rig.cylinder.height} px"
+    )

@@ -238,13 +238,6 @@ def map_file(text: str) -> Path:
     return Path(text)
 
 
-TAGS: Final = option(
-    "--tags",
-    type=Path,
-    metavar="TAGS.toml",
-    setting="places.tags",
-    help="AprilTags (36h11) that are to be landmarks of the map, with names, numbers and sizes; the map keeps them",
-)
 MAP: Final = group(
     "map of places",
     option(
@@ -256,6 +249,5 @@ MAP: Final = group(
         "the 3-D map are written by `omnid replay --cloud FILE.ply`",
     ),
     option("--localize-only", action="store_true", setting="places.localize_only", help="leave the map as it is"),
-    TAGS,
 )
 REPLACE: Final = option("--replace", action="store_true", help="replace it, with all places that routes refer to")

@@ -1,321 +1,347 @@
-"""Map files (.omap): a map of places as an SQLite database; the format is described in OMAP.md.
+"""Map files (.omap): a map of places as an uncompressed .npz file, which `numpy.load` opens; see OMAP.md.
 
 A map is written to a temporary file in the same folder, synced and renamed, so that a program that is killed leaves the
-old map whole. What is read is checked: the schema by its text, each row by its checksum, each value by its range.
+old map whole. What is read is checked: each array by its type, its size and the CRC-32 of the archive, each value by
+its range. The same checks come before a map is written, so that none is replaced by one that would be refused.
 """
 
 from __future__ import annotations
 
-import sqlite3
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence, Set
-from contextlib import ExitStack, closing
-from itertools import islice
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from stat import S_ISFIFO
-from typing import Final
+from typing import IO, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from drivers.bounded_sqlite import bound_work, open_bounded
-from omnid.core.places.code_index import INDEXED, CodeIndex
-from omnid.core.places.map_tags import MAX_VIEWS, TagView
-from omnid.core.places.place_features import FeatureStore, PlaceFeatures, StoredFeatures
-from omnid.core.places.place_map import UNUSED, Link, PlaceMap, StoredPlaces
+from calib.panorama import Cylinder
+from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS
+from omnid.core.places.place_features import DESCRIPTOR, PlaceFeatures
+from omnid.core.places.place_map import UNUSED, KeyframeUse, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
-from omnid.core.places.tags import MAX_TAG
+from omnid.core.places.signature import COLUMNS, ROWS
 from omnid.errors import OmnidError
-from omnid.formats import place_rows
-from omnid.formats.place_rows import KeyframeRow
-from omnid.formats.place_values import BadRowError, require_covariances, require_rigid
-from omnid.formats.stored_features import FeatureFile
 from omnid.formats.whole_file import replacement
 
-VERSION: Final = 6  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
-APPLICATION_ID: Final = 0x6F6D6170  # "omap", in the header of the database
-# Earlier versions that are read as well. Scans before version 4 had heights above the base, not above the floor, and
-# passed over low obstacles before a wall: they are read as unknown. Before version 6 floor was not seen: none is free.
-WITHOUT_TAGS: Final = 2
-WITHOUT_FLOOR: Final = 3
-WITHOUT_CODES: Final = 4  # Features are in the rows of the keyframes, which are read whole.
-WITHOUT_FREE: Final = 5
-MAGIC: Final = b"SQLite format 3\0"
+FORMAT: Final = 7  # to be raised where thumbnails or features of a place are computed otherwise: old maps fit no more
+# Maps up to version 6 were SQLite databases.
+EARLIER: Final = b"SQLite format 3\0"
 MAX_FILE_BYTES: Final = 1 << 30
-MAX_VALUE_BYTES: Final = 1 << 20  # Limit of one value in the database.
-MAX_KEYFRAMES: Final = 100_000
-MAX_LINKS: Final = 1_000_000
-MAX_TAG_VIEWS: Final = 100_000
-LEAST_VARIANCE: Final = 1e-16  # Least variance of a loop in any direction, so that its covariance can be inverted.
-MAX_INSTRUCTIONS: Final = 50_000_000  # Instructions that SQLite may take to read a map.
-SCHEMA: Final = {
-    "keyframe": "CREATE TABLE keyframe (id INTEGER PRIMARY KEY, session INTEGER, stamp_ns INTEGER, found INTEGER, "
-    "missed INTEGER, T_map_rect BLOB, "
-    "T_odom_rect BLOB, covariance BLOB, thumbnail BLOB, scan BLOB, free_m BLOB, features INTEGER, codes BLOB, "
-    "azimuths BLOB, crc32 INTEGER)",
-    "link": "CREATE TABLE link (a INTEGER, b INTEGER, inliers INTEGER, T_a_b BLOB, covariance BLOB, crc32 INTEGER)",
-    "map": "CREATE TABLE map (keyframes INTEGER, links INTEGER, dropped INTEGER, tags INTEGER, tag_views INTEGER, "
-    "width INTEGER, height INTEGER, "
-    "row0 REAL, baseline_m REAL, T_rig_rect BLOB, T_base_rig BLOB, rig_hash TEXT, crc32 INTEGER)",
-    "tag": "CREATE TABLE tag (id INTEGER PRIMARY KEY, name TEXT, size_m REAL, crc32 INTEGER)",
-    "tag_view": "CREATE TABLE tag_view (keyframe INTEGER, tag INTEGER, T_rect_tag BLOB, covariance BLOB, "
-    "crc32 INTEGER)",
-    # The last table, so that what is read at the start lies together in the file.
-    "features": "CREATE TABLE features (id INTEGER PRIMARY KEY, descriptors BLOB, views BLOB, crc32 INTEGER)",
-}
-SCHEMA_5: Final = {**SCHEMA, "keyframe": SCHEMA["keyframe"].replace("free_m BLOB, ", "")}
-SCHEMA_4: Final = {
-    "keyframe": SCHEMA_5["keyframe"].replace(
-        "features INTEGER, codes BLOB, azimuths BLOB", "descriptors BLOB, views BLOB"
-    ),
-    **{table: text for table, text in SCHEMA.items() if table not in ("keyframe", "features")},
-}
-SCHEMA_2: Final = {
-    "keyframe": SCHEMA_4["keyframe"],
-    "link": SCHEMA["link"],
-    "map": SCHEMA["map"].replace("tags INTEGER, tag_views INTEGER, ", ""),
-}
-SCHEMAS: Final = {
-    WITHOUT_TAGS: SCHEMA_2,
-    WITHOUT_FLOOR: SCHEMA_4,
-    WITHOUT_CODES: SCHEMA_4,
-    WITHOUT_FREE: SCHEMA_5,
-    VERSION: SCHEMA,
-}
-IN_MEMORY: Final = 1 << 62  # More bytes than the features of any map have.
-BLOCK: Final = 1000  # Rows of which arrays are made at once: 5 MB of keyframes; by judgement, not measured.
+MAX_FEATURES: Final = 4096  # of a keyframe
+MAX_PIXELS: Final = 1 << 15  # width and height of a panorama
+MAX_INTEGER: Final = 1 << 62
+MAX_POSITION_M: Final = 1e5
+MAX_VARIANCE: Final = 1e8  # m^2 and rad^2
+LEAST_VARIANCE: Final = 1e-16  # of a loop in any direction, so that its covariance can be inverted
+RIGID: Final = 1e-6  # largest difference of an element of R R^T from the identity
+
+# Transforms are the upper rows of the 4x4 matrix.
+HEAD: Final = np.dtype(
+    [
+        ("format", "<i8"),
+        ("dropped", "<i8"),
+        ("width", "<i8"),
+        ("height", "<i8"),
+        ("row0", "<f8"),
+        ("baseline_m", "<f8"),
+        ("T_rig_rect", "<f8", (3, 4)),
+        ("T_base_rig", "<f8", (3, 4)),
+        ("rig_hash", "S64"),
+    ]
+)
+KEYFRAME: Final = np.dtype(
+    [
+        ("id", "<i8"),
+        ("session", "<i8"),
+        ("stamp_ns", "<i8"),
+        ("found", "<i8"),
+        ("missed", "<i8"),
+        ("features", "<i8"),
+        ("T_map_rect", "<f8", (3, 4)),
+        ("T_odom_rect", "<f8", (3, 4)),
+        ("covariance", "<f8", (6, 6)),
+        ("thumbnail", "i1", (ROWS, COLUMNS)),
+        ("scan", "<f2", (SECTORS,)),
+        ("free_m", "<f2", (SECTORS,)),
+    ]
+)
+LINK: Final = np.dtype(
+    [("a", "<i8"), ("b", "<i8"), ("inliers", "<i8"), ("T_a_b", "<f8", (3, 4)), ("covariance", "<f8", (6, 6))]
+)
+# Features of one keyframe after the other.
+DESCRIPTORS: Final = np.dtype(("u1", (DESCRIPTOR,)))
+VIEWS: Final = np.dtype(("<f4", (3,)))
+
+
+class _BadMapError(ValueError):
+    """A map that no omnid has written."""
 
 
 def write_places(path: str | Path, places: PlaceMap, rig: PlaceRig) -> None:
-    """Write a map; the file is replaced at once, never written in part, by one that can be read.
-
-    Raises OmnidError if that is impossible.
-    """
-    path = Path(path)
+    """Write a map; the same map gives the same bytes. Raises OmnidError if that is impossible."""
+    path, ids = Path(path), sorted(places.keyframes)
+    features = [places.keyframes[id].features for id in ids]
+    views = np.concatenate([np.zeros((0, 3), np.float32), *(of_one.views for of_one in features)])
     try:
-        with replacement(path) as partial:
-            _write(partial, places, rig)
-            _require_readable(partial)  # no map is replaced by one that would be refused
-    except (OSError, ValueError, sqlite3.Error) as error:
+        head, keyframes, links = _head(places, rig), _keyframes(places, ids), _links(places)
+        _check(head, keyframes, links)
+        _check_views(views, rig.cylinder)
+        with replacement(path) as partial, zipfile.ZipFile(partial, "w") as archive:
+            _write_array(archive, "map", head.dtype, 1, [head])
+            _write_array(archive, "keyframes", KEYFRAME, len(keyframes), [keyframes])
+            _write_array(archive, "links", LINK, len(links), [links])
+            _write_array(archive, "views", VIEWS, len(views), [views])
+            # Some 50 MB in a large map, which are not copied together in memory.
+            _write_array(archive, "descriptors", DESCRIPTORS, len(views), (of_one.descriptors for of_one in features))
+    except (OSError, ValueError) as error:
         raise OmnidError(f"{path}: cannot write the map: {error}: choose another file") from error
 
 
-def read_places(
-    path: str | Path, into: PlaceMap | None = None, most_feature_bytes: int = IN_MEMORY
-) -> tuple[PlaceMap, PlaceRig]:
+def read_places(path: str | Path, into: PlaceMap | None = None) -> tuple[PlaceMap, PlaceRig]:
     """Return the map of a file and the rig by which it was made.
 
-    into: an empty map that is filled, whose bounds hold as soon as a keyframe is added to it.
-    most_feature_bytes: features that take more stay in the file until they are needed.
-    Raises OmnidError, in one line, for any file that is no whole map; features that stay are checked later.
+    into: an empty map that is filled, whose bound holds as soon as a keyframe is added to it.
+    Raises OmnidError, in one line, for any file that is no whole map.
     """
     path, places = Path(path), PlaceMap() if into is None else into
-    version = _version_of(path)
+    _require_map(path)
     try:
-        with ExitStack() as open_file:
-            database = open_file.enter_context(closing(open_bounded(path, MAX_VALUE_BYTES, unchanging=True)))
-            rig = _read(_Reader(database, version), places, most_feature_bytes)
-            if places.stored is not None:
-                open_file.pop_all()  # features are read from it later
-        return places, rig
-    except BadRowError as error:
+        with zipfile.ZipFile(path) as archive:
+            return places, _read(archive, places)
+    except OSError as error:
+        raise OmnidError(f"{path}: cannot read the map: {error.strerror or error}") from error
+    except Exception as error:  # whatever zipfile and numpy raise for bytes that no omnid has written
+        found = " ".join(str(error).split()) or type(error).__name__
         raise OmnidError(
-            f"{path}: {error}: the map is damaged; take a copy, or build it again with `omnid map build`"
-        ) from error
-    except (sqlite3.Error, OverflowError, MemoryError, UnicodeDecodeError) as error:
-        raise OmnidError(
-            f"{path}: the map is damaged: {' '.join(str(error).split())}; take a copy, or build it again "
-            "with `omnid map build`"
+            f"{path}: the map is damaged: {found}; take a copy, or build it again with `omnid map build`"
         ) from error
 
 
-def _version_of(path: Path) -> int:
-    """Return the version in the header, once it is that of an SQLite database, ours, of a version that is read."""
+def _require_map(path: Path) -> None:
+    """Raise OmnidError for a file that is none of numpy's archives, or too large."""
     try:
         status = path.stat()
-        size = status.st_size
         if S_ISFIFO(status.st_mode):
             raise OmnidError(f"{path}: expected a map of places (.omap), found a pipe: name a file")
         with path.open("rb") as file:
-            header = file.read(100)
+            beginning = file.read(len(EARLIER))
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise OmnidError(f"{path}: cannot read the map: {getattr(error, 'strerror', None) or error}") from error
-    if len(header) < 100 or not header.startswith(MAGIC) or int.from_bytes(header[68:72]) != APPLICATION_ID:
+    if beginning == EARLIER:
+        raise OmnidError(f"{path}: this is a map of an earlier version of omnid: build it again with `omnid map build`")
+    if not beginning.startswith(b"PK"):
         raise OmnidError(f"{path}: expected a map of places (.omap), found another file; `omnid map build` makes one")
-    version = int.from_bytes(header[60:64])
-    if version not in SCHEMAS:
+    if status.st_size > MAX_FILE_BYTES:
         raise OmnidError(
-            f"{path}: this is a map of version {version}, expected {VERSION}: build it again with "
-            "`omnid map build`, or update omnid"
+            f"{path}: expected a map of at most {MAX_FILE_BYTES >> 20} MB, found {status.st_size >> 20} MB"
         )
-    if size > MAX_FILE_BYTES:
-        raise OmnidError(f"{path}: expected a map of at most {MAX_FILE_BYTES >> 20} MB, found {size >> 20} MB")
-    return version
 
 
-def _write(path: Path, places: PlaceMap, rig: PlaceRig) -> None:
-    """Write the database; the same map gives the same bytes."""
-    with closing(sqlite3.connect(path, isolation_level=None)) as database:
-        # Not synced here, and without a journal: the file has another name until it is whole.
-        for setting in (
-            "journal_mode = OFF",
-            "synchronous = OFF",
-            f"application_id = {APPLICATION_ID}",
-            f"user_version = {VERSION}",
-        ):
-            database.execute(f"PRAGMA {setting}")
-        database.execute("BEGIN")
-        for text in SCHEMA.values():
-            database.execute(text)
-        ids = sorted(places.keyframes)
-        keyframes = (
-            place_rows.keyframe_row(
-                places.keyframes[id], places.poses[id], places.uses.get(id, UNUSED), rig.cylinder.width
-            )
-            for id in ids
+def _head(places: PlaceMap, rig: PlaceRig) -> NDArray[Any]:
+    head = np.zeros(1, HEAD)
+    head[0] = (
+        FORMAT,
+        places.dropped,
+        rig.cylinder.width,
+        rig.cylinder.height,
+        rig.cylinder.row0,
+        rig.baseline_m,
+        rig.T_rig_rect[:3],
+        rig.T_base_rig[:3],
+        rig.rig_hash.encode(),
+    )
+    return head
+
+
+def _keyframes(places: PlaceMap, ids: list[int]) -> NDArray[Any]:
+    rows = np.zeros(len(ids), KEYFRAME)
+    for n, id in enumerate(ids):
+        keyframe, use = places.keyframes[id], places.uses.get(id, UNUSED)
+        rows[n] = (
+            id,
+            keyframe.session,
+            keyframe.stamp_ns,
+            use.found,
+            use.missed,
+            len(keyframe.features.views),
+            places.poses[id][:3],
+            keyframe.T_odom_rect[:3],
+            keyframe.covariance,
+            keyframe.thumbnail,
+            keyframe.scan,
+            keyframe.free_m,
         )
-        _insert(database, "keyframe", keyframes)
-        _insert(database, "link", (place_rows.link_row(link) for link in places.links))
-        _insert(database, "tag", (place_rows.tag_row(places.tags.known[id]) for id in sorted(places.tags.known)))
-        _insert(database, "tag_view", (place_rows.tag_view_row(view) for view in places.tags.views))
-        _insert(database, "map", [place_rows.map_row(rig, places)])
-        _insert(database, "features", (place_rows.features_row(places.keyframes[id]) for id in ids))
-        database.execute("COMMIT")
+    return rows
 
 
-def _insert(database: sqlite3.Connection, table: str, rows: Iterable[place_rows.Row]) -> None:
-    """Insert rows, each with its checksum as the last value."""
-    marks = ", ".join("?" * (SCHEMA[table].count(",") + 1))
-    database.executemany(f"INSERT INTO {table} VALUES ({marks})", ((*row, place_rows.checksum(row)) for row in rows))
+def _links(places: PlaceMap) -> NDArray[Any]:
+    rows = np.zeros(len(places.links), LINK)
+    for n, link in enumerate(places.links):
+        rows[n] = (link.a, link.b, link.inliers, link.T_a_b[:3], link.covariance)
+    return rows
 
 
-class _Reader:
-    """Rows of a database that may be hostile: bounded work, no code of the file, checked sums."""
-
-    def __init__(self, database: sqlite3.Connection, version: int) -> None:
-        self.database, self.version = database, version
-        schema = SCHEMAS[version]
-        bound_work(database, MAX_INSTRUCTIONS)
-        found = dict(database.execute("SELECT name, sql FROM sqlite_schema").fetchmany(len(schema) + 1))
-        if found != schema:
-            raise BadRowError("its tables are not those of a map")
-
-    def rows(self, table: str, most: int) -> Iterator[place_rows.Row]:
-        """Yield the rows of a table without their checksums, at most the given number."""
-        for number, row in enumerate(self.database.execute(f"SELECT * FROM {table} ORDER BY rowid")):
-            if number >= most:
-                raise BadRowError(f"more than {most} rows of {table}")
-            if place_rows.checksum(row[:-1]) != row[-1]:
-                raise BadRowError(f"the checksum of row {number + 1} of {table} is wrong")
-            yield row[:-1]
-
-    def blocks(self, table: str, most: int) -> Iterator[list[place_rows.Row]]:
-        """Yield the same rows, BLOCK at a time."""
-        rows = self.rows(table, most)
-        while block := list(islice(rows, BLOCK)):
-            yield block
+def _write_array(
+    archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any], count: int, parts: Iterable[NDArray[Any]]
+) -> None:
+    """Write an array of numpy (.npy, version 1.0) that consists of parts."""
+    item, shape = dtype.base, (count, *dtype.shape)
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+        np.lib.format.write_array_header_1_0(
+            file, {"descr": np.lib.format.dtype_to_descr(item), "fortran_order": False, "shape": shape}
+        )
+        for part in parts:
+            file.write(np.ascontiguousarray(part, item).tobytes())
 
 
-def _read(reader: _Reader, places: PlaceMap, most_feature_bytes: int) -> PlaceRig:
+def _read(archive: zipfile.ZipFile, places: PlaceMap) -> PlaceRig:
     """Fill an empty map; return the rig."""
-    heads = list(reader.rows("map", 1))
-    if not heads:
-        raise BadRowError("the table map is empty")
-    has_tags = reader.version != WITHOUT_TAGS
-    head = place_rows.read_map_row(heads[0] if has_tags else place_rows.head_of_version_2(heads[0]))
-    keyframes, features = _read_keyframes(reader, head.rig, places, most_feature_bytes)
-    links = [link for block in reader.blocks("link", MAX_LINKS) for link in place_rows.read_links(block)]
-    tags = [place_rows.read_tag_row(row) for row in reader.rows("tag", MAX_TAG + 1)] if has_tags else []
-    views = [place_rows.read_tag_view_row(row) for row in reader.rows("tag_view", MAX_TAG_VIEWS)] if has_tags else []
-    for name, found, expected in (
-        ("keyframes", len(keyframes), head.keyframes),
-        ("links", len(links), head.links),
-        ("tags", len(tags), head.tags),
-        ("views of tags", len(views), head.tag_views),
+    # 1. The rig, keyframes and links, with all checks.
+    head, keyframes, links = (
+        _array(archive, *what) for what in (("map", HEAD), ("keyframes", KEYFRAME), ("links", LINK))
+    )
+    _check(head, keyframes, links)
+    cylinder = Cylinder(int(head["width"][0]), int(head["height"][0]), float(head["row0"][0]))
+    rig = PlaceRig(
+        cylinder,
+        float(head["baseline_m"][0]),
+        _transforms(head["T_rig_rect"])[0],
+        _transforms(head["T_base_rig"])[0],
+        head["rig_hash"][0].decode(),
+    )
+    # 2. Features, keyframe by keyframe.
+    views = _array(archive, "views", VIEWS)
+    _check_views(views, cylinder)
+    if len(views) != keyframes["features"].sum():
+        raise _BadMapError("the features are not those of the keyframes")
+    T_map_rect, T_odom_rect = _transforms(keyframes["T_map_rect"]), _transforms(keyframes["T_odom_rect"])
+    with _opened(archive, "descriptors", DESCRIPTORS, len(views)) as file:
+        ends = np.cumsum(keyframes["features"]).tolist()
+        for n, (row, end) in enumerate(zip(keyframes, ends, strict=True)):
+            count, id = int(row["features"]), int(row["id"])
+            descriptors = np.frombuffer(bytearray(file.read(count * DESCRIPTOR)), np.uint8).reshape(count, DESCRIPTOR)
+            places.keyframes[id] = PlaceKeyframe(
+                id,
+                int(row["session"]),
+                int(row["stamp_ns"]),
+                T_odom_rect[n],
+                np.array(row["covariance"]),
+                np.array(row["thumbnail"]),
+                np.array(row["scan"]),
+                np.array(row["free_m"]),
+                PlaceFeatures(descriptors, views[end - count : end].copy()),
+            )
+            places.poses[id] = T_map_rect[n]
+            if row["found"] or row["missed"]:
+                places.uses[id] = KeyframeUse(int(row["found"]), int(row["missed"]))
+    # 3. Links.
+    places.links = [
+        Link(int(row["a"]), int(row["b"]), T, np.array(row["covariance"]), int(row["inliers"]))
+        for row, T in zip(links, _transforms(links["T_a_b"]), strict=True)
+    ]
+    places.dropped = int(head["dropped"][0])
+    return rig
+
+
+@contextmanager
+def _opened(archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any], count: int | None = None) -> Iterator[IO[bytes]]:
+    """Open an array of `count` items, or of any number, behind its header."""
+    info = archive.getinfo(f"{name}.npy")
+    if info.compress_type != zipfile.ZIP_STORED or info.file_size > MAX_FILE_BYTES:
+        raise _BadMapError(f"the array {name} is compressed, or too large")
+    with archive.open(info) as file:
+        if np.lib.format.read_magic(file) != (1, 0):
+            raise _BadMapError(f"the array {name} is of another version of numpy's format")
+        shape, is_fortran, item = np.lib.format.read_array_header_1_0(file)
+        size = info.file_size - file.tell()
+        expected = size // dtype.itemsize if count is None else count
+        if is_fortran or item != dtype.base or shape != (expected, *dtype.shape) or size != expected * dtype.itemsize:
+            raise _BadMapError(f"the array {name} has another type or size")
+        yield file
+
+
+def _array(archive: zipfile.ZipFile, name: str, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return an array of the archive."""
+    with _opened(archive, name, dtype) as file:
+        found = np.frombuffer(bytearray(file.read()), dtype.base)
+    return found.reshape(-1, *dtype.shape).astype(dtype.base.newbyteorder("="), copy=False)
+
+
+def _transforms(upper: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return transforms (N, 4, 4) of their upper rows (N, 3, 4)."""
+    return np.concatenate([upper, np.broadcast_to([0.0, 0.0, 0.0, 1.0], (len(upper), 1, 4))], axis=1)
+
+
+def _check(head: NDArray[Any], keyframes: NDArray[Any], links: NDArray[Any]) -> None:
+    """Check all values but those of the features. Raises _BadMapError."""
+    _require(len(head) == 1 and head["format"][0] == FORMAT, f"expected version {FORMAT} of the format")
+    _require(head["dropped"] >= 0, "a count is negative")
+    for name in ("width", "height"):
+        _require((head[name] >= 1) & (head[name] <= MAX_PIXELS), "the panorama has another size")
+    _require((np.abs(head["row0"]) <= 1e6) & (head["baseline_m"] >= 1e-3) & (head["baseline_m"] <= 1e2), "no such rig")
+    _require(head["rig_hash"][0].isalnum(), "the hash of the rig is none")
+    ids = keyframes["id"]
+    _require(np.diff(ids) > 0, "the keyframes are not in the order of their ids")
+    for name in ("id", "session", "found", "missed", "features"):
+        _require((keyframes[name] >= 0) & (keyframes[name] < MAX_INTEGER), "a number is outside its range")
+    _require(np.abs(keyframes["stamp_ns"]) < MAX_INTEGER, "a stamp is outside its range")
+    _require(keyframes["features"] <= MAX_FEATURES, "a keyframe has too many features")
+    for ranges, is_unknown in ((keyframes["scan"], np.isnan(keyframes["scan"])), (np.abs(keyframes["free_m"]), False)):
+        _require(is_unknown | ((ranges >= 0) & (ranges <= MAX_RANGE_M)), f"a range is outside 0 to {MAX_RANGE_M:g} m")
+    _require(
+        np.isin(links["a"], ids) & np.isin(links["b"], ids) & (links["a"] != links["b"]),
+        "a link joins no two keyframes",
+    )
+    _require((links["inliers"] >= 0) & (links["inliers"] < MAX_INTEGER), "a number is outside its range")
+    for upper in (
+        head["T_rig_rect"],
+        head["T_base_rig"],
+        keyframes["T_map_rect"],
+        keyframes["T_odom_rect"],
+        links["T_a_b"],
     ):
-        if found != expected:
-            raise BadRowError(f"expected {expected} {name}, found {found}")
-    _check(keyframes, links)
-    for row, of_row in zip(keyframes, features, strict=True):
-        if reader.version <= WITHOUT_FLOOR:
-            row.scan.fill(np.nan)
-        places.keyframes[row.id], places.poses[row.id] = row.keyframe(of_row), row.T_map_rect
-        if row.use != UNUSED:
-            places.uses[row.id] = row.use
-    places.links, places.dropped = links, head.dropped
-    _check_views(views, {tag.id for tag in tags}, places.keyframes.keys())
-    places.tags.known = {tag.id: tag for tag in tags}
-    places.tags.views = views
-    return head.rig
+        _check_rigid(upper)
+    is_loop = links["inliers"] > 0
+    _check_covariances(keyframes["covariance"], 0.0)
+    _check_covariances(links["covariance"][~is_loop], 0.0)
+    _check_covariances(links["covariance"][is_loop], LEAST_VARIANCE)
 
 
-def _read_keyframes(
-    reader: _Reader, rig: PlaceRig, places: PlaceMap, most_feature_bytes: int
-) -> tuple[list[KeyframeRow], Sequence[PlaceFeatures | StoredFeatures]]:
-    """Return the keyframes and their features; where these stay in the file, the map gets the index of them."""
-    keyframes: list[KeyframeRow] = []
-    features: list[PlaceFeatures] = []
-    codes: list[place_rows.KeyframeCodes] = []
-    has_codes = reader.version > WITHOUT_CODES
-    for block in reader.blocks("keyframe", MAX_KEYFRAMES):
-        if reader.version <= WITHOUT_FREE:
-            block = [place_rows.keyframe_without_free(row) for row in block]
-        keyframes += place_rows.read_keyframes(block)
-        if has_codes:
-            codes.append(place_rows.read_codes(block))
-        else:
-            features += [place_rows.read_features(row[-2], row[-1], rig) for row in block]
-    if not has_codes:
-        return keyframes, features
-    counts = [count for block in codes for count in block.counts]
-    if sum(counts) * place_rows.FEATURE_BYTES > most_feature_bytes:
-        store = FeatureStore(FeatureFile(reader.database, rig).read, most_feature_bytes)
-        places.stored = StoredPlaces(_index([row.id for row in keyframes], counts, codes), store)
-        return keyframes, [StoredFeatures(row.id, n, store) for row, n in zip(keyframes, counts, strict=True)]
-    by_id = {
-        id: place_rows.read_features(descriptors, views, rig)
-        for id, descriptors, views in reader.rows("features", MAX_KEYFRAMES)
-    }
-    if [(id, one.count) for id, one in by_id.items()] != list(zip([row.id for row in keyframes], counts, strict=True)):
-        raise BadRowError(f"the features are not those of {len(keyframes)} keyframes")
-    return keyframes, list(by_id.values())
+def _check_views(views: NDArray[np.float32], cylinder: Cylinder) -> None:
+    """Check views (N, 3) of features; NaN fails too.
 
-
-def _index(ids: list[int], counts: list[int], codes: list[place_rows.KeyframeCodes]) -> CodeIndex:
-    """Return the index of keyframes, from blocks of their codes."""
-    return CodeIndex(
-        np.array(ids, np.int64),
-        np.minimum(counts, INDEXED),
-        np.concatenate([block.codes for block in codes]),
-        np.concatenate([block.azimuths for block in codes]),
+    The upper camera may show a point at a row below the end of the lower one's panorama.
+    """
+    column, lower, upper = views.T
+    width, height = cylinder.width, cylinder.height
+    _require(
+        (np.abs(column) <= 2 * width) & (np.abs(lower) <= 2 * height) & (upper > lower) & (upper <= 3 * height),
+        "a view of a keyframe is outside the panorama",
     )
 
 
-def _require_readable(path: Path) -> None:
-    """Read a map and check all of it, keyframe after keyframe, so that a large one needs little memory."""
-    places, _ = read_places(path, most_feature_bytes=0)
-    for keyframe in places.keyframes.values():
-        if keyframe.features.copied().count != keyframe.features.count:
-            raise BadRowError(f"the features of keyframe {keyframe.id} are outside their range")
+def _check_rigid(upper: NDArray[np.float64]) -> None:
+    """Check that (N, 3, 4) are rotations with translations up to MAX_POSITION_M."""
+    R = upper[:, :, :3]
+    _require(np.isfinite(upper) & (np.abs(upper) <= MAX_POSITION_M), "a pose is not finite, or too far away")
+    _require(np.abs(R) <= 2, "a pose is no rotation")
+    _require(np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)) <= RIGID, "a pose is no rotation")
+    _require(np.linalg.det(R) > 0, "a pose is no rotation")
 
 
-def _check_views(views: list[TagView], tags: Set[int], keyframes: Set[int]) -> None:
-    """Check poses and covariances of views, and that they are of tags and keyframes of the map."""
-    if any(view.tag not in tags or view.keyframe not in keyframes for view in views):
-        raise BadRowError("a view of a tag is of no tag, or of no keyframe")
-    if any(count > MAX_VIEWS for count in Counter(view.tag for view in views).values()):
-        raise BadRowError(f"a tag has more than {MAX_VIEWS} views")
-    require_rigid([view.T_rect_tag for view in views])
-    require_covariances([view.covariance for view in views], LEAST_VARIANCE)
+def _check_covariances(P: NDArray[np.float64], least: float) -> None:
+    """Check that (N, 6, 6) are symmetric, without an eigenvalue below `least` [m^2, rad^2]."""
+    _require(np.isfinite(P) & (np.abs(P) <= MAX_VARIANCE), "a covariance is not finite, or too large")
+    rounding = 1e-9 * np.abs(P).max(axis=(1, 2), initial=0.0)  # an eigenvalue that is 0 may be less by this
+    asymmetry = np.abs(P - np.swapaxes(P, 1, 2)).max(axis=(1, 2), initial=0.0)
+    _require(asymmetry <= rounding, "a covariance is not symmetric")
+    _require(np.linalg.eigvalsh(P)[:, 0] >= (least or -rounding), "a covariance is not positive")
 
 
-def _check(keyframes: list[KeyframeRow], links: list[Link]) -> None:
-    """Check poses and covariances, all at once, and that links join keyframes."""
-    ids = {keyframe.id for keyframe in keyframes}
-    if any(link.a not in ids or link.b not in ids or link.a == link.b for link in links):
-        raise BadRowError("a link joins no two keyframes")
-    require_rigid([k.T_map_rect for k in keyframes])
-    require_rigid([k.T_odom_rect for k in keyframes])
-    require_rigid([link.T_a_b for link in links])
-    require_covariances([k.covariance for k in keyframes], 0.0)
-    require_covariances([link.covariance for link in links if not link.is_loop], 0.0)
-    require_covariances([link.covariance for link in links if link.is_loop], LEAST_VARIANCE)
+def _require(holds: bool | NDArray[np.bool_], text: str) -> None:
+    """Raise _BadMapError where a condition does not hold for all values."""
+    if not np.all(holds):
+        raise _BadMapError(text)

@@ -17,6 +17,7 @@ Colour = tuple[int, int, int]  # BGR
 
 MARGIN_PX = 64
 WHITE, BLACK, RED, LIGHT_GREY = (255, 255, 255), (0, 0, 0), (0, 0, 190), (205, 205, 205)
+BLUE = (200, 100, 0)
 _CELL_M = 0.05  # default voxel: at a finer scale cells are drawn as squares, not as scattered dots
 _WEAKEST_GREY = 190.0  # Grey level of a cell with the least confidence.
 _TICK_SPACING_PX = 110.0  # Largest spacing of ticks.

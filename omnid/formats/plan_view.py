@@ -10,6 +10,7 @@ from calib.rig import LEAST_HEIGHT_M
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.formats.plan_sheet import (
     BLACK,
+    BLUE,
     MARGIN_PX,
     RED,
     WHITE,
@@ -34,6 +35,7 @@ _PATH_WIDTHS_PX = (7, 3)  # Widths of the white rim and of the line.
 _LOW_M, _HIGH_M = -1.0, 1.5  # heights that are drawn, relative to the lower viewpoint
 # Lower surfaces are the floor: obstacles begin at 0.06 m (obstacles.ring.heights_m), and a voxel of the map has 0.05 m.
 _FLOOR_M = 0.1
+NO_LOOPS: NDArray[np.float64] = np.zeros((0, 2, 2))
 
 
 def drawn_heights(height_m: float) -> tuple[float, float]:
@@ -50,12 +52,14 @@ def plan_view(
     *,
     heights_m: tuple[float, float] = (_LOW_M, _HIGH_M),
     max_side_px: int = 1400,
+    loops_xy: NDArray[np.float64] = NO_LOOPS,
 ) -> Image:
     """Return a BGR image (H, W, 3) of the map's points between two heights [m], and the path (N, 2) [m] over it.
 
     A row of the path that is NaN, or too far away to be drawn, is a gap: what is before and after it is not joined.
     Heights are z of the points' frame. A cell is the darker, the more confident points it has. Neither side exceeds
     `max_side_px` (at most 2000). The farthest half per cent of the points on each side may be cut off, the path never.
+    loops_xy: (L, 2, 2) [m] ends of lines between places of the path that were recognised as one.
     """
     drawable = _drawable(trajectory_xy)
     path = trajectory_xy[drawable].astype(np.float64)
@@ -67,6 +71,9 @@ def plan_view(
     margin = ((MARGIN_PX, MARGIN_PX), (MARGIN_PX, MARGIN_PX), (0, 0))
     image = np.pad(area, margin, constant_values=255)
     draw_frame(image, sheet)
+    for loop in loops_xy:
+        (x1, y1), (x2, y2) = sheet.pixels(loop).tolist()
+        cv2.line(image, (x1, y1), (x2, y2), BLUE, 1, cv2.LINE_AA)
     gaps = np.flatnonzero(np.diff(np.flatnonzero(drawable)) > 1) + 1
     _draw_path(image, np.split(sheet.pixels(path), gaps))
     return image

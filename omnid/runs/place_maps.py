@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -12,12 +12,10 @@ from stat import S_ISREG
 from calib.rig import MountedCamera
 from calib.rig_file import rig_toml
 from omnid.config import Config, PlacesConfig
-from omnid.core.places.map_tags import MapTag
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig, seen_by
 from omnid.core.places.place_views import keep_only, parts
 from omnid.errors import OmnidError
-from omnid.formats.landmark_file import read_tags
 from omnid.formats.place_file import read_places, write_places
 from omnid.runs.pipeline import RunParts
 from omnid.sinks.files import check_outputs
@@ -51,7 +49,7 @@ class RunPlaces:
         A file that does not exist is made by this run, unless it only localises.
         Raises OmnidError for a file that is no map, or that of another rig.
         """
-        settings, self._warn, self._tags = config.places, warn, config.places.tags
+        settings, self._warn = config.places, warn
         _require_consistent(settings)
         uses_file = settings.map and given is None and not build
         self._path = Path(settings.map) if uses_file else None
@@ -61,16 +59,12 @@ class RunPlaces:
         if self._path is not None:
             given = self._read(self._path, settings)
         begins = build or (self._path is not None and given is None)
-        tags = read_tags(Path(settings.tags)) if settings.tags else {}
         self.places: PlaceMap | None = None
         if given is not None:
             self.places = given.places
-        elif begins or tags:
+        elif begins:
             self.places = new_places(settings)
-        self._is_kept = given is not None or begins
         self.written: Path | None = None  # the file, once the run has written it
-        if self.places is not None:
-            self._know(tags, self.places)
         self._saved = frozenset[int]()  # keyframes in the file
         self._known = frozenset(given.places.keyframes) if given else frozenset[int]()
         if given is not None and self._known:
@@ -83,25 +77,7 @@ class RunPlaces:
             if not path.exists():
                 self._warn(f"{path}: there is no such map: this run begins a new one")
                 return None
-        found = RigPlaces(*read_places(path, new_places(settings), settings.limits.max_bytes))
-        if self._writes and found.places.stored is not None and found.places.is_full:
-            raise OmnidError(
-                f"{path}: a map of {len(found.places)} keyframes is more than places.limits.max_keyframes = "
-                f"{settings.limits.max_keyframes} and max_mb = {settings.limits.max_mb:g} leave room for: "
-                "add --localize-only, or raise them"
-            )
-        return found
-
-    def _know(self, tags: Mapping[int, MapTag], places: PlaceMap) -> None:
-        """Let the map know the tags of the settings, under their names there."""
-        for id, tag in tags.items():
-            known = places.tags.known.get(id)
-            if known is not None and known.size_m != tag.size_m:
-                raise OmnidError(
-                    f"places.tags {self._tags}: tag {id} ({tag.name}) has an edge of {tag.size_m:g} m, "
-                    f"but {known.size_m:g} m in the map: correct it, or leave the tag out"
-                )
-        places.tags.known |= tags
+        return RigPlaces(*read_places(path, new_places(settings)))
 
     def known_to(self, parts: RunParts) -> RunParts:
         """Return the parts of the run with this map, if there is one."""
@@ -144,8 +120,7 @@ class RunPlaces:
         if _version(path) not in (None, self._version):
             other = _beside(path)
             self._warn(
-                f"{path}: another program has written this map since this run read it: the map of this run is {other}; "
-                "`omnid map merge` joins both"
+                f"{path}: another program has written this map since this run read it: the map of this run is {other}"
             )
             path = other
         write_places(path, places, self._rig)
@@ -157,7 +132,7 @@ class RunPlaces:
 
         Raises OmnidError if the file cannot be written.
         """
-        if self.places is None or not self._is_kept:
+        if self.places is None:
             return None
         joined = self._joined(self.places)
         new = len(joined - self._known)
@@ -212,7 +187,7 @@ def place_rig(geometry: Geometry) -> PlaceRig:
 
 def new_places(settings: PlacesConfig) -> PlaceMap:
     """Return an empty map with the bounds of the settings."""
-    return PlaceMap(settings.limits.max_keyframes, settings.limits.max_bytes)
+    return PlaceMap(settings.limits.max_keyframes)
 
 
 def _unmasked(camera: MountedCamera) -> MountedCamera:
@@ -223,7 +198,5 @@ def _unmasked(camera: MountedCamera) -> MountedCamera:
 def _require_consistent(settings: PlacesConfig) -> None:
     if settings.map and not settings.enabled:
         raise OmnidError("places.map (--map) needs places.enabled = true: leave one of them out")
-    if settings.tags and not settings.enabled:
-        raise OmnidError("places.tags needs places.enabled = true: leave one of them out")
     if settings.localize_only and not settings.map:
         raise OmnidError("places.localize_only (--localize-only) needs a map: add --map FILE.omap, or leave it out")

@@ -24,7 +24,7 @@ from omnid.engine.graph import Graph
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.signals import handle_stop_signals
 from omnid.engine.telemetry import StageStats
-from omnid.settings import dump
+from omnid.settings_dump import dump
 from omnid.sinks.encoder import Encoder, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus

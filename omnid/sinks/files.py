@@ -18,7 +18,7 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
-from omnid.formats.plan_view import drawn_heights, plan_view
+from omnid.formats.plan_view import NO_LOOPS, drawn_heights, plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
 from omnid.formats.whole_file import write_whole
@@ -190,6 +190,13 @@ class PlanFile:
         write_plan(self._path, update.points, update.path_xy, self._heights_m)
 
 
-def write_plan(path: Path, points: MapPoints, path_xy: NDArray[np.float64], heights_m: tuple[float, float]) -> None:
-    """Write the plan view of points between two heights [m] with a path (N, 2) [m], NaN: a gap. Raises OmnidError."""
-    write_whole(path, cv2.imencode(".png", plan_view(points, path_xy, heights_m=heights_m))[1].tobytes())
+def write_plan(
+    path: Path,
+    points: MapPoints,
+    path_xy: NDArray[np.float64],
+    heights_m: tuple[float, float],
+    loops_xy: NDArray[np.float64] = NO_LOOPS,
+) -> None:
+    """Write the plan view of points between two heights [m], as `plan_view` draws it. Raises OmnidError."""
+    image = plan_view(points, path_xy, heights_m=heights_m, loops_xy=loops_xy)
+    write_whole(path, cv2.imencode(".png", image)[1].tobytes())

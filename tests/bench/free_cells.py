@@ -24,7 +24,6 @@ from calib.kalibr import import_kalibr
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
-from omnid.commands.map import CELL_M
 from omnid.config import Config
 from omnid.core.floor import Floor
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
@@ -40,6 +39,7 @@ from omnid.stages.front_end import FrontEnd
 from tests.bench.results import Cell, Column, ResultTable
 
 Array = NDArray[np.float64]
+CELL_M = 0.05
 COLUMNS = (
     Column("log"),
     Column("height of the cameras"),

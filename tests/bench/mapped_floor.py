@@ -2,8 +2,7 @@
 
 A simulated robot is driven at random through rooms full of things (`cluttered_room.py`) and maps them; the grid is that
 of `omnid map export --grid`. A cell counts to a thing whose outline from above covers its middle; of what is narrower
-than a cell, its middle line. The last column is the grid in which a cell is free where ranges of stereo pass through
-it: of things that are lower than 12 cm, or thin, stereo has none.
+than a cell, its middle line.
 
 With --poles the robot drives between rows of plain poles and back (`pole_rows.py`), and a pole's kind is its width and
 how near the base passes it.
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from omnid.config import load_config
 from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid
-from omnid.core.places.place_views import scans_of
+from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate
 from omnid.simulation.rendering.surfaces import Rectangle
@@ -99,18 +98,18 @@ def pole_kind(radius_m: float, face: Rectangle) -> str:
     return f"plain poles of {width} than 6 cm, passed at {passed} than 0.8 m"
 
 
-def count(world: World, grid: Grid, open_grid: Grid, cells: dict[str, Array], kind_of: KindOf) -> None:
-    """Add the cells of a drive by kind: all, free, occupied, and free by ranges alone."""
+def count(world: World, grid: Grid, cells: dict[str, Array], kind_of: KindOf) -> None:
+    """Add the cells of a drive by kind: all, free, and occupied."""
     at, everything = middles(grid, world.start), np.zeros(grid.cells.shape, bool)
     parts: dict[str, Flags] = {}
     for face in things_of(world):
         inside = covered(face, at)
         parts[kind_of(face)] = parts.get(kind_of(face), np.zeros_like(everything)) | inside
         everything |= inside
-    known = (grid.cells == FREE) | (open_grid.cells == FREE)
+    known = grid.cells == FREE
     around = cv2.dilate(everything.astype(np.uint8), np.ones((NEAR_CELLS, NEAR_CELLS), np.uint8)) > 0
     for kind, part in (*parts.items(), (FLOOR, known & ~everything), (NEAR, around & known & ~everything)):
-        states = grid.cells == FREE, grid.cells == OCCUPIED, open_grid.cells == FREE
+        states = grid.cells == FREE, grid.cells == OCCUPIED
         cells[kind] += np.array([part.sum(), *((part & state).sum() for state in states)])
 
 
@@ -119,8 +118,8 @@ def measure(seed: int, cells: dict[str, Array], *, poles: bool) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "room.omap"
         world, of = drive(seed, path, poles=poles)
-        scans = scans_of(*read_places(path), CELL_M)
-    count(world, scans.grid(), scans.open_grid(), cells, of)
+        found = grid(*read_places(path), CELL_M)
+    count(world, found, cells, of)
 
 
 def drive(seed: int, path: Path, *, poles: bool) -> tuple[World, KindOf]:
@@ -152,11 +151,10 @@ def main() -> None:
             Column("cells"),
             Column("free", "%", 2),
             Column("occupied", "%", 1),
-            Column("free by ranges alone", "%", 1),
         ),
         (OF_POLES if arguments.poles else OF_ROOMS,),
     )
-    family, cells = table.name.replace("_", " "), defaultdict[str, Array](lambda: np.zeros(4))
+    family, cells = table.name.replace("_", " "), defaultdict[str, Array](lambda: np.zeros(3))
     for seed in range(arguments.seeds[0], arguments.seeds[1] + 1):
         measure(seed, cells, poles=arguments.poles)
         table.seeds.append((family, seed))

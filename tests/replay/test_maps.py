@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -100,21 +97,6 @@ def test_localize_only_leaves_the_map_as_it_is_and_a_rig_that_was_calibrated_aga
     assert "calibrated again" in result.err and omap.read_bytes() == before and "written" not in result.out
 
 
-def test_a_map_that_stays_in_its_file_gives_the_same_poses_and_is_not_extended_beyond_its_bounds(
-    omnid: Command, scene: Path, omap: Path, tmp_path: Path
-) -> None:
-    """The features of few keyframes fit in 0.1 MB; the others are read again and again."""
-    arguments = ("--map", omap, "--localize-only", "--map-tum")
-    whole, little = tmp_path / "whole.txt", tmp_path / "little.txt"
-    bound = ("--set", "places.limits.max_mb=0.1")
-    assert omnid.replay(scene / "log.mcap", *arguments, whole, rig=scene / "rig.toml").count("loops") >= 2
-    assert omnid.replay(scene / "log.mcap", *arguments, little, *bound, rig=scene / "rig.toml").count("loops") >= 2
-    assert whole.read_bytes() == little.read_bytes()
-    full = (*bound, "--set", "places.limits.max_keyframes=4")
-    error = omnid.refused("replay", scene / "log.mcap", "--map", omap, *full, "--rig", scene / "rig.toml")
-    assert f"{omap}: a map of {len(read_places(omap)[0])} keyframes is more than" in error
-
-
 def test_what_is_not_recognised_is_left_out_with_a_warning(
     omnid: Command, scene: Path, elsewhere: Path, omap: Path, tmp_path: Path
 ) -> None:
@@ -137,28 +119,6 @@ def test_build_extends_a_map(omnid: Command, scene: Path, omap: Path) -> None:
     before = len(read_places(omap)[0])
     result = omnid("map", "build", scene / "log.mcap", "-o", omap, "--extend", "--rig", scene / "rig.toml", "--quiet")
     assert result.code == 0 and f"keyframes    {2 * before}, " in result.out and "sessions     2" in result.out
-
-
-def test_maps_of_one_place_are_merged_and_of_two_places_refused(
-    omnid: Command, scene: Path, elsewhere: Path, omap: Path, tmp_path: Path
-) -> None:
-    """The second map begins later, so its frame is another one."""
-    later, away = tmp_path / "later.omap", tmp_path / "away.omap"
-    places, rig = read_places(omap)
-    places.drop(0)
-    T = np.linalg.inv(next(iter(places.poses.values())))
-    places.move({id: T @ pose for id, pose in places.poses.items()})
-    places.links = [link for link in places.links if {link.a, link.b} <= places.keyframes.keys()]
-    write_places(later, places, rig)
-    assert omnid("map", "build", elsewhere / "log.mcap", "-o", away, "--rig", scene / "rig.toml", "--quiet").code == 0
-    error = omnid.refused("map", "merge", omap, away, "-o", tmp_path / "both.omap")
-    assert "shares no place" in error and not (tmp_path / "both.omap").exists()
-    before = len(read_places(omap)[0])
-    same = shutil.copy(omap, tmp_path / "same.omap")
-    result = omnid("map", "merge", omap, later, same, "-o", tmp_path / "both.omap")
-    assert result.code == 0 and "sessions     3" in result.out and f"keyframes    {3 * before - 1}," in result.out
-    merged, _ = read_places(tmp_path / "both.omap")
-    np.testing.assert_allclose(merged.poses[before], merged.poses[1], atol=0.005)
 
 
 def test_the_map_of_another_rig_is_refused(omnid: Command, scene: Path, omap: Path) -> None:
@@ -259,7 +219,7 @@ def test_a_replay_whose_map_cannot_be_written_keeps_its_poses(scene: Path, tmp_p
 def test_a_map_that_another_program_has_written_meanwhile_is_not_replaced(
     scene: Path, built: Path, tmp_path: Path, exists: bool
 ) -> None:
-    """Two replays extend one map, or it is aligned while a run goes on: the last one does not win."""
+    """Two replays extend one map: the last one does not win."""
     omap, moved = tmp_path / "place.omap", tmp_path / "moved.omap"
     places, rig = read_places(built)
     places.move({id: se3.transform(np.eye(3), [100.0, 50.0, 0.0]) @ T for id, T in places.poses.items()})
@@ -289,16 +249,3 @@ def test_a_map_that_cannot_be_saved_is_an_error_in_the_status(scene: Path, omap:
         assert int(operator.values("map file")["failed"]) >= 1 and daemon.alive
         code, err = daemon.end()
         assert code == 2 and "cannot write the map" in err and "Traceback" not in err, err
-
-
-@pytest.mark.parametrize("command", ["merge", "check"])
-def test_commands_read_the_compiled_functions_instead_of_compiling_them_again(
-    scene: Path, omap: Path, tmp_path: Path, command: str
-) -> None:
-    words = {
-        "merge": ["map", "merge", omap, shutil.copy(omap, tmp_path / "same.omap"), "-o", tmp_path / "both.omap"],
-        "check": ["calibrate", "check", scene / "log.mcap", "--rig", scene / "rig.toml"],
-    }[command]
-    program = "import sys; sys.modules['numba'] = None; from omnid.cli import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run([sys.executable, "-c", program, *map(str, words)], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple
-
-from msgspec import Meta
+from typing import Final, NamedTuple
 
 from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
+from omnid.settings import knob
 
 OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
@@ -29,17 +28,18 @@ OTHER_SENDER: Final = "another sender drives"
 class SourceSettings:
     """Sources of commands in the order of their priority."""
 
-    names: Annotated[
-        tuple[str, ...],
+    names: tuple[str, ...] = knob(
+        (OPERATOR, PLANNER),
         "sources of commands, highest priority first: topics "
         "cmd/NAME/twist and cmd/NAME/heading; cmd/twist and cmd/heading are the first one's",
-    ] = (OPERATOR, PLANNER)
-    hold_s: Annotated[
-        float,
-        Meta(ge=0.05, le=60),
+    )
+    hold_s: float = knob(
+        0.5,
         "a source keeps out those of lower priority, and its sender all others, for so long "
         "after its newest command, s",
-    ] = 0.5
+        low=0.05,
+        high=60,
+    )
 
     def __post_init__(self) -> None:
         """Raise OmnidError for names that cannot be part of a topic, occur twice, or are too many."""

@@ -116,14 +116,7 @@ class ScanGrid:
         """
         odds = np.maximum(self._odds, self._floor_odds)
         odds[(self._narrow_odds > MISS) & (odds < 0)] = 0
-        return self._grid(odds)
-
-    def open_grid(self) -> Grid:
-        """Return the same, but a cell is free where views passed through it: something low or thin may be there."""
-        return self._grid(self._odds)
-
-    def _grid(self, odds: Cells) -> Grid:
-        """Return the cells; one next to an occupied one is never free, as an obstacle is known to a cell only."""
+        # A cell next to an occupied one is never free, as an obstacle is known to a cell only.
         cells = np.full(self._odds.shape, UNKNOWN, np.int8)
         is_occupied = self._odds >= OCCUPIED_FROM
         near = cv2.dilate(is_occupied.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,12 +22,7 @@ class FixedPlaces:
         self.scans = {id: places.keyframes[id].scan for id in ids}
         self.free_m = {id: places.keyframes[id].free_m for id in ids}
 
-    @cached_property
-    def _rows(self) -> dict[int, int]:
-        return {id: row for row, id in enumerate(self.ids)}
-
-    def within(self, position: Array, reach_m: float, others: Iterable[int]) -> list[int]:
-        """Return the keyframes up to a distance of a position (3,), and those of the others that stay, ascending."""
-        wanted = np.linalg.norm(self.poses[:, :3, 3] - position, axis=1) <= reach_m
-        wanted[[self._rows[id] for id in others if id in self.known]] = True
-        return [self.ids[row] for row in np.flatnonzero(wanted).tolist()]
+    def within(self, position: Array, reach_m: float) -> list[int]:
+        """Return the keyframes up to a distance of a position (3,), ascending."""
+        is_near = np.linalg.norm(self.poses[:, :3, 3] - position, axis=1) <= reach_m
+        return [self.ids[row] for row in np.flatnonzero(is_near).tolist()]

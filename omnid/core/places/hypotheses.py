@@ -23,10 +23,6 @@ KEPT: Final = 6  # recognitions that are remembered
 APART_M, APART_RAD = 0.05, math.radians(5)  # least motion between two frames that count as two
 SAME_M, SAME_RAD = 0.12, math.radians(1.5)  # largest difference of poses that agree
 SURE_INLIERS: Final = 24  # Inliers of recognitions that count without motion: a robot may be at rest.
-# Largest difference of poses by a tag, because its direction is less certain than that of a view.
-TAG_SAME_M, TAG_SAME_RAD = 0.5, math.radians(12)
-# Limit of their squared Mahalanobis distance, because 99 % are below it (chi-squared, 6 dimensions).
-TAG_SQUARED: Final = 16.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +46,7 @@ class Hypothesis:
     @property
     def is_sure(self) -> bool:
         """True if it counts without motion since the one before."""
-        return self.recognition.by_tag or self.recognition.inliers >= SURE_INLIERS
+        return self.recognition.inliers >= SURE_INLIERS
 
     def link(self) -> Link:
         """Return the recognition as an edge from the recognised keyframe to the newest one of the run."""
@@ -99,15 +95,7 @@ class Hypotheses:
 def _consistent(a: Hypothesis, b: Hypothesis, poses: Mapping[int, Array]) -> bool:
     """True if both place the newer frame at the same pose in the map."""
     difference = se3.inverse(a.T_map_odom(poses) @ b.T_odom_rect) @ b.T_map_rect(poses)
-    if not (a.recognition.by_tag or b.recognition.by_tag):
-        return length_m(difference) < SAME_M and angle_rad(difference) < SAME_RAD
-    if length_m(difference) >= TAG_SAME_M or angle_rad(difference) >= TAG_SAME_RAD:
-        return False
-    # The odometry between both frames is far more certain than a tag.
-    A = se3.adjoint(se3.inverse(a.T_odom_rect) @ b.T_odom_rect)
-    S = b.recognition.covariance + np.linalg.inv(A) @ a.recognition.covariance @ np.linalg.inv(A).T
-    error = se3.log(difference)
-    return bool(error @ np.linalg.solve(S, error) < TAG_SQUARED)
+    return length_m(difference) < SAME_M and angle_rad(difference) < SAME_RAD
 
 
 def _apart(a: Hypothesis, b: Hypothesis) -> bool:

@@ -28,11 +28,8 @@ from omnid.core.places.place_features import NOTHING, PlaceFeatures
 from omnid.core.places.place_map import PlaceKeyframe, PlaceMap, by_odometry
 from omnid.core.places.place_search import NEAR_M, Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition
-from omnid.core.places.scan_localiser import ScanLocaliser
 from omnid.core.places.search_schedule import SearchSchedule
 from omnid.core.places.signature import Thumbnail, thumbnail
-from omnid.core.places.tag_recognition import TagRecogniser
-from omnid.core.places.tags import TagPose
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import MapState
 
@@ -43,7 +40,6 @@ TIES: Final = 50  # newest keyframes kept besides a fixed map, so that memory is
 # Largest error of odometry, and its growth with the path; by trial on development seeds.
 GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
-TAG_SIGMAS: Final = 3.0  # Accepted error of a pose by a tag, because 0.3 % of right poses exceed it.
 # After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
 # A pose counts as localised up to this length of path after the last recognition. By judgement; not measured.
@@ -63,11 +59,9 @@ class MapLocaliser:
         self.places = places if places is not None else PlaceMap()
         self._fixed = FixedPlaces(self.places, sorted(self.places.keyframes) if localize_only else [])
         self._localize_only = localize_only
-        bounds = (len(self._fixed.ids) + TIES + 1, None) if localize_only else (limits.max_keyframes, limits.max_bytes)
-        self.places.bound(*bounds)
+        self.places.max_keyframes = len(self._fixed.ids) + TIES + 1 if localize_only else limits.max_keyframes
         # A map has the columns of full turns, whatever sector of them the cameras show.
         self.search = PlaceSearch(replace(model, cylinder=model.cylinder.full_turn))
-        self._tags = TagRecogniser(model, self.places) if self.places.tags else None
         self.correction = MapCorrection(self.places)
         self.ageing = Ageing(self.places)
         self._session = 1 + max((k.session for k in self.places.keyframes.values()), default=-1)
@@ -80,10 +74,8 @@ class MapLocaliser:
         self._path_m = self._confirmed_m = 0.0  # m: the path, and that at the last search before contradictions
         self._path_at: dict[int, float] = {}  # m, of the keyframes of this run
         self._recognised_at: tuple[float, Array] | None = None  # path and place of the last recognition that counted
-        self._by_tag = False  # it was a tag, which gives the pose less exactly than a view
         self._last_T: Array | None = None
         self._scans: tuple[object, KeyframeScans] | None = None  # what they depend on, and they
-        self._by_scan = ScanLocaliser(self.places) if limits.by_scan and self.places.keyframes else None
 
     def process(self, frame: OdometryFrame, *, idle: bool = False) -> MapPose:
         """Return the pose of odom in the map after a frame; idle: only by odometry, to save time."""
@@ -98,20 +90,14 @@ class MapLocaliser:
         if is_keyframe or self._search_is_due(frame):
             small, features = thumbnail(frame.stereo.lower), describe(frame.stereo)
             # 1. Recognise: a shortlist by signatures, matches, RANSAC, Gauss-Newton; not what is ambiguous.
-            tags = self._tags.find(frame.stereo) if self._tags else []
-            found = self._recognise(frame, small, features, tags)
+            found = self._recognise(frame, small, features)
             # 2. Keep the keyframe, linked to the one before by odometry.
             if is_keyframe:
-                self._add(frame, small, features, tags)
+                self._add(frame, small, features)
             # 3. Correct the map where several frames agree; a full one may just have dropped the recognised keyframe.
             if found is not None and self._newest is not None and found.id in self.places.poses:
                 self._close_loop(frame, found, self._newest)
                 self._age(found)
-        # 4. In a saved map of which nothing is recognised, the shape of the room may give the pose.
-        if self._by_scan is not None and self._recognised_at is None and self._schedule.wants_scans:
-            by_scan = self._by_scan.process(frame.T_odom_rect, frame.scan, self._proposed(frame))
-            if by_scan is not None:
-                return MapPose(by_scan.T_map_odom, by_scan.covariance, MapState.LOCALIZED, NO_KEYFRAME, np.eye(4))
         return self._pose(frame, self._state())
 
     @property
@@ -127,9 +113,6 @@ class MapLocaliser:
             "unjoined": max(0, len(self._parts) - 1),
             "ambiguous": self.search.ambiguous,
             "refused": self.search.refused,
-            **({} if self.places.stored is None else self.places.stored.store.counts),
-            **({} if self._tags is None else self._tags.counts),
-            **({} if self._by_scan is None else {"scan_ambiguous": self._by_scan.ambiguous}),
         }
 
     def map(self) -> PlaceMap:
@@ -164,8 +147,6 @@ class MapLocaliser:
             self._hypotheses.clear()
             self._newest, self._recognised_at = None, None
             self._schedule.restart()
-            if self._by_scan is not None:
-                self._by_scan.restart()
             self._parts.begin()
             self.correction.forget()
 
@@ -183,52 +164,23 @@ class MapLocaliser:
 
     def _is_place(self, id: int) -> bool:
         """True if a keyframe holds what recognises it."""
-        return self.places.keyframes[id].features.count > 0
+        return len(self.places.keyframes[id].features.views) > 0
 
-    def _recognise(
-        self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]
-    ) -> Recognition | None:
+    def _recognise(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> Recognition | None:
         """Return the place that the frame shows: near the expected pose, else in parts of the map of unknown pose."""
         self._schedule.begin(frame.stamp_ns, frame.T_odom_rect)
         expected = self._expected(frame)
         found = self.search.near(small, features, self.places, expected)
         self._confirmed_m = self._confirmed_m if self.search.contradicted else self._path_m
         if found is None and (far := self._elsewhere()):
-            by_scan = None if self._by_scan is None else self._by_scan.T_map_rect(frame.T_odom_rect)
-            found = self.search.far(small, features, self.places, far, by_scan)
-        if found is None and tags and self._tags is not None:
-            found = self._recognise_by_tag(self._tags, tags, expected)
+            found = self.search.far(small, features, self.places, far)
         self._schedule.end(found=found is not None, could_find=len(features.views) >= MIN_MATCHES)
         return found
-
-    def _recognise_by_tag(
-        self, recogniser: TagRecogniser, tags: list[TagPose], expected: Expected
-    ) -> Recognition | None:
-        """Return the place of a frame by a tag: as odometry expects it, else in the oldest other part that has it."""
-        near = recogniser.recognise(tags, expected.error_m)
-        if near is not None:
-            return self.search.expected_only(near, self.places, expected)
-        far = self._elsewhere()
-        for part in sorted({self._parts.number(id) for id in far}):
-            found = recogniser.recognise(tags, {id for id in far if self._parts.number(id) == part})
-            if found is not None:
-                return found
-        return None
-
-    def _proposed(self, frame: OdometryFrame) -> list[Array]:
-        """Return the poses (4, 4) in the map that the last search suggests for a frame, ambiguous ones too."""
-        if not self._schedule.has_searched:
-            return []
-        return [T @ self._schedule.motion_since(frame.T_odom_rect) for T in self.search.proposed(self.places.poses)]
 
     def _expected(self, frame: OdometryFrame) -> Expected:
         """Return the expected pose, and the largest errors relative to the keyframes that are no longer in view."""
         T_map_rect = self._T_map_odom @ frame.T_odom_rect
-        # A pose by a tag may err by more than odometry since then.
-        P = self.correction.covariance_at(frame.T_odom_rect, frame.covariance)
-        sigmas = np.sqrt([np.trace(P[:3, :3]), np.trace(P[3:, 3:])]) if self._by_tag else np.zeros(2)
-        slack_m, slack_rad = (TAG_SIGMAS * sigmas).tolist()
-        ids = [id for id in self._around(T_map_rect[:3, 3], slack_m) if self._is_place(id)]
+        ids = [id for id in self._around(T_map_rect[:3, 3]) if self._is_place(id)]
         drift_m = self._path_m - np.array([self._path_at.get(id, -math.inf) for id in ids])
         left = drift_m >= LOCAL_M
         ids, drift_m = [ids[n] for n in np.flatnonzero(left).tolist()], drift_m[left]
@@ -236,8 +188,8 @@ class MapLocaliser:
             path_m, at = self._recognised_at
             apart_m = np.linalg.norm(self.places.positions(ids) - at, axis=1)
             drift_m = np.minimum(drift_m, self._path_m - path_m + apart_m)
-        error_m = dict(zip(ids, (slack_m + GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
-        error_rad = dict(zip(ids, (slack_rad + GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
+        error_m = dict(zip(ids, (GATE_M + GATE_PER_M * drift_m).tolist(), strict=True))
+        error_rad = dict(zip(ids, (GATE_RAD + GATE_RAD_PER_M * drift_m).tolist(), strict=True))
         return Expected(T_map_rect, error_m, error_rad, self._state() is MapState.LOCALIZED)
 
     @property
@@ -245,19 +197,19 @@ class MapLocaliser:
         """True if the current part is a fixed map."""
         return bool(self._fixed.ids) and self._parts.number(self._fixed.ids[0]) == self._parts.current
 
-    def _around(self, position: Array, slack_m: float) -> list[int]:
-        """Return the keyframes of this part; of a fixed map only keyframes that may be near, or that saw tags."""
+    def _around(self, position: Array) -> list[int]:
+        """Return the keyframes of this part; of a fixed map only keyframes that may be near."""
         moving = [id for id in self._parts.ids() if id not in self._fixed.known]
         if not self._is_in_fixed or self._recognised_at is None:
             return moving
         # One that is farther than NEAR_M and the largest error, which grows with its distance, is not looked for.
         path_m, at = self._recognised_at
         drift_m = self._path_m - path_m + float(np.linalg.norm(position - at))
-        reach_m = (NEAR_M + slack_m + GATE_M + GATE_PER_M * drift_m) / (1 - GATE_PER_M)
-        return self._fixed.within(position, reach_m, {view.keyframe for view in self.places.tags.views}) + moving
+        reach_m = (NEAR_M + GATE_M + GATE_PER_M * drift_m) / (1 - GATE_PER_M)
+        return self._fixed.within(position, reach_m) + moving
 
-    def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures, tags: list[TagPose]) -> None:
-        """Add a keyframe to the map, with the tags that it shows."""
+    def _add(self, frame: OdometryFrame, small: Thumbnail, features: PlaceFeatures) -> None:
+        """Add a keyframe to the map."""
         if self._localize_only:
             features = NOTHING
             ties = [id for id in self.places.keyframes if id not in self._fixed.known]
@@ -272,8 +224,6 @@ class MapLocaliser:
         self._parts.add(keyframe.id)
         self._path_at[keyframe.id] = self._path_m
         self._newest = keyframe
-        if self._tags is not None and not self._localize_only:
-            self.places.tags.add(self._tags.views(tags, keyframe.id))
         self._forget_dropped()
 
     def _forget_dropped(self) -> None:
@@ -284,7 +234,7 @@ class MapLocaliser:
 
     def _age(self, found: Recognition) -> None:
         """Count what the search found and missed at a place that is known; what has aged leaves the map."""
-        if found.by_tag or self._localize_only or self._state() is not MapState.LOCALIZED:
+        if self._localize_only or self._state() is not MapState.LOCALIZED:
             return
         at = (self.places.poses[found.id] @ found.T_place_rect)[:3, 3]
         self.ageing.observe(at, self.search.compared, self._path_m)
@@ -307,7 +257,6 @@ class MapLocaliser:
         )
         self._T_map_odom = self.places.poses[newest.id] @ se3.inverse(newest.T_odom_rect)
         self._recognised_at = self._path_m, (self._T_map_odom @ frame.T_odom_rect)[:3, 3]
-        self._by_tag = found.by_tag
 
     def _state(self) -> MapState:
         """Return the state of a frame whose pose in odom is known."""

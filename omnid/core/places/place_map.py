@@ -11,10 +11,8 @@ import scipy
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.code_index import CodeIndex
 from omnid.core.places.drift import relative_covariance
-from omnid.core.places.map_tags import MapTags
-from omnid.core.places.place_features import FeatureStore, PlaceFeatures, StoredFeatures
+from omnid.core.places.place_features import PlaceFeatures
 
 Array = NDArray[np.float64]
 
@@ -36,7 +34,7 @@ class PlaceKeyframe:
     thumbnail: NDArray[np.int8]  # (16, 128) the panorama's contrast, see signature.py
     scan: NDArray[np.float16]  # (360,) m, nearest obstacle by azimuth from -pi on, NaN unknown
     free_m: NDArray[np.float16]  # (360,) in the same order, up to which floor was seen, see FreeRanges
-    features: PlaceFeatures | StoredFeatures
+    features: PlaceFeatures
 
     @property
     def nbytes(self) -> int:
@@ -88,24 +86,16 @@ class KeyframeUse(NamedTuple):
 UNUSED: Final = KeyframeUse()
 
 
-class StoredPlaces(NamedTuple):
-    """Codes of the keyframes whose features are in a file, and the store that reads them."""
-
-    codes: CodeIndex
-    store: FeatureStore
-
-
 class PlaceMap:
-    """Keyframes by id with their poses T_map_rect, and the links between them; bounded in count and bytes."""
+    """Keyframes by id with their poses T_map_rect, and the links between them; bounded in number."""
 
-    def __init__(self, max_keyframes: int = 1000, max_bytes: int | None = 50_000_000) -> None:
-        self._max_keyframes, self._max_bytes = max_keyframes, max_bytes
+    def __init__(self, max_keyframes: int = 2000) -> None:
+        """max_keyframes: bound that holds from the next keyframe on."""
+        self.max_keyframes = max_keyframes
         self.keyframes: dict[int, PlaceKeyframe] = {}
         self.poses: dict[int, Array] = {}
         self.links: list[Link] = []
         self.uses: dict[int, KeyframeUse] = {}  # uses by id; a keyframe without an entry is UNUSED
-        self.tags = MapTags()
-        self.stored: StoredPlaces | None = None  # None: all features are in memory
         self.dropped = 0  # keyframes, because the map was full
 
     def __len__(self) -> int:
@@ -114,8 +104,7 @@ class PlaceMap:
     @property
     def nbytes(self) -> int:
         """Memory that the keyframes take."""
-        of_file = 0 if self.stored is None else self.stored.codes.nbytes + self.stored.store.nbytes
-        return of_file + sum(keyframe.nbytes for keyframe in self.keyframes.values())
+        return sum(keyframe.nbytes for keyframe in self.keyframes.values())
 
     @property
     def next_id(self) -> int:
@@ -141,18 +130,9 @@ class PlaceMap:
         self.poses[keyframe.id] = T_map_rect
         if link is not None:
             self.links.append(link)
-        while len(self) > 2 and self._is_too_large:
+        while len(self) > max(2, self.max_keyframes):
             self.drop(self._least_useful(keyframe.id))
             self.dropped += 1
-
-    @property
-    def is_full(self) -> bool:
-        """True if a keyframe that is added makes another one leave."""
-        return len(self) >= self._max_keyframes or (self._max_bytes is not None and self.nbytes >= self._max_bytes)
-
-    @property
-    def _is_too_large(self) -> bool:
-        return len(self) > self._max_keyframes or (self._max_bytes is not None and self.nbytes > self._max_bytes)
 
     def drop(self, id: int) -> None:
         """Drop a keyframe; its links go on to its neighbour on the path: the next keyframe, else the one before."""
@@ -169,18 +149,9 @@ class PlaceMap:
                 link if link.a < link.b else link.reversed()
                 for link in (*(link for link in joined if not link.is_loop), *loops[:MOST_LOOPS])
             ]
-        # 3. The neighbour takes over the tags, and the keyframe leaves the map.
-        self._move_tag_views(id, bridge)
+        # 3. The keyframe leaves the map.
         del self.keyframes[id], self.poses[id]
         self.uses.pop(id, None)
-
-    def _move_tag_views(self, id: int, bridge: Link | None) -> None:
-        """Give the tags that a keyframe saw to the end of a link from it, or to none."""
-        if bridge is None:
-            self.tags.move_views(id, None, np.eye(4), np.zeros((6, 6)))
-        else:
-            there = bridge.reversed()
-            self.tags.move_views(id, bridge.b, there.T_a_b, there.covariance)
 
     def _least_useful(self, newest: int) -> int:
         """Return the id of the keyframe that is to be dropped, not the newest."""
@@ -195,20 +166,14 @@ class PlaceMap:
         use = self.uses.get(id, UNUSED)
         return use.found - use.missed
 
-    def bound(self, max_keyframes: int, max_bytes: int | None) -> None:
-        """Set other bounds, which hold from the next keyframe on; max_bytes: None is no bound."""
-        self._max_keyframes, self._max_bytes = max_keyframes, max_bytes
-
     def part(self, ids: Iterable[int]) -> PlaceMap:
         """Return a map of some keyframes, and the links between them."""
         chosen = set(ids)
-        part = PlaceMap(self._max_keyframes, self._max_bytes)
+        part = PlaceMap(self.max_keyframes)
         part.keyframes = {id: keyframe for id, keyframe in self.keyframes.items() if id in chosen}
         part.poses = {id: self.poses[id] for id in part.keyframes}
         part.links = [link for link in self.links if link.a in chosen and link.b in chosen]
         part.uses = {id: use for id, use in self.uses.items() if id in part.keyframes}
-        part.tags = self.tags.part(chosen)
-        part.stored = self.stored
         return part
 
     def move(self, poses: dict[int, Array]) -> None:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_map import PlaceMap
 
 Array = NDArray[np.float64]
@@ -59,8 +58,5 @@ def seen_by(places: PlaceMap, rig_of_map: PlaceRig, rig: PlaceRig) -> None:
     shift = rig.cylinder.row0 - rig_of_map.cylinder.row0
     if not shift:
         return
-    if places.stored is not None:
-        places.stored.store.shift_rows(shift)
     for keyframe in places.keyframes.values():
-        if isinstance(keyframe.features, PlaceFeatures):
-            keyframe.features.views[:, 1:] += np.float32(shift)
+        keyframe.features.views[:, 1:] += np.float32(shift)

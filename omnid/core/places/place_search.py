@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.places.features import FEATURES
 from omnid.core.places.hypotheses import angle_rad, length_m
-from omnid.core.places.place_comparison import compare, is_elsewhere, spread, supported, unambiguous
+from omnid.core.places.place_comparison import compare, supported, unambiguous
 from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Recognition
@@ -35,10 +35,6 @@ class Effort(NamedTuple):
 
 NEAR_EFFORT: Final = Effort(16, 3)  # Effort where the pose is known roughly by odometry; by trial on development seeds.
 FAR_EFFORT: Final = Effort(200, 8)  # Effort where it is not; by trial on development seeds.
-# More keyframes than MOST_BY_SIGNATURE are searched by codes, where their features are in a file; the features of
-# VOTED_OF_FILE of them are read; by trial on development seeds, as 200 of 20,000 signatures often lack the right one.
-MOST_BY_SIGNATURE, VOTED_OF_FILE = 1000, 24
-MOST_SIGNATURES: Final = 2000  # Most signatures that are kept of a map in a file, so that they have 17 MB.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +57,6 @@ class PlaceSearch:
         self.refused = 0  # recognitions that odometry contradicts
         self.contradicted = 0  # the newest of them, without one that odometry confirms in between
         self.compared: dict[int, int] = {}  # inliers of each keyframe that the last search compared
-        self._seen: list[Recognition] = []  # recognitions of the last search, whether they count or not
 
     def near(
         self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, expected: Expected
@@ -83,34 +78,11 @@ class PlaceSearch:
         return best
 
     def far(
-        self,
-        small: NDArray[np.int8],
-        features: PlaceFeatures,
-        places: PlaceMap,
-        ids: list[int],
-        T_map_rect: Array | None = None,
+        self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int]
     ) -> Recognition | None:
-        """Return the best recognition among keyframes (ids) of which odometry does not know where they are.
-
-        T_map_rect: the pose by other evidence, which decides between several similar places.
-        """
+        """Return the best recognition among keyframes (ids) of which odometry does not know where they are."""
         found = supported(self._compare(small, features, places, ids, FAR_EFFORT, FEATURES + 1))
-        if T_map_rect is not None:
-            found = [
-                place for place in found if not is_elsewhere(T_map_rect, places.poses[place.id] @ place.T_place_rect)
-            ]
         return self._unambiguous(found, places.poses)
-
-    def expected_only(self, found: Recognition | None, places: PlaceMap, expected: Expected) -> Recognition | None:
-        """Return a recognition by other evidence, None where odometry contradicts it."""
-        if found is None or _is_expected(found, places.poses, expected):
-            return found
-        self.refused += 1
-        return None
-
-    def proposed(self, poses: Mapping[int, Array]) -> list[Array]:
-        """Return the poses T_map_rect (4, 4) that the last search recognised, whether they count or not."""
-        return [poses[place.id] @ place.T_place_rect for place in self._seen if place.id in poses]
 
     def _compare(
         self,
@@ -122,35 +94,17 @@ class PlaceSearch:
         enough: int,
     ) -> list[Recognition]:
         """Return the recognitions among the keyframes of a map (ids); it ends at one with enough inliers."""
-        self.compared, self._seen = {}, []
+        self.compared = {}
         if not ids:
             return []
-        known = {
-            id: places.keyframes[id].features.loaded() for id in self._shortlist(small, features, places, ids, effort)
-        }
+        # The most similar signatures.
+        others = np.array([self._signature(places.keyframes[id]) for id in ids])
+        similar = similarities(signature_of(small), others)
+        shortlist = [ids[n] for n in np.argsort(-similar, kind="stable")[: effort.voted].tolist()]
+        known = {id: places.keyframes[id].features for id in shortlist}
         found = compare(features, known, places.poses, effort.compared, enough, self._model)
         self.compared = {id: 0 if place is None else place.inliers for id, place in found.items()}
-        self._seen = [place for place in found.values() if place is not None]
-        return self._seen
-
-    def _shortlist(
-        self, small: NDArray[np.int8], features: PlaceFeatures, places: PlaceMap, ids: list[int], effort: Effort
-    ) -> list[int]:
-        """Return the keyframes that a closer look is for: by signatures, and by codes where they are many in a file."""
-        by_codes: list[int] = []
-        if places.stored is not None and len(ids) > MOST_BY_SIGNATURE:
-            among = np.array(ids)
-            ranked = places.stored.codes.ranked(features, among, self._model.cylinder.width)
-            chosen = spread(np.arange(len(ranked)), places.positions(ranked), VOTED_OF_FILE)
-            by_codes = [ranked[n] for n in chosen]
-            ids = [int(id) for id in among[~places.stored.codes.has(among)]]
-        if not ids:
-            return by_codes
-        others = np.array([self._signature(places.keyframes[id]) for id in ids])
-        if places.stored is not None and len(self._signatures) > MOST_SIGNATURES:
-            self._signatures = {id: self._signatures[id] for id in ids}
-        similar = similarities(signature_of(small), others)
-        return by_codes + [ids[n] for n in np.argsort(-similar, kind="stable")[: effort.voted].tolist()]
+        return [place for place in found.values() if place is not None]
 
     def _signature(self, keyframe: PlaceKeyframe) -> Signature:
         if keyframe.id not in self._signatures:

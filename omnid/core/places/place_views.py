@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.occupancy_grid import Grid
-from omnid.core.mapping.scan_grid import ScanGrid, scan_grid
+from omnid.core.mapping.scan_grid import scan_grid
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig
@@ -36,8 +36,6 @@ class PlaceSummary:
     parts: int  # number of parts that no link joins; 1: all is one map
     path_m: float  # length of the links of odometry
     extent_m: tuple[float, float]  # along x and y
-    tags: int  # number of tags in the map
-    tags_seen: int
     first_stamp_ns: int
     last_stamp_ns: int
 
@@ -51,14 +49,12 @@ def summary(places: PlaceMap, rig: PlaceRig) -> PlaceSummary:
     return PlaceSummary(
         len(keyframes),
         len({keyframe.session for keyframe in keyframes}),
-        sum(keyframe.features.count for keyframe in keyframes),
+        sum(len(keyframe.features.views) for keyframe in keyframes),
         places.loops,
         places.dropped,
         len(parts(places)),
         float(sum(np.linalg.norm(link.T_a_b[:3, 3]) for link in places.links if not link.is_loop)),
         (float(extent[0]), float(extent[1])),
-        len(places.tags.known),
-        len({view.tag for view in places.tags.views}),
         min(stamps),
         max(stamps),
     )
@@ -83,7 +79,6 @@ def keep_only(places: PlaceMap, ids: Set[int]) -> None:
     for id in places.keyframes.keys() - ids:
         del places.keyframes[id], places.poses[id]
         places.uses.pop(id, None)
-    places.tags = places.tags.part(ids)
 
 
 def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
@@ -91,41 +86,31 @@ def base_poses(places: PlaceMap, rig: PlaceRig) -> Array:
     return _of_base(np.array([places.poses[id] for id in sorted(places.keyframes)]), rig)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MappedDrive:
-    """Keyframes in the order of a drive, with the poses (K, 4, 4) of the base in its axes at the start of the map."""
-
-    session: int
-    ids: list[int]
-    T_map_base: Array
-    T_by_odometry: Array  # the same, if odometry alone had gone on from the first keyframe
-
-
-def drives(places: PlaceMap, rig: PlaceRig) -> list[MappedDrive]:
-    """Return the drives of a map; one ends where the session does, or where odometry lost its pose."""
+def drives(places: PlaceMap) -> list[list[int]]:
+    """Return the ids of the keyframes of each drive; one ends with its session, or where odometry lost its pose."""
     joined = {(min(link.a, link.b), max(link.a, link.b)) for link in places.links if not link.is_loop}
-    parts: list[list[int]] = []
+    found: list[list[int]] = []
     for id in sorted(places.keyframes):
-        last = parts[-1][-1] if parts else -1
-        same = last >= 0 and places.keyframes[last].session == places.keyframes[id].session and (last, id) in joined
-        if same:
-            parts[-1].append(id)
+        last = found[-1][-1] if found else -1
+        if last >= 0 and places.keyframes[last].session == places.keyframes[id].session and (last, id) in joined:
+            found[-1].append(id)
         else:
-            parts.append([id])
-    return [_drive(places, ids, rig) for ids in parts]
+            found.append([id])
+    return found
 
 
 def paths_xy(places: PlaceMap, rig: PlaceRig) -> Array:
     """Return the paths (N, 2) [m] of all drives, a row of NaN after each, as nothing drove from one to the next."""
-    paths = [np.vstack([drive.T_map_base[:, :2, 3], np.full((1, 2), np.nan)]) for drive in drives(places, rig)]
-    return np.vstack([np.zeros((0, 2)), *paths])
+    rows = [np.zeros((0, 2))]
+    for ids in drives(places):
+        rows += [_of_base(np.array([places.poses[id] for id in ids]), rig)[:, :2, 3], np.full((1, 2), np.nan)]
+    return np.vstack(rows)
 
 
-def _drive(places: PlaceMap, ids: list[int], rig: PlaceRig) -> MappedDrive:
-    T_odom = np.array([places.keyframes[id].T_odom_rect for id in ids])
-    by_odometry = places.poses[ids[0]] @ se3.inverse(T_odom[0]) @ T_odom
-    corrected = np.array([places.poses[id] for id in ids])
-    return MappedDrive(places.keyframes[ids[0]].session, ids, _of_base(corrected, rig), _of_base(by_odometry, rig))
+def loops_xy(places: PlaceMap, rig: PlaceRig) -> Array:
+    """Return the ends (L, 2, 2) [m] of the loops."""
+    ends = [[places.poses[link.a], places.poses[link.b]] for link in places.links if link.is_loop]
+    return _of_base(np.array(ends), rig)[:, :2, 3].reshape(-1, 2, 2)
 
 
 def _of_base(T_map_rect: Array, rig: PlaceRig) -> Array:
@@ -135,24 +120,19 @@ def _of_base(T_map_rect: Array, rig: PlaceRig) -> Array:
 
 def grid(places: PlaceMap, rig: PlaceRig, cell_m: float) -> Grid:
     """Return the occupancy grid of the keyframes' range scans and free floor, the newest evidence last."""
-    return scans_of(places, rig, cell_m).grid()
-
-
-def scans_of(places: PlaceMap, rig: PlaceRig, cell_m: float) -> ScanGrid:
-    """Return what the grid is made of."""
     ids = sorted(places.keyframes, key=lambda id: (places.keyframes[id].session, places.keyframes[id].stamp_ns, id))
     poses = np.array([rig.T_base_rect @ places.poses[id] for id in ids]).reshape(-1, 4, 4)
     scans = [places.keyframes[id].scan.astype(np.float32) for id in ids]
     free_m = [places.keyframes[id].free_m.astype(np.float32) for id in ids]
-    return scan_grid(scans, free_m, poses, cell_m)
+    return scan_grid(scans, free_m, poses, cell_m).grid()
 
 
 def landmarks(places: PlaceMap, rig: PlaceRig) -> MapPoints:
     """Return the landmarks of all keyframes, fused in voxels."""
-    count = sum(keyframe.features.count for keyframe in places.keyframes.values())
+    count = sum(len(keyframe.features.views) for keyframe in places.keyframes.values())
     fused = VoxelMap(VOXEL_M, 1 << max(4, (2 * count).bit_length()))
     for id in sorted(places.keyframes):
-        points = triangulate(places.keyframes[id].features.loaded().views.astype(float), rig.cylinder, rig.baseline_m)
+        points = triangulate(places.keyframes[id].features.views.astype(float), rig.cylinder, rig.baseline_m)
         radius = np.hypot(points[:, 0], points[:, 1])
         sigma_m = SIGMA_PX * radius**2 / (rig.cylinder.focal_px * rig.baseline_m)
         sure = sigma_m < MAX_SIGMA_M

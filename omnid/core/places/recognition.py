@@ -44,7 +44,6 @@ class Recognition:
     inliers: int
     matches: int
     sectors: int  # number of SECTORS that hold inliers
-    by_tag: bool = False  # an AprilTag gives the place, whose corners are the inliers
 
 
 def recognise(

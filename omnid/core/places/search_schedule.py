@@ -24,9 +24,6 @@ SEARCH_NS: Final = 200_000_000  # At most five searches a second, so that most o
 JITTER_NS: Final = 5_000_000  # Stamps vary, so a rate that divides that of the cameras is reached with this tolerance.
 # After this number of searches without success only new keyframes are searched for. By judgement; not measured.
 SEARCHES: Final = 10
-# After this number of searches without success range scans are compared, if the settings allow it; by trial on
-# development seeds.
-SEARCHES_BEFORE_SCANS: Final = 3
 
 
 class SearchSchedule:
@@ -62,7 +59,7 @@ class SearchSchedule:
         """
         if self._searched is None:
             return True
-        since_ns, moved = stamp_ns - self._searched[0], self.motion_since(T_odom_rect)
+        since_ns, moved = stamp_ns - self._searched[0], se3.inverse(self._searched[1]) @ T_odom_rect
         if since_ns < SEARCH_NS:
             return False
         if self._failed < SEARCHES and is_unknown:
@@ -79,17 +76,3 @@ class SearchSchedule:
             self._failed = 0
         elif could_find:
             self._failed += 1
-
-    @property
-    def wants_scans(self) -> bool:
-        """True if views have failed so often that range scans are to be compared."""
-        return self._failed >= SEARCHES_BEFORE_SCANS
-
-    def motion_since(self, T_odom_rect: Array) -> Array:
-        """Return the motion (4, 4) since the frame of the last search; the identity before the first one."""
-        return np.eye(4) if self._searched is None else np.asarray(se3.inverse(self._searched[1]) @ T_odom_rect)
-
-    @property
-    def has_searched(self) -> bool:
-        """True if there was a search since the last gap."""
-        return self._searched is not None

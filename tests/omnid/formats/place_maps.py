@@ -6,7 +6,6 @@ import numpy as np
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.places.map_tags import MapTag, TagView
 from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_map import KeyframeUse, Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
@@ -47,9 +46,6 @@ def some_places(count: int, features: int = 256, seed: int = 1) -> PlaceMap:
     if count > 2:
         places.links.append(Link(0, count - 1, se3.exp(rng.normal(size=6)), covariance(rng), 77))
     places.dropped, places.uses = 3, {id: KeyframeUse(id, 1) for id in range(1, count, 2)}
-    if count:
-        places.tags.known = {5: MapTag(5, "dock", 0.16), 586: MapTag(586, "Tor \N{GREEK SMALL LETTER ALPHA}", 0.2)}
-        places.tags.views = [TagView(id % count, 5, se3.exp(rng.normal(size=6)), covariance(rng)) for id in range(3)]
     return places
 
 

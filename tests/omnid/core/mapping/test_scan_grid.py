@@ -74,7 +74,6 @@ def test_what_no_scan_shows_is_free_nowhere_as_its_floor_is_not_seen() -> None:
     grid = scan_grid([scan_of(walls, T) for T in path], free_m, path, 0.05)
     inside = [(x, y) for x in np.arange(0.02, 0.4, 0.05) for y in np.arange(1.02, 1.4, 0.05)]
     assert {at(grid.grid(), x, y) for x, y in inside} == {UNKNOWN}
-    assert {at(grid.open_grid(), x, y) for x, y in inside} == {FREE}
     assert {at(grid.grid(), x, 0.0) for x in np.arange(-2.5, 6.5, 0.1)} == {FREE}
 
 

@@ -17,11 +17,11 @@ T_MAP_ODOM = pose(4.0, -1.0, 0.3)
 COVARIANCE = np.diag([0.01] * 3 + [0.01] * 3) ** 2
 
 
-def hypothesis(x_m: float, error_m: float = 0.0, inliers: int = 12, *, by_tag: bool = False) -> Hypothesis:
+def hypothesis(x_m: float, error_m: float = 0.0, inliers: int = 12) -> Hypothesis:
     """Return a recognition from a frame at x in odom, wrong by an error."""
     T_odom_rect = pose(x_m, 0.0, 0.0)
     T_map_rect = T_MAP_ODOM @ T_odom_rect @ pose(0.0, error_m, 0.0)
-    found = Recognition(PLACE, se3.inverse(POSES[PLACE]) @ T_map_rect, COVARIANCE, inliers, 30, 4, by_tag)
+    found = Recognition(PLACE, se3.inverse(POSES[PLACE]) @ T_map_rect, COVARIANCE, inliers, 30, 4)
     return Hypothesis(found, NEWEST, np.eye(4), COVARIANCE, T_odom_rect)
 
 
@@ -43,13 +43,6 @@ def test_one_that_contradicts_does_not_count() -> None:
 def test_a_robot_at_rest_needs_recognitions_with_more_inliers() -> None:
     assert consistent(*[hypothesis(0.0)] * 5) == 0
     assert consistent(*[hypothesis(0.0, inliers=SURE_INLIERS) for _ in range(3)]) == CONSISTENT
-
-
-def test_a_tag_may_differ_by_its_uncertainty() -> None:
-    """Its direction is less certain than that of a view."""
-    others = [hypothesis(0.0), hypothesis(0.1)]
-    assert consistent(*others, hypothesis(0.2, error_m=0.04, by_tag=True)) == CONSISTENT
-    assert consistent(*others, hypothesis(0.2, error_m=0.3, by_tag=True)) == 0
 
 
 def test_keyframes_that_left_the_map_do_not_count() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from calib import se3
 from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.search_schedule import SEARCH_NS, SEARCHES, SEARCHES_BEFORE_SCANS, WAIT_FACTOR, SearchSchedule
+from omnid.core.places.search_schedule import SEARCH_NS, SEARCHES, WAIT_FACTOR, SearchSchedule
 from tests.omnid.core.places.test_place_map import keyframe
 
 S = 1_000_000_000
@@ -40,19 +40,23 @@ def test_searches_go_on_while_the_place_is_unknown_and_end_after_some() -> None:
             schedule.begin(stamp_ns, np.eye(4))
             schedule.end(found=False, could_find=True)
     assert due == [True] * SEARCHES + [False] * 2 * SEARCHES
-    assert schedule.wants_scans
 
 
 def test_the_dark_counts_as_no_failure_and_a_place_that_is_found_ends_them() -> None:
     schedule = SearchSchedule(LIMITS)
+
+    def is_due() -> bool:
+        return schedule.search_is_due(SEARCH_NS, np.eye(4), is_unknown=True, is_pending=False)
+
+    schedule.begin(0, np.eye(4))
     for _ in range(2 * SEARCHES):
         schedule.end(found=False, could_find=False)
-    assert not schedule.wants_scans
-    for _ in range(SEARCHES_BEFORE_SCANS):
+    assert is_due()
+    for _ in range(SEARCHES):
         schedule.end(found=False, could_find=True)
-    assert schedule.wants_scans
+    assert not is_due()
     schedule.end(found=True, could_find=True)
-    assert not schedule.wants_scans
+    assert is_due()
 
 
 def test_a_recognition_is_checked_in_a_frame_that_has_moved() -> None:
@@ -65,6 +69,3 @@ def test_a_recognition_is_checked_in_a_frame_that_has_moved() -> None:
     ]
     assert asked == [False, False, True]
     assert not schedule.search_is_due(SEARCH_NS - 1, forward(0.2), is_unknown=True, is_pending=True)
-    np.testing.assert_allclose(schedule.motion_since(forward(0.2)), forward(0.2))
-    schedule.restart()
-    assert not schedule.has_searched and np.array_equal(schedule.motion_since(forward(0.2)), np.eye(4))

@@ -1,0 +1,105 @@
+"""Validation of the stamps of buffers, as drivers fill them in."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.camera_state import CameraState
+from drivers.cameras.v4l2_stamps import StampValidator
+
+PERIOD_NS = 33_333_000
+START_NS = 5_000 * 10**9
+DELAY_NS = 2_000_000
+
+
+class Stamps:
+    """A validator with its state and its events."""
+
+    def __init__(self) -> None:
+        self.state, self.events = CameraState(), list[tuple[int, str]]()
+        self.validator = StampValidator("lower camera", self.state, lambda *event: self.events.append(event))
+
+    def validate(self, stamp_ns: int, arrival_ns: int, flags: int = v4l2.TIMESTAMP_MONOTONIC) -> int:
+        buffer = v4l2.V4l2Buffer(flags=flags)
+        buffer.timestamp.tv_sec, rest_ns = divmod(stamp_ns, 10**9)
+        buffer.timestamp.tv_usec = rest_ns // 1000
+        return self.validator.validate(buffer, arrival_ns)
+
+
+@pytest.fixture
+def stamps() -> Stamps:
+    return Stamps()
+
+
+def test_keeps_the_kernels_stamps(stamps: Stamps) -> None:
+    expected = [START_NS + PERIOD_NS * number for number in range(3)]
+    assert [stamps.validate(stamp_ns, stamp_ns + DELAY_NS) for stamp_ns in expected] == expected
+    assert stamps.state == CameraState() and stamps.events == []
+
+
+@pytest.mark.parametrize("flags", [0, 0x4000])
+def test_accepts_an_undeclared_clock_with_one_warning(stamps: Stamps, flags: int) -> None:
+    expected = [START_NS, START_NS + PERIOD_NS]
+    assert [stamps.validate(stamp_ns, stamp_ns + DELAY_NS, flags) for stamp_ns in expected] == expected
+    assert [level for level, _ in stamps.events] == [logging.WARNING]
+    assert stamps.events[0][1].startswith("lower camera: ") and "clock" in stamps.events[0][1]
+
+
+def test_replaces_stamps_in_the_future_by_the_arrival(stamps: Stamps) -> None:
+    """By default vivid stamps the end of the frame, 50 ms ahead."""
+    arrivals = [START_NS + PERIOD_NS * i for i in range(5)]
+    assert [stamps.validate(arrival_ns + 50_000_000, arrival_ns) for arrival_ns in arrivals] == arrivals
+    assert stamps.state.restamped == 5 and len(stamps.events) == 1 and "50.000 ms" in stamps.events[0][1]
+
+
+@pytest.mark.parametrize("stamp_ns", [0, START_NS - 11 * 10**9, 1_700_000_000 * 10**9])
+def test_replaces_stamps_of_another_clock_by_the_arrival(stamps: Stamps, stamp_ns: int) -> None:
+    assert stamps.validate(stamp_ns, START_NS) == START_NS
+    assert stamps.state.restamped == 1
+
+
+def test_stamps_increase_strictly(stamps: Stamps) -> None:
+    first = stamps.validate(START_NS, START_NS + 10)
+    earlier = stamps.validate(START_NS - 1000, START_NS + PERIOD_NS)
+    at_the_same_time = stamps.validate(START_NS, START_NS + PERIOD_NS)
+    replaced_ns = START_NS + PERIOD_NS - 10  # the arrival less the delay of the first
+    assert (first, earlier, at_the_same_time) == (START_NS, replaced_ns, replaced_ns + 1)
+    assert stamps.state.restamped == 2
+
+
+def test_an_invalid_stamp_makes_no_later_one_invalid(stamps: Stamps) -> None:
+    """Also where images arrive later than the period after their capture."""
+    delay_ns, taken = 40_000_000, [START_NS + PERIOD_NS * number for number in range(30)]
+    assert delay_ns > PERIOD_NS
+    found = [
+        stamps.validate(stamp_ns + (delay_ns + 1_000_000) * (number == 5), stamp_ns + delay_ns)
+        for number, stamp_ns in enumerate(taken)
+    ]
+    assert found == taken and stamps.state.restamped == 1
+
+
+def test_images_of_a_clock_that_fell_back_are_dated_by_their_arrival_for_good(stamps: Stamps) -> None:
+    found = []
+    for number in range(300):
+        taken_ns = START_NS + PERIOD_NS * number
+        kernel_ns = taken_ns - 3 * 10**9 * (number >= 30)
+        found.append(stamps.validate(kernel_ns, taken_ns + DELAY_NS) - taken_ns)
+    assert found == [0] * 300 and stamps.state.restamped == 270
+
+
+def test_one_late_image_is_not_the_usual_delay(stamps: Stamps) -> None:
+    for number in range(5):
+        stamps.validate(START_NS + PERIOD_NS * number, START_NS + PERIOD_NS * number + DELAY_NS)
+    late_ns = START_NS + PERIOD_NS * 5
+    assert stamps.validate(late_ns, late_ns + 3 * 10**9) == late_ns
+    now_ns = late_ns + 4 * 10**9
+    assert stamps.validate(now_ns + 1_000_000, now_ns) == now_ns - DELAY_NS
+
+
+def test_reports_each_kind_of_fault_once(stamps: Stamps) -> None:
+    for i in range(100):
+        stamps.validate(START_NS * (1 + i), START_NS + i, flags=0)
+    assert len(stamps.events) == 2 and all("\n" not in text for _, text in stamps.events)
