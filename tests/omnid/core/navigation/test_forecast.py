@@ -8,28 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from omnid.core.navigation.forecast import Forecast, Pace, forecast, yielding
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.navigation.forecast import Forecast, Pace, yielding
 from tests.omnid.core.navigation.test_moving_people import at
-
-
-def test_the_share_of_the_speed_by_hand() -> None:
-    path = np.column_stack([np.arange(0.0, 4.0, 0.05), np.zeros(80)])
-    pace = Pace(0.4, 0.4, 0.3, 0.4, 0.26)
-
-    def judged(length_m: float, moving: Forecast) -> tuple[float, bool]:
-        share, coming = yielding(path, length_m, moving, pace)
-        return share, bool(coming[0])
-
-    assert judged(4.0, at(3.0, 2.0, 0.0, 0.0)) == (1.0, False)
-    # In 2.5 s the base is at 1 m, and the person, from 2 m aside at 0.8 m/s, there as well.
-    share, coming = judged(4.0, at(1.0, 2.0, 0.0, -0.8))
-    assert 0.0 <= share < 1.0 and not coming
-    assert judged(0.2, at(1.0, 2.0, 0.0, -0.8)) == (1.0, False), "it turns at a corner before"
-    assert judged(4.0, at(1.5, 0.0, -0.5, 0.0)) == (1.0, True), "it comes to where the base would wait"
-    assert judged(4.0, at(-0.8, 0.0, 0.8, 0.0)) == (1.0, False), "it comes from behind"
-    share, coming = judged(4.0, at(0.8, 0.0, 0.2, 0.0))
-    assert share == 0.5 and not coming, "it walks ahead, more slowly"
 
 
 def test_a_fast_one_from_the_side_is_not_taken_for_one_from_behind() -> None:
@@ -38,29 +18,6 @@ def test_a_fast_one_from_the_side_is_not_taken_for_one_from_behind() -> None:
     share, coming = yielding(path, 4.0, at(-0.5, 0.9, 2.0, -0.8), pace)
     assert share < 1.0 and not coming[0], "119 degrees from the direction of the path"
     assert yielding(path, 4.0, at(-0.57, 0.9, 2.0, -0.8), pace).share == 1.0, "122 degrees"
-
-
-def test_points_where_it_was_longer_ago_than_the_ring_remembers_are_of_others() -> None:
-    points = np.array([(-0.9, 0.0), (-1.0, 0.0), (0.4, 0.0), (0.5, 0.0)])
-    np.testing.assert_array_equal(at(0.0, 0.0, 1.0, 0.0).others(points), points[[1, 3]])
-    beside = np.array([(-0.25, 0.43), (-0.25, -0.47)])
-    np.testing.assert_array_equal(at(0.0, 0.0, 1.0, 0.0).others(beside), beside[[1]])
-
-
-def test_an_uncertain_velocity_that_belongs_to_an_uncertain_place_makes_it_more_uncertain() -> None:
-    P = np.diag([0.01, 0.01, 0.01, 0.01])
-    P[0, 2] = P[2, 0] = P[1, 3] = P[3, 1] = 0.005
-    found = forecast([MovingObstacle(1.0, 0.0, 0.5, 0.0, P, 0.2)], 0.4)
-    assert found is not None
-    np.testing.assert_allclose(found.variance, [[0.01 + 0.8 * 0.005 + 0.16 * 0.01, 0.005 + 0.4 * 0.01, 0.01]])
-
-
-def test_a_forecast_goes_on_from_the_age_of_the_ring() -> None:
-    one = MovingObstacle(1.0, 0.0, 0.5, 0.0, np.diag([0.01, 0.01, 0.04, 0.04]), 0.2)
-    places, radii = forecast([one], 0.4).at(np.array([0.0, 1.0]))  # type: ignore[union-attr]
-    np.testing.assert_allclose(places[0], [(1.2, 0.0), (1.7, 0.0)])
-    np.testing.assert_allclose(radii[0], 0.2 + np.minimum(np.sqrt([0.01 + 0.04 * 0.16, 0.01 + 0.04 * 1.96]), 0.15))
-    assert forecast([], 0.1) is None
 
 
 def slowly_judged(
@@ -128,53 +85,8 @@ def test_the_share_of_the_speed_is_that_of_a_drive_in_small_steps(seed: int) -> 
     assert len(set(shares)) > 1
 
 
-def test_the_last_points_of_a_path_are_judged_as_well() -> None:
-    pace = Pace(0.0, 0.4, 0.3, 0.4, 0.26)
-    assert yielding(np.array([(0.0, 0.0)]), 0.0, at(0.3, 0.1, 0.0, 0.0), pace).share == 1.0, "it stands"
-    two = np.array([(0.0, 0.0), (0.3, 0.0)])
-    assert yielding(two, 0.3, at(0.7, 0.0, 0.0, 0.0), pace).share < 1.0
-
-
 def test_who_stands_before_the_base_and_begins_to_walk_away_does_not_come() -> None:
     pace = Pace(0.0, 0.4, 0.3, 0.4, 0.26)
     path = np.column_stack([np.arange(0.0, 4.0, 0.05), np.zeros(80)])
     share, coming = yielding(path, 4.0, at(0.3, 0.0, 0.1, 0.0), pace)
     assert share == 0.0 and not coming[0]
-
-
-def test_the_radius_grows_with_the_uncertainty_of_place_and_velocity_together() -> None:
-    moving = Forecast(np.zeros((1, 2)), np.zeros((1, 2)), np.array([0.2]), np.array([[1e-3, 1e-3, 2e-3]]))
-    _, radii = moving.at(np.array([0.0, 0.5, 2.0]))
-    expected = [math.sqrt(1e-3 + 2 * t * 1e-3 + t**2 * 2e-3) for t in (0.0, 0.5, 2.0)]
-    np.testing.assert_allclose(radii[0] - 0.2, expected)
-
-
-def test_the_outline_of_who_comes_is_where_both_meet() -> None:
-    """From 3 m away, at 0.5 m/s, towards a base at 0.25 m/s: after 4 s the person is 1 m from where the base was."""
-    moving = at(3.0, 0.0, -0.5, 0.0)
-    outline = moving.outlines(np.array([True]), np.zeros(2), 0.25).reshape(3, 12, 2)
-    np.testing.assert_allclose(outline.mean(axis=1), [(1.3, 0.0), (1.0, 0.0), (0.7, 0.0)], atol=1e-9)
-    centres = outline.mean(axis=1, keepdims=True)
-    np.testing.assert_allclose(np.hypot(*np.moveaxis(outline - centres, -1, 0)), 0.2)
-    fast = at(1.5, 0.0, -0.5, 0.0)
-    outline_of_fast = fast.outlines(np.array([True]), np.zeros(2), 0.5)
-    np.testing.assert_allclose(outline_of_fast.reshape(3, 12, 2).mean(axis=1)[:, 0], [1.05, 0.75, 0.45])
-    there = Forecast(np.add(fast.xy, (5.0, -4.0)), fast.velocity, fast.radius_m, fast.variance)
-    np.testing.assert_allclose(
-        there.outlines(np.array([True]), np.array([5.0, -4.0]), 0.5), np.add(outline_of_fast, (5.0, -4.0))
-    )
-    near = at(0.2, 0.0, -0.5, 0.0).outlines(np.array([True]), np.zeros(2), 0.5).reshape(3, 12, 2)
-    np.testing.assert_allclose(near.mean(axis=1)[0], (0.2, 0.0), atol=1e-9, err_msg="not before now")
-    assert moving.outlines(np.array([False]), np.zeros(2), 0.25).shape == (0, 2)
-
-
-def test_way_and_speed_with_an_acceleration_up_or_down_to_a_highest_speed() -> None:
-    times = np.linspace(0.0, 4.0, 21)
-    for speed_mps, most_mps in ((0.1, 0.4), (0.4, 0.1), (0.2, 0.2)):
-        ways, speeds = Pace(speed_mps, 1.0, 0.3, 0.4, 0.26).ways(most_mps, times)
-        change_s = abs(most_mps - speed_mps) / 0.3
-        np.testing.assert_allclose(
-            speeds, [speed_mps + (most_mps - speed_mps) * min(1.0, t / max(change_s, 1e-9)) for t in times]
-        )
-        end_m = change_s * (speed_mps + most_mps) / 2 + (4.0 - change_s) * most_mps
-        assert ways[0] == 0.0 and ways[-1] == pytest.approx(end_m)

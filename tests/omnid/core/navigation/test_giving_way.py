@@ -7,21 +7,17 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from omnid.core.navigation.drive import Navigation
-from omnid.core.navigation.giving_way import LONGEST_RETRY_S, REST_S, RETRY_S, GivingWay, Phase, Trail, give_way
-from omnid.core.navigation.local_planner import STANDS
+from omnid.core.navigation.giving_way import REST_S, RETRY_S, Phase, Trail, give_way
 from omnid.core.navigation.navigator import GIVES_WAY, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import Situation, WheelState
+from omnid.core.navigation.situation import Situation
 from omnid.navigation_state import NavigationState
-from omnid.tracking_state import TrackingState
 from tests.omnid.core.navigation.test_local_planner import BaseAmongBoxes, Boxes, clearance_m
 
-Array = NDArray[np.float64]
 SETTINGS = NavigationSettings()
 DOOR = ((2.4, 0.45, 2.6, 4.0), (2.4, -4.0, 2.6, -0.45))
 CORRIDOR = ((-3.0, 0.6, 8.0, 0.8), (-3.0, -0.8, 8.0, -0.6))
@@ -193,128 +189,3 @@ def test_fails_where_it_is_taken_away_while_it_gives_way() -> None:
     base.pose = base.pose + np.array([0.0, 2.0, 0.0])
     answer = base.run(10)
     assert answer.state is NavigationState.FAILED and "2.0 m beside the path" in answer.reason
-
-
-def way_back_from_4_m() -> GivingWay:
-    """Return the way back from x = 4 m to about 3 m."""
-    found = give_way(trail_to(4.0), SETTINGS, np.array([4.0, 0.0, 0.0]), 0, np.zeros((0, 2)), 0.3)
-    assert found is not None
-    return found
-
-
-def test_drives_back_at_20_cm_per_second() -> None:
-    giving = way_back_from_4_m()
-    for tick in range(30):
-        following = giving.drive(tick * 10**8, np.array([3.8, 0.0, 0.0]), -0.2, 0.0)
-    assert following is not None and following.setpoint.velocity_mps == pytest.approx(-0.2)
-
-
-def test_comes_again_from_where_it_stands_on_the_way_back() -> None:
-    giving = way_back_from_4_m()
-    way = giving.way_to_block(np.array([3.32, 0.02, 0.0]))
-    np.testing.assert_allclose(way[0], (3.32, 0.02))
-    assert (np.diff(way[:, 0]) > 0).all() and way[-1, 0] == pytest.approx(4.0)
-
-
-def test_the_waits_before_it_looks_again_double_up_to_a_limit() -> None:
-    """Blocked on its return each time, it goes back and comes again by turns, each time after a longer wait."""
-    giving, waits, phases = way_back_from_4_m(), [], []
-    pose, farthest_m = np.array([3.5, 0.0, 0.0]), float(giving.follower.path.goal[0])
-    for _ in range(8):
-        giving.rest()
-        waited_s = 0.0
-        while giving.phase is Phase.REST and waited_s < 2 * LONGEST_RETRY_S:
-            assert giving.move_on(pose, 1.0, False)
-            waited_s += 1.0
-        waits.append(waited_s)
-        phases.append(giving.phase)
-        assert giving.follower.path.goal[0] == pytest.approx(4.0 if giving.phase is Phase.RETURN else farthest_m)
-    assert waits == [RETRY_S * 2**k for k in range(5)] + [LONGEST_RETRY_S] * 3
-    assert phases == [Phase.RETURN, Phase.BACK] * 4
-
-
-class Blocked:
-    """A navigator whose base has driven straight on to x = 2 m, where a wall ends its way; poses are exact."""
-
-    def __init__(self, beside: tuple[tuple[float, float], ...] = (), settings: NavigationSettings = SETTINGS) -> None:
-        """beside: further obstacles."""
-        wall = np.column_stack([np.full(41, 2.5), np.linspace(-2.0, 2.0, 41)])
-        self.obstacles: Array | None = np.vstack([wall, *beside])
-        self.navigator, self.tick = Navigator(settings), 0
-        path = DrivePath((straight_leg((0.0, 0.0), (5.0, 0.0)),), 0.0)
-        self.navigator.start("goal", NavigationFrame.ODOM, [path], self.at(0.0, None))
-        for x_m in np.arange(0.0, 2.01, 0.05):
-            self.navigator.step(self.at(float(x_m), None, 0.4))
-
-    def at(self, x_m: float, obstacles: Array | None, speed_mps: float = 0.0, held_by: str = "") -> Situation:
-        """Return the situation 0.1 s later."""
-        self.tick += 1
-        return Situation(
-            self.tick * 10**8,
-            np.array([x_m, 0.0, 0.0]),
-            speed_mps,
-            0.0,
-            TrackingState.TRACKING,
-            0,
-            WheelState(True, False, held_by=held_by),
-            obstacles=obstacles,
-        )
-
-    def step(self, x_m: float = 2.0, held_by: str = "") -> Navigation:
-        return self.navigator.step(self.at(x_m, self.obstacles, held_by=held_by))
-
-    def wait(self) -> float:
-        """Stand until it drives back; return how long that took [s]."""
-        for tick in range(400):
-            if self.step().reason == GIVES_WAY:
-                return 0.1 * tick
-        raise AssertionError("it does not give way")
-
-    @property
-    def giving(self) -> GivingWay:
-        assert self.navigator.drive is not None and self.navigator.drive.giving_way is not None
-        return self.navigator.drive.giving_way
-
-
-@pytest.mark.parametrize(("beside_m", "end_m"), [(0.24, 1.3), (0.5, 0.0)])
-def test_the_way_back_leaves_room_for_the_sides_of_the_base(beside_m: float, end_m: float) -> None:
-    blocked = Blocked(((1.2, beside_m), (0.0, 0.5)))
-    blocked.wait()
-    assert blocked.giving.follower.path.goal[0] == pytest.approx(end_m, abs=0.06)
-
-
-@pytest.mark.parametrize(("gave_way", "expected_s"), [(0, 4.0), (1, 8.0), (2, 16.0)])
-def test_each_time_at_the_same_block_it_waits_twice_as_long_before_it_gives_way(
-    gave_way: int, expected_s: float
-) -> None:
-    blocked = Blocked()
-    assert blocked.navigator.drive is not None
-    blocked.navigator.drive.gave_way, blocked.navigator.drive.gave_way_m = gave_way, 3.0
-    assert blocked.wait() == pytest.approx(expected_s, abs=0.3)
-
-
-@pytest.mark.parametrize("seen", [np.array([(1.2, 0.0)]), None])
-def test_rests_where_the_way_back_is_closed_or_not_seen_any_more(seen: Array | None) -> None:
-    blocked = Blocked()
-    blocked.wait()
-    assert blocked.step(1.9).state is NavigationState.AVOIDING
-    blocked.obstacles = seen
-    answer = blocked.step(1.85)
-    assert answer.state is NavigationState.BLOCKED and answer.setpoint is not None
-    assert answer.setpoint.velocity_mps == 0.0 and answer.setpoint.yaw_rate_radps == 0.0
-
-
-def test_rests_again_where_its_return_is_blocked_and_says_by_what() -> None:
-    held = "an obstacle is in the way"
-    for held_by, nearer_m, reason in ((held, 0.0, held), ("", 0.5, STANDS)):
-        blocked = Blocked()
-        blocked.wait()
-        assert blocked.obstacles is not None
-        blocked.giving.rest()
-        for _ in range(400):
-            if blocked.step(1.4).state is NavigationState.DRIVING:
-                break
-        blocked.obstacles = blocked.obstacles - (nearer_m, 0.0)
-        answer = blocked.step(1.4, held_by)
-        assert answer.state is NavigationState.BLOCKED and answer.reason == reason
-        assert blocked.giving.phase is Phase.REST

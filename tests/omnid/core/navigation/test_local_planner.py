@@ -13,7 +13,7 @@ from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.forecast import forecast
-from omnid.core.navigation.local_planner import ARC_S, ARC_STEPS, MARGIN_M, NEARER_M, LocalPlanner, room_ahead
+from omnid.core.navigation.local_planner import ARC_S, ARC_STEPS, MARGIN_M, NEARER_M, LocalPlanner
 from omnid.core.navigation.navigator import WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
@@ -172,24 +172,6 @@ def test_goes_around_a_box_behind_a_curve_and_a_corner() -> None:
     assert clearance_m(base) > 0.02
 
 
-@pytest.mark.parametrize(("speed_mps", "distance_m"), [(0.3, 1.0), (-0.3, 2.0), (0.0, 1.0)])
-def test_the_room_ahead_ends_at_the_nearest_obstacle_that_is_not_behind(speed_mps: float, distance_m: float) -> None:
-    pose = np.array([2.0, -3.0, math.pi / 2])
-    obstacles = np.array([[2.0, -2.0], [2.0, -5.0], [2.5, 0.0]])
-    assert room_ahead(pose, speed_mps, obstacles) == pytest.approx(distance_m)
-    assert room_ahead(pose, speed_mps, np.zeros((0, 2))) == math.inf
-
-
-@pytest.mark.parametrize("away_m", [0.5, 3.0])
-@pytest.mark.parametrize("speed_mps", [0.3, -0.3])
-def test_what_is_within_100_degrees_of_the_motion_is_not_behind(speed_mps: float, away_m: float) -> None:
-    pose = np.array([2.0, -3.0, 0.4])
-    for angle_deg, counts in ((97.0, True), (-97.0, True), (103.0, False), (-103.0, False)):
-        direction = 0.4 + math.radians(angle_deg) + (math.pi if speed_mps < 0 else 0.0)
-        place = pose[:2] + away_m * np.array([math.cos(direction), math.sin(direction)])
-        assert room_ahead(pose, speed_mps, place[None]) == pytest.approx(away_m if counts else math.inf)
-
-
 def arcs(planner: LocalPlanner) -> tuple[Array, Array]:
     """Return the speeds and yaw rates (A, 2) of the arcs and places (A, T, 3) on them, of a base at the origin."""
     motions = np.column_stack([planner._v, planner._w])
@@ -238,32 +220,3 @@ def test_arcs_keep_clear_of_somebody_who_walks_at_each_moment() -> None:
     expected = (away_m >= room_m).all(axis=(0, 2))
     assert 0.1 < expected.mean() < 0.9
     np.testing.assert_array_equal(planner._lets_pass(places[..., :2], moving), expected)
-
-
-def back_to_the_path(pose: tuple[float, float, float]) -> Setpoint:
-    """Return the motion at a pose of a base that has gone around something beside a straight path along x."""
-    planner = LocalPlanner(SETTINGS, OUTLINE)
-    path = np.column_stack([np.arange(0.0, 4.0, 0.05), np.zeros(80)])
-    box = np.column_stack([np.full(5, 1.1), np.linspace(-0.1, 0.1, 5)])
-    assert planner.plan(np.zeros(3), path, box, Setpoint(0.3)).avoiding
-    motion = planner.plan(np.array(pose), path, np.array([(5.0, 5.0)]), Setpoint(0.3)).setpoint
-    assert motion is not None and motion.heading_rad is None
-    return motion
-
-
-@pytest.mark.parametrize("pose", [(0.0, 0.2, -0.42), (0.0, -0.2, 0.42), (0.0, 0.5, -0.84)])
-def test_a_base_beside_its_path_comes_back_to_it_half_a_metre_ahead(pose: tuple[float, float, float]) -> None:
-    motion = back_to_the_path(pose)
-    assert motion.velocity_mps == pytest.approx(0.28) and abs(motion.yaw_rate_radps) < 0.11, "it looks there already"
-
-
-@pytest.mark.parametrize("heading", [-0.4, -1.4])
-def test_an_arc_back_to_the_path_ends_in_the_direction_of_the_way(heading: float) -> None:
-    motion = back_to_the_path((0.0, 0.5, heading))
-    assert heading + ARC_S * motion.yaw_rate_radps == pytest.approx(math.atan2(-0.5, 0.45), abs=0.45)
-
-
-@pytest.mark.parametrize("heading", [math.pi, 2.3, -2.5])
-def test_a_base_that_looks_away_from_the_way_turns_standing_where_there_is_room(heading: float) -> None:
-    motion = back_to_the_path((0.0, 0.5, heading))
-    assert motion.velocity_mps == 0.0 and abs(motion.yaw_rate_radps) == pytest.approx(0.8)

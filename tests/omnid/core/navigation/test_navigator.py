@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -11,16 +12,19 @@ import pytest
 from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
-from omnid.core.navigation.navigator import AROUND, GIVES_WAY, STOPS, WAITS, Navigation, Navigator
+from omnid.core.control.safety_rules import ASKED
+from omnid.core.navigation.drive import Navigation
+from omnid.core.navigation.navigator import AROUND, GIVES_WAY, STOPS, WAITS, Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings
-from omnid.core.navigation.situation import WheelState
+from omnid.core.navigation.situation import MapPosition, Situation, WheelState
 from omnid.navigation_state import NavigationState
-from omnid.tracking_state import TrackingState
+from omnid.tracking_state import MapState, TrackingState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 
 SETTINGS = NavigationSettings(unlocalised_m=1.0, unlocalised_s=4.0, stuck_s=3.0)
+LOCALISED = MapPosition(np.zeros(3), MapState.LOCALIZED, 0.02)
 
 
 def driving(
@@ -213,3 +217,63 @@ def test_nothing_is_sent_before_a_request() -> None:
     base.navigator.cancel("x")
     base.navigator.pause("x")
     assert base.navigator.state is NavigationState.IDLE
+
+
+class Steps:
+    """A navigator that drives straight on from the origin, 0.1 s from step to step."""
+
+    def __init__(self, frame: NavigationFrame = NavigationFrame.ODOM, lengths_m: tuple[float, ...] = (5.0,)) -> None:
+        """lengths_m: of the paths, each from the end of the one before."""
+        self.navigator, self.now_s = Navigator(SETTINGS), 0.0
+        ends = np.concatenate([[0.0], np.cumsum(lengths_m)])
+        paths = [DrivePath((straight_leg((a, 0.0), (b, 0.0)),)) for a, b in itertools.pairwise(ends)]
+        self.navigator.start("goal", frame, paths, self.at(0.0, 0.0, 0.0))
+        self.step(0.0)
+
+    def at(self, x_m: float, y_m: float, step_s: float = 0.1, **change: object) -> Situation:
+        """Return the situation some time after the last one."""
+        self.now_s += step_s
+        now = Situation(
+            round(self.now_s * 1e9),
+            np.array([x_m, y_m, 0.0]),
+            0.0,
+            0.0,
+            TrackingState.TRACKING,
+            0,
+            WheelState(True, False),
+            LOCALISED,
+        )
+        now = now._replace(**change)  # type: ignore[arg-type]
+        return now if now.in_map is None else now._replace(in_map=self._stamped(now.in_map, now.stamp_ns))
+
+    def _stamped(self, in_map: MapPosition, stamp_ns: int) -> MapPosition:
+        return in_map if in_map.stamp_ns else in_map._replace(stamp_ns=stamp_ns)
+
+    def step(self, x_m: float, y_m: float = 0.0, step_s: float = 0.1, **change: object) -> Navigation:
+        return self.navigator.step(self.at(x_m, y_m, step_s, **change))
+
+
+@pytest.mark.hazard("H28")
+def test_a_pose_in_the_map_counts_once() -> None:
+    """The drive ends as without any where no more of them come, as the search for places hangs."""
+    steps = Steps(NavigationFrame.MAP)
+    old = LOCALISED._replace(stamp_ns=round(steps.now_s * 1e9))
+    found = [steps.step(0.3 * k, in_map=old).state for k in range(1, 6)]
+    assert found.index(NavigationState.NOT_LOCALISED) + 1 == math.ceil(SETTINGS.unlocalised_m / 0.3)
+    assert steps.step(1.5).state is NavigationState.DRIVING
+
+
+@pytest.mark.hazard("H26")
+@pytest.mark.parametrize(
+    ("halted_by", "state"), [(ASKED, NavigationState.CANCELLED), ("the bumper is pressed", NavigationState.PAUSED)]
+)
+def test_a_stop_between_two_poses_ends_a_drive_although_it_is_armed_again(
+    halted_by: str, state: NavigationState
+) -> None:
+    steps = Steps()
+    armed = WheelState(True, False, halts=1, halted_by=halted_by)
+    assert steps.step(0.1, wheels=armed).state is state
+    assert steps.step(0.1, wheels=armed).state is state
+    if state is NavigationState.PAUSED:
+        assert not steps.navigator.resume(steps.at(0.1, 0.0, wheels=armed))
+        assert steps.step(0.1, wheels=armed).state is NavigationState.DRIVING, "a person resumed it"
