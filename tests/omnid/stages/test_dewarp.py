@@ -14,7 +14,7 @@ from omnid.config import Config
 from omnid.messages import FramePair
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry, geometry
-from tests.omnid.stages.scene_parts import CONFIG, depth_of, front_end, run_pairs
+from tests.omnid.stages.scene_parts import CONFIG, front_end, run_pairs
 from tests.simulation import build, render_grey
 
 
@@ -40,28 +40,6 @@ def test_panoramas_keep_the_steps_of_their_jpegs(rig_geometry: Geometry, frames:
     (pair,), _ = run_pairs(rig_geometry, frames[:2])
     found = Dewarp(rig_geometry, CONFIG.panorama).process(replace(pair, jpeg_steps=((1, 2), (3, 4))))
     assert (found.lower.jpeg_steps, found.upper.jpeg_steps) == ((1, 2), (3, 4))
-
-
-def test_the_visible_region_has_a_margin(rig_geometry: Geometry, frames: list[Frame]) -> None:
-    margin = CONFIG.panorama.margin_px
-    visible = depth_of(rig_geometry, frames).panoramas.visible
-    assert not visible[: margin + 1].any() and not visible[-margin - 1 :].any() and visible.any()
-    none, wide = (Dewarp(rig_geometry, replace(CONFIG.panorama, margin_px=m)) for m in (0, 20))
-    (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    shares = [dewarp.process(pair).visible.mean() for dewarp in (none, wide)]
-    assert shares[0] > visible.mean() > shares[1]
-
-
-def test_noise_is_measured_again_after_a_second(rig_geometry: Geometry, frames: list[Frame]) -> None:
-    (pair,), _ = run_pairs(rig_geometry, frames[:2])
-    noise = np.random.default_rng(1).normal(0, 8, pair.lower.shape)
-    noisy = replace(pair, lower=np.clip(np.rint(pair.lower + noise), 0, 255).astype(np.uint8))
-    dewarp = Dewarp(rig_geometry, CONFIG.panorama)
-    first, soon, later = (
-        dewarp.process(replace(each, stamp_ns=stamp_ns)).lower.noise_grey
-        for each, stamp_ns in ((pair, 0), (noisy, 900_000_000), (noisy, 1_000_000_000))
-    )
-    assert soon == first < 0.5 * later
 
 
 def test_a_dim_image_is_brightened_and_its_noise_is_known(rig_geometry: Geometry, frames: list[Frame]) -> None:

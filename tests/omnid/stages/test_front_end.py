@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import gc
-import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,29 +48,6 @@ class Seen(RigHealth):
     def begin(self, pair: PanoramaPair, exposure: Exposure | None = None) -> None:
         assert isinstance(pair, Panoramas)
         self.pairs.append((pair.seq, exposure is not None))
-
-
-def test_one_call_gives_the_poses_of_two_stages(place: Geometry, pairs: list[FramePair]) -> None:
-    whole, parts = FrontEnd(place, Config()), FrontEnd(place, Config())
-    for pair in pairs:
-        one, other = whole.process(pair), parts.poses.process(parts.dewarp.process(pair))
-        parts.poses.after()
-        assert one.T_odom_rig.tobytes() == other.T_odom_rig.tobytes()
-        assert whole.dense.of(one.depth).points.tobytes() == parts.dense.of(other.depth).points.tobytes()
-
-
-def test_a_keyframe_does_not_keep_the_evidence_of_its_pair(place: Geometry, pairs: list[FramePair]) -> None:
-    """Eight keyframes had kept 24 MB of panoramas, dense disparities and points (512 px)."""
-    front_end = FrontEnd(place, Config())
-    evidence = []
-    for pair in pairs:
-        update = front_end.process(pair)
-        front_end.poses.after()
-        points = front_end.dense.of(update.depth).points
-        evidence.append((weakref.ref(update.depth.panoramas), weakref.ref(points)))
-    gc.collect()
-    assert evidence[-1][0]() is update.depth.panoramas and evidence[-1][1]() is points
-    assert {kept() for pair in evidence[:-1] for kept in pair} == {None}
 
 
 def test_the_rig_is_checked_by_pairs_that_are_not_synchronised_after_odometry_has_found_their_motion(

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import planar, transform
@@ -38,7 +37,6 @@ from omnid.stages.navigation import NavigationStage
 from omnid.stages.routes import Routes
 from omnid.tracking_state import MapState, TrackingState
 
-Array = NDArray[np.float64]
 T_BASE_RIG = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [0.1, -0.2, 0.9])
 T_MAP_ODOM = transform(np.array([2.0, -1.0, 0.3]))  # of the base's frames
 PERIOD_NS = 100_000_000
@@ -200,16 +198,6 @@ def test_cancel_is_a_stop_at_once(tmp_path: Path) -> None:
     assert update.setpoint is not None and update.setpoint.velocity_mps == 0.0
 
 
-def test_several_requests_at_once_are_done_in_their_order(tmp_path: Path) -> None:
-    robot = Robot(tmp_path)
-    robot.pass_on()
-    requests = [GoalRequest(ODOM, 3.0, 0.0), NavigationVerb.CANCEL]
-    update = robot.stage.process([NavigationCommand(request, 0, id=id) for id, request in enumerate(requests, 7)])
-    assert update is not None and update.state is NavigationState.CANCELLED
-    assert update.answers == ((7, "goal", ""), (8, "cancel", ""))
-    assert robot.stage.process([]) is None
-
-
 def test_a_ring_makes_it_wait_and_an_old_one_does_not(tmp_path: Path) -> None:
     for age_ns, expected in ((0, NavigationState.BLOCKED), (3_000_000_000, NavigationState.DRIVING)):
         robot = Robot(tmp_path)
@@ -262,10 +250,3 @@ def test_a_pose_in_the_map_without_a_known_covariance_begins_no_drive_in_it(tmp_
         PlaceUpdate(9, 9 * PERIOD_NS, np.eye(4), np.eye(4), np.full((6, 6), np.nan), MapState.LOCALIZED, 3, np.eye(4))
     )
     assert "uncertain by nan m" in robot.send(GoalRequest(MAP, 1.0, 0.0), id=7).answers[-1].refusal
-
-
-def test_the_state_is_given_each_second_while_nothing_happens(tmp_path: Path) -> None:
-    robot = Robot(tmp_path)
-    given = [robot.pass_on() for _ in range(30)]
-    assert [k for k, update in enumerate(given) if update is not None] == [0, 10, 20]
-    assert all(update.setpoint is None for update in given if update is not None)

@@ -41,12 +41,6 @@ def test_a_motionless_scene_has_no_repeated_image() -> None:
     assert not any(flags) and not repeated.frozen and repeated.count == 0
 
 
-def test_one_repeated_image_is_counted_and_is_no_frozen_camera() -> None:
-    flags, repeated = seen([1, 2, 2, 3, 4])
-    assert flags == [False, False, True, False, False]
-    assert (repeated.count, repeated.longest, repeated.frozen) == (1, 1, False)
-
-
 def test_a_camera_freezes_and_lives_again() -> None:
     _, repeated = seen([1, *[2] * (FROZEN_IMAGES + 1)])
     assert repeated.frozen and repeated.count == FROZEN_IMAGES
@@ -58,18 +52,6 @@ def test_a_camera_freezes_and_lives_again() -> None:
 def test_a_driver_that_hands_out_its_buffers_in_turn_is_frozen(buffers: int) -> None:
     flags, repeated = seen([*range(100, 120), *list(range(buffers)) * 5])
     assert repeated.frozen and not any(flags[: 20 + buffers]) and all(flags[20 + 2 * buffers :])
-
-
-def test_one_pixel_that_differs_is_a_new_image() -> None:
-    repeated, other = RepeatedImages(), image(1)
-    other[3, 5] += 1  # beside the sampled pixels
-    assert [repeated.add(one) for one in (image(1), other)] == [False, False]
-
-
-def test_a_log_to_and_fro_repeats_the_image_at_its_end_only() -> None:
-    there = list(range(10))
-    flags, repeated = seen([*there, *there[::-1], *there])
-    assert [index for index, flag in enumerate(flags) if flag] == [10, 20] and repeated.longest == 1
 
 
 def frames(lower: Iterable[int], upper: Iterable[int]) -> list[Frame]:

@@ -62,33 +62,10 @@ def test_a_reflection_is_found_within_a_turn_and_nothing_else() -> None:
     assert not rows[: RING.start - 16].any() and not rows[RING.stop + 16 :].any()
 
 
-def test_only_the_directions_are_fixed_in_which_something_is() -> None:
-    parts = FixedParts(CYLINDER)
-    part = slice(200, 500)
-    for heading in TURN:
-        parts.observe(turned(heading), seen(heading, LIGHT_GREY, part), seen(heading), SHOWN)
-    columns = parts.pixels[RING].mean(axis=0)
-    assert columns[part].min() > 0.9 and not columns[: part.start - 10].any() and not columns[part.stop + 10 :].any()
-
-
 def test_a_world_without_fixed_parts_has_none() -> None:
     parts = FixedParts(CYLINDER)
     judged = [parts.observe(turned(heading), seen(heading), seen(heading), SHOWN) for heading in TURN * 2]
     assert any(judged) and not parts.pixels.any()
-
-
-def test_the_border_of_what_the_mirrors_show_is_no_fixed_part() -> None:
-    """It is fixed, and known: beyond it images are black."""
-    parts, shown = FixedParts(CYLINDER), SHOWN.copy()
-    shown[:20], shown[230:] = False, False
-    for heading in TURN:
-        pair = [replace(seen(heading), image=seen(heading).image * _padded(shown)) for _ in range(2)]
-        parts.observe(turned(heading), pair[0], pair[1], shown)
-    assert not parts.pixels.any()
-
-
-def _padded(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    return np.pad(shown, ((0, 0), (PAD_PX, PAD_PX)), mode="wrap").astype(np.uint8)
 
 
 def test_the_horizon_is_at_all_headings_and_no_fixed_part() -> None:
@@ -101,45 +78,8 @@ def test_the_horizon_is_at_all_headings_and_no_fixed_part() -> None:
     assert not parts.pixels.any()
 
 
-def test_a_base_that_goes_to_and_fro_between_some_headings_learns_nothing() -> None:
-    """Lines along a corridor stay where they are, too."""
-    parts = FixedParts(CYLINDER)
-    few = TURN[: LEAST_HEADINGS - 1]
-    assert not any(parts.observe(turned(heading), *(seen(heading, LIGHT_GREY),) * 2, SHOWN) for heading in few * 3)
-
-
 def test_images_that_do_not_follow_the_heading_are_not_taken_for_fixed_ones() -> None:
     """Wheels may carry the pose past images that do not change."""
     parts, still = FixedParts(CYLINDER), seen(0.0)
     judged = [parts.observe(turned(heading), still, still, SHOWN) for heading in TURN]
     assert any(judged) and not parts.pixels.any()
-
-
-def test_what_was_found_stays_and_more_is_found() -> None:
-    parts, half = FixedParts(CYLINDER), slice(0, CYLINDER.width // 2)
-    for heading in TURN:
-        parts.observe(turned(heading), seen(heading, LIGHT_GREY, half), seen(heading), SHOWN)
-    before = parts.pixels
-    for heading in TURN * 2:
-        parts.observe(turned(heading), seen(heading, LIGHT_GREY, slice(half.stop, None)), seen(heading), SHOWN)
-    assert before[RING, half].mean() > 0.9 and before[RING, half.stop + 10 : -10].mean() < 0.1
-    assert parts.pixels[before].all() and parts.pixels[RING].mean() > 0.9
-
-
-def test_a_base_that_turns_as_it_drives_is_not_on_the_spot() -> None:
-    parts = FixedParts(CYLINDER)
-    for n, heading in enumerate(TURN):
-        parts.observe(turned(heading, 0.03 * n), seen(heading, LIGHT_GREY), seen(heading), SHOWN)
-    assert parts.pixels.any() and not parts.is_on_the_spot
-
-
-def test_sectors_have_fixed_parts_too() -> None:
-    sector = Cylinder(436, 253, 86.0, 872, 100)
-    parts = FixedParts(sector)
-    for heading in TURN:
-        lower, upper = (
-            PaddedPanorama(np.ascontiguousarray(whole.panorama[:, 100:536]), 0, NOISE_GREY, turn_px=872, first=100)
-            for whole in (seen(heading), seen(heading, LIGHT_GREY))
-        )
-        parts.observe(turned(heading), lower, upper, SHOWN[:, 100:536])
-    assert parts.pixels.shape == (253, 436) and parts.pixels[RING].mean() > 0.9

@@ -10,7 +10,7 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.cell_kernels import ABOVE, BELOW, FLOOR, LEAST_VISIBLE, SURFACE
+from omnid.core.obstacles.cell_kernels import ABOVE, FLOOR, LEAST_VISIBLE, SURFACE
 from omnid.core.obstacles.cell_kernels import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
@@ -252,37 +252,6 @@ def test_noise_is_no_surface_however_far_the_base_drives(
     assert np.isfinite(ring.ranges_m).any() == is_found
 
 
-def test_a_cell_is_not_free_where_something_may_stand(grid: ObstacleGrid) -> None:
-    """A speck without such evidence is noise, and passed."""
-    grid._odds[:SURFACE] = 4.0
-    grid._odds[FLOOR, 100, [100, 120]] = -3.0
-    grid._odds[SURFACE, 100, [100, 140]] = -3.0  # 5 %
-    free = grid.state() == 1
-    assert free[100, [99, 120, 139]].all() and not free[100, [100, 140]].any()
-
-
-@pytest.mark.parametrize(
-    ("odds", "rows", "is_free"), [(0.5, 1, True), (0.5, 2, True), (0.5, 4, False), (-0.5, 1, False)]
-)
-def test_a_cell_is_floor_by_its_neighbours_only_where_floor_is_more_likely_than_not(
-    grid: ObstacleGrid, odds: float, rows: int, is_free: bool
-) -> None:
-    """Patches of more cells than a speck, with sure floor around; of a wide one the middle stays unknown."""
-    grid._odds[:SURFACE] = 4.0
-    grid._odds[FLOOR, 100 : 100 + rows, 100:116] = odds
-    assert (grid.state()[100 : 100 + rows, 105:110] == 1).all() == is_free
-
-
-@pytest.mark.parametrize(("layer", "cells", "is_free"), [(BELOW, 3, True), (BELOW, 7, False), (ABOVE, 3, False)])
-def test_an_edge_is_wide_and_a_low_thing_may_be_narrow(
-    grid: ObstacleGrid, layer: int, cells: int, is_free: bool
-) -> None:
-    """A joint of tiles looks like an edge now and then, in a few cells."""
-    grid._odds[:SURFACE] = 4.0
-    grid._odds[layer, 100 : 100 + cells, 100 : 100 + cells] = -2.0
-    assert (grid.state()[100 + cells // 2, 100 + cells // 2] == 1) == is_free
-
-
 @pytest.mark.hazard("H19")
 def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pairs) -> None:
     """As a bar under which the floor is seen: the pairs between them contradict it, so that it is never taken."""
@@ -292,20 +261,6 @@ def test_what_every_second_pair_shows_is_not_free(grid: ObstacleGrid, seen: Pair
     ring = after(grid, [seen[0], seen[1]._replace(surface=shown)], 60)
     assert 1.0 < ring.free_m[AHEAD].min() < 1.35
     assert ring.free_m[SECTORS // 2 + 10 : SECTORS // 2 + 30].min() > 1.5
-
-
-@pytest.mark.parametrize("is_thin", [False, True])
-def test_what_a_few_directions_of_a_cell_show_is_noise(grid: ObstacleGrid, seen: Pairs, is_thin: bool) -> None:
-    """As rungs of a ladder match each other too near to show floor; all directions show a thin thing at one range."""
-    bare = seen[0]._replace(surface=0 * seen[0].surface)
-    shown = bare.surface.copy()
-    if is_thin:
-        shown[round(COLUMNS.at_1m / 0.6)] = 3.0
-    else:
-        for k in range(round(COLUMNS.at_1m / 0.8), len(shown)):
-            shown[k, 5 * k % 16 :: 16] = 1.5
-    ring = after(grid, [bare, bare._replace(surface=shown)] if is_thin else [bare._replace(surface=shown)], 60)
-    assert ring.free_m.max() < 0.7 if is_thin else np.median(ring.free_m) > WALL_M - 0.5
 
 
 @pytest.mark.parametrize(("gap_cells", "comes_in"), [(2, False), (6, True)])
@@ -359,17 +314,6 @@ def test_floor_before_a_wall_too_near_for_floor_is_kept_where_the_wall_is_seen(
     assert (np.median(ring.free_m) > near_m - 0.25) == is_known
 
 
-def test_a_single_cell_of_floor_before_a_plain_wall_shows_that_no_one_came(grid: ObstacleGrid) -> None:
-    """The floor at its foot is no evidence: in a corridor 2 m wide a cell may be all that there is."""
-    wall_m = COLUMNS.nearest_floor_m + 0.05
-    found = evidence(stains, plain, wall_m=wall_m)
-    after(grid, found, 20)
-    grid._watch.flooded[:] = 1
-    grid._odds[FLOOR] = PRIOR[FLOOR]
-    ring = after(grid, found, 6, first=20)
-    assert wall_m - 0.25 < np.median(ring.free_m) < wall_m
-
-
 def test_nothing_is_known_after_clear(grid: ObstacleGrid, seen: Pairs) -> None:
     after(grid, seen, 20)
     grid.clear()
@@ -395,15 +339,6 @@ def test_patch_of_usual_floor_that_shows_none_stays_free_where_floor_behind_it_i
         dull[bins, DIRECTIONS // 2 - 6 : DIRECTIONS // 2 + 6] = -2.0
         ring = grid.update(n * PERIOD_NS, np.eye(4), seen[n % len(seen)]._replace(floor=dull))
     assert ring.free_m[AHEAD].min() > 1.5
-
-
-def test_single_directions_that_a_floor_mirrors_are_not_somebody(grid: ObstacleGrid, seen: Pairs) -> None:
-    """On a polished floor a tenth of the directions match what it mirrors; who comes hides all of them."""
-    after(grid, seen, 20)
-    mirrored = seen[0].floor.copy()
-    mirrored[:, DIRECTIONS // 2 - 15 : DIRECTIONS // 2 + 15 : 5] = -5.0
-    ring = grid.update(20 * PERIOD_NS, np.eye(4), seen[0]._replace(floor=mirrored))
-    assert np.isnan(ring.arrivals.ranges_m).all()
 
 
 @pytest.mark.hazard("H17")
@@ -491,24 +426,6 @@ def test_a_low_thing_that_was_seen_from_farther_away_stays_where_nothing_shows_i
     assert after(grid, seen, 100, first=200).ranges_m[AHEAD].max() < 0.75
 
 
-def test_odometry_that_begins_again_twice_forgets_nothing_near(grid: ObstacleGrid, seen: Pairs) -> None:
-    after(grid, seen, 20)
-    put_low_box(grid)
-    grid.begin_again()
-    grid.begin_again()
-    assert after(grid, seen, 30, first=20).ranges_m[AHEAD].max() < 0.75
-
-
-def test_near_is_so_of_the_cameras_when_odometry_begins_again(seen: Pairs) -> None:
-    """Cameras 0.4 m ahead of the base's origin: what stands 1.1 m ahead of that is 0.7 m from them."""
-    grid = ObstacleGrid(COLUMNS.at_1m, SETTINGS)
-    grid.set_floor(se3.inverse(se3.transform(np.eye(3), [0.4, 0.0, HEIGHT_M])), HEIGHT_M)
-    after(grid, seen, 20)
-    put_low_box(grid, 1.1)
-    grid.begin_again()
-    assert after(grid, seen, 30, first=20).ranges_m[AHEAD].max() < 1.2
-
-
 def test_who_stood_near_when_odometry_began_again_and_leaves_is_no_obstacle(grid: ObstacleGrid, seen: Pairs) -> None:
     after(grid, seen, 20)
     after(grid, evidence(stains, striped, wall_m=0.7), 30, first=20)
@@ -550,18 +467,6 @@ def test_masked_struts_of_a_base_that_turns_are_no_person_who_comes(
         moving += len(tracker.update(n * PERIOD_NS, grid.viewpoint(pose), ring.arrivals))
     assert (found, moving) == (0, 0)
     assert (ring.free_m > 1.0).mean() > 0.95
-
-
-@pytest.mark.parametrize("low_m", [0.06, 0.15, 0.3])
-def test_no_plane_beside_the_floor_is_compared_beyond_the_last_row(low_m: float) -> None:
-    columns = Columns(CYLINDER, BASELINE_M, floor_plane(T_RECT_BASE), (low_m, 1.7), (NEAREST_M, 6.0), VISIBLE)
-    compared = np.flatnonzero(columns._floor_bins[:, 1])
-    assert len(compared) > 10
-    for k in compared:
-        first, end = columns._floor_bins[k, :2]
-        rows = np.add.outer(columns._plane_rows[first:end], columns._offsets[:, k].ravel())
-        assert not np.isnan(columns._offsets[:3, k, 0]).any()
-        assert np.nanmin(rows) >= 0 and np.floor(np.nanmax(rows)) + 1 < CYLINDER.height
 
 
 def test_a_surface_stands_no_farther_than_its_foot_where_the_rig_leans_away(grid: ObstacleGrid) -> None:
