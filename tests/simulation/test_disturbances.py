@@ -11,7 +11,7 @@ from calib.models.camera import Mask
 from drivers.errors import FrameDecodeError
 from drivers.frame import Frame, gray
 from omnid.simulation.rendering.sensor import Floats
-from tests.simulation.disturbances import DISTURBANCES, LINES, Disturbance, DisturbedCamera
+from tests.simulation.disturbances import Disturbance, DisturbedCamera
 
 SIDE = 160
 MASK = Mask((79.5, 79.5), 0.0, 75.0)
@@ -41,32 +41,6 @@ def test_light_changes_in_both_cameras_and_is_that_of_the_seed(name: Disturbance
         assert np.array_equal(seen, camera(name, number=number).shown(IDEAL, 3, 0.3))
 
 
-def test_dirt_is_on_one_mirror_and_stays() -> None:
-    for name, dirty in (("dust", 1), ("drop", 0)):
-        changed = [camera(name, number=number).shown(IDEAL, 3, 0.3) != IDEAL for number in (0, 1)]
-        assert changed[dirty].any() and not changed[1 - dirty].any()
-        assert np.array_equal(changed[dirty], camera(name, number=dirty).shown(IDEAL, 40, 4.0) != IDEAL)
-
-
-def test_defocus_grows_to_the_rim() -> None:
-    lost = np.abs(camera("defocus").shown(IDEAL, 0, 0.0) - IDEAL)
-    assert lost[70:90, 70:90].mean() < 0.3 * lost[70:90, 5:15].mean()
-
-
-def test_gain_steps_are_those_of_both_cameras_and_last() -> None:
-    ratios = [camera("gain", number=k).shown(IDEAL, pair, 0.0) / IDEAL for pair in (0, 8, 9) for k in (0, 1)]
-    steps = [float(ratio.mean()) for ratio in ratios]
-    assert steps[0] == steps[1] == steps[2] == steps[3] != steps[4] == steps[5]
-
-
-def test_electronics_repeat_rows_and_add_a_pattern() -> None:
-    image = digits(camera("lines"))
-    changed = np.flatnonzero((image != np.rint(IDEAL)).any(axis=1))
-    assert 0 < len(changed) <= LINES and np.array_equal(image[changed], image[changed - 1])
-    assert not np.array_equal(digits(camera("lines"), 4), image), "other rows in the next pair"
-    assert np.array_equal(digits(camera("pattern"), 3), digits(camera("pattern"), 4))
-
-
 def test_jpeg_is_in_colour_with_another_quality_for_each_image() -> None:
     sizes = set()
     for pair in range(4):
@@ -75,11 +49,6 @@ def test_jpeg_is_in_colour_with_another_quality_for_each_image() -> None:
         sizes.add(len(data))
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (SIDE, SIDE, 3)
     assert len(sizes) > 1
-
-
-def test_motion_blur_renders_times_about_the_stamp() -> None:
-    times = camera(*DISTURBANCES).times_s()
-    assert len(times) > 2 and sum(times) == pytest.approx(0, abs=1e-12)
 
 
 def test_restart_markers_are_lost_in_some_images_of_the_upper_camera_only() -> None:

@@ -19,9 +19,9 @@ from types import SimpleNamespace
 import pytest
 
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph
+from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.runs.systemd import Service, StatusLine, notify, print_stacks_when_killed, stalled_stages, watchdog_s
+from omnid.runs.systemd import Service, notify, print_stacks_when_killed, stalled_stages, watchdog_s
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
@@ -208,51 +208,6 @@ def test_the_watchdog_is_fed_without_images(manager: Manager, running: SimpleNam
     assert "WATCHDOG=1" in manager.received()
 
 
-def test_continuous_work_is_not_stalled(manager: Manager, running: SimpleNamespace) -> None:
-    """There are always messages waiting, and each is soon processed."""
-    running.valve.open.set()
-    running.tap.left = 10**9
-    begins_ns: set[int] = set()
-
-    def has_begun_often() -> bool:
-        """True once each of some messages had its own time of beginning."""
-        assert not stalled_stages(running.graph.telemetry.stages, time.monotonic_ns(), TIMEOUT_S)
-        begins_ns.add(running.graph.telemetry.stages[1].busy_since_ns)
-        return len(begins_ns) > 10
-
-    wait_until(has_begun_often)
-    assert running.graph.telemetry.stages[1].processed > 10
-
-
-def test_a_writer_behind_a_stalled_reader_is_stalled() -> None:
-    """Without drops a writer waits for its reader; both work on one message."""
-    graph, tap, valve = Graph(policy=LOSSLESS, depth=1), Tap(), Valve()
-    through = SimpleNamespace(process=lambda number: number)
-    graph.sink("last", valve, graph.stage("first", through, graph.source("tap", tap.numbers, wake=tap.close)))
-    thread = threading.Thread(target=graph.run)
-    thread.start()
-    tap.left = 10
-    wait_until(lambda: len(stalled_stages(graph.telemetry.stages, time.monotonic_ns(), 0.05)) == 2)
-    valve.open.set()
-    wait_until(lambda: not stalled_stages(graph.telemetry.stages, time.monotonic_ns(), 0.05))
-    graph.stop()
-    thread.join(TIMEOUT_S)
-
-
-def test_a_ticker_that_does_not_return_is_stalled() -> None:
-    graph, valve = Graph(), Valve()
-    ticker = graph.ticker("motor", 0.001, lambda: valve.process(0))
-    tap = Tap()
-    graph.sink("sink", SimpleNamespace(process=lambda number: None), graph.source("tap", tap.numbers, wake=tap.close))
-    thread = threading.Thread(target=graph.run)
-    thread.start()
-    wait_until(lambda: stalled_stages([ticker.stats], time.monotonic_ns(), 0.05))
-    valve.open.set()
-    wait_until(lambda: not stalled_stages([ticker.stats], time.monotonic_ns(), 0.05))
-    graph.stop()
-    thread.join(TIMEOUT_S)
-
-
 def test_a_run_notifies_systemd_from_its_first_tick_to_its_end(manager: Manager) -> None:
     graph, tap = Graph(policy=NEWEST), Tap()
     graph.sink("sink", SimpleNamespace(process=lambda number: None), graph.source("tap", tap.numbers, wake=tap.close))
@@ -266,18 +221,6 @@ def test_a_run_notifies_systemd_from_its_first_tick_to_its_end(manager: Manager)
     while messages[-1][0] != "STOPPING=1":
         messages.append(manager.received())
     assert manager.is_empty()
-
-
-def test_the_status_line_counts_messages_and_deadlines_apart() -> None:
-    telemetry, statistics = Telemetry(), RunStatistics()
-    for name, dropped in (("pair", 3), ("stereo", 4), ("motor", 5)):
-        telemetry.add(StageStats(name, dropped=dropped))
-    status = StatusLine(statistics, telemetry, ("motor",))
-    assert status() == "waiting for images, 0.0 poses/s, 7 messages dropped, 5 deadlines missed"
-    statistics.newest = SimpleNamespace(state="tracking")  # type: ignore[assignment]
-    statistics.poses = 10**6
-    assert status().startswith("tracking, ")
-    assert status().startswith("waiting for images, 0.0 poses/s")
 
 
 def test_does_not_raise_where_stderr_is_no_file(capsys: pytest.CaptureFixture[str]) -> None:
