@@ -25,7 +25,7 @@ from omnid.config import Config, load_config
 from omnid.config_use import unused_settings
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.one_at_a_time import OneAtATime
+from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
 from omnid.messages import DensePoints, FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
@@ -133,7 +133,7 @@ class Odometry:
             place = geometry(with_rims(loaded, self._frames(mask_images)), settings.panorama)
             self._front_end = FrontEnd(place, settings)
         self.rig = place.rig  # with the masks that were found
-        self._lock = OneAtATime()
+        self._lock = Lock()
         self._pairs = 0
         self._skew = Skew()
         self._stamp_ns: int | None = None

@@ -64,9 +64,7 @@ RULES = (
         excepted=(
             "omnid/engine/graph.py",
             "omnid/engine/inbox.py",
-            "omnid/engine/bounded_call.py",
-            "omnid/engine/one_at_a_time.py",
-            "omnid/engine/poller.py",
+            "omnid/engine/threads.py",
             "omnid/engine/ticker.py",
         ),
     ),

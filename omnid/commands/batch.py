@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from omnid.commands.options import CONFIG, SET, cameras, command, option, settings_of
-from omnid.engine.python_program import python, python_environment
+from omnid.engine.process import python, python_environment
 from omnid.errors import OmnidError
 from omnid.plain_text import one_line, plain
 from omnid.version import __version__

@@ -56,7 +56,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 )
 def run(args: argparse.Namespace) -> int:
     """Run until a signal comes."""
-    from omnid.engine.malloc_settings import use_one_malloc_arena
+    from omnid.engine.process import use_one_malloc_arena
 
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from omnid.config_use import unused_settings

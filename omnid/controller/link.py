@@ -21,7 +21,7 @@ from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
-from omnid.engine.python_program import python, python_environment
+from omnid.engine.process import python, python_environment
 from omnid.engine.telemetry import StageStats
 from omnid.errors import OmnidError
 

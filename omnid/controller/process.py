@@ -23,8 +23,8 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
 from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.nanoseconds import S_PER_NS
+from omnid.engine.process import STOP_SIGNALS
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare
-from omnid.engine.signals import STOP_SIGNALS
 
 THREAD_NAME: Final = "controller"
 MOST_OVERDUE: Final = 500  # messages received while a tick is due already: more than can wait in the channel

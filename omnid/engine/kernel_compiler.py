@@ -20,7 +20,7 @@ from typing import Final
 
 from omnid.engine import kernel_store as store
 from omnid.engine.logging_setup import Report
-from omnid.engine.python_program import python, python_environment
+from omnid.engine.process import python, python_environment
 
 MAX_HELPERS: Final = 2  # each takes up to 280 MB, of the 768 that the service may have
 # Without a new folder for this time, another program or a helper counts as hung. A file takes seconds; on a slow and

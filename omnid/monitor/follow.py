@@ -11,7 +11,7 @@ from typing import IO, Final, TypeAlias
 
 from drivers.logs.mcap_writer import LogWriter
 from omnid.client import Robot
-from omnid.engine.signals import handle_stop_signals
+from omnid.engine.process import handle_stop_signals
 from omnid.formats.tum import tum_row
 from omnid.monitor.connecting import connected_until
 from omnid.monitor.robot_state import Inbox, ReceivedMessage, RobotState

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Final
 
 from omnid.client import CONNECT_S, Answer, Driver, NavigationReport, Robot
-from omnid.engine.signals import handle_stop_signals
+from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.navigation_state import NavigationState
 from omnid.transport.bus_config import BusConfig

@@ -16,11 +16,11 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.frame import CAMERAS
 from omnid.config import Config
-from omnid.engine.bounded_call import started
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph
 from omnid.engine.kernel_cache import prepare_kernels, read_kept_kernels
 from omnid.engine.logging_setup import Report
 from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prepare, priorities
+from omnid.engine.threads import started
 from omnid.errors import OmnidError
 from omnid.runs.live_robot import LiveRobot
 from omnid.runs.session import Session

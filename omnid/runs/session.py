@@ -19,11 +19,11 @@ from omnid.core.control.collision_settings import STOP
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.obstacles.column import FLOOR_FOCAL_PX
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.engine.bounded_call import returns_within
 from omnid.engine.graph import Graph
+from omnid.engine.process import handle_stop_signals
 from omnid.engine.realtime import RealtimeSettings
-from omnid.engine.signals import handle_stop_signals
 from omnid.engine.telemetry import StageStats
+from omnid.engine.threads import returns_within
 from omnid.settings_dump import dump
 from omnid.sinks.encoder import Encoder, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims

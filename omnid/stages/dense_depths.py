@@ -7,7 +7,7 @@ from weakref import WeakKeyDictionary
 
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.engine.one_at_a_time import OneAtATime
+from omnid.engine.threads import Lock
 from omnid.messages import DensePoints, Panoramas, StereoDepth
 
 # Computes the dense depth of panoramas for a motion during their exposures; None: unknown, or none is needed.
@@ -27,7 +27,7 @@ class DenseDepths:
     def __init__(self, compute: Compute, confirm: Confirm = lambda _, dense: dense) -> None:
         self._compute, self._confirm = compute, confirm
         self._known: WeakKeyDictionary[Panoramas, _Known] = WeakKeyDictionary()
-        self._one = OneAtATime()
+        self._one = Lock()
 
     def of(self, depth: StereoDepth) -> DensePoints:
         """Return the dense depth of a pair whose pose is known: points that its earlier view does not contradict."""
@@ -57,4 +57,4 @@ class _Known:
         self.points: DensePoints | None = None
         self.exposure: Exposure | None = None
         self.confirmed: tuple[DensePoints, EarlierView | None, DensePoints] | None = None  # as matched, by it, without
-        self.one = OneAtATime()
+        self.one = Lock()

@@ -13,7 +13,7 @@ from typing import Final
 
 import zenoh
 
-from omnid.engine.poller import Poller
+from omnid.engine.threads import Poller
 from omnid.errors import OmnidError
 from omnid.transport import status_names
 from omnid.transport.bus_config import BusConfig, checked

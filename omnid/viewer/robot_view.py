@@ -12,7 +12,7 @@ from drivers.errors import FrameDecodeError
 from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.client import Cloud, Diagnostics, Pose, Robot
 from omnid.core.odometry.stereo_frame import Features
-from omnid.engine.signals import handle_stop_signals
+from omnid.engine.process import handle_stop_signals
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, ReceivedMessage
 from omnid.transport.bus_config import BusConfig

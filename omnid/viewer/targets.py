@@ -18,8 +18,7 @@ from urllib.parse import quote
 
 import rerun as rr
 
-from omnid.engine.python_program import python, python_environment
-from omnid.engine.signals import handle_stop_signals
+from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
 
 ALTERNATIVES: Final = "write a file with -o FILE.rrd, or serve a browser of this machine with --web"

@@ -146,4 +146,4 @@ def test_each_program_is_started_by_one_function() -> None:
         for path in sorted((ROOT / layer).rglob("*.py"))
         if starts.search(path.read_text("utf-8"))
     ]
-    assert found == ["omnid/engine/python_program.py"]
+    assert found == ["omnid/engine/process.py"]

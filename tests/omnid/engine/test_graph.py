@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import pytest
 
-from omnid.engine.graph import LOSSLESS, NEWEST, Graph
+from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot
 from omnid.errors import OmnidError
 from tests.omnid.engine.graph_parts import LONG_S, Action, Apply, Collect, Sums, both, fail_at, stopped_at
 
@@ -37,6 +37,33 @@ def test_threads_give_the_results_of_inline() -> None:
     assert raw == list(range(101))
     assert sums == [4 * k + 1 for k in range(50)] + [100, -1]  # with the results of finish
     assert late == [sums[k] + sums[k + 1] for k in range(0, 52, 2)] + [-1]
+
+
+@both
+def test_a_slot_as_a_sink_keeps_the_newest(threaded: bool) -> None:
+    slot: Slot[int] = Slot()
+    assert slot.get() is None
+    graph = Graph(threaded=threaded)
+    graph.sink("newest", slot, graph.source("numbers", lambda: range(10)))
+    graph.run()
+    assert slot.get() == 9
+
+
+def test_direct_stages_and_sinks_run_in_the_thread_of_the_one_before() -> None:
+    names: list[str] = []
+
+    class Named:
+        def process(self, number: int) -> int:
+            names.append(threading.current_thread().name)
+            return number
+
+    graph, out = Graph(), Collect()
+    first = graph.stage("first", Named(), graph.source("numbers", lambda: iter(range(3))))
+    graph.sink("out", out, graph.stage("second", Named(), first, direct=True))
+    graph.sink("third", Named(), first, direct=True)
+    graph.run()
+    assert set(names) == {"first"} and out.got == [0, 1, 2]
+    assert [stats.processed for stats in graph.telemetry.stages if stats.name in ("second", "third")] == [3, 3]
 
 
 @both
@@ -81,17 +108,6 @@ def test_a_failure_ends_the_wait_of_a_source_that_settles() -> None:
     graph.stage("bad", Apply(fail_at(0)), graph.source("numbers", numbers))
     with pytest.raises(ValueError, match="cannot take 0"):
         graph.run()
-
-
-def test_sinks_that_wait_drop_nothing() -> None:
-    graph = Graph(policy=LOSSLESS, depth=1, sinks_wait=True)
-
-    def crawl(_: int) -> None:
-        threading.Event().wait(1e-4)
-
-    graph.sink("slow", Apply(crawl), graph.source("numbers", lambda: range(200)), policy=NEWEST, depth=1)
-    graph.run()
-    assert (graph.telemetry.of("slow").processed, graph.telemetry.of("slow").dropped) == (200, 0)
 
 
 @both
@@ -303,25 +319,6 @@ def test_runs_leave_no_thread(threaded: bool) -> None:
         graph.run()
         assert sink.got == [1, 5, 4, -1]
         assert set(threading.enumerate()) <= before
-
-
-@both
-def test_threads_have_the_names_of_their_stages(threaded: bool) -> None:
-    names: list[str] = []
-    graph = Graph(threaded=threaded)
-    where = Apply(lambda _: names.append(threading.current_thread().name))
-    graph.stage("where", where, graph.source("one", lambda: [1]))
-    graph.run()
-    assert names == ["where" if threaded else threading.current_thread().name]
-
-
-def test_runs_outside_the_main_thread() -> None:
-    graph, sink = Graph(), Collect()
-    graph.sink("sink", sink, graph.source("numbers", lambda: range(3)))
-    thread = threading.Thread(target=graph.run)
-    thread.start()
-    thread.join()
-    assert sink.got == [0, 1, 2]
 
 
 def test_refuses_wrong_wiring() -> None:

@@ -219,15 +219,3 @@ def test_after_long_work_that_follows_a_result_the_tail_takes_the_newest() -> No
     graph.bound("head", "tail")
     graph.run()
     assert np.median(ages) < np.median(during) / 2
-
-
-def test_a_bound_head_ends_with_a_tail_that_fails() -> None:
-    class Failing:
-        def process(self, number: int) -> None:
-            raise ValueError("broken")
-
-    graph = Graph(policy=NEWEST, depth=1)
-    graph.sink("tail", Failing(), graph.stage("head", Recorded(), graph.source("numbers", lambda: iter(range(50)))))
-    graph.bound("head", "tail")
-    with pytest.raises(ValueError, match="broken"):
-        graph.run()

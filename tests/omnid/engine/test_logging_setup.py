@@ -84,7 +84,7 @@ def test_writes_priorities_for_journald(pipe: tuple[int, int], script: str, writ
 
 def test_the_command_line_writes_its_error_with_priority(pipe: tuple[int, int]) -> None:
     assert run(journal(pipe[1]), pipe[1], "-m", "omnid", "config", "--config", "/nowhere") == 2
-    assert os.read(pipe[0], 1000).startswith(b"<3>cannot read the settings file '/nowhere'")
+    assert os.read(pipe[0], 1000).startswith(b"<3>the settings file '/nowhere' cannot be read")
 
 
 @pytest.mark.parametrize("environment", [{}, {"JOURNAL_STREAM": "1:2"}, {"JOURNAL_STREAM": "nonsense"}])

@@ -22,10 +22,8 @@ from omnid.engine.realtime import (
     LOCK_ADVICE,
     RealtimeSettings,
     ThreadStart,
-    has_capability,
     highest_priority,
     may_lock,
-    name_thread,
     priorities,
 )
 
@@ -33,7 +31,7 @@ ROOT = Path(__file__).parents[3]
 UNPRIVILEGED = 65534
 allowed = pytest.mark.skipif(highest_priority() < 20, reason="no right to real-time priorities: ulimit -r 20")
 PREAMBLE = """
-from omnid.engine.malloc_settings import use_one_malloc_arena
+from omnid.engine.process import use_one_malloc_arena
 import gc, json, os, resource, sys, threading, time
 from pathlib import Path
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, limit_realtime_runs, lock_memory, prepare
@@ -84,32 +82,6 @@ def seen_in(name: str, start: ThreadStart) -> dict[str, tuple[str, int]]:
 
 def test_threads_have_names_in_the_kernel() -> None:
     assert seen_in("lower", ThreadStart({})) == {"source": ("lower", os.SCHED_OTHER), "sink": ("sink", os.SCHED_OTHER)}
-
-
-def test_the_thread_of_a_ticker_has_its_name() -> None:
-    graph, ticked = Graph(on_thread=ThreadStart({})), threading.Event()
-    names: list[str] = []
-
-    def tick() -> None:
-        names.append(Path(f"/proc/self/task/{threading.get_native_id()}/comm").read_text().strip())
-        ticked.set()
-
-    graph.ticker("motor", 0.01, tick)
-    graph.sink("sink", SimpleNamespace(process=lambda number: ticked.wait(20)), graph.source("one", lambda: range(1)))
-    graph.run()
-    assert set(names) == {"motor"}
-
-
-def test_cuts_a_long_name() -> None:
-    thread = threading.Thread(target=lambda: (name_thread("a name of many letters"), names.append(comm())))
-    names: list[str] = []
-
-    def comm() -> str:
-        return Path(f"/proc/self/task/{threading.get_native_id()}/comm").read_text().strip()
-
-    thread.start()
-    thread.join()
-    assert names == ["a name of many"]
 
 
 @allowed
@@ -187,26 +159,6 @@ print(json.dumps({"frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinte
     assert (done.switch_s, done.run) == (pytest.approx(2e-3), 300_000)
 
 
-def test_prepare_leaves_disabled_settings_unchanged() -> None:
-    done = answer("""
-before = sys.getswitchinterval()
-refused = prepare(RealtimeSettings(False, False, 0.0, 0, 0, 0))
-print(json.dumps({"frozen": gc.get_freeze_count(), "same": before == sys.getswitchinterval(), "refused": refused,
-                  "run": resource.getrlimit(resource.RLIMIT_RTTIME), "locked": locked_kb()}))
-""")
-    assert (done.frozen, done.same, done.refused, done.locked) == (0, True, [], 0)
-    assert done.run[0] == done.run[1]
-
-
-def test_keeps_a_stricter_limit_of_the_parent_process() -> None:
-    done = answer("""
-resource.setrlimit(resource.RLIMIT_RTTIME, (1000, 2000))
-limit_realtime_runs(500)
-print(json.dumps({"run": resource.getrlimit(resource.RLIMIT_RTTIME)}))
-""")
-    assert done.run == [1000, 2000]
-
-
 @allowed
 def test_the_kernel_ends_a_real_time_thread_that_does_not_wait() -> None:
     done = process("""
@@ -217,15 +169,6 @@ while time.monotonic() < until_s:
     pass
 """)
     assert done.returncode == -signal.SIGXCPU
-
-
-def test_reads_capabilities() -> None:
-    mask = next(
-        int(line.split()[1], 16)
-        for line in Path("/proc/self/status").read_text().splitlines()
-        if line.startswith("CapEff")
-    )
-    assert [has_capability(number) for number in range(41)] == [bool(mask >> number & 1) for number in range(41)]
 
 
 ALLOCATING_THREAD = """

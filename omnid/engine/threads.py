@@ -1,4 +1,4 @@
-"""A thread that does short work again and again, for rooms that have no graph to run it."""
+"""Threads and locks for code that has no graph: outside of omnid.engine no module imports `threading`."""
 
 from __future__ import annotations
 
@@ -7,6 +7,30 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+
+Lock = threading.Lock
+
+
+def returns_within(action: Callable[[], None], timeout_s: float, name: str) -> bool:
+    """Call an action in a thread; return whether it has returned in time.
+
+    Otherwise it continues in its thread, which does not keep the program from ending. For the end of a run: what the
+    action uses must not be used afterwards.
+    """
+    thread = threading.Thread(target=action, name=name, daemon=True)
+    thread.start()
+    thread.join(timeout_s)
+    return not thread.is_alive()
+
+
+def started(action: Callable[[], None], name: str) -> Callable[[], None]:
+    """Call an action in a thread; return a function that waits for its end.
+
+    The thread does not keep the program from ending. What the action raises is lost.
+    """
+    thread = threading.Thread(target=action, name=name, daemon=True)
+    thread.start()
+    return thread.join
 
 
 class Poller:
