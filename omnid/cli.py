@@ -39,15 +39,8 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "eval": Entry("evaluate", "compare a trajectory with the truth, both in the TUM format"),
         "calibrate live": Entry("calibrate_live", "images of a board, with its coverage so far and what is missing"),
         "calibrate rig": Entry("calibrate_rig", "a rig.toml from images of a board that both cameras saw at once"),
-        "calibrate check": Entry("calibrate_check", "compare a rig with its file, without a board"),
         "calibrate drive": Entry(
-            "calibrate_drive", "a better rig.toml from ordinary drives with turns, without a board"
-        ),
-        "calibrate height": Entry(
-            "calibrate_height", "the height of the cameras above the floor, and their tilt, from a log"
-        ),
-        "calibrate mask": Entry(
-            "calibrate_mask", "masks of what is fixed to the cameras, such as reflections of lenses"
+            "calibrate_drive", "what drives say about a rig, without a board, and the rig that they make"
         ),
         "calibrate import": Entry(
             "calibrate_import",
@@ -98,8 +91,11 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "accept": "`python -m omnid.examples.acceptance LOG DISTANCE_M` judges a drive between two marks",
         "batch --dask": "--scheduler ADDRESS",
         "calibrate board": "print docs/board.pdf (6x7 corners, squares of 25 mm); others: https://calib.io or Kalibr",
+        "calibrate check": "`omnid calibrate drive LOG --only check`; -o FILE stands for --refine -o FILE",
         "calibrate camera": "`omnid calibrate rig` fits both cameras",
         "calibrate export": "calibrate with that program, and `omnid calibrate import` its file",
+        "calibrate height": "`omnid calibrate drive LOG --only height`",
+        "calibrate mask": "`omnid calibrate drive LOG --only mask`",
         "calibrate rig --lower-camera": "`omnid calibrate rig` fits both cameras",
         "calibrate rig --upper-camera": "`omnid calibrate rig` fits both cameras",
         "calibrate rig --refine-cameras": "`omnid calibrate rig` fits both cameras",

@@ -31,6 +31,7 @@ from omnid.calibration.board_search import Progress, silent
 from omnid.calibration.drive_observations import Drives, Topics, collect
 from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
 from omnid.calibration.drive_start import straightened, with_masks
+from omnid.calibration.images import SIDES
 from omnid.calibration.same_rig import require_same_rig
 from omnid.config import Config
 from omnid.errors import OmnidError
@@ -46,6 +47,9 @@ SETTLED = 1e-3
 # Least length of a known distance, so that an error of a centimetre at its ends is negligible. A
 # baseline that would change by more than MAX_SCALE_CHANGE shows a mistake, because a ruler measures it better.
 MIN_DISTANCE_M, MAX_SCALE_CHANGE = 1.0, 0.05
+# Error of the landmarks with the new rig, in parts of that with the old one. Free parameters always lower the error a
+# little, so a smaller gain does not show a better rig.
+SMALL_GAIN = 0.95
 # Distortion terms until the model is chosen: those of a camera tilted below its mirror.
 START_DISTORTION = ("p1", "p2")
 TIMES = (UPPER_DELAY, LINE_TIME)
@@ -75,6 +79,41 @@ class DriveCalibration:
             f"{len(self.adjustment.state.points)} landmarks, lengths change by {100 * self.scale_change:+.3f} %"
             + (f"; drives: {uncertainty}" if uncertainty else "")
         )
+
+    def lines(self) -> list[str]:
+        """Return the result as lines: errors before and after, change of lengths, each parameter with its sigma."""
+        adjustment, parameters = self.adjustment, self.adjustment.parameters
+        uncertainty = drive_uncertainty(self.rig)
+        lines = [
+            f"{'MISFIT: the residuals are not noise. ' if self.is_misfit else ''}{self.drives.keyframes} keyframes, "
+            f"{len(adjustment.state.points)} landmarks, {len(adjustment.observations)} observations; error "
+            f"{self.first_sigma_px:.3f} px before, {adjustment.sigma_px:.3f} px after",
+            *(f"{side}: {structure}" for side, structure in zip(SIDES, self.structure, strict=True)),
+            f"lengths change by {100 * self.scale_change:+.3f} %" + (f"; {uncertainty}" if uncertainty else ""),
+            f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}",
+        ]
+        after = parameters.values + adjustment.state.steps * parameters.units
+        sigmas = adjustment.sigmas * parameters.units
+        rows = zip(parameters.names, parameters.values, after, sigmas, adjustment.seen.tolist(), strict=True)
+        for name, old, new, sigma, seen in rows:
+            unseen = "" if seen else "  the drive does not show it"
+            lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
+        if not np.all(adjustment.seen):
+            lines.append("parameters that the drive does not show stay near their start")
+        if self.times:
+            times = ", ".join(f"{name} {value:.3g}" for name, value in self.times)
+            lines.append(f"times of exposure: {times}: in the table [times] of the file, where runs read them")
+        if self.level_rad:
+            lines.append(
+                f"the rig frame was turned by {np.rad2deg(self.level_rad):.2f} deg, so that the drive lies in "
+                "the x-y plane of the base"
+            )
+        return lines
+
+    @property
+    def is_better(self) -> bool:
+        """True if the landmarks fit better than with the rig before by more than further parameters always bring."""
+        return self.adjustment.sigma_px <= SMALL_GAIN * self.first_sigma_px
 
     @property
     def is_misfit(self) -> bool:

@@ -81,7 +81,7 @@ def calibrate_height(
     floor = estimator.floor
     if floor is None:
         raise OmnidError(
-            f"calibrate height: {log}: the floor is not seen in {len(chosen)} pairs: record a log where "
+            f"calibrate drive: {log}: the floor is not seen in {len(chosen)} pairs: record a log where "
             "the floor has texture all around (tiles, a carpet, newspapers), or give the measured height "
             "as --height-m to the command that makes the rig"
         )

@@ -75,7 +75,7 @@ def calibrate_mask(
             front_end.poses.after()
     if parts.headings < LEAST_HEADINGS:
         raise OmnidError(
-            f"calibrate mask: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "
+            f"calibrate drive: {log}: the robot shows {parts.headings} of {HEADINGS} headings of a turn, "
             f"{LEAST_HEADINGS} are needed: record a log in which it turns once on the spot"
         )
     parts.judge()

@@ -1,22 +1,23 @@
-"""Check of a rig by the pairs of a log: the driver of `omnid calibrate check`."""
+"""Check of a rig by the pairs of a log: `omnid calibrate drive --only check`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from calib.fit.rig_drift import apply_drift
 from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.drive_observations import Topics, tracked_updates
 from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired
 from omnid.config import Config, PanoramaConfig
-from omnid.core.rig.column_finding import RigFinding, judge
+from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding, judge
 from omnid.core.rig.column_matches import Matches, is_motion_unknown, match, together
 from omnid.core.rig.rig_health import RigHealth
 from omnid.core.rig.rig_state import RigState
@@ -31,18 +32,124 @@ from omnid.stages.geometry import geometry
 PAIRS: Final = 24
 
 
+# Most corrections of the upper camera's pose: each finds more points than the one before, as more of them match.
+REFINEMENTS: Final = 3
+# Median time between the exposures of the pairs: the stamps of cameras that are triggered together scatter by less.
+MAX_SKEW_S: Final = 3e-3
+# No mirror moves this far to the side, deg of the baseline; a camera's centre that is some pixels off has this effect.
+NO_MIRROR_DEG: Final = 5.0
+RECALIBRATE = "the cameras' intrinsics have changed, which a rotation does not correct: calibrate again with a board"
+NOT_OBSERVABLE = (
+    "not observable without a board: the length of the baseline (kept), the cameras' intrinsics, and the "
+    "rig's pose on the robot"
+)
+
+
 @dataclass(frozen=True, slots=True)
 class RigCheckResult:
     """Result of the check: columns of both panoramas, and the rims of the lower and the upper mirror if found."""
 
     finding: RigFinding
     rims: tuple[RimShift | None, RimShift | None]
+    pairs: int  # that were compared
+    skew_s: float  # median time from the lower camera's exposure to the upper one's
 
     @property
     def state(self) -> RigState:
         """The state by the columns; a rig that fits has drifted if a rim has moved."""
         fits = all(rim is None or rim.fits for rim in self.rims)
         return RigState.DRIFTED if self.finding.state is RigState.FITS and not fits else self.finding.state
+
+    @property
+    def skewed(self) -> str:
+        """Words that the cameras are not synchronised; empty if they are."""
+        if abs(self.skew_s) < MAX_SKEW_S:
+            return ""
+        late = "later" if self.skew_s > 0 else "earlier"
+        return f"the upper images are {1e3 * abs(self.skew_s):.1f} ms {late} than the lower ones"
+
+    @property
+    def has_changed_intrinsics(self) -> bool:
+        """True if the columns show a change other than that of the upper camera's pose."""
+        shift = np.zeros(2) if self.finding.drift is None else self.finding.drift.shift
+        return self.finding.left_px > DRIFTED_PX or bool(np.rad2deg(np.linalg.norm(shift)) > NO_MIRROR_DEG)
+
+    def __str__(self) -> str:
+        """Return the result as lines of text, the condition first."""
+        finding = self.finding
+        by_azimuth = (f"{azimuth:+.0f}: {median:+.2f}" for azimuth, median, count in finding.by_azimuth if count)
+        lines = [
+            f"{self.state}: {self.pairs} pairs, {finding.matches} of {finding.tried} points found in both panoramas",
+            f"columns: median {finding.offset_px:+.3f} px, spread {finding.spread_px:.3f} px; by azimuth, degrees to "
+            "the left of forward:",
+            "  " + "  ".join(by_azimuth),
+        ]
+        if (drift := finding.drift) is not None:
+            turn, turn_sigma = np.rad2deg(drift.turn), np.rad2deg(drift.turn_sigma)
+            shift, shift_sigma = np.rad2deg(drift.shift), np.rad2deg(drift.shift_sigma)
+            about = zip(turn, turn_sigma, "xyz", strict=True)
+            along = zip(shift, shift_sigma, "xy", strict=True)
+            rotation = ", ".join(f"{value:+.3f} ({sigma:.3f}) about {axis}" for value, sigma, axis in about)
+            translation = ", ".join(f"{value:+.2f} ({sigma:.2f}) along {axis}" for value, sigma, axis in along)
+            lines += [
+                f"upper camera: rotated by {finding.turn_deg:.3f} deg, sigma {np.rad2deg(drift.angle_sigma):.3f}: "
+                f"{rotation}; z is along the baseline",
+                f"upper viewpoint: shifted by {translation} deg, as seen from the lower one",
+                f"remaining offset of the columns: {finding.left_px:.2f} px or less in half of all directions",
+            ]
+            lines += [RECALIBRATE] * self.has_changed_intrinsics
+        lines += [_rim(name, rim) for name, rim in zip(SIDES, self.rims, strict=True)]
+        if self.skewed:
+            lines.append(f"{self.skewed}: the motion in between, as the odometry sees it, is allowed for")
+        return "\n".join(lines)
+
+
+def _rim(name: str, rim: RimShift | None) -> str:
+    if rim is None:
+        return f"{name} rim: not compared, as the mask or the rim in the images is not known"
+    fits = "the mask fits"
+    if not rim.fits:
+        fits = "the mask reaches beyond the mirror: it was drawn so, or the camera has moved"
+    return (
+        f"{name} rim: centre moved by {rim.moved_px[0]:+.1f} {rim.moved_px[1]:+.1f} px from the mask's, radius "
+        f"{rim.wider_px:+.1f} px: {fits}"
+    )
+
+
+def check_log(log: Path, rig: Rig, topics: Topics) -> tuple[RigCheckResult, list[FramePair]]:
+    """Check a rig by pairs spread over a log; return them as well. OmnidError where they show too little."""
+    with closing(open_log(log, topics, rig)) as reader:
+        pairs = read_rig_pairs(reader, rig)
+    found = check_rig(pairs, rig, Config().panorama)
+    if found.skewed:
+        # The motion between the exposures would be taken for a drift.
+        found = replace(found, finding=moving_rig_finding(log, rig, topics, Config()))
+    if found.finding.state is RigState.UNCHECKED:
+        raise OmnidError(
+            f"calibrate drive: expected at least {MIN_MATCHES} points in both panoramas, found "
+            f"{found.finding.matches} of {found.finding.tried} in {len(pairs)} pairs; use a log with more texture"
+        )
+    return found, pairs
+
+
+def with_upper_corrected(rig: Rig, pairs: Sequence[FramePair], found: RigCheckResult) -> tuple[Rig, str]:
+    """Return the rig whose upper camera's pose is corrected by the drift that was found, and what remains, in words."""
+    if found.skewed:
+        raise OmnidError(
+            f"calibrate drive: --only check would take motion for a drift: {found.skewed}; without --only the times of "
+            "exposure are calibrated as well"
+        )
+    is_doubtful = found.has_changed_intrinsics
+    for _ in range(REFINEMENTS):
+        if found.finding.drift is None:
+            raise OmnidError("calibrate drive: too few points match to correct the rig; calibrate it with a board")
+        rig = apply_drift(rig, found.finding.drift)
+        found = check_rig(pairs, rig, Config().panorama)
+        sigma_rad = 0.0 if found.finding.drift is None else np.linalg.norm(found.finding.drift.turn_sigma)
+        if found.finding.turn_deg < 2 * np.rad2deg(sigma_rad):
+            break
+    is_doubtful |= found.finding.state is not RigState.FITS
+    return rig, "\n".join([found.finding.summary, NOT_OBSERVABLE, *[RECALIBRATE] * is_doubtful])
 
 
 def read_rig_pairs(reader: LogReader, rig: Rig) -> list[FramePair]:
@@ -64,7 +171,7 @@ def read_rig_pairs(reader: LogReader, rig: Rig) -> list[FramePair]:
             found.append(FramePair(number, lower.stamp_ns, images[0], images[1], skew_s))
     if not found:
         raise OmnidError(
-            "calibrate check: no pair of images in the log; "
+            "calibrate drive: no pair of images in the log; "
             f"{decode.fault or 'expected nearly equal stamps of both cameras'}"
         )
     return found
@@ -80,7 +187,8 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
         rim_shift(brightest(getattr(pair, side) for pair in pairs), mounted.mask)
         for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)
     )
-    return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]))
+    skew_s = float(np.median([pair.skew_s for pair in pairs]))
+    return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]), len(pairs), skew_s)
 
 
 def moving_rig_finding(log: Path, rig: Rig, topics: Topics, config: Config) -> RigFinding:

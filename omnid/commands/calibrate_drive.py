@@ -1,4 +1,4 @@
-"""`omnid calibrate drive`: a better rig.toml from ordinary drives, without a board."""
+"""`omnid calibrate drive`: what drives say about a rig, without a board, and the rig that they make."""
 
 from __future__ import annotations
 
@@ -7,24 +7,18 @@ import math
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from calib.fit.rig_uncertainty import drive_uncertainty
 from calib.rig_file import read_rig, write_rig
-from omnid.commands.height_option import HEIGHT, height_of, with_height
+from omnid.commands.calibrate_options import HEIGHT, height, height_of, with_height
 from omnid.commands.options import cameras, command, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
 if TYPE_CHECKING:
     from calib.rig import Rig
-    from omnid.calibration.drive import DriveCalibration
 
-# Error of the landmarks with the new rig, in parts of that with the old one. Free parameters always lower the error a
-# little, so a smaller gain does not show a better rig.
-SMALL_GAIN = 0.95
+PARTS: Final = ("check", "height", "mask")
 
 
 @command(
@@ -38,6 +32,14 @@ SMALL_GAIN = 0.95
     ),
     *cameras("the {camera} camera's topic"),
     option(
+        "--only",
+        action="append",
+        choices=PARTS,
+        help="only this, by the first log; may be repeated. check: compare the rig with the images, and correct the "
+        "upper camera's pose; height: height and tilt of the cameras by the floor; mask: hide what is fixed to the "
+        "cameras, by a log in which the robot turns once",
+    ),
+    option(
         "--distance-m",
         type=float,
         metavar="M",
@@ -45,41 +47,56 @@ SMALL_GAIN = 0.95
         "image of a single log: sets the baseline's length, which is kept otherwise",
     ),
     HEIGHT,
-    option("-o", "--output", type=Path, required=True, metavar="FILE", help="the rig.toml to write"),
-    examples=("calibrate drive drive.mcap --rig rig.toml -o better.toml",),
+    option("--ruler-m", type=height, metavar="M", help="the height by ruler, as a check of that by the floor"),
+    option("-o", "--output", type=Path, metavar="FILE", help="the rig.toml to write; may be the file of --rig"),
+    examples=(
+        "calibrate drive drive.mcap --rig rig.toml -o better.toml",
+        "calibrate drive drive.mcap --only check",
+        "calibrate drive drive.mcap --only height --ruler-m 0.92 --rig rig.toml -o rig.toml",
+    ),
+    description="Adjust all parameters of a rig to drives with turns; then find the height of the cameras, if the rig "
+    "states none, and what is fixed to them, where the first log shows it. Exit code 1: the rig has drifted (--only "
+    "check), the ruler contradicts, or nothing was found that could be written.",
 )
 def run(args: argparse.Namespace) -> int:
-    """Return 0 if a rig was written, and 1 if none fits the drives better than the one to start from."""
-    from omnid.calibration.drive import calibrate_drive
+    """Examine the logs, print what was found, and write the rig; see the exit codes above."""
     from omnid.engine.kernel_cache import prepare_kernels
 
     _check(args)
     start = _start(args)
     prepare_kernels()
-    found = calibrate_drive(args.logs, start, (args.lower, args.upper), lambda line: print(line, file=sys.stderr))
-    print("\n".join(describe(found)))
-    if found.adjustment.sigma_px > SMALL_GAIN * found.first_sigma_px and not args.distance_m:
-        print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig: nothing was written")
-        if args.height_m is not None:
-            print(f"--height-m {args.height_m:g} was not applied: state it in T_base_rig of the rig.toml")
+    # 1. Check the rig, or adjust all of it.
+    rig, has_drifted = start, False
+    if args.only is None:
+        rig = _adjusted(args, rig)
+    elif "check" in args.only:
+        rig, has_drifted = _checked(args, rig)
+    # 2. Find the height, and the masks.
+    rig, contradiction = _at_height(args, rig)
+    rig = _masked(args, rig)
+    # 3. Write the rig.
+    if contradiction:
+        print(f"omnid: {contradiction}; nothing was written", file=sys.stderr)
         return 1
-    rig = found.rig
-    if args.distance_m:
-        rig = found.at_distance(args.distance_m)
-        print(
-            f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * rig.baseline_m:.2f} mm by the known distance "
-            f"({found.distance_m:.3f} m before)"
-        )
-    rig = with_height(rig, args)
-    write_rig(args.output, rig)
-    print(f"{args.output}: written, {height_of(rig)}")
-    if found.is_misfit:
-        print(
-            f"{args.output}: warning: the model does not describe these cameras; calibrate with a board, and check "
-            "the mirrors",
-            file=sys.stderr,
-        )
-    return 0
+    if args.output is not None and rig is start:
+        print("nothing was written")
+    elif args.output is not None:
+        write_rig(args.output, rig)
+        print(f"{args.output}: written, {height_of(rig)}")
+    is_found = rig is not start or args.only is not None
+    return 0 if is_found and not has_drifted else 1
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.output is not None:
+        check_outputs([("--output", args.output)], [("the log that is read", log) for log in args.logs])
+    if args.distance_m is not None:
+        if not (math.isfinite(args.distance_m) and args.distance_m > 0):
+            raise OmnidError(f"--distance-m {args.distance_m}: expected a distance above 0 m")
+        if len(args.logs) > 1:
+            raise OmnidError(f"--distance-m is the length of one drive; found {len(args.logs)} logs")
+        if args.only is not None:
+            raise OmnidError("--distance-m sets the length of the baseline, which --only leaves as it is")
 
 
 def _start(args: argparse.Namespace) -> Rig:
@@ -95,43 +112,84 @@ def _start(args: argparse.Namespace) -> Rig:
     return start
 
 
-def _check(args: argparse.Namespace) -> None:
-    inputs = [("the log that is read", log) for log in args.logs]
-    rigs = [("the rig that is read", args.rig)] if args.rig is not None else []
-    check_outputs([("--output", args.output)], [*inputs, *rigs])
-    if args.distance_m is not None and not (math.isfinite(args.distance_m) and args.distance_m > 0):
-        raise OmnidError(f"--distance-m {args.distance_m}: expected a distance above 0 m")
-    if args.distance_m is not None and len(args.logs) > 1:
-        raise OmnidError(f"--distance-m is the length of one drive; found {len(args.logs)} logs")
+def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
+    """Return the rig that fits the drives best; the same one if none fits them better."""
+    from omnid.calibration.drive import calibrate_drive
 
-
-def describe(found: DriveCalibration) -> list[str]:
-    """Return the result as lines of text: errors before and after, scale, and each parameter with its sigma."""
-    adjustment, parameters = found.adjustment, found.adjustment.parameters
-    misfit = "MISFIT: the residuals are not noise. " if found.is_misfit else ""
-    uncertainty = drive_uncertainty(found.rig)
-    lines = [
-        f"{misfit}{found.drives.keyframes} keyframes, {len(adjustment.state.points)} landmarks, "
-        f"{len(adjustment.observations)} observations; error {found.first_sigma_px:.3f} px before, "
-        f"{adjustment.sigma_px:.3f} px after",
-        *(f"{side}: {structure}" for side, structure in zip(("lower", "upper"), found.structure, strict=True)),
-        f"lengths change by {100 * found.scale_change:+.3f} %" + (f"; {uncertainty}" if uncertainty else ""),
-        f"{'parameter':<14}{'before':>14}{'after':>14}{'sigma':>11}",
-    ]
-    after = parameters.values + adjustment.state.steps * parameters.units
-    sigmas = adjustment.sigmas * parameters.units
-    rows = zip(parameters.names, parameters.values, after, sigmas, adjustment.seen.tolist(), strict=True)
-    for name, old, new, sigma, seen in rows:
-        unseen = "" if seen else "  the drive does not show it"
-        lines.append(f"{name:<14}{old:>14.5f}{new:>14.5f}{sigma:>11.5f}{unseen}")
-    if not np.all(adjustment.seen):
-        lines.append("parameters that the drive does not show stay near their start")
-    if found.times:
-        times = ", ".join(f"{name} {value:.3g}" for name, value in found.times)
-        lines.append(f"times of exposure: {times}: in the table [times] of the file, where runs read them")
-    if found.level_rad:
-        lines.append(
-            f"the rig frame was turned by {np.rad2deg(found.level_rad):.2f} deg, so that the drive lies in "
-            "the x-y plane of the base"
+    found = calibrate_drive(args.logs, rig, (args.lower, args.upper), lambda line: print(line, file=sys.stderr))
+    print("\n".join(found.lines()))
+    if not found.is_better and not args.distance_m:
+        print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
+        return rig
+    if found.is_misfit:
+        print(
+            "warning: the model does not describe these cameras; calibrate with a board, and check the mirrors",
+            file=sys.stderr,
         )
-    return lines
+    if not args.distance_m:
+        return found.rig
+    scaled = found.at_distance(args.distance_m)
+    print(
+        f"baseline {1e3 * found.rig.baseline_m:.2f} mm -> {1e3 * scaled.baseline_m:.2f} mm by the known distance "
+        f"({found.distance_m:.3f} m before)"
+    )
+    return scaled
+
+
+def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
+    """Return the rig, with its upper camera's pose corrected if it is to be written, and whether it had drifted."""
+    from omnid.calibration.rig_check import check_log, with_upper_corrected
+    from omnid.core.rig.rig_state import RigState
+
+    found, pairs = check_log(args.logs[0], rig, (args.lower, args.upper))
+    print(found)
+    if args.output is not None:
+        rig, remains = with_upper_corrected(rig, pairs, found)
+        print(f"{args.output}: {remains}")
+    return rig, found.state is not RigState.FITS
+
+
+def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
+    """Return the rig with the height that is given, or else by the floor, and how the ruler contradicts it ("").
+
+    Without --only, a height that the rig states is kept, and a floor that is not seen is no error.
+    """
+    from omnid.calibration.height import calibrate_height
+
+    if args.height_m is not None:
+        return with_height(rig, args), ""
+    is_wanted = args.ruler_m is not None or (args.only is not None and "height" in args.only)
+    if not is_wanted and (args.only is not None or rig.height_m() is not None):
+        return rig, ""
+    try:
+        found = calibrate_height(args.logs[0], rig, (args.lower, args.upper))
+    except OmnidError as error:
+        if is_wanted:
+            raise
+        print(error)
+        return rig, ""
+    print(found)
+    print(f"the rig so far: {height_of(rig)}")
+    if args.ruler_m is not None:
+        contradiction = found.contradiction(args.ruler_m)
+        if contradiction:
+            return rig, contradiction
+        print(f"{args.ruler_m:.3f} m by ruler agrees")
+    return found.rig, ""
+
+
+def _masked(args: argparse.Namespace, rig: Rig) -> Rig:
+    """Return the rig whose masks hide what is fixed to its cameras. A log without a turn is no error but for --only."""
+    from omnid.calibration.mask import calibrate_mask
+
+    if args.only is not None and "mask" not in args.only:
+        return rig
+    try:
+        found = calibrate_mask(args.logs[0], rig, (args.lower, args.upper))
+    except OmnidError as error:
+        if args.only is not None:
+            raise
+        print(error)
+        return rig
+    print(found)
+    return found.rig if found.share or args.only is not None else rig

@@ -20,7 +20,7 @@ from calib.ocam_file import import_ocam
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
 from calib.transform_file import read_transform, straight_up
-from omnid.commands.height_option import HEIGHT, height_of, with_height
+from omnid.commands.calibrate_options import HEIGHT, height_of, with_height
 from omnid.commands.options import command, exclusive, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs

@@ -13,7 +13,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from omnid.commands.board_options import BOARD, board_of, options_of
+from omnid.commands.calibrate_options import BOARD, board_of, options_of
 from omnid.commands.options import SETTINGS, cameras, command, option, settings_of
 from omnid.errors import OmnidError
 

@@ -11,8 +11,7 @@ from calib.fit.boards.camera_selection import MODEL_CHOICES
 from omnid.calibration.board_search import silent
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
-from omnid.commands.board_options import BOARD, board_of
-from omnid.commands.height_option import HEIGHT, height_of, with_height
+from omnid.commands.calibrate_options import BOARD, HEIGHT, board_of, height_of, with_height
 from omnid.commands.options import cameras, command, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs

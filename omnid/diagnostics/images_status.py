@@ -18,7 +18,7 @@ from omnid.transport.status_names import FIXED_PERCENT, IMAGES, lost_parts_key
 LIVE = "all parts are live"
 FIXED = (
     "a part of the panoramas ({:.0%}) shows what is fixed to a camera, such as the reflection of its lens: "
-    "obstacles are judged without it; `omnid calibrate mask` on a log of a turn makes a mask of it"
+    "obstacles are judged without it; `omnid calibrate drive --only mask` on a log of a turn makes a mask of it"
 )
 
 

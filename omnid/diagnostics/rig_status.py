@@ -25,11 +25,11 @@ ADVICE: Final = MappingProxyType(
     {
         RigState.UNCHECKED: "not checked yet: the robot must drive past different places",
         RigState.FITS: "fits",
-        RigState.DRIFTED: "drifted: run omnid calibrate check on a recording; --refine corrects the upper camera's "
-        "rotation",
+        RigState.DRIFTED: "drifted: run omnid calibrate drive --only check on a recording; -o corrects the rotation of "
+        "the upper camera",
         RigState.EXCHANGED: "the cameras are exchanged: exchange them in the configuration",
         RigState.BROKEN: "broken: a camera is covered or has moved by degrees, or the rig's file is of other cameras: "
-        "run omnid calibrate check on a recording",
+        "run omnid calibrate drive --only check on a recording",
     }
 )
 

@@ -82,7 +82,7 @@ def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[
             "warning",
             "rig",
             f"{path} does not state the height of the cameras: nothing is free until the images show the floor",
-            "state it by `omnid calibrate height LOG`, with --ruler-m as a check",
+            "state it by `omnid calibrate drive LOG --only height`, with --ruler-m as a check",
         )
     bare = [name for name, mounted in cameras.items() if mounted.mask is None]
     if bare:

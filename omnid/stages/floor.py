@@ -15,7 +15,7 @@ from omnid.messages import DensePoints
 
 Array = NDArray[np.float64]
 
-ADVICE: Final = "state it by `omnid calibrate height LOG --rig rig.toml -o rig.toml`"
+ADVICE: Final = "state it by `omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
 
 
 class CameraFloor:

@@ -63,8 +63,8 @@ REMARKS: Final = (
 PART_REMARKS: Final = (
     "Places: the share of the poses that are known in the map of the clean drive, and the largest error of those. "
     "Depth: points of keyframes against the world: the median error of the range, and the share that is wrong by more "
-    "than 5 % and 3 of their own sigmas. Rig: what `omnid calibrate check` says of the right rig. Obstacles: sectors "
-    "whose obstacle was called free, of those that have one, and ranges before the nearest obstacle.",
+    "than 5 % and 3 of their own sigmas. Rig: what `calibrate drive --only check` says of the right rig. Obstacles: "
+    "sectors whose obstacle was called free, of those that have one, and ranges before the nearest obstacle.",
 )
 
 

@@ -1,8 +1,8 @@
 """Right rigs by their check: `python -m tests.bench.right_rigs [--seeds N ...] [--only RIG ...]`.
 
-Every log is a drive of 5 m in a corridor, 12 pairs, with the rig that took it. What `omnid calibrate check` says of it
-is compared with the truth: the upper camera is turned by nothing, and the rig fits. The error over sigma is that of the
-turn, sqrt(w^T C^-1 w / 3) with its covariance C, of which 1 is expected.
+Every log is a drive of 5 m in a corridor, 12 pairs, with the rig that took it. What `calibrate drive --only check` says
+of it is compared with the truth: the upper camera is turned by nothing, and the rig fits. The error over sigma is that
+of the turn, sqrt(w^T C^-1 w / 3) with its covariance C, of which 1 is expected.
 """
 
 from __future__ import annotations

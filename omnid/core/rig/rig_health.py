@@ -21,7 +21,9 @@ EXCHANGE: Final = (
     "exchange --lower and --upper, or the cameras in the configuration; if that does not help, the rig "
     "is that of other cameras"
 )
-CALIBRATE: Final = "give the rig of these cameras, or calibrate it: `omnid calibrate check` shows by how much it is off"
+CALIBRATE: Final = (
+    "give the rig of these cameras, or calibrate it: `omnid calibrate drive --only check` shows by how much it is off"
+)
 LATE_OR_MOVED: Final = "; if the rig was right before, one of the cameras is late now, or was moved"
 
 
@@ -104,7 +106,8 @@ class RigHealth:
         if finding.state is RigState.DRIFTED and self._first.used_unknown_motion:
             return (
                 "the rig could only be checked to 2 deg: the cameras are not synchronised, and the motion between "
-                "their exposures is not known: check it by a recording of slow driving, `omnid calibrate check`"
+                "their exposures is not known: check it by a recording of slow driving, `omnid calibrate drive --only "
+                "check`"
             )
         if finding.state is RigState.DRIFTED:
             return (

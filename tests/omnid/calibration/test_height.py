@@ -70,7 +70,7 @@ def test_a_ruler_that_says_otherwise_names_the_baseline_that_would_fit() -> None
 def test_the_command_writes_the_rig_unless_the_ruler_contradicts(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], found: HeightCalibration
 ) -> None:
-    words = ("height", scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
+    words = ("drive", scene / "log.mcap", "--only", "height", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml")
     assert command(*words, "--ruler-m", found.floor.height_m + 0.3) == 1
     assert "nothing was written" in capsys.readouterr().err and not (tmp_path / "rig.toml").exists()
     assert command(*words, "--ruler-m", f"{found.floor.height_m:.2f}") == 0
@@ -83,17 +83,3 @@ def test_a_log_without_a_floor_ends_with_one_line(scene: Path, monkeypatch: pyte
     monkeypatch.setattr("omnid.core.floor.LEAST_EVIDENCE", np.inf)
     with pytest.raises(omnid.OmnidError, match="the floor is not seen in"):
         omnid.calibrate_height(scene / "log.mcap", read_rig(scene / "rig.toml"))
-
-
-def test_commands_that_make_a_rig_take_its_height(
-    tmp_path: Path, scene: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ("import", scene / "camchain.yaml", "-o", tmp_path / "rig.toml")
-    assert command(*words) == 0 and "no height of the cameras" in capsys.readouterr().out
-    assert "T_base_rig" not in (tmp_path / "rig.toml").read_text()
-    assert command(*words, "--height-m", "1.2") == 0 and "cameras 1.200 m above the floor" in capsys.readouterr().out
-    assert read_rig(tmp_path / "rig.toml").height_m() == pytest.approx(1.2)
-    for wrong in ("0", "-1", "high", "nan", "1200"):
-        with pytest.raises(SystemExit):
-            command(*words, "--height-m", wrong)
-        assert "--height-m: expected 0.1 to 10 m" in capsys.readouterr().err

@@ -56,10 +56,11 @@ def test_the_command_writes_a_rig_that_needs_no_other_mask(
     spin: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], found: MaskCalibration
 ) -> None:
     masked = tmp_path / "rig.toml"
-    assert command("mask", spin / "log.mcap", "--rig", spin / "rig.toml", "-o", masked) == 0
+    words = ("drive", spin / "log.mcap", "--only", "mask", "--rig")
+    assert command(*words, spin / "rig.toml", "-o", masked) == 0
     assert f"{found}\n{masked}: written" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {"rig.toml", "rig.lower.png", "rig.upper.png"}
-    assert command("mask", spin / "log.mcap", "--rig", masked) == 0
+    assert command(*words, masked) == 0
     assert capsys.readouterr().out.startswith("nothing is fixed to the cameras that the masks do not hide")
 
 

@@ -75,22 +75,23 @@ def test_exchanged_cameras_are_refused(scene: Path, tmp_path: Path, capsys: pyte
     assert not (tmp_path / "rig.toml").exists()
 
 
-@pytest.mark.parametrize("height", [(), ("--height-m", "0.9")])
 def test_a_rig_that_fits_as_well_as_any_is_kept(
-    scene: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    height: tuple[str, ...],
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    as_good = SimpleNamespace(adjustment=SimpleNamespace(sigma_px=0.2), first_sigma_px=0.2)
+    """A height that is given is written all the same, and one by the floor where the rig states none."""
+    as_good = SimpleNamespace(is_better=False, lines=lambda: [])
     monkeypatch.setattr("omnid.calibration.drive.calibrate_drive", lambda *_: as_good)
-    monkeypatch.setattr("omnid.commands.calibrate_drive.describe", lambda _: [])
-    code = calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", tmp_path / "rig.toml", *height)
+    rig = read_rig(scene / "rig.toml")
+    write_rig(tmp_path / "high.toml", rig.at_height(0.9))
+    out = tmp_path / "out.toml"
+    assert calibrate(scene / "log.mcap", "--rig", tmp_path / "high.toml", "-o", out) == 1
     printed = capsys.readouterr().out
-    assert code == 1 and "fits these drives as well as any rig: nothing was written" in printed
-    assert ("--height-m 0.9 was not applied" in printed) == bool(height)
-    assert not (tmp_path / "rig.toml").exists()
+    assert "fits these drives as well as any rig" in printed and printed.endswith("nothing was written\n")
+    assert "of 16 headings of a turn" in printed and not out.exists()
+    assert calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", out, "--height-m", "0.9") == 0
+    assert read_rig(out).height_m() == pytest.approx(0.9)
+    assert calibrate(scene / "log.mcap", "--rig", scene / "rig.toml", "-o", out) == 0
+    assert "by the floor in" in capsys.readouterr().out and read_rig(out).height_m() == pytest.approx(1.2, abs=0.08)
 
 
 def disturbed(mounted: MountedCamera, sign: float) -> MountedCamera:

@@ -32,6 +32,10 @@ def test_imports_kalibr_files(kalibr: Path, tmp_path: Path, capsys: pytest.Captu
     assert omnid(kalibr, "--lower", "cam1", "-o", tmp_path / "swapped.toml", "--height-m", 0.8) == 0
     swapped = read_rig(tmp_path / "swapped.toml")
     assert swapped.topics == NAMED[::-1] and swapped.height_m() == pytest.approx(0.8)
+    for wrong in ("0", "-1", "high", "nan", "1200"):
+        with pytest.raises(SystemExit):
+            omnid(kalibr, "-o", tmp_path / "rig.toml", "--height-m", wrong)
+        assert "--height-m: expected 0.1 to 10 m" in capsys.readouterr().err
 
 
 def test_says_what_an_import_takes_from_the_imu(

@@ -83,7 +83,7 @@ def test_refuses_a_rig_that_is_degrees_off(omnid: Command, tmp_path: Path, scene
         write_rig(tmp_path / "rig.toml", with_upper_rotated(read_rig(scene / "rig.toml"), turn_deg))
         err = omnid.refused("replay", scene / "log.mcap", "--rig", tmp_path / "rig.toml", "--quiet")
         assert "turned by 3.0 deg" in err or "turned by 2.9 deg" in err
-        assert "omnid calibrate check" in err
+        assert "omnid calibrate drive --only check" in err
 
 
 def test_a_refused_rig_may_be_a_warning(omnid: Command, scene: Path) -> None:
