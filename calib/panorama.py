@@ -21,7 +21,7 @@ from calib.rig import MountedCamera, Rig
 
 Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 # Grid on which the common field of view is measured, and the least share of the azimuths, of a full turn or of the
-# sector, at which a slope is visible. By judgement; not measured.
+# sector, at which a slope is visible.
 SLOPES, AZIMUTH_STEP_DEG, MIN_VISIBLE = 400, 15, 0.5
 # A sector begins and ends at one of SECTOR_STEPS steps of a full turn, each of a whole number of columns. Steps of 3.75
 # degrees are five directions of the obstacles, so that both share their borders, and a sector is at most two of them
@@ -34,7 +34,7 @@ SECTOR_GRID = 10 * SECTOR_STEPS
 MIN_UNSEEN_RAD = math.radians(45)
 # Least elevations that both cameras see, because 15 degrees have 60 rows at scale 1, four windows of the tracker.
 MIN_SHARED_DEG = 15.0
-# Least length of the horizon, a full turn, of a camera that sees it. By judgement; not measured.
+# Least length of the horizon, a full turn, of a camera that sees it.
 MIN_HORIZON_PX = 64
 # Steps along the horizon are about as long as each other, because a longer one leads from one end of the image to the
 # other.

@@ -40,25 +40,24 @@ from calib.models.camera import Array
 
 # Shorter side of the smallest image that is searched.
 MIN_SIDE_PX = 32
-# Number of grids per image that are grown and checked, those closest to the board's corner count. By judgement; not
-# measured.
+# Number of grids per image that are grown and checked, those closest to the board's corner count.
 TRIED_GRIDS = 5
-# Largest distance of a corner from where its neighbours predict it, in parts of a square. By judgement; not measured.
+# Largest distance of a corner from where its neighbours predict it, in parts of a square.
 MAX_IRREGULARITY = 0.2
 # A corner that is farther off than its board's others is one that a shadow or a cover moves, by judgement: in parts of
 # the median, where the prediction's own spread is taken out, and least distance in parts of a square.
 MAX_OUTLIER, MIN_OUTLIER = 4.0, 0.015
-# Least share of accepted corners in a detected board. By judgement; not measured.
+# Least share of accepted corners in a detected board.
 MIN_GOOD = 0.75
-# Number of boards without an outline that OpenCV is asked to confirm in one image. By judgement; not measured.
+# Number of boards without an outline that OpenCV is asked to confirm in one image.
 MAX_UNCONFIRMED = 2
-# Least share of the board's corners in a grid around which OpenCV searches once more. By judgement; not measured.
+# Least share of the board's corners in a grid around which OpenCV searches once more.
 PARTIAL = 0.6
-# Least share of corners accepted of a board without outline that one detector alone finds. By judgement; not measured.
+# Least share of corners accepted of a board without outline that one detector alone finds.
 MIN_LONE_PART = 0.9
-# Larger grids are not grown: in parts of the board's corners, and at least. By judgement; not measured.
+# Larger grids are not grown: in parts of the board's corners, and at least.
 FLOOR_PART, MIN_FLOOR_CORNERS = 3, 200
-# A grid that shares more than this part of its corners with a floor belongs to it. By judgement; not measured.
+# A grid that shares more than this part of its corners with a floor belongs to it.
 MAX_SHARED = 0.5
 # A smaller grid is not reported as a board of another size, because bricks and letters form a few squares by chance.
 MIN_HINT_CORNERS = 12

@@ -12,10 +12,10 @@ from calib.boards.corner_candidates import Grey, sample
 from calib.boards.corner_grid import Grid
 from calib.models.camera import Array
 
-# Least share of known corners in the whole board and in each of its four borders. By judgement; not measured.
+# Least share of known corners in the whole board and in each of its four borders.
 MIN_FILLED = 0.9
 MIN_BORDER = 0.6
-# A row just outside with at least this share of corners belongs to a larger board. By judgement; not measured.
+# A row just outside with at least this share of corners belongs to a larger board.
 BEYOND = 0.7
 
 

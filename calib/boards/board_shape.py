@@ -21,13 +21,13 @@ WEIGHT_WIDTH = 3
 # (MIN_SPACING_PX).
 MIDDLE = np.linspace(0.3, 0.7, 5)
 # The squares of a print are uniform. A grey step between neighbouring squares counts if it has the right sign and at
-# least MIN_STEP of the median step. MIN_STEPS is the least share of such steps (the edge of a shadow spoils some), and
-# MAX_SPREAD the largest standard deviation within a square, in parts of the median step. By judgement; not measured.
+# least MIN_STEP of the median step. MIN_STEPS is the least share of such steps (the edge of a shadow spoils some),
+# and MAX_SPREAD the largest standard deviation within a square, in parts of the median step.
 MIN_STEP = 0.25
 MAX_SPREAD, MIN_STEPS = 0.22, 0.6
 # Bricks and letters form a few squares by chance, so stricter limits hold for boards of fewer corners than this.
 FEW_CORNERS, FEW_MAX_SPREAD, FEW_MIN_STEPS = 20, 0.08, 0.9
-# Least share of right steps in the outermost ring of squares. By judgement; not measured.
+# Least share of right steps in the outermost ring of squares.
 MIN_AROUND = 0.85
 # Largest share, on any side, of steps beyond the board of at least BEYOND_STEP of the median step, because a light
 # margin next to the squares yields about a quarter, a pattern that continues 1: the limit is near the middle.

@@ -14,22 +14,22 @@ from calib.models.camera import Array
 Grey = NDArray[np.float32]
 # Samples on the ring about a corner, about one a pixel because the largest one is 29 px around.
 RING = 32
-# Standard deviation of the Gaussian blur before grey levels of a ring are sampled. By judgement; not measured.
+# Standard deviation of the Gaussian blur before grey levels of a ring are sampled.
 BLUR_PX = 0.7
-# Least contrast of a ring [grey levels]. By judgement; not measured.
+# Least contrast of a ring [grey levels].
 MIN_CONTRAST = 6.0
 # Largest ratio of the ring's odd part to its even part (standard deviations), because opposite sides of a corner are
 # alike.
 MAX_ODD = 0.6
-# Least angle between the two edges of a corner. By judgement; not measured.
+# Least angle between the two edges of a corner.
 MIN_CROSSING_RAD = np.deg2rad(18)
-# Least second derivative at a saddle point [grey levels / px^2]. By judgement; not measured.
+# Least second derivative at a saddle point [grey levels / px^2].
 MIN_SADDLE = 0.6
 # Quality falls from 1 to this over the accepted range of the odd part; it stays above 0, because 0 is no corner.
 MIN_RING_QUALITY = 0.1
-# Contrast [grey levels] above which candidates are ranked by quality alone. By judgement; not measured.
+# Contrast [grey levels] above which candidates are ranked by quality alone.
 FULL_CONTRAST = 40
-# Smallest side [px] of a shrunk image that is searched. By judgement; not measured.
+# Smallest side [px] of a shrunk image that is searched.
 MIN_LEVEL_SIDE_PX = 100
 MAX_PER_LEVEL = 4000  # Most candidates of a level, so that the largest board fits: 61 x 61 corners.
 # Candidates closer than SAME_PX, or than this part of their ring's radius, are the same corner, because neighbours are

@@ -33,11 +33,11 @@ MIN_RING_PX = 2.0
 MIN_SPACING_PX = 3
 # A corner has a quality of MIN_RING_QUALITY to 1; one near the lower end is left out, because its ring is too odd.
 MIN_QUALITY = 0.15
-# Least contrast of a predicted corner, in parts of the grid's median contrast. By judgement; not measured.
+# Least contrast of a predicted corner, in parts of the grid's median contrast.
 MIN_CONTRAST_PART = 0.25
 # Corners of which that median is taken, because measuring all of them takes long on a wall full of corners.
 CONTRAST_CELLS = 64
-# cv2.cornerSubPix: half window in parts of the corner spacing, and its limits. By judgement; not measured.
+# cv2.cornerSubPix: half window in parts of the corner spacing, and its limits.
 WINDOW_PART, MIN_WINDOW_PX, MAX_WINDOW_PX = 0.3, 2, 15
 # Its iterations and convergence, as in OpenCV's tutorial of it.
 SUBPIXEL_ITERATIONS, SUBPIXEL_CONVERGED_PX = 40, 1e-3

@@ -17,8 +17,8 @@ from calib.models.camera import Array
 NEAREST = 28
 # Largest angle between an arm and the line to its neighbour, because edges in a mirror image are curved.
 MAX_TURN_RAD = np.deg2rad(22)
-# The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it. Its
-# two sides must differ by MIN_EDGE of the corners' contrast. By judgement; not measured.
+# The edge between two neighbours is sampled on both sides, ASIDE of its length away, at the fractions ALONG of it.
+# Its two sides must differ by MIN_EDGE of the corners' contrast.
 ASIDE = 0.17
 ALONG = np.array([0.2, 0.35, 0.5, 0.65, 0.8])
 MIN_EDGE = 0.3

@@ -26,7 +26,7 @@ ToImage = Callable[[Array], Array]
 REACH_PX = 8
 # Least samples along a side of the window: 25 for the six terms of the surface, since 9 would be too few.
 MIN_WINDOW_SAMPLES = 5
-# Width of the window's Gaussian weight in parts of its half side. By judgement; not measured.
+# Width of the window's Gaussian weight in parts of its half side.
 WEIGHT_PART = 0.6
 # Enough: 8 of 11 boards of test_board_finder.py end before; a last step is a fifth of the accuracy.
 MAX_ITERATIONS = 4

@@ -17,12 +17,11 @@ Image = NDArray[np.uint8]
 MAX_ENLARGED_PIXELS = 1_600_000
 # Largest width of one turn of a log-polar strip, and its width in turns, so that boards across its ends are seen whole.
 MAX_STRIP_PX, STRIP_TURNS = 2400, 1.3
-# Inner radius of a log-polar strip, in parts of the image's smaller side. By judgement; not measured.
+# Inner radius of a log-polar strip, in parts of the image's smaller side.
 STRIP_INNER_PART = 1 / 16
 # Outer radius, in parts of the larger side, because the border is there.
 STRIP_OUTER_PART = 1 / 2
-# Contrast limited adaptive histogram equalisation (CLAHE): clip limit, and number of tiles along each axis. By
-# judgement; not measured.
+# Contrast limited adaptive histogram equalisation (CLAHE): clip limit, and number of tiles along each axis.
 CLAHE_CLIP_LIMIT, CLAHE_TILES = 4.0, 8
 
 

@@ -24,7 +24,7 @@ DICTIONARIES = {
 }
 # Least part of a square that a marker fills, and largest, because a light margin has to remain.
 MIN_MARKER_PART, MAX_MARKER_PART = 0.3, 0.95
-# Least and largest space between two tags, in parts of a tag. By judgement; not measured.
+# Least and largest space between two tags, in parts of a tag.
 MIN_SPACING, MAX_SPACING = 0.05, 1.0
 # Tags as in Kalibr: family, width of the border [bits], bits along a side within the border.
 TAG_FAMILY, TAG_BORDER_BITS, TAG_BITS = "APRILTAG_36h11", 2, 6

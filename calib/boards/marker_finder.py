@@ -20,25 +20,23 @@ from calib.boards.marker_board import MarkerBoard
 from calib.boards.marker_reading import read_markers
 from calib.models.camera import Array
 
-# Points of which a mapping is fitted: the nearest ones, its reach [squares], width of their Gaussian weight [squares].
-# By judgement; not measured.
+# Points of which a mapping is fitted: the nearest ones, its reach [squares], width of their Gaussian weight
+# [squares].
 NEAREST, REACH, WEIGHT_WIDTH = 24, 3.0, 1.5
 # Least numbers of points of a mapping of third, second and first order, because these have 10, 6 and 3 terms.
 MIN_CUBIC, MIN_QUADRATIC, MIN_AFFINE = 16, 10, 4
-# Least ratio of the mapping's singular values. By judgement; not measured.
+# Least ratio of the mapping's singular values.
 MIN_CONDITION = 0.02
 # A predicted corner lies at most this far from a known one [squares]; it may move by a part of its square and pixels.
-# By judgement; not measured.
 MAX_AHEAD, MAX_MOVE, MAX_MOVE_PX = 1.1, 0.12, 1.5
-# Radius of the ring about a corner, in parts of the window, and least radius [px]. By judgement; not measured.
+# Radius of the ring about a corner, in parts of the window, and least radius [px].
 RING_PART, MIN_RING_PX = 1.2, 1.8
 # Half side of the window of the first refinement [px]; a smaller one has fewer than nine pixels, too few.
 MIN_WINDOW_PX = 1.5
 ROUNDS = 12  # enough: the boards of test_marker_finder.py take 2 to 4
 # Least quality of a corner's ring, because the edge of what hides the board crosses others.
 MIN_QUALITY = 0.4
-# Largest distance of a corner from the mapping of the others: in squares, and in pixels added to it. By judgement; not
-# measured.
+# Largest distance of a corner from the mapping of the others: in squares, and in pixels added to it.
 MAX_IRREGULARITY, MAX_IRREGULARITY_PX = 0.03, 0.4
 # Least number of corners, and how far they lie off one line (ratio of the standard deviations), because fewer, or those
 # of a line, determine no pose well.

@@ -15,14 +15,14 @@ Markers = dict[int, Array]
 # Least perimeter of a marker in parts of the image's larger side, and pixels per bit when it is read: half and 1.5 of
 # OpenCV's defaults, because markers are small in a mirror image.
 MIN_PERIMETER_PART, PIXELS_PER_BIT = 0.015, 6
-# Markers whose middles are at most this many sides (of the larger one) apart must predict each other's position, within
-# this part of a side. By judgement; not measured.
+# Markers whose middles are at most this many sides (of the larger one) apart must predict each other's position,
+# within this part of a side.
 NEIGHBOUR_SIDES, MAX_OFF_PART = 3.2, 0.45
 # One marker alone may be misread.
 MIN_MARKERS = 2
 # The largest dictionary of every family that users print.
 FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
-# Least markers of another dictionary of which a hint tells. By judgement; not measured.
+# Least markers of another dictionary of which a hint tells.
 MIN_HINT_MARKERS = 4
 
 

@@ -22,7 +22,6 @@ DOUBLED = SECTOR | cv2.CALIB_CB_ACCURACY
 # smallest squares, otherwise a corner would be near two.
 SAME_PART, SAME_PX = 0.25, 1.0
 # Margin around known corners in parts of their extent, around an incomplete grid, and least margin.
-# By judgement; not measured.
 MARGIN_PART, WIDE_MARGIN_PART, MIN_MARGIN_PX = 0.3, 1.5, 20
 
 

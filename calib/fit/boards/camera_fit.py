@@ -29,8 +29,7 @@ BAD_RATIO, BAD_PX = 3.0, 0.25
 BAD_LINEAR_RATIO, BAD_LINEAR_RAD = 5.0, 0.01
 # A bound for the loop. Each round rejects at most a third of the views, so it ends earlier for lack of views.
 MAX_REJECTIONS = 10
-# Limits for warnings: directions with corners, relative sigma of the scale, sigma of the centre, mean error. By
-# judgement; not measured.
+# Limits for warnings: directions with corners, relative sigma of the scale, sigma of the centre, mean error.
 SECTORS, MIN_SECTORS = 12, 9
 MAX_SCALE_SIGMA, MAX_CENTER_SIGMA_PX = 0.005, 1.0
 MAX_MEAN_PX = 1.0

@@ -29,7 +29,6 @@ MIN_IMPROVEMENT = 0.1
 # Degrees tried above DEGREE: higher ones would bend the profile between the radii of the corners.
 HIGHER_DEGREES = (5, 6)
 # A tangential camera of degree 5 is used if its held-out error is lower by this part than that of degree 4.
-# By judgement; not measured.
 MIN_HELD_OUT_IMPROVEMENT = 0.01
 
 

@@ -30,7 +30,6 @@ MODEL_CHOICES: tuple[ModelChoice, ...] = ("auto", *MODELS)
 # The other models start from the ocam camera.
 FIT_ORDER: tuple[Model, ...] = ("ocam", *(model for model in MODELS if model != "ocam"))
 # Of models whose held-out errors differ by less than this part, the one with the fewest parameters is selected.
-# By judgement; not measured.
 TIE_PART = 0.01
 
 

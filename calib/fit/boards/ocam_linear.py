@@ -16,7 +16,7 @@ from calib.fit.boards.bundle import Observations
 from calib.models.camera import Array
 from calib.models.ocam import View
 
-# Grid search for the centre: start half width in parts of the image. By judgement; not measured.
+# Grid search for the centre: start half width in parts of the image.
 SEARCH_PART = 0.16
 # Points per axis, and factor of the width per round, so that a round goes as far as to the neighbours of the best point
 # of the last one: half of its width, and a tenth.

@@ -20,12 +20,11 @@ from calib.models.camera import Array, OmniCamera
 # Largest mean ray error of a board's pose in a given camera; beyond it the corners or the camera are wrong.
 MAX_POSE_ERROR_RAD = np.deg2rad(1.0)
 # Distance of two transforms: angle [rad] plus shift relative to the baseline. A pair is an inlier below INLIER_RATIO
-# times the median distance, within these limits. By judgement; not measured.
+# times the median distance, within these limits.
 MIN_INLIER_DISTANCE, MAX_INLIER_DISTANCE, INLIER_RATIO = 0.06, 0.3, 5.0
 # The order of corners is ambiguous if a transform farther away than any inlier costs less than this ratio.
-# By judgement; not measured.
 MIN_COST_RATIO = 3.0
-# Weight of the capped mean in a transform's cost, which breaks ties of the median; the cap. By judgement; not measured.
+# Weight of the capped mean in a transform's cost, which breaks ties of the median; the cap.
 MEAN_WEIGHT, MEAN_CAP = 0.1, 1.0
 MIN_LENGTH_M = 1e-9  # Least divisor, so that a transform without translation has a distance, too.
 ViewPair = tuple[BoardView | None, BoardView | None]

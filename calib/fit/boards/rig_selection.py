@@ -25,7 +25,7 @@ RADII = 60
 # Start values of terms that are fitted: a wavefront [m], tangential terms [1/px], so small that no pixel changes,
 # because 0 stands for a term that is not fitted.
 START_M, START_TANGENTIAL = 1e-9, (1e-12, 1e-12)
-# The more general rig is selected if its held-out error is lower by this part. By judgement; not measured.
+# The more general rig is selected if its held-out error is lower by this part.
 MIN_IMPROVEMENT = 0.01
 # Mirrors below telecentric lenses are selected if their cost is larger by less, in variances of a coordinate, because
 # the sum of squares of ten normal values, of the five terms of both wavefronts, is larger once in twenty times.

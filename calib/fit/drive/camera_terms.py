@@ -17,7 +17,6 @@ from calib.rig import Rig
 # mirror. A drive on a floor hardly distinguishes radial ones from a stretched world: they are the last resort.
 DISTORTIONS: tuple[tuple[str, ...], ...] = ((), ("p1", "p2"), ("k1", "p1", "p2"))
 # A model with more terms is chosen where it lowers the error of landmarks held out by this part.
-# By judgement; not measured.
 MIN_GAIN = 0.01
 
 

@@ -10,15 +10,15 @@ from calib.models.camera import Array
 from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import Rig
 
-# A nominal rig: mirror data sheet, rim of the mirror in the images, baseline by ruler. By judgement; not measured.
+# A nominal rig: mirror data sheet, rim of the mirror in the images, baseline by ruler.
 XI_SIGMA, FOCAL_SIGMA, CENTRE_SIGMA_PX, DISTORTION_SIGMA_PX, TANGENTIAL_SIGMA_PX = 0.02, 0.02, 3.0, 1.0, 3.0
 TURN_SIGMA_RAD, DIRECTION_SIGMA_RAD = np.deg2rad(1.5), np.deg2rad(2.0)
 RULER_SIGMA_M = 0.5e-3
-# Powers of the polynomial that have this prior, because the largest one has 63; 0 for a paraboloid. By judgement.
-# 0 for a paraboloid. By judgement; not measured.
+# Powers of the polynomial that have this prior, because the largest one has 63; 0 for a paraboloid. 0 for a
+# paraboloid.
 HIGHER_POWERS, POLYNOMIAL_SIGMA_PX = tuple(f"a{power}" for power in range(3, 64)), 0.5
 WAVEFRONT_SIGMA_M = 1e-3  # because a ray of a mirror camera passes the viewpoint within about a millimetre
-# Cameras without a trigger, and lines of a rolling shutter. By judgement; not measured.
+# Cameras without a trigger, and lines of a rolling shutter.
 DELAY_SIGMA_MS, LINE_TIME_SIGMA_US = 15.0, 30.0
 # Smallest part of a nominal sigma to which a board's covariance is trusted, because mirrors are knocked and metal
 # grows.

@@ -11,7 +11,7 @@ from omnid.core.control.velocity_limits import VelocityLimits
 # Between the heading that the motor controller reported and its turn to the next goal; by trial with simulated
 # controllers.
 REACTION_S: Final = 0.15
-# Times the yaw rate's limit, reported: the goal is the present heading until it is slower. By judgement; not measured.
+# Times the yaw rate's limit, reported: the goal is the present heading until it is slower.
 OVERSPEED: Final = 1.1
 
 

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from omnid.core.control.collision_geometry import long_runs
 
-# Floor that is seen so far is open; a ring may end nearer than that, and nothing is known beyond. Chosen by judgement.
+# Floor that is seen so far is open; a ring may end nearer than that, and nothing is known beyond.
 FAR_M: Final = 5.0
 UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
 

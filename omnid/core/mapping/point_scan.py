@@ -20,7 +20,7 @@ Counts = NDArray[np.intp]
 
 HEIGHT_SIGMAS: Final = 2.0  # Sigmas above the floor from which a point is an obstacle, so that 2 % of the floor's are.
 INVERSE_STEP: Final = 0.02  # 1/m: width of a bin, because two of them are about four sigma of a usual rig
-NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base. By judgement; not measured.
+NEAREST_M: Final = 0.2  # Range of the first bin, from the middle of the base.
 
 
 class ScanLimits(NamedTuple):

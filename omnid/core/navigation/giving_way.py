@@ -31,7 +31,7 @@ LOOK_M: Final = 1.0
 PASS_M: Final = 0.8
 REST_S: Final = 3.0  # Least time before the base returns: a person needs it to go past a base.
 SPREAD_S: Final = 4  # Added to it, by the stamp of the pose, so that two robots that met move at different times.
-# The base returns after this time in any case, to search a way; then after twice the time. By judgement; not measured.
+# The base returns after this time in any case, to search a way; then after twice the time.
 RETRY_S: Final = 10.0
 LONGEST_RETRY_S: Final = 300.0  # Twelve attempts an hour, so that a way that becomes free is found.
 FREE_S: Final = 1.0  # The way ahead has been free for this time, because rings vote for half a second.

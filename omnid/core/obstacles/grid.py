@@ -41,7 +41,7 @@ Floats = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
 
-CELL_M: Final = 0.05  # Side of a cell. By judgement; not measured.
+CELL_M: Final = 0.05  # Side of a cell.
 CELLS: Final = 256  # Cells of a side, because they hold twice the largest range, and the way until the square is moved.
 MARGIN_CELLS: Final = 110  # nearer to the border than this, the square is moved: enough for each 0.9 m of the way
 VIEW_CELLS: Final = 90  # Cells on either side of the robot that a pair changes, because they are within the margin.

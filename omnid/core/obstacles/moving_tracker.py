@@ -21,24 +21,24 @@ from omnid.core.obstacles.usual_floor import Arrivals
 Array = NDArray[np.float64]
 
 MOST_TRACKS: Final = 16  # Most tracks, so that the memory is bounded.
-SAME_SURFACE_M: Final = 0.15  # Step in range between sectors of one cluster without noise. By judgement; not measured.
+SAME_SURFACE_M: Final = 0.15  # Step in range between sectors of one cluster without noise.
 # Sigmas of a range, so that 0.5 % of the steps within a surface are larger: 2.8 of a difference.
 NOISE_SIGMAS: Final = 4.0
-SECTOR_GAP: Final = 2  # sectors without range within a cluster. By judgement; not measured.
-WIDEST_M: Final = 1.2  # Width of the widest cluster that may be a person or a cart. By judgement; not measured.
+SECTOR_GAP: Final = 2  # sectors without range within a cluster.
+WIDEST_M: Final = 1.2  # Width of the widest cluster that may be a person or a cart.
 LEAST_SECTORS: Final = 3  # because a person is five sectors wide at FARTHEST_M
 FARTHEST_M: Final = 4.0  # Farther clusters are ignored because stereo's noise there appears as motion.
 # Most squared Mahalanobis distance of a cluster from a track, because 99.9 % are below it (chi-squared, 2 dimensions).
 GATE: Final = 13.8
-ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person. By judgement; not measured.
+ACCELERATION_PSD: Final = 0.2  # (m/s^2)^2/Hz of a person.
 SIGMA_M: Final = 0.06  # Least sigma of a cluster's middle, because its visible side changes.
 PERSON_M: Final = 0.4  # width of a person, because the rest of a narrower cluster may be on either side
-START_MPS: Final = 1.0  # sigma of the velocity of a new track. By judgement; not measured.
-LEAST_MPS: Final = 0.2  # Least speed of a moving obstacle. By judgement; not measured.
-SPEED_SIGMAS: Final = 1.5  # Sigmas by which the speed must exceed its noise. By judgement; not measured.
+START_MPS: Final = 1.0  # sigma of the velocity of a new track.
+LEAST_MPS: Final = 0.2  # Least speed of a moving obstacle.
+SPEED_SIGMAS: Final = 1.5  # Sigmas by which the speed must exceed its noise.
 NEW_UPDATES: Final = 3  # Pairs after which a new object counts as moving at any speed, because it was not there before.
 CONFIRMED: Final = 2  # Pairs that must have seen it, because a single one may be noise.
-FORGOTTEN_S: Final = 0.9  # A track without a cluster ends after this time. By judgement; not measured.
+FORGOTTEN_S: Final = 0.9  # A track without a cluster ends after this time.
 
 
 @dataclass(frozen=True, slots=True, eq=False)

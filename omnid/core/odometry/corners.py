@@ -18,7 +18,7 @@ Flags = NDArray[np.bool_]
 CELL_PX = 48
 # More cells than a row of any panorama has, so that one index encodes row and column.
 MAX_CELLS = 4096
-BLOCK_PX = 5  # window over which the gradients of a corner are summed. By judgement; not measured.
+BLOCK_PX = 5  # window over which the gradients of a corner are summed.
 # Side of the square in which a corner is the maximum: that of LANDMARK_SPACING_PX, because nearer corners would be two
 # landmarks of one piece of texture. At all scales, because patches have as many pixels at each.
 APART_PX = 9

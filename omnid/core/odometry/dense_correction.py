@@ -25,7 +25,7 @@ Indices = NDArray[np.intp]
 # Spacing, at scale 1, of the points at which the correction is computed exactly. The fields follow the azimuth and the
 # row smoothly, so that interpolation over 16 px, 5 degrees of a panorama of 1300 columns, loses little.
 GRID_PX = 16
-DISPARITIES_PX = (8.0, 40.0)  # At scale 1: disparities at which the correction is exact. By judgement; not measured.
+DISPARITIES_PX = (8.0, 40.0)  # At scale 1: disparities at which the correction is exact.
 
 
 class CorrectedPixels(NamedTuple):

@@ -17,11 +17,10 @@ from omnid.core.odometry.motion_filter import START_VELOCITY_VARIANCE, MotionFil
 
 Array = NDArray[np.float64]
 
-# Steps over which means are taken, and no time, because their noise falls with their number. By judgement; not
-# measured.
+# Steps over which means are taken, and no time, because their noise falls with their number.
 MEMORY = 12.0
 MIN_STEPS = 4  # With fewer steps the filter's covariance is used, because their scatter is not known.
-LEAST_SIGMA = np.repeat([1e-3, 1e-3], 3)  # m/s, rad/s: of the mean. By judgement; not measured.
+LEAST_SIGMA = np.repeat([1e-3, 1e-3], 3)  # m/s, rad/s: of the mean.
 
 # After a start or a sudden turn, because nothing else is known then: the variance of the filter's own start.
 UNKNOWN_VELOCITY = RigVelocity(np.zeros(6), START_VELOCITY_VARIANCE * np.eye(6))

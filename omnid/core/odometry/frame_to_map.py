@@ -34,7 +34,7 @@ OUTLIER_SQUARED = 16.0
 # `struts` 5 at 384 px: in 99 % of the frames the last round ends within 0.02 sigmas of where 50 steps lead, and the
 # coarse one within 0.24.
 COARSE_STEPS, STEPS = (3,), (2, 4)
-# Share of the tracks that are inliers, below which the velocity may have been wrong. By judgement; not measured.
+# Share of the tracks that are inliers, below which the velocity may have been wrong.
 FEW_RATIO = 0.6
 # Refinements of a recognised pose, because the first one brings most patches into reach, the second one aligns them
 # all.
@@ -45,8 +45,7 @@ LIKELY_RATIO = 0.15  # share of them that a wrong hypothesis hardly reaches
 ENOUGH_RATIO = 0.5  # share of them, tracked, that ends the search; as in section IV.F
 # M and rad; a smaller step of the coarse pose is the last one, because it moves no track by 0.05 px.
 COARSE_CONVERGED = 1e-4
-# Standard deviation of a track whose patch was not yet warped to the new viewpoint. Measured: with 0.67 and 1.5 times
-# as much the odometry errs 0.95 to 1.09 times as much.
+# Standard deviation of a track whose patch was not yet warped to the new viewpoint.
 COARSE_SIGMA_PX = 0.3
 # Landmarks that count as one in the covariance: neighbours have texture, depth and keyframe in common, so that their
 # errors are correlated.

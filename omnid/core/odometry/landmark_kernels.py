@@ -13,7 +13,7 @@ from omnid.core.odometry.view_kernels import MIN_RADIUS_M, CameraNumbers, moved
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one. By judgement; not measured.
+CORRELATED_FRAMES = 4.0  # frames whose disparities of one landmark count as one.
 OUTLIER_SQUARED = 9.0  # squared distance (3 sigma) from which a disparity is not used, so that 0.3 % of right ones are
 
 

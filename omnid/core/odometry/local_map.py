@@ -25,7 +25,7 @@ Indices = NDArray[np.intp]
 COARSE_ITERATIONS = 8  # Iterations of Lucas-Kanade on each level, few because the patches are aligned afterwards.
 # Reach of the alignment, because a new landmark, whose depth is uncertain, may be off by more than a pixel.
 REACH_PX = 2
-# Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked. By judgement; not measured.
+# Px: a landmark predicted nearer to the panorama's upper or lower edge is not tracked.
 EDGE_ROWS = 3
 
 

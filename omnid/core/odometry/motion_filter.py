@@ -13,8 +13,8 @@ Array = NDArray[np.float64]
 # Spectral density of the jerk for translation and rotation, (m/s^3)^2/Hz and (rad/s^3)^2/Hz, of a wheeled robot.
 # Measured: with 0.67 and 1.5 times as much the odometry errs 0.98 to 1.01 times as much, but for one log at 1152 px
 JERK_PSD = (10.0, 40.0)
-START_VELOCITY_VARIANCE = 1.0  # (m/s)^2 and (rad/s)^2 of a motion that is not known yet. By judgement; not measured.
-START_ACCELERATION_VARIANCE = 4.0  # (m/s^2)^2 and (rad/s^2)^2. By judgement; not measured.
+START_VELOCITY_VARIANCE = 1.0  # (m/s)^2 and (rad/s)^2 of a motion that is not known yet.
+START_ACCELERATION_VARIANCE = 4.0  # (m/s^2)^2 and (rad/s^2)^2.
 MIN_VELOCITY_VARIANCE = 1e-10  # added to each measurement, so that its covariance can be inverted
 
 

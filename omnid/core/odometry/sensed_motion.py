@@ -12,7 +12,7 @@ from calib import se3
 
 Array = NDArray[np.float64]
 
-LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval. By judgement; not measured.
+LONGEST_GAP_S = 0.15  # Longest gap between samples, and before the end of an interval.
 MOST_SAMPLES = 512  # Samples that are kept, so that memory is bounded: two seconds of a sensor of 250 Hz.
 
 

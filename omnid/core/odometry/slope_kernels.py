@@ -25,7 +25,7 @@ UNKNOWNS = 5  # exact: shift along column and row, slopes along column and row, 
 SLOPE_SIGMA = 0.1
 # Enough: 59 fits of test_plane_patches.py take 3 to 5. A last step is below the errors: of slopes about 0.008.
 ITERATIONS, CONVERGED_PX, CONVERGED_SLOPE = 10, 0.005, 5e-4
-MAX_SHIFT_PX = 1.5  # Most distance from where the patch was found before. By judgement; not measured.
+MAX_SHIFT_PX = 1.5  # Most distance from where the patch was found before.
 DAMPING = 1e-3  # grey^2, of the shifts, so that patches without texture are not singular
 
 

@@ -22,13 +22,13 @@ Flags = NDArray[np.bool_]
 # Columns are compared only if the world should have moved by this angle, and by these pixels at half resolution: in a
 # small panorama the angle is one pixel, by which most of a view hardly changes.
 MIN_FLOW_RAD, MIN_FLOW_PX = 0.04, 2.0
-MOVED_RATIO = 0.5  # share of the columns that moved before a comparison is made. By judgement; not measured.
-USUAL_RANGE_M = 3.0  # range at which a translation is converted to an angle. By judgement; not measured.
+MOVED_RATIO = 0.5  # share of the columns that moved before a comparison is made.
+USUAL_RANGE_M = 3.0  # range at which a translation is converted to an angle.
 # Grey levels: largest difference that counts as unchanged. Measured: with 0.67 and 1.5 times as much the odometry errs
 # by 1.00 to 1.06 times as much.
 SAME_LEVEL = 6
 MIN_CONTRAST = 25  # grey levels within REACH_PX, because without contrast nothing can be seen to keep its place
-REACH_PX = 4  # at half resolution. By judgement; not measured.
+REACH_PX = 4  # at half resolution.
 EVIDENCE = 5  # consecutive comparisons, so many that chance repeats no pixel in all of them; each is of another view
 MAX_EVIDENCE = 4 * EVIDENCE  # Limit, so that a pixel that was wrongly taken for fixed is released after a few changes.
 

@@ -12,7 +12,7 @@ Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
 STEP_RAD = math.radians(18)  # the paper's step, Dang et al. 2012, section IV.F
-PEAKS = 3  # Peaks of the correlation that are tried. By judgement; not measured.
+PEAKS = 3  # Peaks of the correlation that are tried.
 # Two peaks are at least a 36th of a full turn apart: 10 degrees, because nearer ones would be two samples of one peak.
 PEAKS_APART = 36
 MAX_GRADIENT = 100.0  # grey levels, Sobel: stronger edges are cut, so that none dominates the correlation

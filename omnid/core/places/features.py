@@ -17,7 +17,7 @@ from omnid.core.places.place_features import PlaceFeatures
 
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
 CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds
-# Side of a feature, in baselines of the rig: disparity times this is its side in px. By judgement; not measured.
+# Side of a feature, in baselines of the rig: disparity times this is its side in px.
 PATCH_BASELINES: Final = 2.0
 LEAST_SIDE_PX: Final = 16.0  # at all scales, because it has one sample a pixel
 LARGEST_SIDE_PX: Final = 240.0  # at scale 1; by trial on development seeds

@@ -42,7 +42,7 @@ GATE_M, GATE_PER_M = 0.15, 0.05
 GATE_RAD, GATE_RAD_PER_M = math.radians(3), math.radians(0.4)  # The same of the heading; by trial on development seeds.
 # After so many contradictions in a row odometry has missed a motion, because right ones in worlds that repeat had 3.
 CONTRADICTIONS: Final = 10
-# A pose counts as localised up to this length of path after the last recognition. By judgement; not measured.
+# A pose counts as localised up to this length of path after the last recognition.
 RECENT_M: Final = 15.0
 
 

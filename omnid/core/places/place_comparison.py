@@ -26,11 +26,11 @@ FAR_INLIERS, FAR_SECTORS = 24, 5
 PER_PLACE, SAME_PLACE_M = 3, 1.5
 # Share of the inliers with which another place makes a recognition ambiguous; by trial on development seeds.
 RUNNER_UP: Final = 0.6
-# Poses farther apart are different places. By judgement; not measured.
+# Poses farther apart are different places.
 RUNNER_UP_M, RUNNER_UP_RAD = 0.5, math.radians(10)
-# Features of a frame that vote, evenly spread, the strongest ones first. By judgement; not measured.
+# Features of a frame that vote, evenly spread, the strongest ones first.
 VOTERS: Final = 64
-BINS: Final = 24  # Bins of the yaw angle; three neighbours count together. By judgement; not measured.
+BINS: Final = 24  # Bins of the yaw angle; three neighbours count together.
 
 
 def compare(

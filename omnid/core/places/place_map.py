@@ -16,7 +16,7 @@ from omnid.core.places.place_features import PlaceFeatures
 
 Array = NDArray[np.float64]
 
-# Most loops that a dropped keyframe leaves to its neighbour, the most certain ones. By judgement; not measured.
+# Most loops that a dropped keyframe leaves to its neighbour, the most certain ones.
 MOST_LOOPS = 4
 # Bytes of a keyframe without its large arrays, because poses, covariance and links take about so many.
 OVERHEAD_BYTES = 1500

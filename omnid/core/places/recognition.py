@@ -29,7 +29,7 @@ LARGEST_SQUARED: Final = 0.35 * 512**2
 # Squared Mahalanobis distance (4 sigma) from which a view is an outlier; so that 0.1 % of right ones are lost.
 OUTLIER_SQUARED: Final = 16.0
 CORRELATED: Final = 4.0  # features that count as one in the covariance; by trial on development seeds
-# m, rad: least standard deviations, however many features there are. By judgement; not measured.
+# m, rad: least standard deviations, however many features there are.
 FLOOR: Final = np.diag([0.004] * 3 + [0.0007] * 3) ** 2
 SECTORS: Final = 8  # Sectors of azimuth in which inliers are counted; of 45 degrees; by trial on development seeds.
 

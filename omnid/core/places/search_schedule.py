@@ -16,13 +16,13 @@ from omnid.core.places.place_map import PlaceKeyframe
 Array = NDArray[np.float64]
 
 # Odometry computes dense depth at its own keyframes. Where it makes none, the map waits for this multiple of the
-# distance between its keyframes before it asks for dense depth itself. By judgement; not measured.
+# distance between its keyframes before it asks for dense depth itself.
 WAIT_FACTOR: Final = 2.0
 # A recognition is checked in a frame that has moved by this amount; by trial on development seeds.
 CHECK_M, CHECK_RAD = 0.1, math.radians(8)
 SEARCH_NS: Final = 200_000_000  # At most five searches a second, so that most of the time is left to other stages.
 JITTER_NS: Final = 5_000_000  # Stamps vary, so a rate that divides that of the cameras is reached with this tolerance.
-# After this number of searches without success only new keyframes are searched for. By judgement; not measured.
+# After this number of searches without success only new keyframes are searched for.
 SEARCHES: Final = 10
 
 

@@ -14,7 +14,7 @@ from omnid.core.types.panorama import PaddedPanorama
 ROWS, COLUMNS = 16, 128  # 2 kB a keyframe, 2.8 degrees a column; by trial on development seeds
 # Columns, rows: window of the mean that is subtracted, because brightness changes with the light.
 SMOOTH: Final = (31, 5)
-LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare. By judgement; not measured.
+LEAST_CONTRAST: Final = 4.0  # grey levels: below it there is nothing to compare.
 THUMBNAIL_SCALE: Final = 30.0  # Root mean square of a thumbnail's values, so that hardly any exceeds a byte.
 
 Signature = NDArray[np.complex64]

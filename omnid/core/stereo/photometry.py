@@ -20,7 +20,7 @@ from omnid.core.stereo.tile_sums import TileSums
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
 
-TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought. By judgement; not measured.
+TARGET_LEVEL = 80.0  # grey levels: mean to which dimmer panoramas are brought.
 LEAST_CONTRAST_TO_NOISE = 1.0  # because below it there is more noise than scene
 NOTHING_BUT_NOISE = 0.5  # contrast to noise, because corners and patches are then those of noise
 LEAST_NOISE_GREY = 0.3  # Standard deviation of rounding: 1 / sqrt(12).
@@ -40,7 +40,7 @@ SMOOTHEST_PERCENT = 5.0
 NOISE_SCALE = 6.1
 BANDS, BAND_ROWS = 4, 24  # rows in which noise is measured: all would take milliseconds
 MIN_BLOCKS = 20  # With fewer visible blocks the noise is not known, because the smoothest of few have texture.
-UNKNOWN_NOISE = 1.0  # grey levels. By judgement; not measured.
+UNKNOWN_NOISE = 1.0  # grey levels.
 
 
 @dataclass(frozen=True, slots=True)

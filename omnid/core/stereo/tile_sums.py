@@ -17,12 +17,12 @@ Numbers = NDArray[np.int32]
 # Of a full turn; a sector has fewer. So many because 6 degrees, 15 columns of a panorama at scale 1 (512 px images),
 # are less than the narrowest part that matters.
 TILE_COLUMNS: Final = 60
-TILE_ROWS: Final = 4  # 63 rows at scale 1. By judgement; not measured.
+TILE_ROWS: Final = 4  # 63 rows at scale 1.
 # Rows and columns from one counted pixel to the next, because a quarter of the pixels is enough in a quarter of the
 # time, where a tile has LEAST_SAMPLES of them: a few may keep their greys by chance, as at 160 px.
 SPACING_PX: Final = 2
 LEAST_SAMPLES: Final = 100
-# Grey level from which a pixel is saturated. By judgement; not measured.
+# Grey level from which a pixel is saturated.
 SATURATED_GREY: Final = np.uint8(250)
 
 

@@ -32,7 +32,7 @@ Flags = NDArray[np.bool_]
 Side = Literal["lower", "upper"]
 SIDES: Final[tuple[Side, Side]] = ("lower", "upper")
 
-# Share of a tile that shows the world; tiles that show less are not judged. By judgement; not measured.
+# Share of a tile that shows the world; tiles that show less are not judged.
 JUDGED_SHARE: Final = 0.5
 IN_A_ROW: Final = 2  # pairs that find a tile dead or blurred before it counts, because one may be a glitch of a driver
 # Share of the judged tiles that must change before others are dead, because else the whole image is still.
@@ -49,7 +49,7 @@ TEXTURE_GREY: Final = 4.0  # standard deviation, because it is more than what su
 LIVELY_GAIN, LIVELY_SHARE = 0.1, 0.75
 BLACK_GREY: Final = 16.0  # black of limited-range video (source: ITU-R BT.601)
 DARK_CONTRAST: Final = 1.5  # standard deviation of a dark tile in those of the noise, because more is a dim scene
-SATURATED_SHARE: Final = 0.8  # of the pixels of a tile. By judgement; not measured.
+SATURATED_SHARE: Final = 0.8  # of the pixels of a tile.
 # A column is blurred if its energy by the other camera's is below this share of the usual, in BLURRED_COLUMNS columns,
 # because a poster that only one camera sees is all the texture of a column: 0.15 was left in rendered corridors. A drop
 # leaves less.
@@ -57,7 +57,7 @@ BLURRED_SHARE: Final = 0.1
 BLURRED_COLUMNS: Final = 3
 LEAST_ENERGY: Final = 2.0  # Energy of a column, in variances of the noise, because with less texture no blur is seen.
 COMPARED_COLUMNS: Final = 15  # Columns that must have this energy, because else a single poster decides what is usual.
-# A column's direction is unknown if a larger share of its judged tiles is blind. By judgement; not measured.
+# A column's direction is unknown if a larger share of its judged tiles is blind.
 BLIND_SHARE: Final = 0.5
 
 

@@ -40,12 +40,12 @@ EPSILON_PX = 3  # eq. (8): largest distance of a located point from the feature 
 THRESHOLD_M = 0.05  # largest 3-D error of a point of the consensus set, as in section IV.B
 # Points of the consensus set, below which the motion is refused, because three determine it and as many confirm it.
 MIN_INLIERS = 6
-# Share of a keyframe's largest consensus set, below which the current frame replaces it. By judgement; not measured.
+# Share of a keyframe's largest consensus set, below which the current frame replaces it.
 KEYFRAME_RATIO = 0.5
 # Spectral density of the jerk, (m/s^3)^2/Hz and (rad/s^3)^2/Hz. The turns of section IV.F change the yaw rate by
 # radians per second within 0.1 s; a filter that takes this for impossible would shorten the turn and overshoot.
 JERK_PSD = (10.0, 4000.0)
-# Standard deviation of the velocity while nothing is tracked, m/s and rad/s. By judgement; not measured.
+# Standard deviation of the velocity while nothing is tracked, m/s and rad/s.
 UNTRACKED_SPEED_SIGMA = 0.5
 
 
