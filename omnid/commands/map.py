@@ -178,7 +178,7 @@ def _exported(
     from omnid.core.places import place_views
     from omnid.formats.grid_map import write_grid
     from omnid.formats.place_file import read_places
-    from omnid.formats.plan_view import drawn_heights
+    from omnid.formats.plan import drawn_heights
     from omnid.formats.ply import write_ply
     from omnid.sinks.files import check_outputs, write_plan
     from omnid.stages.floor import ADVICE

@@ -10,7 +10,7 @@ import numpy as np
 
 from drivers.logs.mcap_info import LogState
 from omnid.errors import OmnidError
-from omnid.formats.plan_view import drawn_heights
+from omnid.formats.plan import drawn_heights
 from omnid.formats.tum import Trajectory
 from omnid.report import chart, health, plan, sections, setup, svg
 from omnid.report.chart import Clock

@@ -6,24 +6,13 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Final
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.navigation.requests import NavigationFrame, PathRequest, RouteAction, RouteRequest
-from omnid.formats.plan_sheet import (
-    BLACK,
-    LIGHT_GREY,
-    MARGIN_PX,
-    RED,
-    Sheet,
-    cells_image,
-    draw_frame,
-    draw_start,
-    with_legend,
-)
+from omnid.formats.plan import BLACK, LIGHT_GREY, RED, Lines, Sheet, draw_ends, draw_plan, with_legend
 from omnid.messages import NavigationUpdate, ObstacleRing, PlaceUpdate
 from omnid.navigation_state import NavigationState
 from omnid.simulation.clearance import footprints
@@ -152,17 +141,11 @@ def draw(world: World, obstacles: Array, first: Array, second: Array) -> NDArray
     segments = footprints(world.standing, 1.2)
     corners = segments.reshape(-1, 2)
     sheet = Sheet(corners.min(axis=0) - BORDER_M, corners.max(axis=0) + BORDER_M, PX_PER_M)
-    area = cells_image(sheet, obstacles, np.ones(len(obstacles), np.float32))
-    image = np.pad(area, ((MARGIN_PX, MARGIN_PX), (MARGIN_PX, MARGIN_PX), (0, 0)), constant_values=255)
-    for segment in segments:
-        cv2.polylines(image, [sheet.pixels(segment)], False, LIGHT_GREY, WALL_PX, cv2.LINE_AA)
-    draw_frame(image, sheet)
-    for path, (_, colour, width_px) in zip((first, second), LINES, strict=True):
-        if len(path):
-            cv2.polylines(image, [sheet.pixels(path)], False, colour, width_px, cv2.LINE_AA)
+    lines = [Lines(list(segments), LIGHT_GREY, WALL_PX)]
+    lines += [Lines([path], colour, width) for path, (_, colour, width) in zip((first, second), LINES, strict=True)]
+    image = draw_plan(sheet, obstacles, np.ones(len(obstacles), np.float32), lines)
     if len(first):
-        x, y = sheet.pixels(first[:1])[0]
-        draw_start(image, (int(x), int(y)))
+        draw_ends(image, sheet, first[0])
     return with_legend(image, (*LINES, ("seen obstacles", SEEN, SEEN_PX), ("walls and boxes", LIGHT_GREY, WALL_PX)))
 
 

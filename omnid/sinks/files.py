@@ -18,7 +18,7 @@ from drivers.logs.image_folder import IMAGE_SUFFIXES
 from drivers.logs.log_formats import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
-from omnid.formats.plan_view import NO_LOOPS, drawn_heights, plan_view
+from omnid.formats.plan import NO_LOOPS, drawn_heights, plan_view
 from omnid.formats.ply import write_ply
 from omnid.formats.tum import tum_row
 from omnid.formats.whole_file import write_whole

@@ -12,7 +12,7 @@ import pytest
 from omnid.controller.statistics import ControllerState
 from omnid.core.navigation.path import drive_path
 from omnid.core.navigation.requests import PathRequest, RouteAction, RouteRequest
-from omnid.formats.plan_sheet import MARGIN_PX
+from omnid.formats.plan import MARGIN_PX
 from omnid.messages import NavigationUpdate, PlaceUpdate, RequestAnswer
 from omnid.navigation_state import NavigationState
 from omnid.simulation.demonstration import PX_PER_M, RECOGNISED_S, TeachAndRepeat, cross_track_m, draw, oval
