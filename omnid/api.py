@@ -21,8 +21,7 @@ from calib.rig import Rig
 from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
-from omnid.config import Config, load_config
-from omnid.config_use import unused_settings
+from omnid.config import Config, load_config, unused_settings
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.threads import Lock
@@ -30,8 +29,7 @@ from omnid.errors import OmnidError
 from omnid.messages import DensePoints, FramePair, OdometryUpdate
 from omnid.runs.replay import ReplayOptions, run_log
 from omnid.runs.run_result import RunResult
-from omnid.settings import parse
-from omnid.settings_dump import dump
+from omnid.settings import dump, parse
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
 from omnid.stages.repeated_images import RepeatedImages

@@ -3,48 +3,53 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Annotated, Literal
 
-from drivers.cameras.v4l2_settings import EXPOSURE_MODES, PIXEL_FORMATS, POWER_LINE, SWITCH, V4l2Settings
+from msgspec import Meta
+
+from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-from omnid.settings import knob
 
 
 @dataclass(frozen=True, slots=True)
 class CamerasConfig:
     """Devices and settings of the cameras; both have the same settings."""
 
-    rig: str = knob("/etc/omnid/rig.toml", "calibration of the cameras, see `omnid calibrate`")
-    lower: str = knob("/dev/omnid/lower", "device of the lower camera, by a persistent name, see `omnid cameras`")
-    upper: str = knob("/dev/omnid/upper", "device of the upper camera")
-    width_px: int = knob(1280, "width of the images, px", low=16, high=16384)
-    height_px: int = knob(960, "height of the images, px", low=16, high=16384)
-    rate_hz: float = knob(30.0, "images per second; 0: the camera's own rate", low=0, high=1000)
-    pixel_format: str = knob("auto", "pixel format of the images on USB", choices=PIXEL_FORMATS)
-    auto_exposure: str = knob(
-        "rig",
+    rig: Annotated[str, "calibration of the cameras, see `omnid calibrate`"] = "/etc/omnid/rig.toml"
+    lower: Annotated[str, "device of the lower camera, by a persistent name, see `omnid cameras`"] = "/dev/omnid/lower"
+    upper: Annotated[str, "device of the upper camera"] = "/dev/omnid/upper"
+    width_px: Annotated[int, Meta(ge=16, le=16384), "width of the images, px"] = 1280
+    height_px: Annotated[int, Meta(ge=16, le=16384), "height of the images, px"] = 960
+    rate_hz: Annotated[float, Meta(ge=0, le=1000), "images per second; 0: the camera's own rate"] = 30.0
+    pixel_format: Annotated[
+        Literal["auto", "GREY", "NV12", "YUYV", "UYVY", "MJPG", "JPEG"], "pixel format of the images on USB"
+    ] = "auto"
+    auto_exposure: Annotated[
+        Literal["keep", "on", "off", "rig"],
         "automatic exposure; 'rig': omnid run sets exposure and gain of both cameras "
         "alike, by what the mirrors show without the black corners; where they cannot be set, "
         "and in other commands, as 'on'; 'on': each camera's own; 'keep': as it is",
-        choices=EXPOSURE_MODES,
-    )
-    exposure_limit_ms: float = knob(
-        20.0,
+    ] = "rig"
+    exposure_limit_ms: Annotated[
+        float,
+        Meta(ge=0.1, le=1000),
         "longest exposure of 'rig', ms, and at most 90 % of the images' period; "
         "1 ms blurs by 0.16 px in a turn of 45 deg/s (panorama of 1300 columns)",
-        low=0.1,
-        high=1000,
-    )
-    exposure_us: int = knob(0, "fixed exposure, us; 0: not fixed", low=0, high=10_000_000)
-    auto_gain: str = knob("keep", "automatic gain", choices=SWITCH)
-    gain: int = knob(-1, "fixed gain in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
-    auto_white_balance: str = knob("keep", "automatic white balance", choices=SWITCH)
-    auto_focus: str = knob("keep", "automatic focus; best off: each focus has another calibration", choices=SWITCH)
-    focus: int = knob(-1, "fixed focus in the camera's own units; -1: not fixed", low=-1, high=2**31 - 1)
-    power_line: str = knob("keep", "mains frequency against the flicker of lamps, Hz", choices=POWER_LINE)
-    controls: tuple[str, ...] = knob((), "other controls by their names in v4l2-ctl --list-ctrls: 'sharpness=2'")
-    buffers: int = knob(4, "image buffers of the kernel", low=2, high=32)
-    timeout_s: float = knob(2.0, "a camera without an image for so long is opened again, s", low=0.05, high=60)
-    retry_s: float = knob(2.0, "longest wait between two tries to open a lost camera, s", low=0.05, high=60)
+    ] = 20.0
+    exposure_us: Annotated[int, Meta(ge=0, le=10_000_000), "fixed exposure, us; 0: not fixed"] = 0
+    auto_gain: Annotated[Literal["keep", "on", "off"], "automatic gain"] = "keep"
+    gain: Annotated[int, Meta(ge=-1, le=2**31 - 1), "fixed gain in the camera's own units; -1: not fixed"] = -1
+    power_line: Annotated[
+        Literal["keep", "off", "50", "60", "auto"], "mains frequency against the flicker of lamps, Hz"
+    ] = "keep"
+    controls: Annotated[
+        tuple[str, ...],
+        "other controls by their names in v4l2-ctl --list-ctrls; best with a fixed focus, as each one has another "
+        "calibration: 'focus_automatic_continuous=0', 'focus_absolute=20'",
+    ] = ()
+    buffers: Annotated[int, Meta(ge=2, le=32), "image buffers of the kernel"] = 4
+    timeout_s: Annotated[float, Meta(ge=0.05, le=60), "a camera without an image for so long is opened again, s"] = 2.0
+    retry_s: Annotated[float, Meta(ge=0.05, le=60), "longest wait between two tries to open a lost camera, s"] = 2.0
 
     def settings(self, camera: str) -> V4l2Settings:
         """Return the settings of the lower or the upper camera; DriverError if they contradict each other."""
@@ -63,34 +68,30 @@ class CamerasConfig:
 class PairConfig:
     """Synchronisation of the cameras."""
 
-    tolerance_ms: float = knob(
-        0.0,
+    tolerance_ms: Annotated[
+        float,
+        Meta(ge=0, le=1000),
         "largest difference between the stamps of a pair, ms; 0: half the period of the "
         "images, so that cameras may run freely",
-        low=0,
-        high=1000,
-    )
-    repeated_images: str = knob(
-        "drop",
+    ] = 0.0
+    repeated_images: Annotated[
+        Literal["drop", "use"],
         "images with all pixels as before, which a frozen camera delivers; 'use' only for simulators without noise",
-        choices=("drop", "use"),
-    )
+    ] = "drop"
 
 
 @dataclass(frozen=True, slots=True)
 class TimingConfig:
     """Times of exposure relative to the stamps; 0: as the rig's file says, see `omnid calibrate drive`."""
 
-    line_time_us: float = knob(
-        0.0,
+    line_time_us: Annotated[
+        float,
+        Meta(ge=0, le=1000),
         "rolling shutter: time from the exposure of an image row to that of the next, us; "
         "the stamp is that of the first row; 0: as in the rig's file, or global",
-        low=0,
-        high=1000,
-    )
-    upper_delay_ms: float = knob(
-        0.0,
+    ] = 0.0
+    upper_delay_ms: Annotated[
+        float,
+        Meta(ge=-1000, le=1000),
         "time by which the upper camera's exposure is later than the stamps say, ms; 0: as in the rig's file",
-        low=-1000,
-        high=1000,
-    )
+    ] = 0.0

@@ -69,7 +69,7 @@ COMMANDS: Final[Mapping[str, Entry]] = MappingProxyType(
         "map show": Entry("map:show", "keyframes, sessions, loops, size, and the rig that made the map; plan and grid"),
         "map export": Entry("map:export", "write a map for other programs"),
         "map save": Entry("map:save", "ask a robot to save its map now, before it is switched off"),
-        "doctor": Entry("doctor", "check cameras, USB, motor, rig, clock, rights, bus and disk"),
+        "doctor": Entry("doctor", "check cameras, motor, rig, clock, rights, bus and disk"),
         "motor test": Entry("motor", "turn each wheel, ask what moved, print the settings for that"),
         "config": Entry("config", "print or check settings"),
         "install-service": Entry("install_service", "install omnid as a systemd service"),

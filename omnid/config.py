@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Final
+from types import MappingProxyType
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
 
 from drivers.logs.log_folder import RotationSettings
 from omnid.camera_config import CamerasConfig, PairConfig, TimingConfig
@@ -19,7 +22,8 @@ from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.limits import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
-from omnid.settings import knob, load
+from omnid.errors import OmnidError
+from omnid.settings import changed, load
 from omnid.transport.bus_config import BusConfig
 
 
@@ -27,53 +31,61 @@ from omnid.transport.bus_config import BusConfig
 class LogConfig:
     """Reading of logs."""
 
-    reorder_frames: int = knob(32, "images sorted by their stamps: how late one may be in the log", low=1, high=1000)
+    reorder_frames: Annotated[
+        int, Meta(ge=1, le=1000), "images sorted by their stamps: how late one may be in the log"
+    ] = 32
 
 
 @dataclass(frozen=True, slots=True)
 class LiveConfig:
     """Reports of `omnid run`."""
 
-    status_s: float = knob(1.0, "period of the status, s", low=0.1, high=60)
-    cloud_s: float = knob(2.0, "period of the maps on the bus, s; 0: only at the end", low=0, high=3600)
-    cloud_points: int = knob(
-        50_000, "largest number of map points on the bus: the most confident ones", low=0, high=10_000_000
-    )
-    shed_load: bool = knob(True, "give up the map, then half the landmarks, while the computer is too slow")
+    status_s: Annotated[float, Meta(ge=0.1, le=60), "period of the status, s"] = 1.0
+    cloud_s: Annotated[float, Meta(ge=0, le=3600), "period of the maps on the bus, s; 0: only at the end"] = 2.0
+    cloud_points: Annotated[
+        int, Meta(ge=0, le=10_000_000), "largest number of map points on the bus: the most confident ones"
+    ] = 50_000
+    shed_load: Annotated[bool, "give up the map, then half the landmarks, while the computer is too slow"] = True
 
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
     """Is the rig right? Checks of the images against it."""
 
-    check: str = knob(
-        "refuse",
+    check: Annotated[
+        Literal["refuse", "warn", "off"],
         "if the first images contradict the rig: end with an error, warn only, or do not check",
-        choices=("refuse", "warn", "off"),
-    )
-    check_s: float = knob(
-        5.0, "time between two views that a live run compares with the rig, s; 0: none", low=0, high=3600
-    )
+    ] = "refuse"
+    check_s: Annotated[
+        float, Meta(ge=0, le=3600), "time between two views that a live run compares with the rig, s; 0: none"
+    ] = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class PanoramaConfig:
     """Size and borders of the panoramas."""
 
-    width_px: int = knob(0, "columns of a full turn, px; 0: the images' own resolution", low=0, high=65536)
-    scale: float = knob(1.0, "where width_px is 0: columns as a share of the images' own resolution", low=0.25, high=1)
-    elevation_deg: tuple[float, float] = knob((-50.0, 40.0), "lowest and highest elevation, deg", low=-80, high=80)
-    pad_px: int = knob(48, "columns more on either side, so that windows run across the seam", low=16, high=256)
-    rim_margin_px: float = knob(4.0, "margin along rim and hub in the images, px", low=0, high=100)
-    margin_px: int = knob(7, "margin along the border of the common view of both cameras, px", low=0, high=100)
+    width_px: Annotated[int, Meta(ge=0, le=65536), "columns of a full turn, px; 0: the images' own resolution"] = 0
+    scale: Annotated[
+        float, Meta(ge=0.25, le=1), "where width_px is 0: columns as a share of the images' own resolution"
+    ] = 1.0
+    elevation_deg: Annotated[
+        tuple[Annotated[float, Meta(ge=-80, le=80)], Annotated[float, Meta(ge=-80, le=80)]],
+        "lowest and highest elevation, deg",
+    ] = (-50.0, 40.0)
+    pad_px: Annotated[int, Meta(ge=16, le=256), "columns more on either side, so that windows run across the seam"] = 48
+    rim_margin_px: Annotated[float, Meta(ge=0, le=100), "margin along rim and hub in the images, px"] = 4.0
+    margin_px: Annotated[int, Meta(ge=0, le=100), "margin along the border of the common view of both cameras, px"] = 7
 
 
 @dataclass(frozen=True, slots=True)
 class StereoConfig:
     """Depth by matching along the columns of the panoramas."""
 
-    min_range_m: float = knob(0.65, "distance of the nearest points from the rig's axis, m", low=0.01, high=100)
-    noise_px: float = knob(0.5, "sigma of a disparity, px: sets the weight of a point in the map", low=0.01, high=10)
+    min_range_m: Annotated[float, Meta(ge=0.01, le=100), "distance of the nearest points from the rig's axis, m"] = 0.65
+    noise_px: Annotated[
+        float, Meta(ge=0.01, le=10), "sigma of a disparity, px: sets the weight of a point in the map"
+    ] = 0.5
     matching: MatchingSettings = field(default_factory=MatchingSettings)
 
 
@@ -81,10 +93,10 @@ class StereoConfig:
 class OdometryConfig:
     """Visual odometry."""
 
-    method: str = knob("default", "method of the odometry", choices=("default", "paper"))
-    tracker: str = knob("improved", "feature tracker of the paper's method", choices=("improved", "klt"))
-    reference: str = knob("previous", "reference frame of the paper's method", choices=("previous", "keyframe"))
-    noise_px: float = knob(0.1, "sigma of a tracked corner, px", low=0.01, high=10)
+    method: Annotated[Literal["default", "paper"], "method of the odometry"] = "default"
+    tracker: Annotated[Literal["improved", "klt"], "feature tracker of the paper's method"] = "improved"
+    reference: Annotated[Literal["previous", "keyframe"], "reference frame of the paper's method"] = "previous"
+    noise_px: Annotated[float, Meta(ge=0.01, le=10), "sigma of a tracked corner, px"] = 0.1
     klt: KltSettings = field(default_factory=KltSettings)
     limits: OdometryLimits = field(default_factory=OdometryLimits)
 
@@ -93,15 +105,15 @@ class OdometryConfig:
 class PlacesConfig:
     """Recognition of places: loops, and the pose in the map."""
 
-    enabled: bool = knob(True, "recognise places and correct the pose in the map; off: it is that of odometry")
-    map: str = knob(
-        "",
+    enabled: Annotated[bool, "recognise places and correct the pose in the map; off: it is that of odometry"] = True
+    map: Annotated[
+        str,
         "map of places (.omap) to localise in; a run that recognises it extends it, and makes it where there is none",
-    )
-    localize_only: bool = knob(False, "leave the map as it is: do not extend the file, do not move its keyframes")
-    save_s: float = knob(
-        60.0, "time between two saves of the extended map, s; it is also saved at the end", low=1, high=86400
-    )
+    ] = ""
+    localize_only: Annotated[bool, "leave the map as it is: do not extend the file, do not move its keyframes"] = False
+    save_s: Annotated[
+        float, Meta(ge=1, le=86400), "time between two saves of the extended map, s; it is also saved at the end"
+    ] = 60.0
     limits: PlaceLimits = field(default_factory=PlaceLimits)
 
 
@@ -109,33 +121,31 @@ class PlacesConfig:
 class MappingConfig:
     """Voxel map of the whole run."""
 
-    rate_hz: float = knob(
-        5.0,
+    rate_hz: Annotated[
+        float,
+        Meta(ge=0, le=1000),
         "pairs a second that enter the map, each with dense stereo; 0: all; "
         "keyframes only while no client receives and no log records the cloud of a live run",
-        low=0,
-        high=1000,
-    )
-    voxel_m: float = knob(0.05, "edge of a voxel, m", low=0.001, high=10)
-    log2_voxels: int = knob(18, "the map holds up to 0.7 * 2^n voxels of 52 bytes", low=10, high=24)
-    max_sigma_m: float = knob(0.15, "largest sigma of a point that enters the map, m", low=0.001, high=100)
-    min_frames: int = knob(
-        6, "frames that must have observed a voxel that is written; fewer in a short run", low=1, high=1000
-    )
-    path_poses: int = knob(
-        10_000,
+    ] = 5.0
+    voxel_m: Annotated[float, Meta(ge=0.001, le=10), "edge of a voxel, m"] = 0.05
+    log2_voxels: Annotated[int, Meta(ge=10, le=24), "the map holds up to 0.7 * 2^n voxels of 52 bytes"] = 18
+    max_sigma_m: Annotated[float, Meta(ge=0.001, le=100), "largest sigma of a point that enters the map, m"] = 0.15
+    min_frames: Annotated[
+        int, Meta(ge=1, le=1000), "frames that must have observed a voxel that is written; fewer in a short run"
+    ] = 6
+    path_poses: Annotated[
+        int,
+        Meta(ge=100, le=10_000_000),
         "vertices of the path in the plan view; when full, every second one is dropped",
-        low=100,
-        high=10_000_000,
-    )
+    ] = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class ObstaclesConfig:
     """Ring of the nearest obstacles around the base, published as scan."""
 
-    enabled: bool = knob(True, "find obstacles; off: nothing keeps the base from driving against them")
-    rate_hz: float = knob(10.0, "rings a second at most; 0: one for each pair", low=0, high=100)
+    enabled: Annotated[bool, "find obstacles; off: nothing keeps the base from driving against them"] = True
+    rate_hz: Annotated[float, Meta(ge=0, le=100), "rings a second at most; 0: one for each pair"] = 10.0
     ring: RingSettings = field(default_factory=RingSettings)
 
 
@@ -143,20 +153,26 @@ class ObstaclesConfig:
 class RecordConfig:
     """Recordings of `omnid run`, `omnid record` and `omnid replay --record`."""
 
-    enabled: bool = knob(False, "omnid run records images and results")
-    folder: str = knob("recordings", "folder of the recordings; it is made if it is missing")
-    file_mb: int = knob(500, "size at which a new file begins, MB", low=1, high=1_000_000)
-    file_s: float = knob(600.0, "duration at which a new file begins, s", low=1, high=86_400)
-    keep_files: int = knob(1000, "number of files kept; the oldest are deleted", low=1, high=100_000)
-    keep_mb: int = knob(20_000, "total size of all files, MB; the oldest are deleted", low=2, high=1_000_000_000)
-    free_mb: int = knob(1000, "free space left on the disk, MB; with less nothing is recorded", low=0, high=1_000_000)
-    sync_s: float = knob(
-        3.0, "period of syncing the files to the disk, s: a power cut loses no more", low=0.1, high=3600
+    enabled: Annotated[bool, "omnid run records images and results"] = False
+    folder: Annotated[str, "folder of the recordings; it is made if it is missing"] = "recordings"
+    file_mb: Annotated[int, Meta(ge=1, le=1_000_000), "size at which a new file begins, MB"] = 500
+    file_s: Annotated[float, Meta(ge=1, le=86_400), "duration at which a new file begins, s"] = 600.0
+    keep_files: Annotated[int, Meta(ge=1, le=100_000), "number of files kept; the oldest are deleted"] = 1000
+    keep_mb: Annotated[int, Meta(ge=2, le=1_000_000_000), "total size of all files, MB; the oldest are deleted"] = (
+        20_000
     )
-    queue: int = knob(20, "messages of each kind that may wait for the disk; more drop the oldest", low=1, high=1000)
-    cloud_points: int = knob(
-        200_000, "largest number of map points in the log: the most confident ones", low=0, high=10_000_000
-    )
+    free_mb: Annotated[
+        int, Meta(ge=0, le=1_000_000), "free space left on the disk, MB; with less nothing is recorded"
+    ] = 1000
+    sync_s: Annotated[
+        float, Meta(ge=0.1, le=3600), "period of syncing the files to the disk, s: a power cut loses no more"
+    ] = 3.0
+    queue: Annotated[
+        int, Meta(ge=1, le=1000), "messages of each kind that may wait for the disk; more drop the oldest"
+    ] = 20
+    cloud_points: Annotated[
+        int, Meta(ge=0, le=10_000_000), "largest number of map points in the log: the most confident ones"
+    ] = 200_000
 
     def rotation(self) -> RotationSettings:
         """Return these settings in the units of the driver."""
@@ -169,17 +185,17 @@ class RecordConfig:
 class GraphConfig:
     """Inboxes and threads of the stages."""
 
-    depth: int = knob(2, "messages that may wait in front of a stage", low=1, high=100)
-    opencv_threads: int = knob(1, "threads OpenCV may use within a stage", low=1, high=64)
+    depth: Annotated[int, Meta(ge=1, le=100), "messages that may wait in front of a stage"] = 2
+    opencv_threads: Annotated[int, Meta(ge=1, le=64), "threads OpenCV may use within a stage"] = 1
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceConfig:
     """Supervision by systemd."""
 
-    stall_timeout_s: float = knob(
-        10.0, "systemd restarts the daemon if a stage works on one message for longer, s", low=0.5, high=600
-    )
+    stall_timeout_s: Annotated[
+        float, Meta(ge=0.5, le=600), "systemd restarts the daemon if a stage works on one message for longer, s"
+    ] = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,21 +244,73 @@ def load_config(path: str | PathLike[str] | None = None, overrides: Sequence[str
     return load(Config, path, overrides)
 
 
-# The settings that a new robot needs, in `omnid config --minimal`.
+# Keys and sections that only one of `omnid run` and `omnid replay` uses; the longest path counts. "": both use it.
+USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "bus.panorama_hz": "run",
+        "cameras": "run",
+        "controller.arming": "run",
+        "controller.setpoint": "replay",
+        "controller.sources": "run",
+        "graph.depth": "replay",
+        "live": "run",
+        "log": "replay",
+        "places.save_s": "run",
+        "navigation": "run",
+        "realtime": "run",
+        "record": "run",
+        "record.cloud_points": "",
+        "rig": "run",
+        "rig.check": "",
+        "service": "run",
+    }
+)
+
+
+def unused_settings(config: Config, command: str, overrides: Sequence[str]) -> list[str]:
+    """Return the warning, if there is one, that a command ignores settings of the configuration file.
+
+    command: run or replay. Raises OmnidError for an override that the command ignores, and for a setpoint in `run`:
+    a robot must not be expected to drive by itself.
+    """
+    for override in overrides:
+        path = ".".join(part.strip() for part in override.partition("=")[0].split("."))
+        if _ignores(command, path):
+            raise OmnidError(f"override {override!r}: `omnid {command}` does not use {path}: leave it out")
+    ignored = [path for path in changed(config) if _ignores(command, path)]
+    if command == "run":
+        for path in ignored:
+            if path.startswith("controller.setpoint."):
+                raise OmnidError(
+                    f"{path} is set, but `omnid run` drives by the setpoints that it receives, as "
+                    "cmd/twist or cmd/heading: remove it from the configuration"
+                )
+    return [f"`omnid {command}` does not use these settings: {', '.join(ignored)}"] if ignored else []
+
+
+def _ignores(command: str, path: str) -> bool:
+    """True if only the other command uses the key."""
+    parts = path.split(".")
+    for depth in range(len(parts), 0, -1):
+        only = USED_ONLY_BY.get(".".join(parts[:depth]))
+        if only is not None:
+            return only not in ("", command)
+    return False
+
+
+# The settings that a new robot may need, in `omnid config --minimal`.
 FIRST_SETTINGS: Final = (
-    "cameras.rig",
-    "cameras.lower",
-    "cameras.upper",
-    "cameras.width_px",
-    "cameras.height_px",
-    "cameras.rate_hz",
-    "controller.limits.velocity_mps",
+    *(f"cameras.{key}" for key in ("rig", "lower", "upper", "width_px", "height_px", "rate_hz", "auto_exposure")),
+    "panorama.scale",
+    "places.map",
+    *(f"controller.deadlines.{key}" for key in ("pose_s", "command_s")),
+    *(f"controller.limits.{key}" for key in ("velocity_mps", "acceleration_mps2", "deceleration_mps2")),
     "controller.limits.yaw_rate_radps",
-    "motor.port",
-    "motor.protocol",
-    "motor.drive.track_m",
-    "bus.robot",
-    "bus.listen",
-    "record.enabled",
-    "record.folder",
+    "controller.arming",
+    *(f"controller.collision.{key}" for key in ("front_m", "rear_m", "half_width_m", "stop_m", "unknown")),
+    *(f"navigation.{key}" for key in ("goal_cm", "goal_deg", "clearance_m", "routes", "pursuit.velocity_mps")),
+    *(f"motor.{key}" for key in ("port", "protocol", "baud", "watchdog_ms")),
+    *(f"motor.drive.{key}" for key in ("track_m", "wheel_radius_m", "max_wheel_mps", "gear")),
+    *(f"bus.{key}" for key in ("robot", "listen", "connect", "ros2")),
+    *(f"record.{key}" for key in ("enabled", "folder", "keep_mb", "free_mb")),
 )

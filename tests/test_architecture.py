@@ -25,12 +25,11 @@ TIERS: Mapping[str, str] = {
     "geometry": "calib",
     "hardware and logs": "drivers",
     "settings and states": "omnid.errors omnid.version omnid.load_level omnid.navigation_state omnid.tracking_state "
-    "omnid.settings omnid.settings_file omnid.settings_keys omnid.settings_migration omnid.settings_dump omnid.sample "
+    "omnid.settings omnid.sample "
     "omnid.plain_text omnid.utc",
     "numerics": "omnid.core",
     "threads, queues, the controller process": "omnid.engine omnid.controller",
-    "messages, formats, bus": "omnid.messages omnid.camera_config omnid.config omnid.config_use omnid.formats "
-    "omnid.transport",
+    "messages, formats, bus": "omnid.messages omnid.camera_config omnid.config omnid.formats omnid.transport",
     "parts of a run": "omnid.stages omnid.recordings omnid.service",
     "what watches and writes a run": "omnid.diagnostics omnid.sinks omnid.light omnid.report omnid.calibration",
     "runs and clients": "omnid.runs omnid.simulation omnid.client omnid.monitor omnid.doctor",

@@ -1,11 +1,64 @@
-"""State and counters of a camera."""
+"""State and counters of a camera, and its exposure where a program sets it: ranges, wish and values in force."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.cameras.camera_exposure import CameraExposure
+
+@dataclass(frozen=True, slots=True)
+class ValueRange:
+    """Range of a control in its own units."""
+
+    low: int
+    high: int
+    step: int = 1
+
+    def nearest(self, value: float) -> int:
+        """Return the nearest value that the control accepts."""
+        steps = round((min(max(value, self.low), self.high) - self.low) / max(1, self.step))
+        return min(self.low + steps * max(1, self.step), self.high)
+
+    def common(self, other: ValueRange) -> ValueRange:
+        """Return the range of values that both controls accept, for controls of one model of camera."""
+        return ValueRange(max(self.low, other.low), min(self.high, other.high), max(self.step, other.step))
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureRanges:
+    """Ranges of the exposure time and of the gain."""
+
+    exposure_us: ValueRange
+    gain: ValueRange | None = None  # in the camera's own units; None: not to be set
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureSetting:
+    """Exposure time and gain."""
+
+    exposure_us: int
+    gain: int | None = None  # None: as it is
+
+
+@dataclass(frozen=True, slots=True)
+class ExposureRequest:
+    """A setting that the camera shall have from the first image with a stamp after after_ns on."""
+
+    setting: ExposureSetting | None  # None: the camera's own automatic exposure again
+    after_ns: int
+
+
+@dataclass(slots=True)
+class CameraExposure:
+    """The exposure of a camera that offers to set it.
+
+    One thread writes `request`; the capturing thread carries it out and writes the rest. Any thread may read a field.
+    """
+
+    ranges: ExposureRanges
+    request: ExposureRequest | None = None  # the newest; None: none yet
+    in_force: ExposureSetting | None = None  # None: unknown
+    problem: str = ""  # reason for which the device refused a request; no more are carried out until it is opened again
 
 
 @dataclass(slots=True)

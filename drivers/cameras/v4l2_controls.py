@@ -1,113 +1,156 @@
-"""The controls of a camera: list them, plan which to set, set them and verify them."""
+"""The controls of a camera: planned and verified when it is opened, and its exposure, which a run sets by requests."""
 
 from __future__ import annotations
 
 import errno
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass
 from typing import Final
 
 from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.camera_state import (
+    CameraExposure,
+    ExposureRanges,
+    ExposureRequest,
+    ExposureSetting,
+    ValueRange,
+)
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
-
-_MAX_CONTROLS: Final = 512  # bounds the enumeration of a faulty driver
-_MAX_MENU: Final = 64
-_KINDS: Final = (v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, v4l2.CONTROL_MENU, v4l2.CONTROL_INTEGER_MENU)
 
 # linux/v4l2-controls.h: V4L2_CID_*
 GAIN: Final = 0x00980913
 AUTO_GAIN: Final = 0x00980912
-AUTO_WHITE_BALANCE: Final = 0x0098090C
 POWER_LINE_FREQUENCY: Final = 0x00980918
 AUTO_EXPOSURE: Final = 0x009A0901
 EXPOSURE: Final = 0x009A0902
 EXPOSURE_MAY_SLOW: Final = 0x009A0903  # V4L2_CID_EXPOSURE_AUTO_PRIORITY: automatic exposure may lower the rate
-FOCUS: Final = 0x009A090A
-AUTO_FOCUS: Final = 0x009A090C
-EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
-MANUAL_EXPOSURE: Final = 1  # enum v4l2_exposure_auto_type, with the next two
-_APERTURE_PRIORITY, _AUTO = 3, 0
-_POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
-_MENU_VALUE: Final = slice(8, 16)  # bytes of struct v4l2_querymenu: a 64-bit integer in the place of the name
 _NAMES: Final = {
     GAIN: "gain",
     AUTO_GAIN: "automatic gain",
-    AUTO_WHITE_BALANCE: "automatic white balance",
     POWER_LINE_FREQUENCY: "power line frequency",
     AUTO_EXPOSURE: "automatic exposure",
     EXPOSURE: "exposure time",
-    FOCUS: "focus",
-    AUTO_FOCUS: "automatic focus",
 }
+EXPOSURE_UNIT_US: Final = 100  # unit of V4L2_CID_EXPOSURE_ABSOLUTE
+AUTOMATIC, MANUAL_EXPOSURE, APERTURE_PRIORITY = 0, 1, 3  # enum v4l2_exposure_auto_type
+_POWER_LINE: Final = {"off": 0, "50": 1, "60": 2, "auto": 3}  # enum v4l2_power_line_frequency
+_MAX_CONTROLS: Final = 512  # bounds the enumeration of a faulty driver
+_MAX_MENU: Final = 64
+_MENUS: Final = (v4l2.CONTROL_MENU, v4l2.CONTROL_INTEGER_MENU)
+_LOST: Final = (errno.ENODEV, errno.EBUSY)  # the camera is opened again, with its settings and its request
 
 
 @dataclass(frozen=True, slots=True)
 class CameraControl:
-    """One control of a device, with its range."""
+    """One control of a device, with the values that it accepts."""
 
     id: int
     name: str  # the driver's, as `v4l2-ctl --list-ctrls` writes it: gain, exposure_time_absolute
-    kind: int  # CONTROL_INTEGER, CONTROL_BOOLEAN, CONTROL_MENU or CONTROL_INTEGER_MENU
-    low: int
-    high: int
-    step: int = 1
-    menu: Mapping[int, str] = field(default_factory=dict)  # value -> name
+    range: ValueRange
+    menu: tuple[int, ...] = ()  # of a menu: the values that it offers
 
     def accepts(self, value: int) -> bool:
-        """True if the value is in range."""
-        if self.menu:
-            return value in self.menu
-        return self.low <= value <= self.high and (value - self.low) % max(1, self.step) == 0
+        """True if the control has this value."""
+        return value in self.menu if self.menu else self.range.nearest(value) == value
 
     @property
-    def range(self) -> str:
-        """The range as text."""
+    def accepted(self) -> str:
+        """The values that it accepts, as text."""
         if self.menu:
-            return ", ".join(f"{value} ({text})" for value, text in self.menu.items())
-        return f"{self.low} to {self.high}" + (f" in steps of {self.step}" if self.step > 1 else "")
+            return ", ".join(map(str, self.menu))
+        steps = f" in steps of {self.range.step}" if self.range.step > 1 else ""
+        return f"{self.range.low} to {self.range.high}{steps}"
 
 
 def list_controls(fd: int) -> dict[int, CameraControl]:
     """Return the writable numeric controls of an open device by id."""
-    found = {}
-    for entry in _queried(fd):
-        if entry.type in _KINDS and not entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
-            found[entry.id] = CameraControl(
-                entry.id, _plain(entry.name), entry.type, entry.minimum, entry.maximum, entry.step, _menu(fd, entry)
-            )
+    found, last = {}, 0
+    for _ in range(_MAX_CONTROLS):  # the driver returns the control after `last`, and an error after the last one
+        entry = v4l2.QueryControl(id=last | v4l2.NEXT_CONTROL)
+        try:
+            v4l2.call(fd, v4l2.QUERYCTRL, entry)
+        except OSError:
+            break
+        last = entry.id
+        numeric = entry.type in (v4l2.CONTROL_INTEGER, v4l2.CONTROL_BOOLEAN, *_MENUS)
+        if numeric and not entry.flags & (v4l2.CONTROL_DISABLED | v4l2.CONTROL_READ_ONLY):
+            # As v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'.
+            name = re.sub(r"[^a-z0-9]+", "_", entry.name.decode("utf-8", "replace").lower()).strip("_")
+            values = ValueRange(entry.minimum, entry.maximum, max(1, entry.step))
+            found[last] = CameraControl(last, name, values, tuple(_menu(fd, entry)) if entry.type in _MENUS else ())
     return found
+
+
+def _menu(fd: int, entry: v4l2.QueryControl) -> Iterator[int]:
+    """Yield the values of a menu; the driver rejects those that it does not offer."""
+    for index in range(max(0, entry.minimum), min(entry.maximum, _MAX_MENU) + 1):
+        with suppress(OSError):
+            v4l2.call(fd, v4l2.QUERYMENU, v4l2.QueryMenu(id=entry.id, index=index))
+            yield index
 
 
 def plan_controls(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> list[tuple[CameraControl, int]]:
     """Return the controls to set with their values, automatic modes before the values that they govern.
 
-    Raises DriverError for a control that the device does not offer, and for a value out of its range.
+    Raises DriverError for a control that the device does not offer, and for a value that it does not accept.
     """
-    wanted = list(_automatic_modes(settings, offered)) + list(_fixed_values(settings))
-    plan = [(_offered(control_id, offered), value) for control_id, value in wanted]
-    plan += [_named(text, offered) for text in settings.controls]
+    by_name = {control.name: control for control in offered.values()}
+    all_names = f"It has: {', '.join(by_name) or 'none'}"
+    plan = []
+    for control_id, value in _wanted(settings, offered):
+        if control_id not in offered:
+            raise DriverError(f"the device has no control of its {_NAMES[control_id]}; leave it as it is. {all_names}")
+        plan.append((offered[control_id], value))
+    for text in settings.controls:
+        name, _, number = text.partition("=")
+        if name.strip() not in by_name:
+            raise DriverError(f"the device has no control '{name.strip()}'. {all_names}")
+        plan.append((by_name[name.strip()], int(number)))
     for control, value in plan:
         if not control.accepts(value):
-            raise DriverError(f"control {control.name}: {value} was requested, it accepts {control.range}")
+            raise DriverError(f"control {control.name}: {value} was requested, it accepts {control.accepted}")
     return plan
+
+
+def _wanted(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
+    """Yield (control id, value), automatic modes first; a fixed value switches its automatic mode off."""
+    if settings.auto_exposure != "keep" or settings.exposure_us:
+        mode = MANUAL_EXPOSURE
+        # An exposure that a run regulates is automatic until the run sends its first value.
+        if settings.auto_exposure == "on" or settings.is_regulated:
+            control = offered.get(AUTO_EXPOSURE)
+            mode = APERTURE_PRIORITY if control and AUTOMATIC not in control.menu else AUTOMATIC  # USB cameras; others
+        if AUTO_EXPOSURE in offered or not settings.is_regulated:
+            yield AUTO_EXPOSURE, mode
+        if EXPOSURE_MAY_SLOW in offered:
+            yield EXPOSURE_MAY_SLOW, 0
+    if settings.auto_gain != "keep" or (settings.gain >= 0 and AUTO_GAIN in offered):
+        yield AUTO_GAIN, int(settings.auto_gain == "on")
+    if settings.exposure_us:
+        yield EXPOSURE, round(settings.exposure_us / EXPOSURE_UNIT_US)
+    if settings.gain >= 0:
+        yield GAIN, settings.gain
+    if settings.power_line != "keep":
+        yield POWER_LINE_FREQUENCY, _POWER_LINE[settings.power_line]
 
 
 def apply_controls(fd: int, plan: list[tuple[CameraControl, int]]) -> None:
     """Set the controls in order, then read them back; raise DriverError for a value that the device did not take."""
     for control, value in plan:
         try:
-            v4l2.call(fd, v4l2.S_CTRL, v4l2.V4l2Control(control.id, value))
+            _write(fd, control.id, value)
         except OSError as error:
-            if error.errno in (errno.ENODEV, errno.EBUSY):
+            if error.errno in _LOST:
                 raise
             raise DriverError(
                 f"control {control.name}: the device refused {value} ({error.strerror}); "
-                f"it accepts {control.range}, and some only while their automatic mode is off"
+                f"it accepts {control.accepted}, and some only while their automatic mode is off"
             ) from error
     for control, value in plan:
-        found = read_control(fd, control.id)
+        found = _read(fd, control.id)
         if found != value:
             raise DriverError(
                 f"control {control.name}: {value} was set, the device stays at {found}; "
@@ -115,96 +158,92 @@ def apply_controls(fd: int, plan: list[tuple[CameraControl, int]]) -> None:
             )
 
 
-def read_control(fd: int, control_id: int) -> int:
-    """Return the value in force of a control."""
+def _read(fd: int, control_id: int) -> int:
     control = v4l2.V4l2Control(control_id)
     v4l2.call(fd, v4l2.G_CTRL, control)
     return int(control.value)
 
 
-def _automatic_modes(settings: V4l2Settings, offered: Mapping[int, CameraControl]) -> Iterator[tuple[int, int]]:
-    """Yield (control id, value) of the automatic modes; a fixed value switches its automatic mode off."""
-    if settings.auto_exposure != "keep" or settings.exposure_us:
-        # An exposure that a run regulates is automatic until the run sends its first value.
-        automatic = settings.auto_exposure == "on" or settings.is_regulated
-        if AUTO_EXPOSURE in offered or not settings.is_regulated:
-            yield AUTO_EXPOSURE, _automatic_exposure(offered) if automatic else MANUAL_EXPOSURE
-        if EXPOSURE_MAY_SLOW in offered:
-            yield EXPOSURE_MAY_SLOW, 0
-    for control_id, switch, fixed in (
-        (AUTO_GAIN, settings.auto_gain, settings.gain >= 0),
-        (AUTO_WHITE_BALANCE, settings.auto_white_balance, False),
-        (AUTO_FOCUS, settings.auto_focus, settings.focus >= 0),
-    ):
-        if switch != "keep" or (fixed and control_id in offered):
-            yield control_id, int(switch == "on")
+def _write(fd: int, control_id: int, value: int) -> None:
+    v4l2.call(fd, v4l2.S_CTRL, v4l2.V4l2Control(control_id, value))
 
 
-def _automatic_exposure(offered: Mapping[int, CameraControl]) -> int:
-    """Return the menu entry for automatic exposure: aperture priority on USB cameras, automatic on others."""
-    control = offered.get(AUTO_EXPOSURE)
-    return _APERTURE_PRIORITY if control and _AUTO not in control.menu else _AUTO
+class ExposureControls:
+    """The controls of an open device.
 
+    The automatic modes are switched off by the first request, and on again by the request for none and by `release`;
+    a gain that was set before is set again.
+    """
 
-def _fixed_values(settings: V4l2Settings) -> Iterator[tuple[int, int]]:
-    if settings.exposure_us:
-        yield EXPOSURE, round(settings.exposure_us / EXPOSURE_UNIT_US)
-    if settings.gain >= 0:
-        yield GAIN, settings.gain
-    if settings.focus >= 0:
-        yield FOCUS, settings.focus
-    if settings.power_line != "keep":
-        yield POWER_LINE_FREQUENCY, _POWER_LINE[settings.power_line]
+    def __init__(self, fd: int, *, with_gain: bool = True) -> None:
+        """with_gain: False leaves the gain as it is, also where the device has one."""
+        self._fd = fd
+        offered = list_controls(fd)
+        self._modes = [(AUTO_EXPOSURE, MANUAL_EXPOSURE)] if AUTO_EXPOSURE in offered else []
+        self._modes += [(AUTO_GAIN, 0)] if AUTO_GAIN in offered and with_gain else []
+        self.ranges: ExposureRanges | None = None  # None: the device has no exposure time to set
+        if EXPOSURE in offered:
+            times = offered[EXPOSURE].range
+            low, high, step = (value * EXPOSURE_UNIT_US for value in (times.low, times.high, times.step))
+            gains = offered[GAIN].range if GAIN in offered and with_gain else None
+            self.ranges = ExposureRanges(ValueRange(low, high, step), gains)
+        self._has_gain = GAIN in offered and with_gain
+        self._before: list[tuple[int, int]] = []  # control and value, while requests are in force
+        self._done: ExposureRequest | None = None
 
+    def read(self) -> ExposureSetting | None:
+        """Return the values in force as the device reports them; None where it does not."""
+        if self.ranges is None:
+            return None
+        with suppress(OSError):
+            gain = None if self.ranges.gain is None else _read(self._fd, GAIN)
+            return ExposureSetting(_read(self._fd, EXPOSURE) * EXPOSURE_UNIT_US, gain)
+        return None
 
-def _offered(control_id: int, offered: Mapping[int, CameraControl]) -> CameraControl:
-    if control_id not in offered:
-        raise DriverError(f"the device has no control of its {_NAMES[control_id]}; leave it as it is. {_all(offered)}")
-    return offered[control_id]
+    def follow(self, exposure: CameraExposure, stamp_ns: int) -> None:
+        """Carry out the newest request, if it is due after an image with that stamp.
 
-
-def _named(text: str, offered: Mapping[int, CameraControl]) -> tuple[CameraControl, int]:
-    name, _, number = text.partition("=")
-    for control in offered.values():
-        if control.name == name.strip():
-            return control, int(number)
-    raise DriverError(f"the device has no control '{name.strip()}'. {_all(offered)}")
-
-
-def _all(offered: Mapping[int, CameraControl]) -> str:
-    return f"It has: {', '.join(control.name for control in offered.values()) or 'none'}"
-
-
-def _queried(fd: int) -> Iterator[v4l2.QueryControl]:
-    last = 0
-    for _ in range(_MAX_CONTROLS):  # the driver returns the control after `last`, and an error after the last one
-        entry = v4l2.QueryControl(id=last | v4l2.NEXT_CONTROL)
-        try:
-            v4l2.call(fd, v4l2.QUERYCTRL, entry)
-        except OSError:
+        A value that the device refuses is kept as `exposure.problem`. Raises OSError for a lost device.
+        """
+        request = exposure.request
+        if request is None or request is self._done or stamp_ns < request.after_ns or exposure.problem:
             return
-        yield entry
-        last = entry.id
+        self._done = request
+        try:
+            if request.setting is None:
+                self.release()
+            else:
+                self._set(request.setting)
+            exposure.in_force = self.read()
+        except OSError as error:
+            if error.errno in _LOST:
+                raise
+            with suppress(OSError):
+                self.release()
+            exposure.problem = f"it refused an exposure ({error.strerror})"
 
+    def release(self) -> None:
+        """Give exposure and gain back to the automatic modes that were on; raise OSError for a lost device."""
+        while self._before:
+            _write(self._fd, *self._before.pop())
 
-def _plain(name: bytes) -> str:
-    """Return the name as v4l2-ctl writes it: exposure_time_absolute for 'Exposure Time, Absolute'."""
-    return re.sub(r"[^a-z0-9]+", "_", name.decode("utf-8", "replace").lower()).strip("_")
+    def _set(self, setting: ExposureSetting) -> None:
+        # 1. Switch the automatic modes off, and keep what `release` restores: the gain first, then the modes.
+        if not self._before:
+            self._before = [(control, _read(self._fd, control)) for control, _ in self._modes]
+            if self._has_gain:
+                self._before.append((GAIN, _read(self._fd, GAIN)))
+            for control, value in self._modes:
+                _write(self._fd, control, value)
+        # 2. Set the values.
+        _write(self._fd, EXPOSURE, round(setting.exposure_us / EXPOSURE_UNIT_US))
+        if setting.gain is not None:
+            _write(self._fd, GAIN, setting.gain)
 
-
-def _menu(fd: int, entry: v4l2.QueryControl) -> dict[int, str]:
-    """Return value -> name of a menu; the driver rejects values that it does not offer."""
-    items = {}
-    if entry.type in (v4l2.CONTROL_MENU, v4l2.CONTROL_INTEGER_MENU):
-        for index in range(max(0, entry.minimum), min(entry.maximum, _MAX_MENU) + 1):
-            item = v4l2.QueryMenu(id=entry.id, index=index)
-            try:
-                v4l2.call(fd, v4l2.QUERYMENU, item)
-            except OSError:
-                continue
-            items[index] = (
-                item.name.decode("utf-8", "replace")
-                if entry.type == v4l2.CONTROL_MENU
-                else str(int.from_bytes(bytes(item)[_MENU_VALUE], "little", signed=True))
-            )
-    return items
+    def __str__(self) -> str:
+        """The ranges as text; "" where there is no exposure time to set."""
+        if self.ranges is None:
+            return ""
+        times, gain = self.ranges.exposure_us, self.ranges.gain
+        text = f"exposure {times.low / 1000:g} to {times.high / 1000:g} ms"
+        return text if gain is None else f"{text}, gain {gain.low} to {gain.high}"

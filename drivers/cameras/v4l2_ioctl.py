@@ -14,7 +14,6 @@ from typing import Final
 CAPTURE: Final = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
 MMAP: Final = 1  # V4L2_MEMORY_MMAP
 PROGRESSIVE: Final = 1  # V4L2_FIELD_NONE
-DISCRETE: Final = 1  # V4L2_FRMSIZE_TYPE_DISCRETE and V4L2_FRMIVAL_TYPE_DISCRETE
 
 CAP_VIDEO_CAPTURE: Final = 0x00000001
 CAP_STREAMING: Final = 0x04000000
@@ -47,44 +46,10 @@ class Capability(ctypes.Structure):
     )
 
 
-class FormatDescription(ctypes.Structure):
-    """struct v4l2_fmtdesc."""
-
-    _fields_ = (
-        ("index", _u32),
-        ("type", _u32),
-        ("flags", _u32),
-        ("description", ctypes.c_char * 32),
-        ("pixelformat", _u32),
-        ("mbus_code", _u32),
-        ("reserved", _u32 * 3),
-    )
-
-
-class FrameSize(ctypes.Structure):
-    """struct v4l2_frmsizeenum; size: width, height, or min, max, step of the width and then of the height."""
-
-    _fields_ = (("index", _u32), ("pixel_format", _u32), ("type", _u32), ("size", _u32 * 6), ("reserved", _u32 * 2))
-
-
 class Fraction(ctypes.Structure):
     """struct v4l2_fract."""
 
     _fields_ = (("numerator", _u32), ("denominator", _u32))
-
-
-class FrameInterval(ctypes.Structure):
-    """struct v4l2_frmivalenum; interval [s]: one discrete value, or min, max, step."""
-
-    _fields_ = (
-        ("index", _u32),
-        ("pixel_format", _u32),
-        ("width", _u32),
-        ("height", _u32),
-        ("type", _u32),
-        ("interval", Fraction * 3),
-        ("reserved", _u32 * 2),
-    )
 
 
 class PixelFormat(ctypes.Structure):
@@ -206,7 +171,6 @@ def _request(direction: int, number: int, argument: type[ctypes.Structure] | typ
 
 
 QUERYCAP: Final = _request(_READ, 0, Capability)
-ENUM_FMT: Final = _request(_READ | _WRITE, 2, FormatDescription)
 G_FMT: Final = _request(_READ | _WRITE, 4, Format)
 S_FMT: Final = _request(_READ | _WRITE, 5, Format)
 REQBUFS: Final = _request(_READ | _WRITE, 8, BufferRequest)
@@ -221,8 +185,6 @@ G_CTRL: Final = _request(_READ | _WRITE, 27, V4l2Control)
 S_CTRL: Final = _request(_READ | _WRITE, 28, V4l2Control)
 QUERYCTRL: Final = _request(_READ | _WRITE, 36, QueryControl)
 QUERYMENU: Final = _request(_READ | _WRITE, 37, QueryMenu)
-ENUM_FRAMESIZES: Final = _request(_READ | _WRITE, 74, FrameSize)
-ENUM_FRAMEINTERVALS: Final = _request(_READ | _WRITE, 75, FrameInterval)
 
 
 def call(fd: int, request: int, argument: ctypes.Structure | Int32) -> None:

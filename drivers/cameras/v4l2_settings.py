@@ -6,9 +6,11 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.cameras.v4l2_modes import ENCODINGS, MAX_SIZE_PX
 from drivers.errors import DriverError
 
+# V4L2's fourcc -> the name in a Frame, in the order of preference: no decoding first, then fewer bytes
+ENCODINGS: Final = {"GREY": "mono8", "NV12": "nv12", "YUYV": "yuyv", "UYVY": "uyvy", "MJPG": "jpeg", "JPEG": "jpeg"}
+MAX_SIZE_PX: Final = 16384
 SWITCH: Final = ("keep", "on", "off")  # "keep" leaves a control as the camera has it
 EXPOSURE_MODES: Final = (*SWITCH, "rig")  # "rig": set by a run, by the requests of CameraExposure, else as "on"
 POWER_LINE: Final = ("keep", "off", "50", "60", "auto")
@@ -29,11 +31,8 @@ class V4l2Settings:
     exposure_us: int = 0  # above 0: fixed, automatic exposure off; in steps of 100
     auto_gain: str = "keep"
     gain: int = -1  # 0 and above: fixed, in the device's own units
-    auto_white_balance: str = "keep"
-    auto_focus: str = "keep"
-    focus: int = -1  # 0 and above: fixed, in the device's own units
     power_line: str = "keep"  # keep, off, 50, 60 (Hz) or auto: suppresses the flicker of lamps
-    controls: tuple[str, ...] = ()  # any others, as `v4l2-ctl --list-ctrls` names them: "sharpness=2"
+    controls: tuple[str, ...] = ()  # any others, as `v4l2-ctl --list-ctrls` names them: "focus_absolute=2"
     buffers: int = 4  # v4l2loopback needs exactly this number
     timeout_s: float = 2.0  # the device is opened again after this time without an image
     retry_s: float = 2.0  # longest wait between two tries to open a lost device
@@ -44,8 +43,6 @@ class V4l2Settings:
             ("power_line", POWER_LINE),
             ("auto_exposure", EXPOSURE_MODES),
             ("auto_gain", SWITCH),
-            ("auto_white_balance", SWITCH),
-            ("auto_focus", SWITCH),
         ):
             self._require(name, getattr(self, name) in allowed, f"one of {', '.join(allowed)}")
         for name, low, high in (
@@ -57,14 +54,13 @@ class V4l2Settings:
             ("retry_s", 0.05, 60),
             ("exposure_us", 0, 10**7),
             ("gain", -1, _MAX_CONTROL),
-            ("focus", -1, _MAX_CONTROL),
         ):
             value = getattr(self, name)
             self._require(name, low <= value <= high, f"{low} to {high}")
         self._require("device", self.device.startswith("/"), "a path such as /dev/v4l/by-path/..., see `omnid cameras`")
         for text in self.controls:
             self._require("controls", re.fullmatch(r"\w+ *= *-?\d{1,10}", text) is not None, "entries such as 'gain=3'")
-        for name, fixed in (("exposure", self.exposure_us > 0), ("gain", self.gain >= 0), ("focus", self.focus >= 0)):
+        for name, fixed in (("exposure", self.exposure_us > 0), ("gain", self.gain >= 0)):
             self._require(
                 f"auto_{name}",
                 not (fixed and getattr(self, f"auto_{name}") == "on"),

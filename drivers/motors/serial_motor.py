@@ -10,6 +10,7 @@ import os
 import termios
 import time
 from dataclasses import replace
+from enum import Enum, auto
 from typing import Final
 
 import serial  # type: ignore[import-untyped]
@@ -41,6 +42,27 @@ class NoReplyError(DriverError):
 
 class LateReplyError(NoReplyError):
     """No reply before the timeout, but the last one is so recent that the controller's watchdog cannot have expired."""
+
+
+class _State(Enum):
+    """What the next command finds, and what it becomes by an answer.
+
+    | state      | next command                                   | answer                                 |
+    |------------|------------------------------------------------|----------------------------------------|
+    | GONE       | open the port, then as SETTING_UP              |                                        |
+    | SETTING_UP | set the watchdog, then as STOP_FIRST           |                                        |
+    | STOP_FIRST | a stop in its place                            | DRIVING; STOP_FIRST where it expired   |
+    | SILENT     | a stop in its place                            | SETTING_UP: it may have lost its power |
+    | DRIVING    | the command                                    | DRIVING; STOP_FIRST where it expired   |
+
+    No answer, or a pause in which the watchdog may expire: SILENT. A rejected command: STOP_FIRST. A lost port: GONE.
+    """
+
+    GONE = auto()
+    SETTING_UP = auto()
+    STOP_FIRST = auto()
+    SILENT = auto()
+    DRIVING = auto()
 
 
 class SerialMotor:
@@ -83,10 +105,8 @@ class SerialMotor:
         self._name, self._baud = port, baud or self._protocol.baud
         self._timeout_s, self._watchdog_ms = timeout_s, watchdog_ms
         self._port: serial.Serial | None = None
-        self._closed = self._armed = False
-        self._stop_first = True
-        # True after silence, in which the controller may have lost power and settings, until it replies to a stop.
-        self._set_up_again = False
+        self._closed = False
+        self._state = _State.GONE
         self._last_sent_s = -math.inf  # start of the last command that got a reply, by _clock_s
         self._fresh_s = 0.0  # after it: the watchdog cannot have expired
         self._reopening, self._next_open_s = Backoff(FIRST_WAIT_S, LONGEST_WAIT_S), -math.inf
@@ -108,20 +128,18 @@ class SerialMotor:
         Raises LateReplyError or NoReplyError at the timeout, DriverError where the port is gone or the command is
         rejected.
         """
-        was_armed = self._armed
+        before = self._state
         try:
             return self._send(command, time.monotonic() + self._timeout_s)
         except DriverError as error:
             self.errors += 1
-            if isinstance(error, NoReplyError) and self._watchdog_alive():
-                raise LateReplyError(str(error)) from None
-            self._stop_first = True
-            self._set_up_again |= was_armed and isinstance(error, NoReplyError)
+            is_silent = isinstance(error, NoReplyError)
+            if is_silent and self._state is _State.DRIVING and _clock_s() - self._last_sent_s <= self._fresh_s:
+                raise LateReplyError(str(error)) from None  # the controller's watchdog cannot have expired by now
+            if self._state in (_State.STOP_FIRST, _State.DRIVING):
+                was_set_up = before not in (_State.GONE, _State.SETTING_UP)
+                self._state = _State.SILENT if is_silent and was_set_up else _State.STOP_FIRST
             raise
-
-    def _watchdog_alive(self) -> bool:
-        """True if the controller's watchdog cannot have expired by now."""
-        return self._armed and not self._stop_first and _clock_s() - self._last_sent_s <= self._fresh_s
 
     def close(self) -> None:
         """Stop the wheels if the controller replies, and release the port; a second call does nothing."""
@@ -133,22 +151,26 @@ class SerialMotor:
         self._release()
 
     def _send(self, command: VelocityCommand, deadline_s: float) -> MotorStatus:
-        if self._port is None:
+        # 1. Open the port and set up the controller where that is to be done.
+        is_new = self._state in (_State.GONE, _State.SETTING_UP)
+        if self._state is _State.GONE:
             self._open()
-        was_armed = self._armed
-        if not was_armed:
-            self._arm(time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
+        if is_new:
+            self._set_up(time.monotonic() + max(CONNECT_TRY_S, self._timeout_s))
             deadline_s = max(deadline_s, time.monotonic() + self._timeout_s)
+        # 2. Send the command, or a stop in its place.
         now_s = _clock_s()
-        paused = now_s - self._last_sent_s > self._fresh_s
-        self._set_up_again |= was_armed and paused
-        stopping = self._stop_first or paused
+        if not is_new and now_s - self._last_sent_s > self._fresh_s:
+            self._state = _State.SILENT
+        stopping = self._state is not _State.DRIVING
         sent = stop_command(command.stamp_ns) if stopping else command
         status = self._run(self._protocol.drive(sent, now_s), deadline_s)
+        # 3. What the answer says of the next command.
         self._last_sent_s = now_s
-        self._stop_first = status.watchdog_expired
-        if self._set_up_again:  # The reply is that to a stop, which had to come first: the next call sets it up.
-            self._armed = False
+        if self._state is _State.SILENT:
+            self._state = _State.SETTING_UP
+        else:
+            self._state = _State.STOP_FIRST if status.watchdog_expired else _State.DRIVING
         if is_stop(command) or not stopping:
             return status
         self.replaced_by_stop += 1
@@ -159,7 +181,7 @@ class SerialMotor:
         deadline_s = time.monotonic() + connect_s
         self._open()
         try:
-            while self._stop_first:
+            while self._state is not _State.DRIVING:
                 self._try_to_stop(deadline_s)
         except BaseException:
             self._release()
@@ -173,14 +195,13 @@ class SerialMotor:
             if time.monotonic() >= deadline_s:
                 raise
             return
-        if self._stop_first and time.monotonic() >= deadline_s:
+        if self._state is _State.STOP_FIRST and time.monotonic() >= deadline_s:
             raise DriverError(f"motor on {self._name} stays stopped by its watchdog; switch it off and on again")
 
-    def _arm(self, deadline_s: float) -> None:
-        self._stop_first = True
+    def _set_up(self, deadline_s: float) -> None:
         in_force_ms = self._run(self._protocol.connect(self._watchdog_ms), deadline_s)
         self._fresh_s = FRESH_SHARE * in_force_ms / 1000
-        self._armed, self._set_up_again = True, False
+        self._state = _State.STOP_FIRST
         self._reopening.reset()
         self.connections += 1
 
@@ -198,10 +219,10 @@ class SerialMotor:
         if wait_s > 0:
             raise DriverError(f"motor on {self._name} is gone; plug it in, it is tried again in {wait_s:.1f} s")
         self._next_open_s = time.monotonic() + self._reopening.next_s()
-        self._port = _opened(self._name, self._baud)
+        self._port, self._state = _opened(self._name, self._baud), _State.SETTING_UP
 
     def _release(self) -> None:
-        port, self._port, self._armed = self._port, None, False
+        port, self._port, self._state = self._port, None, _State.GONE
         if port is not None:
             with contextlib.suppress(OSError, termios.error):
                 fcntl.ioctl(port.fileno(), termios.TIOCNXCL)

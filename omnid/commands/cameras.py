@@ -37,7 +37,7 @@ To name them /dev/omnid/lower and /dev/omnid/upper in whatever order they are pl
         "cameras --snapshot views --config /etc/omnid/omnid.toml",
         "cameras --snapshot views --log drive.mcap",
     ),
-    description="List cameras, their modes and the udev rule to copy. With --snapshot write an image of each "
+    description="List cameras and the udev rule to copy. With --snapshot write an image of each "
     "configured camera with the mirror's rim, and print a measure of its focus, which is highest where "
     "the lens is set best.",
 )
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    from drivers.cameras.v4l2_devices import RULES_FILE, capture_devices, describe_device, udev_rules
+    from drivers.cameras.v4l2_device import RULES_FILE, capture_devices, udev_rules
 
     devices = capture_devices(ROOT)
     if not devices:
@@ -61,7 +61,12 @@ def _list() -> int:
             file=sys.stderr,
         )
         return 1
-    print("\n\n".join("\n".join(describe_device(device)) for device in devices))
+    for device in devices:
+        print(f"{device.node}  {device.name}  ({', '.join(filter(None, (device.driver, device.bus)))})")
+        exposure = device.exposure or "no exposure time to set"
+        for line in filter(None, (device.by_path, device.by_id, device.problem or exposure)):
+            print(f"  {line}")
+    print(f"\nThe modes of a camera: v4l2-ctl -d {devices[0].node} --list-formats-ext")
     if rules := list(udev_rules(devices)):
         print(_ADVICE.format(file=RULES_FILE), *rules, sep="\n")
     return 0

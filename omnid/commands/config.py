@@ -29,7 +29,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 def run(args: argparse.Namespace) -> int:
     """Print or check settings."""
     from omnid.config import FIRST_SETTINGS
-    from omnid.settings_dump import dump, dump_minimal
+    from omnid.settings import dump, dump_minimal
 
     if (args.action == "print") != (args.file is None):
         raise OmnidError(

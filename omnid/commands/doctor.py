@@ -37,20 +37,18 @@ def run(args: argparse.Namespace) -> int:
 
 def examine(config: Config) -> Iterator[Finding]:
     """Return the findings of all checks, the quick ones first."""
-    from drivers.cameras.v4l2_devices import capture_devices
-    from omnid.doctor import cameras, devices, machine, wiring
+    from drivers.cameras.v4l2_device import capture_devices
+    from omnid.doctor import devices, machine
 
     camera, wanted = config.cameras, config.realtime
     yield from machine.programs()
-    yield from cameras.cameras(
-        {name: camera.settings(name) for name in ("lower", "upper")}, capture_devices(ROOT), ROOT
-    )
-    yield from wiring.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
-    yield from wiring.motor(config.motor.port, ROOT)
-    yield devices.memberships()
+    named = {name: camera.settings(name) for name in ("lower", "upper")}
+    yield from devices.cameras(named, capture_devices(ROOT), ROOT)
+    yield from machine.rig(Path(camera.rig), (camera.width_px, camera.height_px), config.obstacles.ring.floor_m)
+    yield from devices.motor(config.motor, ROOT)
     yield from machine.rights(max(wanted.motor_priority, wanted.capture_priority), wanted.lock_memory)
-    yield from machine.clock()
+    yield machine.clock()
     yield from machine.compiled_functions()
     rate = 2 * camera.width_px * camera.height_px * BYTES_PER_PIXEL * (camera.rate_hz or 30.0)
     yield from machine.disk(machine.STATE / config.record.folder, config.record, rate)
-    yield from wiring.bus(config.bus)
+    yield machine.bus(config.bus)

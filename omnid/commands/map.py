@@ -52,7 +52,7 @@ CELL = option("--cell", type=float, default=0.05, metavar="M", help="edge of a c
 )
 def build(args: argparse.Namespace) -> int:
     """Replay the logs one after the other, each in the map of those before; write the map."""
-    from omnid.config_use import unused_settings
+    from omnid.config import unused_settings
     from omnid.core.places.place_views import summary
     from omnid.formats.place_file import write_places
     from omnid.sinks.files import check_outputs

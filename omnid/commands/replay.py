@@ -49,6 +49,12 @@ if TYPE_CHECKING:  # the help and other commands do not load these
         option("--plan", type=Path, metavar="FILE.png", help="the map from above with the path"),
         option("--record", type=Path, metavar="FILE.mcap", help="poses, transforms, commands, states and map"),
         option(
+            "--rerun",
+            type=Path,
+            metavar="FILE.rrd",
+            help="path, images with features, depth and plots for the viewer Rerun; not beside --record",
+        ),
+        option(
             "--publish",
             action="store_true",
             help="publish on the bus as `<robot>/odom` and so on; off by default, because a robot's daemon publishes "
@@ -92,9 +98,12 @@ if TYPE_CHECKING:  # the help and other commands do not load these
 )
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print its summary; return 1 where no pose was found."""
-    from omnid.config_use import unused_settings
+    from omnid.config import unused_settings
     from omnid.runs.replay import ReplayOptions
 
+    config = settings_of(args)
+    for warning in unused_settings(config, "replay", args.overrides):
+        print(f"omnid: warning: {warning}", file=sys.stderr)
     options = ReplayOptions(
         rig=args.rig,
         topics=(args.lower, args.upper),
@@ -111,10 +120,14 @@ def run(args: argparse.Namespace) -> int:
         drops=args.realtime,
         settings=args.config,
     )
-    config = settings_of(args)
-    for warning in unused_settings(config, "replay", args.overrides):
-        print(f"omnid: warning: {warning}", file=sys.stderr)
-    return replay_and_print(args.log, config, options, Output(args.quiet, args.verbose, args.json))
+    output = Output(args.quiet, args.verbose, args.json)
+    if args.rerun is None:
+        return replay_and_print(args.log, config, options, output)
+    if args.record is not None:
+        raise OmnidError("--rerun and --record exclude each other: replay the log once for each")
+    from omnid.commands.view import draw_replay, sink_of
+
+    return draw_replay(sink_of(args.rerun, args.log), args.log, config, options, output)
 
 
 class Output(NamedTuple):

@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from omnid.engine.process import use_one_malloc_arena
 
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
-    from omnid.config_use import unused_settings
+    from omnid.config import unused_settings
     from omnid.engine.logging_setup import HANDLER, log
     from omnid.runs.live import LiveRun
     from omnid.runs.live_robot import ConnectedRobot

@@ -1,20 +1,53 @@
-"""`omnid view`: show path, map, images with features, depth and plots in rerun."""
+"""`omnid view`: show path, map, images with features, depth and plots of a log or a robot in Rerun."""
 
 from __future__ import annotations
 
 import argparse
+import math
+import os
+import signal
+import socket
+import subprocess
 import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
+from urllib.parse import quote
 
 from omnid.commands.listen import check_seconds
-from omnid.commands.options import QUIET, RIG, ROBOT, SECONDS, SETTINGS, cameras, command, group, option, settings_of
+from omnid.commands.options import (
+    QUIET,
+    RIG,
+    ROBOT,
+    SECONDS,
+    SETTINGS,
+    cameras,
+    command,
+    exclusive,
+    group,
+    option,
+    settings_of,
+)
 from omnid.commands.replay import Output, replay_and_print
+from omnid.engine.process import handle_stop_signals, python, python_environment
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
+    import rerun
+
     from omnid.config import Config
-    from omnid.viewer.targets import ViewerTarget
+    from omnid.runs.replay import ReplayOptions
+    from omnid.stages.front_end import FrontEnd
+    from omnid.viewer.rerun_sink import RerunSink
+
+LOCALHOST: Final = "127.0.0.1"
+# `python -m rerun_cli` does not return the exit code of the viewer.
+VIEWER: Final = ("-c", "import sys; from rerun_cli.__main__ import main; sys.exit(main())")
+MAP_EVERY_S: Final = 2.0  # between two maps of a replay
 
 
 @command(
@@ -26,23 +59,15 @@ if TYPE_CHECKING:  # the help and other commands do not load these
         help="a recording, which is shown as it stands, or a log of images, which goes through the stages; without "
         "one, a robot is listened to",
     ),
-    group(
-        "output; default: a window",
+    exclusive(
         option(
             "-o",
             "--output",
             type=Path,
             metavar="FILE.rrd",
-            help="a file that `rerun FILE.rrd` opens, here or elsewhere; needs no display",
+            help="a file that `rerun FILE.rrd` opens, here or elsewhere; default: a window",
         ),
-        option("--web", action="store_true", help="a browser of this machine"),
-        option(
-            "--port",
-            type=int,
-            default=0,
-            metavar="N",
-            help="of --web: serve the page at port N and its data at N + 1, for ssh -L; default: any free ones",
-        ),
+        option("--web", action="store_true", help="a browser of this machine, until Ctrl-C"),
     ),
     group(
         "a log",
@@ -54,78 +79,180 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     ),
     group("a robot", *ROBOT, SECONDS),
     *SETTINGS,
-    examples=("view out.mcap", "view out.mcap -o out.rrd", "view out.mcap --web --port 9090"),
+    examples=("view out.mcap", "view out.mcap -o out.rrd", "view --robot rover --connect tcp/robot:7447"),
 )
 def run(args: argparse.Namespace) -> int:
     """Show the log or the robot; return 1 if there was no pose to show."""
-    _refuse_contradictions(args)
-    _require_rerun()
-    from omnid.viewer.view import check_file, show_robot, target_for
-
-    config = settings_of(args)
-    check_file(
-        args.output,
-        ("the log that is read", args.log),
-        ("the rig that is read", args.rig),
-        ("the configuration that is read", args.config),
-    )
-    place = target_for(args.output, args.web, args.port)
-    if args.log is not None:
-        return _log(args, config, place)
-    code = show_robot(config.bus, args.seconds, place)
-    if code == 1:
-        print(
-            f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there",
-            file=sys.stderr,
-        )
-    return code
-
-
-def _log(args: argparse.Namespace, config: Config, place: ViewerTarget) -> int:
-    from functools import partial
-
-    from omnid.viewer.view import Log, show_log
-
-    log = Log(
-        args.log,
-        robot=args.robot,
-        topic=args.topic,
-        replay=args.replay,
-        rig=args.rig,
-        topics=(args.lower, args.upper),
-        settings=args.config,
-    )
-    return show_log(log, config, place, partial(replay_and_print, output=Output(quiet=args.quiet)))
-
-
-def _refuse_contradictions(args: argparse.Namespace) -> None:
-    live = {"--connect": args.connect, "--seconds": args.seconds}
-    of_log = {
-        "--topic": args.topic,
-        "--replay": args.replay,
-        "--rig": args.rig,
-        "--lower": args.lower,
-        "--upper": args.upper,
-    }
-    wrong = [name for name, value in (of_log if args.log is None else live).items() if value]
-    if wrong:
-        instead = "name a LOG as well" if args.log is None else "leave out the LOG to show a robot"
-        raise OmnidError(f"{wrong[0]} does not go with {'a robot' if args.log is None else args.log}: {instead}")
-    if args.output is not None and args.web:
-        raise OmnidError("-o and --web exclude each other: leave one of them out")
-    if args.port and not args.web:
-        raise OmnidError("--port belongs to --web: add it, or leave the port out")
-    if not 0 <= args.port < 65535:
-        raise OmnidError(f"--port {args.port}: expected a port of 1 to 65534")
     check_seconds(args.seconds)
+    if args.log is None and (args.topic or args.replay or args.rig):
+        raise OmnidError("--topic, --replay and --rig belong to a log: name a LOG as well")
+    if args.log is not None and (args.connect or args.seconds):
+        raise OmnidError(f"--connect and --seconds do not go with {args.log}: leave out the LOG to show a robot")
+    config, viewers = settings_of(args), list[subprocess.Popen[bytes]]()
+    sink = sink_of(args.output, args.log, web=args.web, viewers=viewers)
+    try:
+        code = _robot(sink, config, args.seconds) if args.log is None else _log(sink, config, args)
+        sink.close()
+        if sink.poses:
+            print(f"{sink.poses} poses and {sink.images} images shown", flush=True)
+        if args.web and viewers:
+            print("omnid: complete; Ctrl-C ends the server", file=sys.stderr, flush=True)
+            with handle_stop_signals(lambda *_: _end(viewers)):
+                viewers[0].wait()
+        return code
+    finally:
+        sink.close()
+        if args.web:
+            _end(viewers)
 
 
-def _require_rerun() -> None:
-    import os
-    from importlib.util import find_spec
+def _end(viewers: list[subprocess.Popen[bytes]]) -> None:
+    for viewer in viewers:
+        with suppress(ProcessLookupError):
+            os.killpg(viewer.pid, signal.SIGTERM)
 
+
+def sink_of(
+    output: Path | None, log: Path | None, *, web: bool = False, viewers: list[subprocess.Popen[bytes]] | None = None
+) -> RerunSink:
+    """Return a sink that draws into a file, or into a viewer (output None), which it adds to the viewers.
+
+    Raise OmnidError where Rerun is missing, or the file is the log.
+    """
     if find_spec("rerun") is None:
         raise OmnidError(
-            f"omnid view draws with rerun, which is not installed: {sys.executable} -m pip install 'rerun-sdk>=0.41'"
+            f"this draws with rerun, which is not installed: {sys.executable} -m pip install 'rerun-sdk>=0.41'"
         )
     os.environ.setdefault("RUST_LOG", "off")  # omnid reports errors of rerun itself
+    from omnid.sinks.files import check_outputs
+    from omnid.viewer.rerun_sink import RerunSink, layout
+
+    def file() -> rerun.RecordingStream:
+        import rerun
+
+        stream = rerun.RecordingStream("omnid")
+        try:
+            stream.save(str(output), layout())
+        except (OSError, RuntimeError) as error:
+            raise OmnidError(f"{output}: cannot be written: {error}; name another file") from error
+        return stream
+
+    if output is not None:
+        check_outputs([("the drawing", output)], [] if log is None else [("the log that is read", log)])
+        return RerunSink(file)
+    return RerunSink(lambda: _viewer(web, [] if viewers is None else viewers))
+
+
+def _viewer(web: bool, viewers: list[subprocess.Popen[bytes]]) -> rerun.RecordingStream:
+    """Start Rerun's viewer and return its stream; unlike `rerun.spawn`, it is served to this machine only."""
+    import rerun
+
+    from omnid.viewer.rerun_sink import layout
+
+    if not web and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"):
+        raise OmnidError("there is no display for a window: use -o FILE.rrd, or --web for a browser of this machine")
+    port, page = _free_port(), _free_port()
+    url = f"rerun+http://{LOCALHOST}:{port}/proxy"
+    mode = ("--serve-web", "--web-viewer-port", str(page)) if web else ("--expect-data-soon",)
+    # The viewer would report its use to its makers; `rerun analytics enable` turns that on again.
+    subprocess.run(python(*VIEWER, "analytics", "disable"), capture_output=True, check=False, env=python_environment())
+    words = python(*VIEWER, "--bind", LOCALHOST, "--port", str(port), "--hide-welcome-screen", *mode)
+    environment = python_environment(RUST_LOG="warn")
+    # In a session of its own: Ctrl-C does not end a window.
+    viewers.append(subprocess.Popen(words, stdin=subprocess.DEVNULL, start_new_session=True, env=environment))
+    stream = rerun.RecordingStream("omnid")
+    stream.connect_grpc(url, default_blueprint=layout())  # it waits for the viewer
+    if web:
+        print(f"omnid: open http://{LOCALHOST}:{page}/?url={quote(url, safe='')}", file=sys.stderr, flush=True)
+    return stream
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOCALHOST, 0))
+        return int(probe.getsockname()[1])
+
+
+def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
+    """Draw the recorded poses of a log, else what is computed from its images."""
+    from drivers.errors import FrameDecodeError
+    from drivers.logs.mcap_info import read_log_info
+    from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose, odometry_topics
+    from omnid.recordings.recording_reader import CLOUD, ODOMETRY, STATUS, RecordingReader
+    from omnid.runs.replay import ReplayOptions
+    from omnid.transport.records import OdometryRecord
+    from omnid.transport.topics import MAP_POSE, SCAN
+
+    found = read_log_info(args.log)
+    if args.replay or not (args.topic or args.robot or odometry_topics(found)):
+        options = ReplayOptions(
+            rig=args.rig,
+            topics=(args.lower, args.upper),
+            settings=args.config,
+        )
+        return draw_replay(sink, args.log, config, options, Output(quiet=args.quiet))
+    reader = RecordingReader(found, choose_odometry_topic(found, args.topic, args.robot))
+    pending: OdometryRecord | None = None  # a pose until its state is known, which is recorded after it
+    broken_images = 0
+    for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, SCAN, reader.image_name())):
+        due, content = pending, message.content
+        if isinstance(content, OdometryRecord):
+            pending = content
+        else:
+            due = None
+            try:
+                sink.draw(content)
+            except FrameDecodeError:
+                broken_images += 1
+        if due is not None:
+            sink.draw(due)
+    if pending is not None:
+        sink.draw(pending)
+    if unreadable := reader.unreadable.total() + reader.damaged + broken_images:
+        print(f"omnid: warning: {args.log}: {unreadable} messages or pieces cannot be read", file=sys.stderr)
+    if not sink.poses:
+        raise no_pose(args.log, reader.topic)
+    return 0
+
+
+def draw_replay(sink: RerunSink, log: Path, config: Config, options: ReplayOptions, output: Output) -> int:
+    """Replay a log, print its summary, and draw what its stages compute. Return the exit code."""
+    from omnid.viewer.rerun_sink import ReplayDrawing
+
+    def observer(front_end: FrontEnd, _: object) -> ReplayDrawing:
+        return ReplayDrawing(sink, front_end)
+
+    try:
+        return replay_and_print(log, config, replace(options, map_every_s=MAP_EVERY_S, observer=observer), output)
+    finally:
+        sink.close()
+
+
+def _robot(sink: RerunSink, config: Config, seconds: float | None) -> int:
+    """Draw a live robot until a signal, or for a number of seconds."""
+    from drivers.errors import FrameDecodeError
+    from omnid.client import Cloud, Diagnostics, Robot
+    from omnid.monitor.robot_state import Inbox
+    from omnid.viewer.rerun_sink import decoded
+
+    end_s, signals = time.monotonic() + (math.inf if seconds is None else seconds), list[int]()
+    stopping: Callable[..., None] = lambda number, _: signals.append(number)  # noqa: E731
+    with handle_stop_signals(stopping), Robot(settings=config.bus, timeout_s=2.0) as robot:
+        inbox = Inbox()
+        robot.on_message(inbox.put)
+        # What was published before.
+        with robot.subscribe(Diagnostics) as reports, robot.subscribe(Cloud) as clouds:
+            for newest in (reports.newest(), clouds.newest()):
+                if newest is not None:
+                    sink.draw(newest)
+        while time.monotonic() < end_s and not signals:
+            message = inbox.get(0.5)
+            if message is None:
+                continue
+            with suppress(OmnidError, FrameDecodeError):  # a message of another program
+                content = decoded(message.topic, message.payload, message.attachment, message.received_ns)
+                if content is not None:
+                    sink.draw(content, message.attachment, message.received_ns)
+    if not sink.poses:
+        print(f"omnid: no pose of {config.bus.robot} came: `omnid listen` names those that are there", file=sys.stderr)
+    return int(not sink.poses)

@@ -1,10 +1,12 @@
-"""Checks of the machine: clocks, real-time rights, disk, packages, compiled functions."""
+"""Checks of the machine: clock, real-time rights, disk, packages, compiled functions, the rig file and the bus."""
 
 from __future__ import annotations
 
 import ctypes
+import ipaddress
 import os
 import platform
+import re
 import shutil
 import time
 from collections.abc import Iterator
@@ -14,10 +16,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
+from calib.errors import CalibError
+from calib.rig_file import read_rig
 from omnid.config import RecordConfig
 from omnid.doctor.finding import Finding
 from omnid.engine.kernel_cache import kept_kernels
 from omnid.engine.realtime import LOCK_ADVICE, highest_priority, may_lock, priority_advice
+from omnid.errors import OmnidError
+from omnid.transport.bus_config import BusConfig, checked
 
 PACKAGES: Final = {
     "numpy": "numpy",
@@ -31,39 +37,28 @@ PACKAGES: Final = {
 BUILT_S: Final = 1_735_689_600  # the start of 2025: an earlier time is wrong
 _UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2)
 _TIMEX_BYTES: Final = 1024  # more than struct timex has on any platform
-_SLOW_CLOCKS: Final = ("hpet", "acpi_pm", "jiffies", "refined-jiffies", "pit")
+_ENDPOINT = re.compile(r"[a-z-]+/\[?(?P<host>[^\]/]+?)\]?:\d{1,5}(?:[?#].*)?")
 STATE: Final = Path("/var/lib/omnid")  # StateDirectory and working directory of the unit
 CACHE: Final = Path("/var/cache/omnid")  # CacheDirectory of the unit
 
 
-def clock(now_s: float | None = None, synchronised: bool | None = None, root: Path = Path("/")) -> Iterator[Finding]:
-    """Check that the system's time is plausible and synchronised, and that the monotonic clock is fast."""
+def clock(now_s: float | None = None, synchronised: bool | None = None) -> Finding:
+    """Check that the system's time is plausible and synchronised."""
     now_s = time.time() if now_s is None else now_s
     synchronised = is_synchronised() if synchronised is None else synchronised
     shown = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(now_s))
     if now_s < BUILT_S:
-        yield Finding(
+        return Finding(
             "error", "clock", f"the time is wrong: {shown}", "`timedatectl set-ntp true`, or `sudo date -s ...`"
         )
-    elif not synchronised:
-        yield Finding(
+    if not synchronised:
+        return Finding(
             "warning",
             "clock",
             f"{shown}, not synchronised: logs of several machines will not match",
             "`timedatectl set-ntp true`, or install chrony",
         )
-    else:
-        yield Finding("ok", "clock", f"{shown}, synchronised")
-    source = _word(root / "sys/devices/system/clocksource/clocksource0/current_clocksource")
-    if source in _SLOW_CLOCKS:
-        yield Finding(
-            "warning",
-            "monotonic",
-            f"the kernel reads time from {source}, which takes microseconds",
-            "`dmesg | grep -i clocksource` has the reason why the processor's counter is not used",
-        )
-    else:
-        yield Finding("ok", "monotonic", f"CLOCK_MONOTONIC from {source or 'an unnamed source'}")
+    return Finding("ok", "clock", f"{shown}, synchronised")
 
 
 def is_synchronised() -> bool:
@@ -170,7 +165,77 @@ def _version(package: str) -> str:
     return "(of another package)"  # OpenCV has four, and distributions have their own
 
 
-def _word(path: Path) -> str:
-    with suppress(OSError):
-        return path.read_text("utf-8", "replace").strip()[:40]
-    return ""
+def rig(path: Path, size_px: tuple[int, int], floor_m: float = 0.0) -> Iterator[Finding]:
+    """Check that the rig can be read, is of images of this size (width, height), states its height, and has masks.
+
+    floor_m: height of the floor in the base frame.
+    """
+    try:
+        found = read_rig(path)
+    except CalibError as error:
+        advice = "" if "omnid calibrate" in str(error) else "create one with `omnid calibrate`"
+        yield Finding("error", "rig", str(error), advice)
+        return
+    cameras = {"lower": found.lower, "upper": found.upper}
+    for name, mounted in cameras.items():
+        width, height = mounted.camera.size
+        if (width, height) != size_px:
+            yield Finding(
+                "error",
+                "rig",
+                f"{path}: the {name} camera was calibrated with {width}x{height} px, "
+                f"[cameras] asks for {size_px[0]}x{size_px[1]}",
+                "set cameras.width_px and height_px",
+            )
+    height_m = found.height_m(floor_m)
+    if height_m is None:
+        yield Finding(
+            "warning",
+            "rig",
+            f"{path} does not state the height of the cameras: nothing is free until the images show the floor",
+            "state it by `omnid calibrate drive LOG --only height`, with --ruler-m as a check",
+        )
+    bare = [name for name, mounted in cameras.items() if mounted.mask is None]
+    if bare:
+        yield Finding(
+            "warning",
+            "rig",
+            f"{path} has no mask for {' and '.join(bare)}, the rim is searched at each start",
+            f"add [{bare[0]}.mask] with center, inner_px and outer_px",
+        )
+    else:
+        yield Finding(
+            "ok",
+            "rig",
+            f"{path}, {found.baseline_m:.3f} m between the viewpoints"
+            + ("" if height_m is None else f", {height_m:.3f} m above the floor"),
+        )
+
+
+def bus(config: BusConfig) -> Finding:
+    """Check the settings of the bus, and who may send commands."""
+    try:
+        checked(config)
+    except OmnidError as error:
+        return Finding("error", "bus", str(error), "the daemon does not start with these settings")
+    endpoints = ", ".join(endpoint for endpoint in (*config.listen, *config.connect) if not _is_local(endpoint))
+    accepted = ", ".join((*config.command_names, *config.command_users))
+    if endpoints and not accepted:
+        return Finding(
+            "warning",
+            "bus",
+            f"anyone who reaches {endpoints} can drive the robot",
+            "set bus.command_names or bus.command_users, or listen on tcp/127.0.0.1:7447 only",
+        )
+    if endpoints:
+        return Finding("ok", "bus", f"reachable at {endpoints}; commands are accepted from {accepted} only")
+    return Finding("ok", "bus", "reachable from this machine only")
+
+
+def _is_local(endpoint: str) -> bool:
+    parts = _ENDPOINT.fullmatch(endpoint)
+    if parts is None:  # a socket in the file system
+        return True
+    with suppress(ValueError):
+        return ipaddress.ip_address(parts["host"]).is_loopback
+    return parts["host"] == "localhost"

@@ -119,16 +119,18 @@ class WiringTest:
         return answer == "y"
 
     def _scaled(self, motor: SerialMotor, drive: DriveSettings) -> DriveSettings:
-        """Turn both wheels by a number of turns, ask for the true number, and correct the scale."""
+        """Turn both wheels by a number of turns, ask for the true number, and correct the gear by their ratio."""
         around_m = math.tau * drive.wheel_radius_m
         self._ask(f"Mark both tyres. The wheels will turn forwards {self._turns:g} times. Press Enter: ")
         moved_s = self._move(motor, self._speed_mps, 0.0, self._turns * around_m / self._speed_mps)
         commanded = moved_s * self._speed_mps / around_m
         while True:
             answer = self._ask(f"{commanded:.2f} turns were commanded. How many were there (Enter if as many)? ")
-            turns = _number(answer) if answer else commanded
-            if turns is not None and 0 < turns <= LARGEST_TURNS:
-                return rescaled(drive, turns / commanded)
+            with suppress(ValueError):  # no number: ask again
+                turns = float(answer.replace(",", ".")) if answer else commanded
+                if 0 < turns <= LARGEST_TURNS:
+                    is_right = abs(turns / commanded - 1) <= RIGHT_SCALE
+                    return drive if is_right else replace(drive, gear=float(f"{drive.gear * commanded / turns:.4g}"))
 
     def _move(self, motor: SerialMotor, velocity_mps: float, yaw_rate_radps: float, duration_s: float) -> float:
         """Drive for this time, then stop; return the time for which it drove, s."""
@@ -169,20 +171,6 @@ def wiring(first: Seen, second: Seen) -> dict[str, bool]:
     """Return the settings of a base by the wheels that its two motors turn, which must be different wheels."""
     left, right = (first, second) if first.side == "left" else (second, first)
     return {"swapped": first.side == "right", "reverse_left": not left.forward, "reverse_right": not right.forward}
-
-
-def rescaled(drive: DriveSettings, ratio: float) -> DriveSettings:
-    """Return the drive with the gear corrected; ratio: true by commanded turns."""
-    if abs(ratio - 1) <= RIGHT_SCALE:
-        return drive
-    return replace(drive, gear=float(f"{drive.gear / ratio:.4g}"))
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text.replace(",", "."))
-    except ValueError:
-        return None
 
 
 def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:

@@ -19,10 +19,11 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
+
+from msgspec import Meta
 
 from omnid.engine.logging_setup import log
-from omnid.settings import knob
 
 CAP_IPC_LOCK: Final = 14
 CAP_SYS_NICE: Final = 23
@@ -43,21 +44,20 @@ _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 class RealtimeSettings:
     """Requests to the kernel and to Python, so that deadlines hold."""
 
-    lock_memory: bool = knob(True, "lock all memory against swapping; needs LimitMEMLOCK=infinity")
-    freeze_gc: bool = knob(True, "exclude what exists at the start from garbage collection")
-    switch_interval_ms: float = knob(
-        1.0, "time after which Python switches threads, ms; 0: Python's default, 5 ms", low=0, high=100
-    )
-    motor_priority: int = knob(
-        20, "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none", low=0, high=99
-    )
-    capture_priority: int = knob(10, "SCHED_FIFO priority of the capture threads; 0: none", low=0, high=99)
-    longest_run_ms: int = knob(
-        500,
+    lock_memory: Annotated[bool, "lock all memory against swapping; needs LimitMEMLOCK=infinity"] = True
+    freeze_gc: Annotated[bool, "exclude what exists at the start from garbage collection"] = True
+    switch_interval_ms: Annotated[
+        float, Meta(ge=0, le=100), "time after which Python switches threads, ms; 0: Python's default, 5 ms"
+    ] = 1.0
+    motor_priority: Annotated[
+        int, Meta(ge=0, le=99), "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none"
+    ] = 20
+    capture_priority: Annotated[int, Meta(ge=0, le=99), "SCHED_FIFO priority of the capture threads; 0: none"] = 10
+    longest_run_ms: Annotated[
+        int,
+        Meta(ge=0, le=10_000),
         "longest run of a SCHED_FIFO thread without a wait, ms; beyond it the kernel ends the daemon; 0: no limit",
-        low=0,
-        high=10_000,
-    )
+    ] = 500
 
 
 def prepare(config: RealtimeSettings) -> list[str]:

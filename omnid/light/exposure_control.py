@@ -6,8 +6,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from drivers.cameras.camera_exposure import CameraExposure, ExposureRanges, ExposureRequest, ExposureSetting
-from drivers.cameras.camera_state import CameraState
+from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRanges, ExposureRequest, ExposureSetting
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
 from omnid.core.nanoseconds import S_PER_NS

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Final, Literal
 
-from drivers.cameras.camera_exposure import ExposureRanges, ExposureSetting, ValueRange
+from drivers.cameras.camera_state import ExposureRanges, ExposureSetting, ValueRange
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.light.grey_levels import GreyLevels
 

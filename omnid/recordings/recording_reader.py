@@ -116,7 +116,7 @@ def _decoder(name: str, topic: LogTopic) -> Decoder | None:
     """Return the decoder of messages of a topic; None where they are of another type than expected."""
     if name in IMAGES and topic.type in IMAGE_TYPES:
         return partial(parse_image, topic.type, aligned=topic.aligned)
-    expected, decoder = _DECODERS.get(name, ("", None))
+    expected, decoder = DECODERS.get(name, ("", None))
     return decoder if topic.type == expected else None
 
 
@@ -127,7 +127,7 @@ def _finite_twist(data: memoryview) -> TwistRecord:
     return twist
 
 
-_DECODERS: Final[Mapping[str, tuple[str, Decoder]]] = {
+DECODERS: Final[Mapping[str, tuple[str, Decoder]]] = {
     ODOMETRY: (ODOMETRY_SCHEMA, lambda data: odometry_from_cdr(bytes(data))),
     MAP_POSE: (MAP_POSE_SCHEMA, lambda data: decode_map_pose(bytes(data))),
     STATUS: (DIAGNOSTICS_SCHEMA, lambda data: decode_diagnostics(bytes(data))),

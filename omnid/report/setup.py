@@ -15,7 +15,7 @@ from calib.rig import MountedCamera, Rig
 from omnid.config import Config
 from omnid.report.page import facts, note, table
 from omnid.report.report_data import ReportData
-from omnid.settings_dump import dump
+from omnid.settings import dump
 
 _MAX_SETTINGS_BYTES: Final = 1 << 18
 _MAX_SETTINGS: Final = 60

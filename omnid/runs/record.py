@@ -15,7 +15,7 @@ from drivers.logs.rotating_log import RotatingLog
 from omnid.config import Config
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.process import handle_stop_signals
-from omnid.settings_dump import dump
+from omnid.settings import dump
 from omnid.sinks.encoder import Encoder
 from omnid.sinks.recorder import Recorder
 

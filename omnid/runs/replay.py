@@ -39,7 +39,7 @@ from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.sensor_sources import motion_topics
 from omnid.runs.session import Session
-from omnid.settings_dump import dump
+from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing

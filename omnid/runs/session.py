@@ -24,7 +24,7 @@ from omnid.engine.process import handle_stop_signals
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import returns_within
-from omnid.settings_dump import dump
+from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus

@@ -16,7 +16,7 @@ from omnid.config import FIRST_SETTINGS, Config
 from omnid.errors import OmnidError
 from omnid.formats.whole_file import write_whole
 from omnid.plain_text import plain
-from omnid.settings_dump import dump_minimal
+from omnid.settings import dump_minimal
 
 ROOT: Final = Path("/")
 SHIPPED_PROGRAM: Final = "/opt/omnid/bin/omnid"  # The path of omnid in the shipped units.

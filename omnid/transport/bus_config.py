@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
 
 from omnid.errors import OmnidError
-from omnid.settings import knob
 
 KEY: Final = re.compile(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*")
 _ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/[^/\s]+:\d{1,5}([?#].*)?|unixsock-stream/\S+")
@@ -36,39 +37,43 @@ _MAX_FILE_BYTES: Final = 1 << 20
 class BusConfig:
     """Endpoints of the bus and permissions on it; keys are `<robot>/...`. The default is this machine only."""
 
-    robot: str = knob("omnid", "first part of every key, and of the topics of --record")
-    mode: str = knob(
-        "peer",
+    robot: Annotated[str, "first part of every key, and of the topics of --record"] = "omnid"
+    mode: Annotated[
+        Literal["peer", "client"],
         "peer: other programs connect to this one; client: all traffic goes through a router, "
         "which may be started later",
-        choices=("peer", "client"),
+    ] = "peer"
+    listen: Annotated[tuple[str, ...], "zenoh endpoints to listen on"] = ("tcp/127.0.0.1:7447",)
+    connect: Annotated[tuple[str, ...], "zenoh endpoints to connect to"] = ()
+    retry_s: Annotated[
+        float, Meta(ge=0.1, le=60), "longest wait between two attempts to reach an endpoint of connect, s"
+    ] = 2.0
+    config: Annotated[str, "a zenoh configuration file (JSON5) that is read first; settings here override it"] = ""
+    tls_ca: Annotated[
+        str, "certificate of the authority that signs the others' certificates, PEM; for tls/ endpoints"
+    ] = ""
+    tls_listen_key: Annotated[str, "private key for incoming connections, PEM"] = ""
+    tls_listen_certificate: Annotated[str, "certificate for incoming connections, PEM"] = ""
+    tls_connect_key: Annotated[str, "private key for outgoing connections, PEM"] = ""
+    tls_connect_certificate: Annotated[str, "certificate for outgoing connections, PEM; with one, tls_mutual is on"] = (
+        ""
     )
-    listen: tuple[str, ...] = knob(("tcp/127.0.0.1:7447",), "zenoh endpoints to listen on")
-    connect: tuple[str, ...] = knob((), "zenoh endpoints to connect to")
-    retry_s: float = knob(2.0, "longest wait between two attempts to reach an endpoint of connect, s", low=0.1, high=60)
-    config: str = knob("", "a zenoh configuration file (JSON5) that is read first; settings here override it")
-    tls_ca: str = knob("", "certificate of the authority that signs the others' certificates, PEM; for tls/ endpoints")
-    tls_listen_key: str = knob("", "private key for incoming connections, PEM")
-    tls_listen_certificate: str = knob("", "certificate for incoming connections, PEM")
-    tls_connect_key: str = knob("", "private key for outgoing connections, PEM")
-    tls_connect_certificate: str = knob("", "certificate for outgoing connections, PEM; with one, tls_mutual is on")
-    tls_mutual: bool = knob(False, "clients must present a certificate that tls_ca has signed")
-    user: str = knob("", "user name for outgoing connections")
-    password_file: str = knob("", "file with the password of user, one line")
-    users_file: str = knob("", "file with the users that may connect: lines user:password")
-    command_names: tuple[str, ...] = knob((), "certificates (common names) that may send commands")
-    command_users: tuple[str, ...] = knob((), "users that may send commands; with neither: all that can connect")
-    command_clock: str = knob(
-        "synchronised",
+    tls_mutual: Annotated[bool, "clients must present a certificate that tls_ca has signed"] = False
+    user: Annotated[str, "user name for outgoing connections"] = ""
+    password_file: Annotated[str, "file with the password of user, one line"] = ""
+    users_file: Annotated[str, "file with the users that may connect: lines user:password"] = ""
+    command_names: Annotated[tuple[str, ...], "certificates (common names) that may send commands"] = ()
+    command_users: Annotated[tuple[str, ...], "users that may send commands; with neither: all that can connect"] = ()
+    command_clock: Annotated[
+        Literal["synchronised", "arrival"],
         "synchronised: stamps of commands must be within controller.deadlines.command_s of this machine's clock; "
         "arrival: for senders with another clock, stamps must only rise",
-        choices=("synchronised", "arrival"),
-    )
-    ros2: str = knob("off", "connection to ROS 2 by its middleware rmw_zenoh", choices=("off", "rmw_zenoh"))
-    ros2_domain: int = knob(0, "ROS_DOMAIN_ID, for rmw_zenoh", low=0, high=232)
-    panorama_hz: float = knob(
-        2.0, "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none", low=0, high=60
-    )
+    ] = "synchronised"
+    ros2: Annotated[Literal["off", "rmw_zenoh"], "connection to ROS 2 by its middleware rmw_zenoh"] = "off"
+    ros2_domain: Annotated[int, Meta(ge=0, le=232), "ROS_DOMAIN_ID, for rmw_zenoh"] = 0
+    panorama_hz: Annotated[
+        float, Meta(ge=0, le=60), "panoramas on the bus per second, as JPEG, made while somebody subscribes; 0: none"
+    ] = 2.0
 
 
 def checked(config: BusConfig) -> BusConfig:

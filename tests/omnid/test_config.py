@@ -7,16 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from omnid.config import Config, load_config
+from omnid.config import FIRST_SETTINGS, USED_ONLY_BY, Config, load_config, unused_settings
 from omnid.errors import OmnidError
-from omnid.settings_dump import dump
+from omnid.settings import dump_minimal, paths_of
 
 SHIPPED = Path(__file__).parents[2] / "systemd" / "omnid.toml"
 
 
-def test_the_shipped_configuration_is_the_default_with_every_knob() -> None:
+def test_the_shipped_configuration_is_the_default() -> None:
     assert load_config(SHIPPED) == Config()
-    assert SHIPPED.read_text() == dump(Config()), "run `omnid config > systemd/omnid.toml`"
+    assert SHIPPED.read_text() == dump_minimal(Config(), FIRST_SETTINGS), "run `omnid config --minimal`"
+    assert set(FIRST_SETTINGS) <= set(paths_of(Config))
 
 
 @pytest.mark.parametrize(
@@ -37,16 +38,56 @@ def test_the_papers_method_works_on_the_enhanced_sad_unless_the_matching_is_set(
 @pytest.mark.parametrize(
     ("key", "proposed"),
     [
-        ("controller.max_velocity", "did you mean controller.limits.velocity_mps or "),
-        ("motor.wheel_base_mm", "did you mean motor.drive.track_m?"),
-        ("wheel_separation", "did you mean motor.drive.track_m?"),
-        ("mapping.voxel_mm", "did you mean mapping.voxel_m?"),
+        ("controller.limits.velocity_mpss", "controller.limits.velocity_mps"),
+        ("controller.velocity_mps", "controller.limits.velocity_mps"),
+        ("mapping.voxel_mm", "mapping.voxel_m"),
     ],
 )
-def test_a_wrong_key_is_answered_by_keys_of_its_own_section(key: str, proposed: str) -> None:
-    with pytest.raises(OmnidError, match=re.escape(f"unknown key {key}: {proposed}")):
+def test_a_wrong_key_is_answered_by_a_similar_one(key: str, proposed: str) -> None:
+    with pytest.raises(OmnidError, match=re.escape(f"unknown key {key}: did you mean {proposed}?")):
         load_config(None, [f"{key}=1"])
 
 
 def test_one_override_needs_no_list() -> None:
     assert load_config(overrides="motor.rate_hz=31") == load_config(overrides=["motor.rate_hz=31"]) != Config()
+
+
+@pytest.mark.parametrize("path", USED_ONLY_BY)
+def test_the_table_of_unused_settings_names_keys_that_exist(path: str) -> None:
+    assert any(f"{known}.".startswith(f"{path}.") for known in paths_of(Config))
+
+
+@pytest.mark.parametrize(
+    ("command", "override"),
+    [
+        ("run", "graph.depth=3"),
+        ("run", " controller.setpoint . velocity_mps=0.0"),
+        ("run", "log.reorder_frames=8"),
+        ("replay", "cameras.width_px=640"),
+        ("replay", "live.cloud_s=1"),
+        ("replay", "record.enabled=true"),
+    ],
+)
+def test_refuses_an_override_that_the_command_ignores(command: str, override: str) -> None:
+    config = load_config(None, [override])
+    with pytest.raises(OmnidError, match=rf"^override '.*': `omnid {command}` does not use \S+: leave it out$"):
+        unused_settings(config, command, [override])
+
+
+def test_warns_in_one_line_of_settings_in_the_file_that_a_replay_ignores() -> None:
+    config = load_config(None, ["cameras.width_px=640", "service.stall_timeout_s=5", "record.cloud_points=7"])
+    (warning,) = unused_settings(config, "replay", ["record.cloud_points=7"])
+    assert warning == "`omnid replay` does not use these settings: cameras.width_px, service.stall_timeout_s"
+    assert unused_settings(config, "run", []) == []
+
+
+def test_the_daemon_refuses_a_setpoint_in_its_configuration() -> None:
+    config = load_config(None, ["controller.setpoint.velocity_mps=0.3"])
+    with pytest.raises(OmnidError, match="velocity_mps is set, but `omnid run` drives by the setpoints"):
+        unused_settings(config, "run", [])
+    assert unused_settings(config, "replay", ["controller.setpoint.velocity_mps=0.3"]) == []
+
+
+@pytest.mark.parametrize("command", ["run", "replay"])
+def test_the_defaults_give_no_warning(command: str) -> None:
+    assert unused_settings(Config(), command, []) == []

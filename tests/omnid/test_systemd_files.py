@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.v4l2_devices import CaptureDevice, udev_rules
+from drivers.cameras.v4l2_device import CaptureDevice, udev_rules
 from omnid.engine.realtime import RealtimeSettings
 
 SYSTEMD = Path(__file__).parents[2] / "systemd"

@@ -6,7 +6,6 @@ from typing import Final, NamedTuple
 
 from omnid.core.control.contacts import LATCHING
 from omnid.core.control.safety_rules import ASKED
-from omnid.settings import knob
 
 MANUAL: Final = "manual"
 AUTOMATIC: Final = "automatic"
@@ -15,16 +14,6 @@ STARTED: Final = "not armed since the start"
 # Reasons to refuse a request to arm. A fault that holds is another one (omnid.core.control.safety_rules).
 OLDER_THAN_STOP: Final = "older than the last stop"
 TOO_LATE: Final = "it was not handled in time"
-
-
-def arming_knob() -> str:
-    """Return the declaration of `controller.arming`."""
-    return knob(
-        MANUAL,
-        "manual: the wheels turn only after cmd/arm (`omnid arm`), again after each stop and each "
-        "fault; automatic: for service without an operator, faults that have passed need no cmd/arm, stops do",
-        choices=(MANUAL, AUTOMATIC),
-    )
 
 
 class ArmRequest(NamedTuple):

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from collections import Counter
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
+
+from msgspec import Meta
 
 from omnid.core.control.heading_controller import Setpoint
 from omnid.errors import OmnidError
-from omnid.settings import knob
 
 OPERATOR: Final = "operator"
 PLANNER: Final = "planner"
@@ -28,18 +29,17 @@ OTHER_SENDER: Final = "another sender drives"
 class SourceSettings:
     """Sources of commands in the order of their priority."""
 
-    names: tuple[str, ...] = knob(
-        (OPERATOR, PLANNER),
+    names: Annotated[
+        tuple[str, ...],
         "sources of commands, highest priority first: topics "
         "cmd/NAME/twist and cmd/NAME/heading; cmd/twist and cmd/heading are the first one's",
-    )
-    hold_s: float = knob(
-        0.5,
+    ] = (OPERATOR, PLANNER)
+    hold_s: Annotated[
+        float,
+        Meta(ge=0.05, le=60),
         "a source keeps out those of lower priority, and its sender all others, for so long "
         "after its newest command, s",
-        low=0.05,
-        high=60,
-    )
+    ] = 0.5
 
     def __post_init__(self) -> None:
         """Raise OmnidError for names that cannot be part of a topic, occur twice, or are too many."""

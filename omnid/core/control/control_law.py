@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Final, NamedTuple
+from typing import Annotated, Final, Literal, NamedTuple
 
-from omnid.core.control.arming import AUTOMATIC, Arming, ArmRequest, arming_knob
+from msgspec import Meta
+
+from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest
 from omnid.core.control.collision_monitor import CollisionMonitor
 from omnid.core.control.collision_settings import CollisionSettings
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
@@ -31,7 +33,6 @@ from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInput
 from omnid.core.control.trust import TrustSettings
 from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.settings import knob
 
 TO_STAND: Final = Setpoint(0.0)
 # Change of the heading beyond what the base can turn, from which odometry was corrected or is wrong. By judgement, far
@@ -43,8 +44,8 @@ JUMP_RAD: Final = 0.3
 class ReplaySetpoint:
     """The setpoint of a replay, which has no operator; it is renewed all the time."""
 
-    velocity_mps: float = knob(0.0, "replay: forward speed, m/s", low=-10, high=10)
-    heading_deg: float = knob(0.0, "replay: heading in odom, counter-clockwise, deg", low=-360, high=360)
+    velocity_mps: Annotated[float, Meta(ge=-10, le=10), "replay: forward speed, m/s"] = 0.0
+    heading_deg: Annotated[float, Meta(ge=-360, le=360), "replay: heading in odom, counter-clockwise, deg"] = 0.0
 
     def setpoint(self) -> Setpoint:
         """Return it in SI units."""
@@ -60,7 +61,11 @@ class ControllerSettings:
     heading: HeadingLimits = field(default_factory=HeadingLimits)
     setpoint: ReplaySetpoint = field(default_factory=ReplaySetpoint)
     sources: SourceSettings = field(default_factory=SourceSettings)
-    arming: str = arming_knob()
+    arming: Annotated[
+        Literal["manual", "automatic"],
+        "manual: the wheels turn only after cmd/arm (`omnid arm`), again after each stop and each "
+        "fault; automatic: for service without an operator, faults that have passed need no cmd/arm, stops do",
+    ] = MANUAL
     trust: TrustSettings = field(default_factory=TrustSettings)
     motion: MotionSettings = field(default_factory=MotionSettings)
     collision: CollisionSettings = field(default_factory=CollisionSettings)

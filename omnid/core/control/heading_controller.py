@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Annotated, Final
+
+from msgspec import Meta
 
 from omnid.errors import OmnidError
-from omnid.settings import knob
 
 LONGEST_TICK_S: Final = 0.2  # a late tick does not allow a larger step; by trial on development seeds
 HALF_TURN_RAD: Final = 0.2  # closer to half a turn than this, noise would change the side to turn to
@@ -19,11 +20,11 @@ BRAKING_SHARE: Final = 0.8
 class HeadingLimits:
     """Limits of the heading controller, in magnitude, and its gain."""
 
-    velocity_mps: float = knob(0.5, "highest speed, m/s", low=0.001, high=10)
-    acceleration_mps2: float = knob(0.5, "highest acceleration, m/s^2", low=0.001, high=100)
-    yaw_rate_radps: float = knob(1.0, "highest yaw rate, rad/s", low=0.001, high=20)
-    yaw_acceleration_radps2: float = knob(3.0, "highest yaw acceleration, rad/s^2", low=0.001, high=200)
-    gain_hz: float = knob(1.5, "yaw rate per heading error, 1/s", low=0.001, high=50)
+    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.5
+    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.5
+    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.0
+    yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 3.0
+    gain_hz: Annotated[float, Meta(ge=0.001, le=50), "yaw rate per heading error, 1/s"] = 1.5
 
     def __post_init__(self) -> None:
         """Raise OmnidError unless each number is finite and above 0."""

@@ -17,12 +17,13 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from itertools import takewhile
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
+
+from msgspec import Meta
 
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.settings import knob
 
 MOST_ACCOUNTS: Final = 2048  # kept of each kind, because 10 s at the highest rate of commands have so many
 SIGMAS: Final = 3.0  # Of right differences 0.3 % exceed this, so that false alarms are rare.
@@ -80,15 +81,17 @@ AGREE: Final = Witness()
 class MotionSettings:
     """Plausible differences between commanded, reported and seen motion."""
 
-    check: bool = knob(True, "compare the motion that is commanded, reported by the wheels and seen by the cameras")
-    delay_s: float = knob(0.5, "time after which the base must follow a command, s", low=0.05, high=5)
-    slip: float = knob(0.4, "plausible slip of the wheels, as a share of the speed", low=0, high=0.95)
-    speed_mps: float = knob(0.02, "difference in speed that means nothing, m/s", low=0, high=1)
-    yaw_rate_radps: float = knob(0.15, "difference in yaw rate that means nothing, rad/s", low=0, high=3)
-    slow_m: float = knob(0.05, "unexplained motion that slows the base down, m", low=0.001, high=10)
-    stop_m: float = knob(0.15, "unexplained motion that stops the base, m", low=0.001, high=10)
-    slow_rad: float = knob(0.15, "unexplained rotation that slows the base down, rad", low=0.001, high=10)
-    stop_rad: float = knob(0.5, "unexplained rotation that stops the base, rad", low=0.001, high=10)
+    check: Annotated[bool, "compare the motion that is commanded, reported by the wheels and seen by the cameras"] = (
+        True
+    )
+    delay_s: Annotated[float, Meta(ge=0.05, le=5), "time after which the base must follow a command, s"] = 0.5
+    slip: Annotated[float, Meta(ge=0, le=0.95), "plausible slip of the wheels, as a share of the speed"] = 0.4
+    speed_mps: Annotated[float, Meta(ge=0, le=1), "difference in speed that means nothing, m/s"] = 0.02
+    yaw_rate_radps: Annotated[float, Meta(ge=0, le=3), "difference in yaw rate that means nothing, rad/s"] = 0.15
+    slow_m: Annotated[float, Meta(ge=0.001, le=10), "unexplained motion that slows the base down, m"] = 0.05
+    stop_m: Annotated[float, Meta(ge=0.001, le=10), "unexplained motion that stops the base, m"] = 0.15
+    slow_rad: Annotated[float, Meta(ge=0.001, le=10), "unexplained rotation that slows the base down, rad"] = 0.15
+    stop_rad: Annotated[float, Meta(ge=0.001, le=10), "unexplained rotation that stops the base, rad"] = 0.5
 
 
 class Motion(NamedTuple):

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
+
+from msgspec import Meta
 
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_FOLLOWED, NOT_SEEN, WITNESSES
-from omnid.settings import knob
 from omnid.tracking_state import TrackingState
 
 
@@ -21,11 +22,13 @@ from omnid.tracking_state import TrackingState
 class Deadlines:
     """Ages of pose and setpoint, and lateness of a tick, beyond which the wheels stop."""
 
-    pose_s: float = knob(0.5, "the wheels stop when the newest pose's images are older, s", low=0.05, high=10)
-    command_s: float = knob(0.5, "the wheels stop when the newest setpoint arrived longer ago, s", low=0.05, high=10)
-    tick_s: float = knob(
-        0.25, "the wheels stop when a tick is later, because the host is overloaded, s", low=0.01, high=10
-    )
+    pose_s: Annotated[float, Meta(ge=0.05, le=10), "the wheels stop when the newest pose's images are older, s"] = 0.5
+    command_s: Annotated[
+        float, Meta(ge=0.05, le=10), "the wheels stop when the newest setpoint arrived longer ago, s"
+    ] = 0.5
+    tick_s: Annotated[
+        float, Meta(ge=0.01, le=10), "the wheels stop when a tick is later, because the host is overloaded, s"
+    ] = 0.25
 
 
 @dataclass(frozen=True, slots=True)

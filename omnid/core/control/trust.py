@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Annotated, Final, Literal
+
+from msgspec import Meta
 
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.settings import knob
 
 # A voltage that is low for a shorter time is that of a motor that starts; by trial on development seeds.
 BATTERY_S: Final = 2.0
@@ -17,26 +18,24 @@ OFF: Final = 0.0  # exact: the value of a setting that switches its rule off
 class TrustSettings:
     """Levels at which the base slows down or stops."""
 
-    degraded_speed: float = knob(
-        0.5,
+    degraded_speed: Annotated[
+        float,
+        Meta(ge=0.05, le=1),
         "share of the speed and yaw rate of controller.limits while the pose is degraded "
         "or some motion is unexplained; 1: no slowing",
-        low=0.05,
-        high=1,
-    )
-    velocity_sigma_mps: float = knob(
-        0.2,
+    ] = 0.5
+    velocity_sigma_mps: Annotated[
+        float,
+        Meta(ge=0, le=10),
         "the wheels stop when the standard deviation of the seen velocity stays higher, m/s; 0: never",
-        low=0,
-        high=10,
-    )
-    yaw_rate_sigma_radps: float = knob(0.4, "the same of the yaw rate, rad/s; 0: never", low=0, high=20)
-    sigma_s: float = knob(0.3, "time for which a standard deviation may be higher, s", low=0, high=10)
-    odometry_reset: str = knob("stop", "when odometry has lost its map and begins again", choices=("stop", "ignore"))
-    motor_fault: str = knob("stop", "when the motor controller reports a fault", choices=("stop", "ignore"))
-    battery_v: float = knob(
-        0.0, "the wheels stop when the battery's voltage stays below, V; 0: never", low=0, high=1000
-    )
+    ] = 0.2
+    yaw_rate_sigma_radps: Annotated[float, Meta(ge=0, le=20), "the same of the yaw rate, rad/s; 0: never"] = 0.4
+    sigma_s: Annotated[float, Meta(ge=0, le=10), "time for which a standard deviation may be higher, s"] = 0.3
+    odometry_reset: Annotated[Literal["stop", "ignore"], "when odometry has lost its map and begins again"] = "stop"
+    motor_fault: Annotated[Literal["stop", "ignore"], "when the motor controller reports a fault"] = "stop"
+    battery_v: Annotated[
+        float, Meta(ge=0, le=1000), "the wheels stop when the battery's voltage stays below, V; 0: never"
+    ] = 0.0
 
 
 class PoseTrust:

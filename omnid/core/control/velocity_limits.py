@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Annotated, Final
+
+from msgspec import Meta
 
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Twist
 from omnid.errors import OmnidError
-from omnid.settings import knob
 
 STOP: Final = Twist()
 
@@ -17,11 +18,11 @@ STOP: Final = Twist()
 class VelocityLimits:
     """Limits of the commands to the wheels, in magnitude; the deceleration holds for stops as well."""
 
-    velocity_mps: float = knob(0.6, "highest speed, m/s", low=0.001, high=10)
-    acceleration_mps2: float = knob(0.6, "highest acceleration, m/s^2", low=0.001, high=100)
-    deceleration_mps2: float = knob(1.5, "highest deceleration, at stops as well, m/s^2", low=0.001, high=100)
-    yaw_rate_radps: float = knob(1.2, "highest yaw rate, rad/s", low=0.001, high=20)
-    yaw_acceleration_radps2: float = knob(4.0, "highest yaw acceleration, rad/s^2", low=0.001, high=200)
+    velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.6
+    acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.6
+    deceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest deceleration, at stops as well, m/s^2"] = 1.5
+    yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.2
+    yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 4.0
 
     def __post_init__(self) -> None:
         """Raise OmnidError unless each number is finite and above 0."""

@@ -3,62 +3,60 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from omnid.errors import OmnidError
-from omnid.settings import knob
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryLimits:
     """Number of landmarks and keyframes, and the thresholds of the acceptance test and of the tracking state."""
 
-    features: int = knob(500, "landmarks wanted in a keyframe", low=20, high=10_000)
-    refresh: float = knob(
-        0.9, "a keyframe is added when less than this share of the last one's landmarks is left", low=0, high=1
-    )
+    features: Annotated[int, Meta(ge=20, le=10_000), "landmarks wanted in a keyframe"] = 500
+    refresh: Annotated[
+        float, Meta(ge=0, le=1), "a keyframe is added when less than this share of the last one's landmarks is left"
+    ] = 0.9
     # Defaults of times lie in the middle between two pairs at 10 Hz, so that the jitter of stamps changes nothing.
-    sparse_s: float = knob(
-        0.45, "time after which a keyframe is added where the features wanted are not reached, s", low=0, high=100
-    )
-    keyframes: int = knob(8, "keyframes in the local map; 1: frame to frame", low=1, high=50)
-    min_inliers: int = knob(20, "inliers below which a pose is refused", low=4, high=10_000)
-    min_inlier_ratio: float = knob(
-        0.4,
+    sparse_s: Annotated[
+        float, Meta(ge=0, le=100), "time after which a keyframe is added where the features wanted are not reached, s"
+    ] = 0.45
+    keyframes: Annotated[int, Meta(ge=1, le=50), "keyframes in the local map; 1: frame to frame"] = 8
+    min_inliers: Annotated[int, Meta(ge=4, le=10_000), "inliers below which a pose is refused"] = 20
+    min_inlier_ratio: Annotated[
+        float,
+        Meta(ge=0, le=1),
         "inliers, as a share of the tracked landmarks, below which a pose is refused; likewise those that the upper "
         "camera shows, as a share of the inliers",
-        low=0,
-        high=1,
-    )
-    good_inliers: int = knob(50, "inliers below which a pose is degraded", low=4, high=10_000)
-    good_inlier_ratio: float = knob(
-        0.6,
+    ] = 0.4
+    good_inliers: Annotated[int, Meta(ge=4, le=10_000), "inliers below which a pose is degraded"] = 50
+    good_inlier_ratio: Annotated[
+        float,
+        Meta(ge=0, le=1),
         "inlier ratio below which other yaw angles are tried, and share of the inliers in the upper camera below which "
         "a pose is degraded",
-        low=0,
-        high=1,
-    )
-    max_speed_mps: float = knob(5.0, "poses that imply a higher speed are refused, m/s", low=0.1, high=100)
-    lost_s: float = knob(
-        0.15, "time from the first of consecutive refused frames after which the state is lost, s", low=0, high=100
-    )
-    restart_s: float = knob(
-        0.85,
+    ] = 0.6
+    max_speed_mps: Annotated[float, Meta(ge=0.1, le=100), "poses that imply a higher speed are refused, m/s"] = 5.0
+    lost_s: Annotated[
+        float, Meta(ge=0, le=100), "time from the first of consecutive refused frames after which the state is lost, s"
+    ] = 0.15
+    restart_s: Annotated[
+        float,
+        Meta(ge=0, le=1000),
         "time from the first frame with enough corners that matches no landmark while lost, after which the map is "
         "started again, s",
-        low=0,
-        high=1000,
-    )
-    max_gap_s: float = knob(0.5, "a pose after a longer time without frames is degraded, s", low=0.01, high=60)
-    bridge_s: float = knob(
-        10.0,
+    ] = 0.85
+    max_gap_s: Annotated[float, Meta(ge=0.01, le=60), "a pose after a longer time without frames is degraded, s"] = 0.5
+    bridge_s: Annotated[
+        float,
+        Meta(ge=0, le=600),
         "longest time for which wheels and gyro carry the pose on while the cameras show "
         "nothing, as degraded; 0: never, s",
-        low=0,
-        high=600,
-    )
-    bridge_sigma_m: float = knob(
-        0.15, "uncertainty of the position that ends that, standard deviation, m", low=0.001, high=10
-    )
+    ] = 10.0
+    bridge_sigma_m: Annotated[
+        float, Meta(ge=0.001, le=10), "uncertainty of the position that ends that, standard deviation, m"
+    ] = 0.15
 
     def __post_init__(self) -> None:
         """Raise OmnidError unless a keyframe may have more landmarks than a pose needs."""

@@ -3,44 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated, Literal
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.settings import knob
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSensorSettings:
     """Wheels and gyro in addition to the cameras. Scales, bias and offsets of their clocks are estimated on the way."""
 
-    wheels: str = knob(
-        "auto",
+    wheels: Annotated[
+        Literal["auto", "off"],
         "speeds of the wheels: those that the motor controller reports, of the bus (cmd/wheel_odom) or of the log",
-        choices=("auto", "off"),
-    )
-    imu: str = knob("auto", "gyro: that of the bus (cmd/imu) or of the log", choices=("auto", "off"))
-    wheel_topic: str = knob(
-        "",
+    ] = "auto"
+    imu: Annotated[Literal["auto", "off"], "gyro: that of the bus (cmd/imu) or of the log"] = "auto"
+    wheel_topic: Annotated[
+        str,
         "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
         "name contains 'wheel'. With left_joint: of JointState; empty: the only one",
-    )
-    left_joint: str = knob(
-        "",
+    ] = ""
+    left_joint: Annotated[
+        str,
         "name of the left wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, "
         "which then stands for the Odometry of the wheels; empty: none",
-    )
-    right_joint: str = knob("", "name of the right one; radius and track are those of motor.drive")
-    imu_topic: str = knob("", "topic of a log with sensor_msgs/msg/Imu; empty: the only one")
-    imu_roll_deg: float = knob(
-        0.0,
+    ] = ""
+    right_joint: Annotated[str, "name of the right one; radius and track are those of motor.drive"] = ""
+    imu_topic: Annotated[str, "topic of a log with sensor_msgs/msg/Imu; empty: the only one"] = ""
+    imu_roll_deg: Annotated[
+        float,
+        Meta(ge=-360, le=360),
         "orientation of the IMU on the base: roll about x, deg; not applied to messages in the frame base_link",
-        low=-360,
-        high=360,
-    )
-    imu_pitch_deg: float = knob(0.0, "... then pitch about y, deg", low=-360, high=360)
-    imu_yaw_deg: float = knob(0.0, "... then yaw about z, deg", low=-360, high=360)
+    ] = 0.0
+    imu_pitch_deg: Annotated[float, Meta(ge=-360, le=360), "... then pitch about y, deg"] = 0.0
+    imu_yaw_deg: Annotated[float, Meta(ge=-360, le=360), "... then yaw about z, deg"] = 0.0
 
     @property
     def R_base_imu(self) -> NDArray[np.float64]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from omnid.core.types.panorama import PaddedPanorama
-from omnid.settings import knob
 
 Array = NDArray[np.float64]
 
@@ -24,10 +25,10 @@ MIN_EIGENVALUE = 1e-4  # Of the window's gradients; OpenCV's default: below it t
 class KltSettings:
     """Settings of the pyramidal Lucas-Kanade tracker and of the forward-backward check."""
 
-    window_px: int = knob(15, "side of the tracking window, px", low=5, high=61)
-    levels: int = knob(3, "pyramid levels above the image", low=0, high=MAX_LEVELS)
-    max_error_px: float = knob(0.5, "largest forward-backward error of a track, px", low=0.01, high=10)
-    iterations: int = knob(20, "iterations on each pyramid level", low=1, high=200)
+    window_px: Annotated[int, Meta(ge=5, le=61), "side of the tracking window, px"] = 15
+    levels: Annotated[int, Meta(ge=0, le=MAX_LEVELS), "pyramid levels above the image"] = 3
+    max_error_px: Annotated[float, Meta(ge=0.01, le=10), "largest forward-backward error of a track, px"] = 0.5
+    iterations: Annotated[int, Meta(ge=1, le=200), "iterations on each pyramid level"] = 20
 
 
 def track(

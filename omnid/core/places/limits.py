@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from omnid.settings import knob
+from msgspec import Meta
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceLimits:
     """Distance and number of the keyframes that stay."""
 
-    keyframe_m: float = knob(
-        0.3, "distance after which a keyframe is kept for the recognition of the place, m", low=0.05, high=10
-    )
-    keyframe_deg: float = knob(15.0, "turn after which a keyframe is kept, deg", low=1, high=180)
-    rate_hz: float = knob(
-        5.0, "keyframes a second, at most: each is searched for in the map, which takes some 30 ms", low=0.1, high=100
-    )
-    max_keyframes: int = knob(
-        2000,
+    keyframe_m: Annotated[
+        float, Meta(ge=0.05, le=10), "distance after which a keyframe is kept for the recognition of the place, m"
+    ] = 0.3
+    keyframe_deg: Annotated[float, Meta(ge=1, le=180), "turn after which a keyframe is kept, deg"] = 15.0
+    rate_hz: Annotated[
+        float,
+        Meta(ge=0.1, le=100),
+        "keyframes a second, at most: each is searched for in the map, which takes some 30 ms",
+    ] = 5.0
+    max_keyframes: Annotated[
+        int,
+        Meta(ge=2, le=100_000),
         "keyframes kept, of some 35 kB each in memory; more drop those that others are nearest to",
-        low=2,
-        high=100_000,
-    )
+    ] = 2000

@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Annotated, Literal, Protocol, TypeVar
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from omnid.core.stereo.anchors import AnchorPropagation, Candidates
 from omnid.core.stereo.edges import edge_pixels, smooth
 from omnid.core.stereo.sad import NO_MATCH, Costs, Indices, SadVolume, local_minima, subpixel
 from omnid.core.stereo.semiglobal import ColumnShift, SemiGlobalPrior, WarpedSad, refined
-from omnid.settings import knob
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]
@@ -37,31 +37,37 @@ EDGE_NOISE = 6.0
 class MatchingSettings:
     """Settings of the matching: method, window and threshold of the SAD, choice of edges."""
 
-    method: str = knob(
-        "auto",
+    method: Annotated[
+        Literal["auto", "sad", "enhanced", "semiglobal"],
         "chooses among several candidates; auto: enhanced for the paper's odometry, else semiglobal",
-        choices=("auto", *METHODS),
-    )
-    window_px: int = knob(9, "side of the matching window, px; odd", low=3, high=15)
-    disparities: int = knob(
-        128, "largest number of disparities searched, px; fewer where stereo.min_range_m needs fewer", low=8, high=512
-    )
-    max_difference: float = knob(
-        12.0, "largest mean difference of grey levels in the window of a match", low=0, high=255
-    )
-    runner_up_ratio: float = knob(
-        2.0,
+    ] = "auto"
+    window_px: Annotated[int, Meta(ge=3, le=15), "side of the matching window, px; odd"] = 9
+    disparities: Annotated[
+        int,
+        Meta(ge=8, le=512),
+        "largest number of disparities searched, px; fewer where stereo.min_range_m needs fewer",
+    ] = 128
+    max_difference: Annotated[
+        float, Meta(ge=0, le=255), "largest mean difference of grey levels in the window of a match"
+    ] = 12.0
+    runner_up_ratio: Annotated[
+        float,
+        Meta(ge=1, le=10),
         "enhanced: a runner-up's SAD is at most so many times the lowest one, plus runner_up_difference",
-        low=1,
-        high=10,
-    )
-    runner_up_difference: float = knob(
-        4.0, "enhanced: mean difference of grey levels; a point without a runner-up is an anchor", low=0, high=255
-    )
-    edge_threshold: int = knob(40, "least Sobel response of an edge, 8 per grey level and pixel", low=0, high=1020)
-    max_points: int = knob(30_000, "largest number of edge pixels matched in a pair", low=100, high=1_000_000)
-    sigma_px: float = knob(0.8, "standard deviation of the Gaussian blur before matching, px; 0: none", low=0, high=10)
-    max_candidates: int = knob(8, "enhanced: largest number of candidates compared for one pixel", low=2, high=64)
+    ] = 2.0
+    runner_up_difference: Annotated[
+        float, Meta(ge=0, le=255), "enhanced: mean difference of grey levels; a point without a runner-up is an anchor"
+    ] = 4.0
+    edge_threshold: Annotated[
+        int, Meta(ge=0, le=1020), "least Sobel response of an edge, 8 per grey level and pixel"
+    ] = 40
+    max_points: Annotated[int, Meta(ge=100, le=1_000_000), "largest number of edge pixels matched in a pair"] = 30_000
+    sigma_px: Annotated[
+        float, Meta(ge=0, le=10), "standard deviation of the Gaussian blur before matching, px; 0: none"
+    ] = 0.8
+    max_candidates: Annotated[
+        int, Meta(ge=2, le=64), "enhanced: largest number of candidates compared for one pixel"
+    ] = 8
 
 
 class CandidateSearch(Protocol):

@@ -30,7 +30,7 @@ from omnid.config import Config, load_config
 from omnid.errors import OmnidError
 from omnid.formats.place_file import read_places, write_places
 from omnid.formats.tum import read_tum
-from omnid.settings_dump import dump
+from omnid.settings import dump
 from omnid.transport import codec
 from omnid.transport.decode import decode_diagnostics, decode_pose
 from omnid.transport.pose_attachment import PoseAttachment

@@ -1,93 +1,186 @@
-"""Controls of a camera: planned in their order, and refused where the camera does not accept them."""
+"""Controls of a camera: planned in their order, refused where they are not accepted, and the exposure by requests."""
 
 from __future__ import annotations
 
+import errno
 from typing import Any
 
 import pytest
 
+from drivers.cameras import v4l2_ioctl as v4l2
+from drivers.cameras.camera_state import (
+    CameraExposure,
+    ExposureRanges,
+    ExposureRequest,
+    ExposureSetting,
+    ValueRange,
+)
 from drivers.cameras.v4l2_controls import (
     AUTO_EXPOSURE,
     AUTO_GAIN,
     EXPOSURE,
     EXPOSURE_MAY_SLOW,
     GAIN,
-    POWER_LINE_FREQUENCY,
-    CameraControl,
+    ExposureControls,
+    apply_controls,
+    list_controls,
     plan_controls,
 )
 from drivers.cameras.v4l2_settings import V4l2Settings
 from drivers.errors import DriverError
+from tests.drivers.cameras.fake_camera import APERTURE_PRIORITY, FakeCamera
 
-MENU = {0: "Disabled", 1: "50 Hz", 2: "60 Hz"}
-
-
-OFFERED = {
-    control.id: control
-    for control in (
-        CameraControl(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={1: "Manual Mode", 3: "Aperture Priority Mode"}),
-        CameraControl(EXPOSURE, "exposure_time_absolute", 1, 3, 2047),
-        CameraControl(EXPOSURE_MAY_SLOW, "exposure_dynamic_framerate", 2, 0, 1),
-        CameraControl(GAIN, "gain", 1, 0, 100, 5),
-        CameraControl(AUTO_GAIN, "gain_automatic", 2, 0, 1),
-        CameraControl(POWER_LINE_FREQUENCY, "power_line_frequency", 3, 0, 2, menu=MENU),
-        CameraControl(0x980901, "contrast", 1, -64, 64),
-    )
-}
+FD = 1000
 
 
-def settings(**fields: Any) -> V4l2Settings:
-    return V4l2Settings("/dev/omnid/lower", **fields)
-
-
-def test_sets_no_control_by_default() -> None:
-    assert plan_controls(settings(), OFFERED) == [] and plan_controls(settings(), {}) == []
+@pytest.fixture
+def camera(monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
+    made = FakeCamera()
+    monkeypatch.setattr(v4l2, "call", made.call)
+    return made
 
 
 def plan(**fields: Any) -> list[tuple[str, int]]:
-    return [(control.name, value) for control, value in plan_controls(settings(**fields), OFFERED)]
+    settings = V4l2Settings("/dev/omnid/lower", **fields)
+    return [(control.name, value) for control, value in plan_controls(settings, list_controls(FD))]
 
 
-def test_switches_the_automatic_mode_off_before_a_fixed_value() -> None:
-    assert plan(exposure_us=10_040, gain=15) == [
-        ("auto_exposure", 1), ("exposure_dynamic_framerate", 0), ("gain_automatic", 0),
-        ("exposure_time_absolute", 100), ("gain", 15),
-    ]  # fmt: skip
+@pytest.mark.parametrize(
+    ("fields", "expected"),
+    [
+        ({}, []),
+        (
+            {"exposure_us": 10_040, "gain": 15},
+            [
+                ("auto_exposure", 1),
+                ("exposure_dynamic_framerate", 0),
+                ("gain_automatic", 0),
+                ("exposure_time_absolute", 100),
+                ("gain", 15),
+            ],
+        ),
+        ({"auto_exposure": "on"}, [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]),
+        ({"auto_exposure": "rig"}, [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]),
+        ({"controls": ("contrast = -3",)}, [("contrast", -3)]),
+    ],
+)
+def test_automatic_modes_come_before_the_values_that_they_govern(
+    camera: FakeCamera, fields: dict[str, Any], expected: list[tuple[str, int]]
+) -> None:
+    assert plan(**fields) == expected
 
 
-def test_uses_the_cameras_automatic_exposure_and_keeps_the_rate() -> None:
-    assert plan(auto_exposure="on") == [("auto_exposure", 3), ("exposure_dynamic_framerate", 0)]
-    full = {
-        AUTO_EXPOSURE: CameraControl(AUTO_EXPOSURE, "auto_exposure", 3, 0, 3, menu={0: "Auto", 1: "Manual", 3: "A"})
-    }
-    assert plan_controls(settings(auto_exposure="on"), full) == [(full[AUTO_EXPOSURE], 0)]
-
-
-def test_a_fixed_gain_needs_no_automatic_mode_but_switching_it_does() -> None:
-    only_gain = {GAIN: OFFERED[GAIN]}
-    assert plan_controls(settings(gain=15), only_gain) == [(OFFERED[GAIN], 15)]
-    with pytest.raises(DriverError, match="no control of its automatic gain"):
-        plan_controls(settings(auto_gain="off"), only_gain)
-
-
-def test_sets_other_controls_by_name() -> None:
-    assert plan(power_line="50", controls=("contrast=-3",)) == [("power_line_frequency", 1), ("contrast", -3)]
+def test_what_a_camera_lacks_is_needed_only_where_it_is_asked_for(camera: FakeCamera) -> None:
+    camera.menu = (0, 1, 3)
+    assert plan(auto_exposure="on")[0] == ("auto_exposure", 0)
+    del camera.controls[AUTO_GAIN], camera.controls[AUTO_EXPOSURE], camera.controls[EXPOSURE_MAY_SLOW]
+    assert plan(gain=15) == [("gain", 15)] and plan(auto_exposure="rig") == []
+    for fields, name in (({"auto_gain": "off"}, "automatic gain"), ({"power_line": "50"}, "power line frequency")):
+        with pytest.raises(DriverError, match=f"no control of its {name}"):
+            plan(**fields)
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"gain": 101}, "gain: 101 was requested, it accepts 0 to 100 in steps of 5"),
+        ({"gain": 300}, "gain: 300 was requested, it accepts 0 to 255 in steps of 5"),
         ({"gain": 13}, "steps of 5"),
         ({"exposure_us": 40}, "exposure_time_absolute: 0 was requested, it accepts 3 to 2047"),
-        ({"power_line": "auto"}, r"0 \(Disabled\), 1 \(50 Hz\), 2 \(60 Hz\)"),
-        ({"focus": 3}, "no control of its focus.*It has: auto_exposure, exposure"),
-        ({"auto_white_balance": "on"}, "automatic white balance"),
+        ({"controls": ("auto_exposure=2",)}, "it accepts 1, 3"),
         ({"controls": ("contrast=65",)}, "-64 to 64"),
-        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: auto_exposure"),
+        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: contrast, gain_automatic"),
     ],
 )
-def test_refuses_controls_that_the_camera_does_not_accept(fields: dict[str, Any], message: str) -> None:
+def test_refuses_what_the_camera_does_not_accept(camera: FakeCamera, fields: dict[str, Any], message: str) -> None:
     with pytest.raises(DriverError, match=message) as caught:
-        plan_controls(settings(**fields), OFFERED)
+        plan(**fields)
     assert "\n" not in str(caught.value)
+
+
+def test_controls_are_set_in_order_and_read_back(camera: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = V4l2Settings("/dev/x", auto_exposure="rig", exposure_us=5000)
+    assert not settings.is_regulated and V4l2Settings("/dev/x", auto_exposure="rig").is_regulated
+    apply_controls(FD, plan_controls(settings, list_controls(FD)))
+    assert camera.values[AUTO_EXPOSURE] == 1 and camera.values[EXPOSURE] == 50
+    contrast = plan_controls(V4l2Settings("/dev/x", controls=("contrast=3",)), list_controls(FD))
+    monkeypatch.setattr(camera, "_set_control", lambda control: None)
+    with pytest.raises(DriverError, match="contrast: 3 was set, the device stays at 1"):
+        apply_controls(FD, contrast)
+    camera.failing = errno.EIO
+    with pytest.raises(DriverError, match=r"contrast: the device refused 3 \(Input/output error\)"):
+        apply_controls(FD, contrast)
+    camera.failing = errno.ENODEV
+    with pytest.raises(OSError, match="No such device"):
+        apply_controls(FD, contrast)
+
+
+def exposure_of(controls: ExposureControls) -> CameraExposure:
+    assert controls.ranges is not None
+    return CameraExposure(controls.ranges, in_force=controls.read())
+
+
+def test_reads_ranges_and_values_of_the_exposure(camera: FakeCamera) -> None:
+    exposure = exposure_of(ExposureControls(FD))
+    assert exposure.ranges == ExposureRanges(ValueRange(300, 204_700, 100), ValueRange(0, 255, 5))
+    assert exposure.in_force == ExposureSetting(15_600, 65) and camera.written == []
+    assert str(ExposureControls(FD)) == "exposure 0.3 to 204.7 ms, gain 0 to 255"
+    assert str(ExposureControls(FD, with_gain=False)) == "exposure 0.3 to 204.7 ms"
+    del camera.controls[EXPOSURE]
+    controls = ExposureControls(FD)
+    assert controls.ranges is None and controls.read() is None and str(controls) == ""
+
+
+def test_takes_over_sets_once_when_due_and_gives_all_back(camera: FakeCamera) -> None:
+    before, controls = dict(camera.values), ExposureControls(FD)
+    exposure = exposure_of(controls)
+    controls.follow(exposure, 500)
+    exposure.request = ExposureRequest(ExposureSetting(8000, 10), after_ns=1000)
+    controls.follow(exposure, 999)
+    assert camera.written == []
+    for stamp_ns in (1000, 2000):
+        controls.follow(exposure, stamp_ns)
+        assert camera.written == [(AUTO_EXPOSURE, 1), (AUTO_GAIN, 0), (EXPOSURE, 80), (GAIN, 10)]
+        assert exposure.in_force == ExposureSetting(8000, 10)
+    exposure.request = ExposureRequest(ExposureSetting(4000, 5), after_ns=0)
+    controls.follow(exposure, 3000)
+    assert camera.written[4:] == [(EXPOSURE, 40), (GAIN, 5)]
+    controls.release()
+    controls.release()
+    assert camera.written[6:] == [(GAIN, 65), (AUTO_GAIN, 1), (AUTO_EXPOSURE, APERTURE_PRIORITY)]
+    assert {**camera.values, EXPOSURE: before[EXPOSURE]} == before
+
+
+def test_a_request_for_none_gives_back_and_the_next_one_takes_over_again(camera: FakeCamera) -> None:
+    controls = ExposureControls(FD, with_gain=False)
+    exposure = exposure_of(controls)
+    for setting, mode in ((ExposureSetting(8000), 1), (None, APERTURE_PRIORITY), (ExposureSetting(900), 1)):
+        exposure.request = ExposureRequest(setting, after_ns=0)
+        controls.follow(exposure, 1)
+        assert camera.values[AUTO_EXPOSURE] == mode and camera.values[GAIN] == 65
+
+
+def test_a_refusal_is_kept_and_ends_the_requests_a_lost_device_raises(camera: FakeCamera) -> None:
+    controls = ExposureControls(FD)
+    exposure = exposure_of(controls)
+    exposure.request, camera.failing = ExposureRequest(ExposureSetting(8000, 1), after_ns=0), errno.ERANGE
+    controls.follow(exposure, 1)
+    assert exposure.problem == "it refused an exposure (Numerical result out of range)"
+    camera.failing = 0
+    exposure.request = ExposureRequest(ExposureSetting(8000, 2), after_ns=0)
+    controls.follow(exposure, 2)
+    assert camera.values[GAIN] == 65
+    lost = exposure_of(ExposureControls(FD))
+    lost.request, camera.failing = exposure.request, errno.ENODEV
+    with pytest.raises(OSError, match="No such device"):
+        ExposureControls(FD).follow(lost, 1)
+
+
+@pytest.mark.parametrize(("value", "nearest"), [(-9, 3), (3.9, 3), (6, 8), (12, 13), (20, 18), (1e9, 18)])
+def test_the_nearest_value_is_a_step_of_the_range(value: float, nearest: int) -> None:
+    """The largest value of a range need not be one of its steps."""
+    assert ValueRange(3, 19, 5).nearest(value) == nearest
+
+
+def test_both_cameras_accept_a_common_range() -> None:
+    assert ValueRange(3, 200, 1).common(ValueRange(10, 100, 5)) == ValueRange(10, 100, 5)
+    assert ValueRange(0, 50, 2).nearest(49.9) == 50 and ValueRange(7, 7, 0).nearest(3) == 7

@@ -5,6 +5,7 @@ from __future__ import annotations
 import grp
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -15,62 +16,23 @@ from pathlib import Path
 
 import pytest
 
-from drivers.cameras.v4l2_devices import CaptureDevice
-from drivers.cameras.v4l2_modes import Mode, SizeRange
+from calib.rig_file import read_rig, write_rig
+from drivers.cameras.v4l2_device import CaptureDevice, StreamFormat
 from drivers.cameras.v4l2_settings import V4l2Settings
+from drivers.errors import DriverError
 from omnid.cli import main
-from omnid.doctor.cameras import cameras
-from omnid.doctor.devices import access
+from omnid.config import RecordConfig
+from omnid.controller.motor_settings import MotorSettings
+from omnid.doctor import devices, machine
+from omnid.doctor.devices import access, cameras, holders, motor
 from omnid.doctor.finding import Finding
-from omnid.doctor.wiring import bus, motor
+from omnid.doctor.machine import BUILT_S, bus, clock, compiled_functions, disk, is_synchronised, programs, rig
+from omnid.engine.kernel_store import cache_folder
 from omnid.transport.bus_config import BusConfig
 
 ROOT = Path(__file__).parents[3]
 UNPRIVILEGED = 65534
-FORMATS = (
-    Mode("YUYV", SizeRange(640, 640), SizeRange(480, 480), (30.0,)),
-    Mode("MJPG", SizeRange(1280, 1280), SizeRange(960, 960), (30.0, 15.0)),
-)
-
-
-class Robot:
-    """A tree like /sys and /dev with two cameras and their properties."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        self.known = [self._plug(number) for number in (0, 2)]
-
-    def _plug(self, number: int) -> CaptureDevice:
-        port = self.root / f"sys/devices/usb{number}/1-{number}/1-{number}:1.0"
-        port.mkdir(parents=True)
-        (port.parent / "busnum").write_text("1\n")
-        (port.parent / "speed").write_text("480\n")
-        entry = self.root / f"sys/class/video4linux/video{number}"
-        entry.mkdir(parents=True)
-        (entry / "device").symlink_to(port)
-        node = self.root / f"dev/video{number}"
-        (self.root / "dev/omnid").mkdir(parents=True, exist_ok=True)
-        node.touch()
-        node.chmod(0o666)
-        (self.root / f"dev/omnid/{'upper' if number else 'lower'}").symlink_to(node)
-        return CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "usb", "", "", "", FORMATS)
-
-    def examined(self, lower: str = "/dev/omnid/lower", **how: int | str | float) -> list[Finding]:
-        """Return the findings for both cameras with these settings."""
-        wanted = {
-            name: V4l2Settings(device, **{"width_px": 1280, "height_px": 960, **how})  # type: ignore[arg-type]
-            for name, device in (("lower", lower), ("upper", "/dev/omnid/upper"))
-        }
-        return list(cameras(wanted, self.known, self.root))
-
-
-@pytest.fixture
-def robot(tmp_path: Path) -> Robot:
-    return Robot(tmp_path)
-
-
-def levels(findings: list[Finding]) -> list[str]:
-    return [finding.level for finding in findings]
+IMAGE = StreamFormat("MJPG", 1280, 960, 0, 30.0)
 
 
 @contextmanager
@@ -83,51 +45,62 @@ def opened_elsewhere(path: Path | str) -> Iterator[None]:
         it.communicate()
 
 
-def test_accepts_cameras_with_the_configured_mode(robot: Robot) -> None:
-    first, second, usb = robot.examined(pixel_format="YUYV", width_px=640, height_px=480)
-    assert str(first) == "ok       camera lower  HD Webcam at /dev/video0, YUYV 640x480 at 30 Hz"
+class Robot:
+    """A tree like /dev with two cameras and their persistent names."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        (root / "dev/omnid").mkdir(parents=True)
+        self.known = []
+        for number, name in ((0, "lower"), (2, "upper")):
+            node = root / f"dev/video{number}"
+            node.touch()
+            node.chmod(0o666)
+            (root / f"dev/omnid/{name}").symlink_to(node)
+            self.known.append(CaptureDevice(f"/dev/video{number}", "HD Webcam", "uvcvideo", "usb", "", "", ""))
+
+    def examined(self, lower: str = "/dev/omnid/lower", **how: str) -> list[Finding]:
+        """Return the findings for both cameras with these settings."""
+        wanted = {"lower": V4l2Settings(lower, **how), "upper": V4l2Settings("/dev/omnid/upper", **how)}  # type: ignore[arg-type]
+        return list(cameras(wanted, self.known, self.root))
+
+
+@pytest.fixture
+def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
+    monkeypatch.setattr(devices, "offered_image", lambda _: IMAGE)
+    return Robot(tmp_path)
+
+
+def test_accepts_cameras_with_the_configured_image(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = robot.examined()
+    assert str(first) == "ok       camera lower  HD Webcam at /dev/video0, MJPG 1280x960 at 30 Hz"
     assert second.level == "ok" and "/dev/video2" in second.found
-    assert (usb.level, usb.subject) == ("ok", "usb bus 1") and "295 of 384 Mbit/s" in usb.found
-
-
-def test_tells_whether_a_run_can_set_the_exposure(robot: Robot) -> None:
-    mode: dict[str, str | int] = {"pixel_format": "YUYV", "width_px": 640, "height_px": 480, "auto_exposure": "rig"}
-    assert robot.examined(**mode)[0].found.endswith("30 Hz, exposure left to it: it cannot be set")
+    assert robot.examined(auto_exposure="rig")[0].found.endswith("30 Hz, exposure left to it")
     robot.known = [replace(device, exposure="exposure 1 to 9 ms") for device in robot.known]
-    assert robot.examined(**mode)[0].found.endswith("30 Hz, exposure 1 to 9 ms set by omnid run")
+    assert robot.examined(auto_exposure="rig")[0].found.endswith("30 Hz, exposure 1 to 9 ms set by omnid run")
+    monkeypatch.setattr(devices, "offered_image", lambda _: None)
+    assert "in use, so that its image was not tried" in robot.examined()[0].found
 
 
-def test_finds_a_mode_that_is_not_offered(robot: Robot) -> None:
-    found = robot.examined(rate_hz=60.0)
-    assert levels(found) == ["error", "error"] and "MJPG 1280x960 at 30, 15 Hz" in found[0].found
-    assert "[cameras]" in found[0].advice
-
-
-def test_finds_a_missing_camera(robot: Robot) -> None:
-    found = robot.examined(lower="/dev/omnid/lowest")
-    assert found[0].level == "error" and "/dev/omnid/lowest does not exist" in found[0].found
-    assert "omnid cameras" in found[0].advice and found[1].level == "ok"
-
-
-def test_finds_a_device_that_is_no_camera(robot: Robot) -> None:
+def test_finds_faults_of_cameras(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
+    (missing, right) = robot.examined(lower="/dev/omnid/lowest")
+    assert missing.level == "error" and "/dev/omnid/lowest does not exist" in missing.found
+    assert "omnid cameras" in missing.advice and right.level == "ok"
     (robot.root / "dev/null").touch()
     assert "is no camera" in robot.examined(lower="/dev/null")[0].found
-
-
-def test_finds_a_camera_that_cannot_be_queried(robot: Robot) -> None:
-    robot.known[0] = CaptureDevice("/dev/video0", "", "", "", "", "", "", (), "is broken; mend it")
+    assert robot.examined(lower="/dev/video2")[-1].found == "both names lead to one device"
+    robot.known[0] = replace(robot.known[0], problem="is broken; mend it")
     assert "is broken" in str(robot.examined()[0]) and robot.examined()[0].level == "error"
-
-
-def test_finds_one_device_for_both_cameras(robot: Robot) -> None:
-    assert any("lead to one device" in finding.found for finding in robot.examined(lower="/dev/video2"))
-
-
-def test_finds_a_camera_open_in_another_process(robot: Robot) -> None:
     (robot.root / "proc").symlink_to("/proc")
-    with opened_elsewhere(robot.root / "dev/video0"):
-        assert "is open in python" in robot.examined()[0].found
-    assert robot.examined()[0].level == "ok"
+    with opened_elsewhere(robot.root / "dev/video2"):
+        assert "is open in python" in robot.examined()[1].found
+    assert robot.examined()[1].level == "ok"
+
+    def refuse(_: V4l2Settings) -> StreamFormat:
+        raise DriverError("auto 1280x960 at 60 Hz is not offered")
+
+    monkeypatch.setattr(devices, "offered_image", refuse)
+    assert robot.examined()[1].level == "error" and "[cameras]" in robot.examined()[1].advice
 
 
 @pytest.fixture
@@ -139,62 +112,152 @@ def port() -> Iterator[str]:
     os.close(controller)
 
 
-def test_accepts_a_motor_port(port: str) -> None:
+def test_checks_the_port_of_the_motor(port: str) -> None:
+    settings = MotorSettings(port)
     os.chmod(port, 0o666)
-    assert [str(finding) for finding in motor(port)] == [f"ok       motor         {port}"]
-
-
-def test_finds_a_port_of_another_group(port: str) -> None:
+    assert [str(finding) for finding in motor(settings)] == [f"ok       motor         line on {port}"]
+    with opened_elsewhere(port):
+        (found,) = motor(settings)
+    assert found.level == "error" and "in use by python" in found.found
     os.chmod(port, 0o660)
     group = grp.getgrgid(os.stat(port).st_gid).gr_name
-    (found,) = motor(port)
+    (found,) = motor(settings)
     assert found.level == "warning" and f"of group {group}" in found.found and 'GROUP="dialout"' in found.advice
 
 
-def test_finds_a_port_in_use(port: str) -> None:
-    os.chmod(port, 0o666)
-    with opened_elsewhere(port):
-        (found,) = motor(port)
-    assert found.level == "error" and "in use by python" in found.found
-    assert levels(list(motor(port))) == ["ok"]
+@pytest.mark.parametrize(
+    ("settings", "level", "words"),
+    [
+        (MotorSettings(), "ok", "motor.port is empty"),
+        (MotorSettings("simulated"), "ok", "simulated"),
+        (MotorSettings(protocol="waveshare_json"), "error", "'waveshare_json' is not known"),
+        (MotorSettings("/dev/ttyNONE"), "error", "does not exist"),
+        (MotorSettings("/etc/passwd"), "error", "is no serial port"),
+    ],
+)
+def test_checks_other_motor_settings(settings: MotorSettings, level: str, words: str) -> None:
+    found = next(motor(settings))
+    assert found.level == level and words in found.found
+
+
+def test_names_the_process_that_has_a_device_open() -> None:
+    with open(os.devnull), opened_elsewhere(ROOT / "pyproject.toml"):
+        (holder,) = holders(ROOT / "pyproject.toml")
+    assert holder.startswith("python") and "pid" in holder
+    assert holders(ROOT / "pyproject.toml") == []
+
+
+def as_another_user(script: str) -> list[str]:
+    """Return the lines that a script prints as a user without rights."""
+    text = f"import os, resource; from pathlib import Path\n{script.format(user=UNPRIVILEGED)}"
+    done = subprocess.run([sys.executable, "-c", text], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to group video")
 def test_finds_a_device_without_permission() -> None:
-    """As an unprivileged user, in a process of its own."""
     with tempfile.NamedTemporaryFile(prefix="omnid-doctor-") as file:
-        _closed_then_open(Path(file.name))
-
-
-def _closed_then_open(device: Path) -> None:
-    device.chmod(0)
-    os.chown(device, -1, grp.getgrnam("video").gr_gid)
-    script = (
-        f"import os, json; from pathlib import Path; from omnid.doctor.devices import access\n"
-        f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
-        f"print(json.dumps([str(finding) for finding in access('motor', Path('{device}'))]))"
-    )
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    assert "no permission" in json.loads(done.stdout)[0] and "usermod" in done.stdout, done.stderr
-    device.chmod(0o660)
-    assert list(access("motor", device)) == []
+        device = Path(file.name)
+        device.chmod(0)
+        os.chown(device, -1, grp.getgrnam("video").gr_gid)
+        (line,) = as_another_user(
+            "from omnid.doctor.devices import access\nos.setuid({user})\n"
+            + f"print(*access('motor', Path('{device}')))"
+        )
+        assert "no permission" in line and "usermod" in line
+        device.chmod(0o660)
+        assert list(access("motor", device)) == []
 
 
 def test_checks_the_rights_of_this_user() -> None:
-    script = (
-        "import os, resource; from omnid.doctor.machine import rights\n"
+    lines = as_another_user(
+        "from omnid.doctor.machine import rights\n"
         "for kind in (resource.RLIMIT_RTPRIO, resource.RLIMIT_MEMLOCK): resource.setrlimit(kind, (0, 0))\n"
-        f"os.getuid() or os.setuid({UNPRIVILEGED})\n"
+        "os.getuid() or os.setuid({user})\n"
         "print(*rights(20, True), *rights(0, False), sep='\\n')"
     )
-    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True)
-    lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines] == ["warning", "warning", "ok", "ok"], done.stderr
+    assert [line.split()[0] for line in lines] == ["warning", "warning", "ok", "ok"]
     assert "LimitRTPRIO=20" in lines[0] and "LimitMEMLOCK=infinity" in lines[1]
 
 
-def router(endpoint: str) -> list[Finding]:
-    return [finding for finding in bus(BusConfig(connect=(endpoint,))) if finding.subject == "router"]
+@pytest.mark.parametrize(
+    ("now_s", "synchronised", "level"),
+    [(BUILT_S + 1e8, True, "ok"), (BUILT_S + 1e8, False, "warning"), (0.0, True, "error")],
+)
+def test_checks_the_system_time(now_s: float, synchronised: bool, level: str) -> None:
+    assert clock(now_s, synchronised).level == level
+    assert is_synchronised() in (True, False)
+
+
+def test_checks_the_space_for_recordings(tmp_path: Path) -> None:
+    (found,) = disk(machine.STATE / "not" / "yet", RecordConfig(keep_mb=10, free_mb=0), 1e6)
+    assert found.level == "ok" and f"free at {machine.STATE.parent}" in found.found and "newest 0.0 GB" in found.found
+    for enabled, level in ((False, "warning"), (True, "error")):
+        (found,) = disk(machine.STATE, RecordConfig(enabled=enabled, free_mb=10**9), 1e6)
+        assert found.level == level and "record.free_mb = 1000000000" in found.found
+    *_, found = disk(tmp_path, RecordConfig(free_mb=0), 1e6)
+    assert found.level == "warning" and f"ReadWritePaths={tmp_path}" in found.advice
+    unit = (ROOT / "systemd" / "omnid.service").read_text()
+    assert f"\nWorkingDirectory={machine.STATE}\n" in unit and f"\nStateDirectory={machine.STATE.name}\n" in unit
+
+
+def test_checks_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    (found,) = programs()
+    assert found.level == "ok" and "cv2" in found.found and "zenoh 1." in found.found
+    monkeypatch.setitem(machine.PACKAGES, "missing-package", "missing_part")  # type: ignore[attr-defined]
+    assert [finding.level for finding in programs()] == ["error", "ok"]
+
+
+def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
+    size = read_rig(scene / "rig.toml").lower.camera.size
+    assert all(finding.level != "error" for finding in rig(scene / "rig.toml", size))
+    wrong = [finding for finding in rig(scene / "rig.toml", (1280, 960)) if finding.level == "error"]
+    assert len(wrong) == 2 and "256x256" in wrong[0].found and "asks for 1280x960" in wrong[0].found
+    found = list(rig(scene / "rig.toml", size))
+    assert any(one.level == "warning" and "does not state the height" in one.found for one in found)
+    assert not any("does not state" in one.found for one in rig(scene / "rig.toml", size, -1.2))
+    whole = read_rig(scene / "rig.toml").at_height(1.2)
+    write_rig(tmp_path / "masked.toml", whole)
+    bare = replace(whole, lower=replace(whole.lower, mask=None), upper=replace(whole.upper, mask=None))
+    write_rig(tmp_path / "bare.toml", bare)
+    (masked,) = rig(tmp_path / "masked.toml", size)
+    assert masked.level == "ok" and "between the viewpoints, 1.200 m above the floor" in masked.found
+    (without,) = rig(tmp_path / "bare.toml", size)
+    assert without.level == "warning" and "no mask for lower and upper" in without.found
+    for text in (None, "", "nonsense = [", "schema = 99"):
+        if text is not None:
+            (tmp_path / "rig.toml").write_text(text)
+        (unread,) = rig(tmp_path / "rig.toml", size)
+        assert unread.level == "error" and ("omnid calibrate" in unread.found) != ("omnid calibrate" in unread.advice)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/[::1]:7447", True),
+        ("tcp/localhost:7447", True),
+        ("unixsock-stream//run/x", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/192.168.1.2:7447", False),
+        ("udp/robot.local:7447", False),
+    ],
+)
+def test_warns_of_open_endpoints_without_command_users(endpoint: str, local: bool) -> None:
+    for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
+        found = bus(config)
+        assert (found.level == "ok") == local and local != ("bus.command_users" in found.advice)
+
+
+def test_names_the_users_that_may_command_and_finds_wrong_settings(tmp_path: Path) -> None:
+    users = tmp_path / "users"
+    users.write_text("anna:secret")
+    found = bus(BusConfig(listen=("tcp/0.0.0.0:7447",), users_file=str(users), command_users=("anna",)))
+    assert found.level == "ok" and "from anna only" in found.found
+    wrong = bus(BusConfig(command_users=("anna",)))
+    assert wrong.level == "error" and "bus.users_file" in wrong.found
 
 
 def test_the_command_runs_all_checks_and_returns_an_exit_code(
@@ -204,23 +267,36 @@ def test_the_command_runs_all_checks_and_returns_an_exit_code(
     assert main(["doctor", "--set", missing]) == 1
     *lines, last = capsys.readouterr().out.splitlines()
     assert {line[:9].strip() for line in lines} <= {"ok", "warning", "error"}
-    for subject in (
-        "camera lower",
-        "camera upper",
-        "rig",
-        "motor",
-        "groups",
-        "real time",
-        "memory",
-        "clock",
-        "disk",
-        "router",
-        "programs",
-    ):
-        assert any(line[9:].startswith(subject) for line in lines)
-    assert " errors, " in last
-
-
-def test_the_command_refuses_a_wrong_configuration(capsys: pytest.CaptureFixture[str]) -> None:
+    subjects = "camera lower,camera upper,rig,motor,real time,memory,clock,disk,bus,programs"
+    assert set(subjects.split(",")) <= {line[9:22].strip() for line in lines} and " errors, " in last
+    assert main(["doctor", "--set", missing, "--json"]) == 1
+    assert {found["level"] for found in json.loads(capsys.readouterr().out)} <= {"ok", "warning", "error"}
     assert main(["doctor", "--set", "cameras.widht_px=3"]) == 2
     assert "cameras.width_px" in capsys.readouterr().err
+
+
+def test_tells_whether_functions_are_compiled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nowhere = tmp_path / "no service"
+    (kept,) = compiled_functions(nowhere)
+    assert kept.level == "ok" and " functions in " in kept.found, "conftest.py has compiled them"
+    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "empty"))
+    (empty,) = compiled_functions(nowhere)
+    assert empty.level == "ok" and "will be compiled at the next start" in empty.found
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("OMNID_CACHE_DIR", str(tmp_path / "file" / "cache"))
+    (refused,) = compiled_functions(nowhere)
+    assert refused.level == "warning" and "Not a directory" in refused.found and "OMNID_CACHE_DIR" in refused.advice
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root reads the service's cache")
+def test_root_learns_of_the_services_functions(tmp_path: Path) -> None:
+    service = tmp_path / "service"
+    shutil.copytree(cache_folder(), service, ignore=shutil.ignore_patterns("making-*"))
+    for path in (service, *service.rglob("*")):
+        os.chown(path, UNPRIVILEGED, UNPRIVILEGED)
+    (kept,) = compiled_functions(service)
+    assert kept.level == "ok" and str(service) in kept.found and " functions in " in kept.found
+    for folder in service.glob("kernels-*"):
+        folder.chmod(0o777)
+    (open_to_all,) = compiled_functions(service)
+    assert "will be compiled" in open_to_all.found

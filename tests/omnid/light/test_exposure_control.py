@@ -7,8 +7,7 @@ import pytest
 
 from calib.panorama import fit_cylinder
 from calib.rig import Rig
-from drivers.cameras.camera_exposure import CameraExposure, ExposureRanges, ExposureSetting, ValueRange
-from drivers.cameras.camera_state import CameraState
+from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRanges, ExposureSetting, ValueRange
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
 from omnid.light.exposure_control import ExposureControl

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.cameras.camera_exposure import ExposureRanges, ExposureSetting, ValueRange
+from drivers.cameras.camera_state import ExposureRanges, ExposureSetting, ValueRange
 from omnid.light.exposure_law import LONGEST_STEP_S, STEP_S, TARGET, ExposureLaw
 from omnid.light.grey_levels import GreyLevels
 

@@ -1,0 +1,195 @@
+"""Settings files, rig files and world files: tables of TOML as dataclasses or structs whose fields state their ranges.
+
+    @dataclass(frozen=True, slots=True)
+    class Stereo:
+        window_px: Annotated[int, Meta(ge=3, le=31), "side of the matching window, px"] = 11
+
+    stereo = convert(Stereo, table_of(b"window_px = 9"))
+
+msgspec checks every value, in `convert` only: a constructor takes any. An error is one line that names the dotted path
+of what is wrong.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import is_dataclass
+from functools import cache
+from os import PathLike
+from types import MappingProxyType
+from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
+
+import msgspec
+from msgspec import Meta
+
+from calib.bounded_toml import parse_toml
+
+T = TypeVar("T")
+Path: TypeAlias = tuple[str, ...]
+_NAMES: Final = MappingProxyType(
+    {
+        bool: ("true or false", "booleans"),
+        int: ("an integer", "integers"),
+        float: ("a number", "numbers"),
+        str: ("a string", "strings"),
+    }
+)
+_SHOWN: Final = 60  # characters of a value in a message
+
+
+def bytes_of(path: str | PathLike[str], most: int) -> bytes:
+    """Return the content of a file of at most so many bytes. Raise ValueError for any other."""
+    try:
+        with open(path, "rb") as file:
+            data = file.read(most + 1)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+    if len(data) > most:
+        raise ValueError(f"has more than {most} bytes: is it the right file?")
+    return data
+
+
+def table_of(data: bytes) -> dict[str, Any]:
+    """Return the table of TOML bytes. Raise ValueError for any others."""
+    try:
+        return parse_toml(data.decode())
+    except UnicodeDecodeError as error:
+        raise ValueError(f"expected TOML in UTF-8, found another byte at offset {error.start}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"expected TOML, found: {' '.join(str(error).split())}") from None
+
+
+def convert(root: type[T], table: dict[str, Any]) -> T:
+    """Return the struct of a table. Raise ValueError for an unknown or missing key and for an unfit value."""
+    _check(root, root, table, ())
+    try:
+        return msgspec.convert(table, root)
+    except msgspec.ValidationError as error:
+        raise ValueError(_explained(root, table, str(error))) from None
+
+
+def dotted(path: Sequence[str]) -> str:
+    """Return a path as it is written in TOML."""
+    return ".".join(part if re.fullmatch(r"[\w-]{1,80}(\[\d+\])?", part) else shown(part) for part in path)
+
+
+def shown(value: object) -> str:
+    """Return a value from a file on one short line."""
+    if isinstance(value, dict):
+        return "a section"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # an integer of thousands of digits, lists of lists of lists
+        return f"a huge {type(value).__name__}"
+    return text if len(text) <= _SHOWN else text[:_SHOWN] + "..."
+
+
+def is_section(kind: Any) -> bool:
+    """True for the type of a section."""
+    return isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, msgspec.Struct))
+
+
+def types_of(section: Any) -> dict[str, Any]:
+    """Return the types of the keys of a section, with their annotations."""
+    return _hints(section)
+
+
+@cache
+def _hints(section: Any) -> dict[str, Any]:
+    return get_type_hints(section, include_extras=True)
+
+
+def key_paths(section: Any, path: Path = ()) -> Iterator[Path]:
+    """Yield the paths of all keys that are no sections."""
+    for name, kind in types_of(section).items():
+        if is_section(kind):
+            yield from key_paths(kind, (*path, name))
+        else:
+            yield (*path, name)
+
+
+def unknown_key(root: Any, section: Any, path: Path) -> ValueError:
+    """Return the error for a key that its section does not have; it proposes one with a similar name."""
+    neighbours = [(*path[:-1], name) for name in types_of(section)]
+    known = list(key_paths(root))
+    for candidates in (neighbours, [other for other in known if other[0] == path[0]], known):
+        names = {other[-1]: other for other in reversed(candidates)}
+        for near in difflib.get_close_matches(path[-1][:80], names, n=1, cutoff=0.7):
+            return ValueError(f"unknown key {dotted(path)}: did you mean {dotted(names[near])}?")
+    return ValueError(f"unknown key {dotted(path)}: known are {', '.join(map(dotted, neighbours))}")
+
+
+def described(kind: Any) -> str:
+    """Return type and range of a key in words."""
+    kind, bounds = _bounded(kind)
+    if get_origin(kind) is Literal:
+        return "one of " + ", ".join(repr(choice) for choice in get_args(kind))
+    if get_origin(kind) is tuple:
+        elements = get_args(kind)
+        length = "" if elements[-1] is Ellipsis else f"{len(elements)} "
+        element, bounds = _bounded(elements[0])
+        return f"a list of {length}{_NAMES.get(element, ('', 'tables'))[1]}{bounds}"
+    return _NAMES.get(kind, ("another type", ""))[0] + bounds
+
+
+def _bounded(kind: Any) -> tuple[Any, str]:
+    """Return a type without its annotation, and its range in words with a leading blank."""
+    if get_origin(kind) is not Annotated:
+        return kind, ""
+    bare, meta = get_args(kind)[0], next((found for found in get_args(kind)[1:] if isinstance(found, Meta)), Meta())
+    low, high = (meta.ge if meta.gt is None else meta.gt), meta.le
+    if low is None:
+        return bare, "" if high is None else f" of at most {high}"
+    if high is None:
+        return bare, f" above {low}" if meta.ge is None else f" of at least {low}"
+    return bare, f" from {low} to {high}"
+
+
+def _check(root: Any, kind: Any, value: object, path: Path) -> None:
+    """Raise ValueError for unknown keys, values in the place of sections, and numbers that are not finite."""
+    bare, _ = _bounded(kind)
+    element = get_args(bare)[0] if get_origin(bare) is tuple else None
+    if is_section(kind):
+        if not isinstance(value, dict):
+            raise ValueError(f"{dotted(path)}: expected a section, found {shown(value)}")
+        types = types_of(kind)
+        for name, inner in value.items():
+            if name not in types:
+                raise unknown_key(root, kind, (*path, name))
+            _check(root, types[name], inner, (*path, name))
+    elif is_section(element) and isinstance(value, list):
+        for number, inner in enumerate(value):
+            _check(root, element, inner, (*path[:-1], f"{path[-1]}[{number}]"))
+    elif not _is_finite(value):
+        raise ValueError(f"{dotted(path)}: expected {described(kind)}, found {shown(value)}")
+
+
+def _is_finite(value: object) -> bool:
+    """True if all numbers in a value, which may be a list, are finite."""
+    if isinstance(value, list):
+        return all(map(_is_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _explained(root: Any, table: dict[str, Any], message: str) -> str:
+    """Return an error of msgspec as it is shown: with the dotted path, what is expected there, and what is found."""
+    text, _, where = message.partition(" - at `$")
+    kind: Any
+    value: Any
+    kind, value, path = root, table, ""
+    for part in re.findall(r"\w+|\[\d+\]", where):
+        if part.startswith("["):
+            element = get_args(_bounded(kind)[0])[0]
+            if not is_section(element):
+                break  # what is wrong is shown as the whole list
+            kind, value, path = element, value[int(part[1:-1])], f"{path}{part}"
+        else:
+            kind, value, path = types_of(kind)[part], value[part], f"{path}.{part}".lstrip(".")
+    if missing := re.search(r"required field `(.*)`", text):
+        return f"{path}.{missing[1]} is missing".lstrip(".")
+    if is_section(kind):
+        return f"{path}: {text}"
+    return f"{path}: expected {described(kind)}, found {shown(value)}"

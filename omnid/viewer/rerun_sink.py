@@ -1,0 +1,351 @@
+"""A run drawn in Rerun: a replay as it computes, a recording, or a live robot by its messages; time is the stamp.
+
+Entities: odom (the world) with path, covariance, map, keyframes, loops, and base_link with obstacles and the points of
+the newest images; panorama with its features; depth; plots of speed, yaw_rate, landmarks, sigma, latency, correction;
+state; log. Colours are those of Okabe and Ito, which colour-blind people can distinguish.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any, Final, TypeAlias
+
+import cv2
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from calib import se3
+from drivers.frame import gray
+from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
+from omnid.core.frames import base_pose
+from omnid.core.odometry.stereo_frame import Features
+from omnid.messages import OdometryUpdate, PlaceUpdate
+from omnid.plain_text import plain
+from omnid.recordings.recording_reader import DECODERS, Content
+from omnid.sinks.encoder import Encoder, MapEncoding, Outgoing, StateReports
+from omnid.stages.front_end import FrontEnd
+from omnid.transport import status_names
+from omnid.transport.decode import Cloud, Diagnostics, Pose, PoseInMap, decode_pose
+from omnid.transport.features_attachment import features_from_bytes
+from omnid.transport.pose_attachment import PoseAttachment
+from omnid.transport.records import OdometryRecord
+from omnid.transport.scan_codec import Scan
+from omnid.transport.status_names import ODOMETRY, STAGE_PREFIX, parsed_time_key, short_name
+from omnid.transport.topics import PANORAMA
+
+Array: TypeAlias = NDArray[np.float64]
+TIMELINE: Final = "stamp"
+# Drawn in full at first, then every 2nd, 4th, 8th ... after each further so many.
+MOST: Final = {"pose": 20_000, "scan": 20_000, "image": 1_000, "cloud": 50, "places": 200}
+MAP_POINTS, RIG_POINTS = 50_000, 3_000
+SIGMAS: Final = 3.0  # radius of the ellipsoid in standard deviations
+BLUE, ORANGE, RED, YELLOW = (86, 180, 233), (230, 159, 0), (213, 94, 0), (240, 228, 66)
+GREY, DARK, VIOLET = (150, 150, 150), (60, 60, 60), (170, 80, 200)
+# Colour and width in px of the path: the worse the state, the thicker.
+STATES: Final = {"tracking": (BLUE, 1.5), "degraded": (ORANGE, 3.0), "lost": (RED, 5.0), "unknown": (GREY, 1.5)}
+LEVELS: Final = ("INFO", "WARN", "ERROR", "WARN")  # of Rerun, by the level of a status
+LEGEND: Final = f"""
+**Path**: thin blue tracking, thicker orange degraded, thickest red lost, grey unknown.
+
+**Panorama**: blue dots are inliers, red dots features that do not agree with the pose, yellow dots new landmarks.
+
+**Ellipsoid**: {SIGMAS:g} sigma of the position; its label says by how many times it is magnified.
+
+**Obstacles**: red dots around the base; grey ones mark directions that are unknown.
+
+**Keyframes** of the map: dark dots and the path through them, corrected by loops (violet); odometry's path stays.
+
+**Map and points**: dark below, light above. **Depth**: m from the rig's axis.
+"""
+
+
+def layout() -> Any:
+    """Return the blueprint: the world on the left, images on the right, plots below."""
+    start, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    until_now = rrb.VisibleTimeRanges(rrb.VisibleTimeRange(TIMELINE, start=start, end=now))
+    eye = rrb.EyeControls3D(position=(-5.0, -4.0, 8.0), look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0))
+    world = rrb.Spatial3DView(origin="odom", name="World", overrides={"odom/path": [until_now]}, eye_controls=eye)
+    images = [rrb.Spatial2DView(origin="panorama", name="Image"), rrb.Spatial2DView(origin="depth", name="Depth")]
+    state = rrb.StateTimelineView(origin="state", name="State")
+    log, legend = rrb.TextLogView(origin="log", name="Log"), rrb.TextDocumentView(origin="legend", name="Legend")
+    plots = [
+        rrb.Vertical(*(rrb.TimeSeriesView(origin=name, name=title) for name, title in column))
+        for column in (
+            (("speed", "Speed"), ("yaw_rate", "Yaw rate")),
+            (("landmarks", "Landmarks"), ("sigma", "Standard deviation")),
+            (("latency", "Latency, ms"), ("correction", "Correction by the map")),
+        )
+    ]
+    upper = rrb.Horizontal(world, rrb.Vertical(*images, rrb.Tabs(state, log, legend)), column_shares=[5, 4])
+    panels = (rrb.TimePanel(timeline=TIMELINE, state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+    return rrb.Blueprint(
+        rrb.Vertical(upper, rrb.Horizontal(*plots), row_shares=[5, 3]), *panels, rrb.BlueprintPanel(state="collapsed")
+    )
+
+
+def decoded(topic: str, payload: bytes, attachment: bytes, received_ns: int) -> Content | Pose | None:
+    """Return the content of a message, None for other topics; raise OmnidError or FrameDecodeError if it is broken."""
+    if topic == "odom":
+        return decode_pose(payload, attachment, received_ns)
+    if topic == PANORAMA:
+        return parse_image(COMPRESSED_IMAGE, memoryview(payload))
+    return DECODERS[topic][1](memoryview(payload)) if topic in DECODERS else None
+
+
+class RerunSink:
+    """Draws messages; opened with the first of them, so that an empty run leaves no file. For one thread only."""
+
+    def __init__(self, open_stream: Callable[[], rr.RecordingStream]) -> None:
+        self._open_stream = open_stream
+        self._stream: rr.RecordingStream | None = None
+        self._offered: Counter[str] = Counter()
+        self._drawn: Counter[str] = Counter()
+        self._end: Array | None = None  # (3,) m, of the path
+        self._state = "unknown"
+        self._shown_state = ""
+        self._poses: deque[Pose | OdometryRecord] = deque(maxlen=100)  # a pose in the map comes later than that in odom
+        self._messages: dict[str, tuple[int, str]] = {}  # level and message of each status
+        self.poses = self.images = 0
+
+    def draw(self, content: Content | Pose, attachment: bytes = b"", received_ns: int = 0) -> None:
+        """Draw a decoded message; attachment: of a panorama; received_ns: of a pose by the bus, 0: not known."""
+        match content:
+            case Pose() | OdometryRecord():
+                self._pose(content)
+                if received_ns:
+                    self._plot(content.stamp_ns, "latency", "age", 1e-6 * (received_ns - content.stamp_ns))
+            case PoseInMap(stamp_ns, T_map_base):
+                for pose in (pose for pose in self._poses if pose.stamp_ns == stamp_ns):
+                    self.correction(stamp_ns, T_map_base @ se3.inverse(pose.T_odom_base))
+            case Diagnostics():
+                self._status(content)
+            case Cloud() if self.wants("cloud"):
+                points = content.points[np.isfinite(content.points).all(axis=1)]
+                self._at(content.stamp_ns).log("odom/map", _points_3d(points, MAP_POINTS, 1.5))
+            case Scan() if self.wants("scan"):
+                self._scan(content)
+            case RosImage() if self.wants("image"):
+                is_compressed = content.encoding in ("jpeg", "png")
+                data = bytes(content.data) if is_compressed else _jpeg(gray(content.frame()))
+                self.panorama(content.stamp_ns, data, content.encoding if is_compressed else "jpeg")
+                if attachment:
+                    self.features(content.stamp_ns, Features(**features_from_bytes(attachment)))
+
+    def panorama(self, stamp_ns: int, data: bytes, kind: str = "jpeg") -> None:
+        """Draw a compressed image; kind: jpeg or png."""
+        self._at(stamp_ns).log("panorama", rr.EncodedImage(contents=data, media_type=f"image/{kind}"))
+        self.images += 1
+
+    def features(self, stamp_ns: int, features: Features) -> None:
+        """Draw the features of the panorama."""
+        stream = self._at(stamp_ns)
+        for name, pixels, colour in (
+            ("inliers", features.inliers, BLUE),
+            ("rejected", features.rejected, RED),
+            ("new", features.new, YELLOW),
+        ):
+            stream.log(f"panorama/{name}", rr.Points2D(pixels, colors=colour, radii=_px(2.5)))
+
+    def depth(self, stamp_ns: int, disparity: NDArray[np.float32], focal_baseline: float, points: Array) -> None:
+        """Draw distances from the rig's axis over the panorama, and points (N, 3) [m] around the base.
+
+        disparity: (H, W) px, NaN unknown; each known pixel is drawn as a square. focal_baseline: px times m.
+        """
+        spots = cv2.dilate(np.nan_to_num(disparity, nan=0.0), np.ones((3, 3), np.uint8))
+        mm = np.where(spots > 0, np.minimum(1e3 * focal_baseline / np.maximum(spots, 1e-3), 65535), 0).astype(np.uint16)
+        far_mm = float(np.percentile(mm[mm > 0], 95)) if mm.any() else 1.0
+        png = cv2.imencode(".png", mm)[1].tobytes()
+        image = rr.EncodedDepthImage(png, media_type="image/png", meter=1000.0, depth_range=(0.0, far_mm))
+        stream = self._at(stamp_ns)
+        stream.log("depth", image)
+        stream.log("odom/base_link/points", _points_3d(points, RIG_POINTS, 2.0))
+
+    def correction(self, stamp_ns: int, T_map_odom: Array) -> None:
+        """Plot by how much the map corrects odometry."""
+        self._plot(stamp_ns, "correction", "position mm", 1e3 * float(np.linalg.norm(T_map_odom[:3, 3])))
+        self._plot(stamp_ns, "correction", "heading mdeg", 1e3 * float(np.rad2deg(se3.yaw(T_map_odom))))
+
+    def places(self, stamp_ns: int, keyframes: Array, loops: Array) -> None:
+        """Draw keyframes (K, 3) in the order of the drives, the path through them, and loops (L, 2, 3), in odom [m]."""
+        stream = self._at(stamp_ns)
+        stream.log("odom/keyframes", rr.Points3D(keyframes, colors=DARK, radii=_px(2.5)))
+        stream.log("odom/keyframes/path", rr.LineStrips3D([keyframes], colors=DARK, radii=_px(1.0)))
+        stream.log("odom/loops", rr.LineStrips3D(list(loops), colors=VIOLET, radii=_px(1.0)))
+
+    def close(self) -> None:
+        """Flush and end the drawing; a second call does nothing."""
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            stream.flush()
+            stream.disconnect()
+
+    def wants(self, kind: str) -> bool:
+        """Return whether the next message of a kind is to be drawn."""
+        is_due: bool = self._offered[kind] % 2 ** (self._drawn[kind] // MOST[kind]) == 0
+        self._offered[kind] += 1
+        self._drawn[kind] += is_due
+        return is_due
+
+    def _opened(self) -> rr.RecordingStream:
+        """Return the stream, which is opened with what never changes."""
+        if self._stream is None:
+            self._stream = stream = self._open_stream()
+            stream.log("odom", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+            axes = rr.Arrows3D(vectors=0.3 * np.eye(3), colors=(RED, (0, 158, 115), (0, 114, 178)), radii=_px(2.5))
+            stream.log("odom/base_link", axes, static=True)
+            stream.log("legend", rr.TextDocument(LEGEND, media_type="text/markdown"), static=True)
+            colours = [colour for colour, _ in STATES.values()]
+            stream.log("state", rr.StateConfiguration(values=list(STATES), colors=colours), static=True)
+        return self._stream
+
+    def _at(self, stamp_ns: int) -> rr.RecordingStream:
+        stream = self._opened()
+        stream.set_time(TIMELINE, timestamp=np.datetime64(stamp_ns, "ns"))
+        return stream
+
+    def _plot(self, stamp_ns: int, plot: str, name: str, value: float) -> None:
+        if np.isfinite(value):
+            self._at(stamp_ns).log([plot, name], rr.Scalars(value))
+
+    def _pose(self, pose: Pose | OdometryRecord) -> None:
+        """Draw the robot, the newest piece of its path and its covariance; plot speeds and landmarks."""
+        if isinstance(pose, Pose) and pose.state != self._state:
+            self._state = pose.state
+        colour, width_px = STATES.get(self._state, STATES["unknown"])
+        if self._state != self._shown_state:
+            self._shown_state = self._state
+            self._at(pose.stamp_ns).log("state", rr.StateChange(state=plain(self._state)))
+        self._poses.append(pose)
+        self.poses += 1
+        if not self.wants("pose"):
+            return
+        # 1. The robot and its path.
+        stamp_ns, T, stream = pose.stamp_ns, pose.T_odom_base, self._at(pose.stamp_ns)
+        stream.log("odom/base_link", rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        piece = np.array([T[:3, 3] if self._end is None else self._end, T[:3, 3]])
+        self._end = T[:3, 3]
+        stream.log("odom/path", rr.LineStrips3D([piece], colors=colour, radii=_px(width_px)))
+        # 2. The ellipsoid, 1, 10, 100 or 1000 times as large, so that millimetres are visible.
+        if np.isfinite(pose.covariance).all():
+            variances, axes = np.linalg.eigh(pose.covariance[:3, :3])
+            sigma_m = np.sqrt(np.maximum(variances, 0.0))
+            axes[:, 2] *= np.sign(np.linalg.det(axes))
+            times = 10 ** int(np.clip(np.ceil(np.log10(0.05 / max(SIGMAS * sigma_m.max(), 1e-9))), 0, 3))
+            shape = rr.Ellipsoids3D(
+                half_sizes=[times * SIGMAS * sigma_m],
+                centers=[T[:3, 3]],
+                quaternions=[rr.Quaternion(xyzw=se3.quaternion(axes))],
+                colors=colour,
+                labels=[f"{SIGMAS:g} sigma: {1e3 * SIGMAS * sigma_m.max():.1f} mm, drawn x{times}"],
+                show_labels=False,
+            )
+            stream.log("odom/covariance", shape)
+            self._plot(stamp_ns, "sigma", "position mm", 1e3 * float(sigma_m.max()))
+            heading_rad = float(np.sqrt(max(0.0, pose.covariance[5, 5])))
+            self._plot(stamp_ns, "sigma", "heading mdeg", 1e3 * float(np.rad2deg(heading_rad)))
+        # 3. The plots.
+        self._plot(stamp_ns, "speed", "m/s", float(np.linalg.norm(pose.velocity[:3])))
+        self._plot(stamp_ns, "yaw_rate", "deg/s", float(np.rad2deg(pose.velocity[5])))
+        if isinstance(pose, Pose) and pose.attachment.seq >= 0:
+            self._plot(stamp_ns, "landmarks", "tracked", pose.attachment.tracked)
+            self._plot(stamp_ns, "landmarks", "inliers", pose.attachment.inliers)
+
+    def _status(self, diagnostics: Diagnostics) -> None:
+        """Plot the medians of the stages' and other times; add a line to the log for each entry that has changed."""
+        stamp_ns = diagnostics.stamp_ns
+        for status in diagnostics.statuses:
+            if status.name == ODOMETRY:
+                self._state = status_names.tracking_state(status.message, status.values) or self._state
+            for key, text in status.values.items():
+                time, value_ms = parsed_time_key(key), status_names.number(text)
+                if time is not None and value_ms is not None and time.statistic == "p50":
+                    own = status.name.removeprefix(STAGE_PREFIX)
+                    name = own if own != status.name else f"{short_name(status.name)} {time.name}"
+                    self._plot(stamp_ns, "latency", plain(name), value_ms)
+            if self._messages.get(status.name) != (status.level, status.message):
+                self._messages[status.name] = status.level, status.message
+                text, level = f"{short_name(status.name)}: {status.message}", LEVELS[status.level % len(LEVELS)]
+                self._at(stamp_ns).log("log", rr.TextLog(plain(text), level=level))
+
+    def _scan(self, scan: Scan) -> None:
+        """Draw the obstacles around the base, and near it where their directions are unknown."""
+        ranges = np.where(np.isnan(scan.ranges_m), 0.4, scan.ranges_m)
+        rays = np.column_stack([np.cos(scan.azimuths_rad), np.sin(scan.azimuths_rad), np.zeros(len(ranges))])
+        stream, known, unknown = self._at(scan.stamp_ns), np.isfinite(scan.ranges_m), np.isnan(scan.ranges_m)
+        stream.log(
+            "odom/base_link/obstacles",
+            rr.Points3D(ranges[known, None] * rays[known], colors=(213, 40, 40), radii=_px(3.0)),
+        )
+        stream.log(
+            "odom/base_link/unknown", rr.Points3D(ranges[unknown, None] * rays[unknown], colors=GREY, radii=_px(1.5))
+        )
+
+
+class ReplayDrawing:
+    """Sink of a replay: draws each message as a robot's subscribers get it, with features, depth, keyframes, loops."""
+
+    def __init__(self, sink: RerunSink, front_end: FrontEnd) -> None:
+        self._sink, self._geometry, self._dense = sink, front_end.geometry, front_end.dense
+        self._encode, self._states = Encoder(front_end.geometry.rig.T_base_rig, MapEncoding(MAP_POINTS)), StateReports()
+        self._keyframes: object = None  # that were drawn last
+
+    def process(self, message: Outgoing) -> None:
+        """Draw a message."""
+        attachment = b""
+        if isinstance(message, OdometryUpdate):
+            counts = (message.reset_counter, message.inliers, message.tracks)
+            attachment = PoseAttachment(message.seq, message.state, *counts).to_bytes()
+        changed = self._states(message) if isinstance(message, OdometryUpdate | PlaceUpdate) else ()
+        for topic, _, payload in (*changed, *self._encode(message)):
+            content = decoded(topic, payload, attachment if topic == "odom" else b"", 0)
+            if content is not None and not isinstance(content, PoseInMap):  # which may come before the pose in odom
+                self._sink.draw(content)
+        if isinstance(message, OdometryUpdate):
+            self._images(message)
+        elif isinstance(message, PlaceUpdate):
+            self._places(message)
+
+    def _images(self, odometry: OdometryUpdate) -> None:
+        sink, rig = self._sink, self._geometry.rig
+        if sink.wants("image"):
+            sink.panorama(odometry.stamp_ns, _jpeg(odometry.depth.panoramas.lower.panorama))
+            sink.features(odometry.stamp_ns, odometry.features)
+            dense = self._dense.of(odometry.depth)
+            focal_baseline = self._geometry.cylinder.focal_px * rig.baseline_m
+            sink.depth(odometry.stamp_ns, dense.disparity, focal_baseline, se3.apply(rig.T_base_rig, dense.points))
+
+    def _places(self, update: PlaceUpdate) -> None:
+        """Plot the correction, and draw keyframes and loops where the map has them now."""
+        keyframes, T_base_rig = update.scans, self._geometry.rig.T_base_rig
+        T_map_odom, _ = base_pose(update.T_map_odom, update.covariance, T_base_rig)
+        self._sink.correction(update.stamp_ns, T_map_odom)
+        if keyframes is None or keyframes is self._keyframes or not self._sink.wants("places"):
+            return
+        self._keyframes = keyframes
+        to_odom = se3.inverse(T_map_odom) @ T_base_rig @ self._geometry.T_rig_rect
+        at = dict(zip(keyframes.scans, (to_odom @ keyframes.T_map_rect)[:, :3, 3], strict=True))
+        loops = [(at[a], at[b]) for a, b in keyframes.loops if a in at and b in at]
+        self._sink.places(
+            update.stamp_ns, np.array(list(at.values())).reshape(-1, 3), np.array(loops).reshape(-1, 2, 3)
+        )
+
+
+def _jpeg(image: NDArray[np.uint8]) -> bytes:
+    return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 85))[1].tobytes()
+
+
+def _px(size: float) -> Any:
+    """Return a radius on the screen, independent of the distance."""
+    return rr.components.Radius.ui_points(size)
+
+
+def _points_3d(points: NDArray[Any], most: int, size_px: float) -> Any:
+    """Return points (N, 3), evenly chosen, dark below and light above, between percentiles of the heights."""
+    points = points[:: max(1, -(-len(points) // most))]
+    low, high = np.percentile(points[:, 2], (2, 98)) if len(points) else (0.0, 1.0)
+    share = np.clip((points[:, 2] - low) / max(1e-3, high - low), 0, 1)
+    colours = cv2.applyColorMap((255 * share).astype(np.uint8).reshape(-1, 1), cv2.COLORMAP_VIRIDIS)
+    return rr.Points3D(points, colors=colours.reshape(-1, 3)[:, ::-1], radii=_px(size_px))
