@@ -5,27 +5,24 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from copy import copy
 
 from drivers.errors import DriverError
 from drivers.motion import WheelSample
 from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
-from omnid.controller.statistics import ControllerState, TickReport
+from omnid.controller.statistics import ControllerState, TickReport, cuts_drive_short, transitions
 from omnid.core.control.arming import ArmRequest
-from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Twist
-from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Motion
-from omnid.core.control.plausibility import MOTION_DOUBTFUL, MotorReport
-from omnid.core.control.safety_rules import ENDS, IDLE
+from omnid.core.control.motion_monitor import Motion
+from omnid.core.control.plausibility import MotorReport
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
-
-UNTIL_ARMED = "they stay stopped until cmd/arm (`omnid arm`)"
 
 
 class Controller:
@@ -109,10 +106,7 @@ class Controller:
             now_ns, dt_s, late_s=late_s, motor_failed=self.state.failed, motor_stopped=self._motor_stopped
         )
         # 2. Keep its state for the status, and report what has changed.
-        self._report_arming()
-        self._report_slowing()
-        self._report_obstacles()
-        self._count_stop(output.reason)
+        self._keep_state(output.reason)
         # 3. Send its motion, and report to the law whether it was sent.
         command = VelocityCommand(now_ns, output.motion.velocity_mps, output.heading_rad, output.motion.yaw_rate_radps)
         status = self._send(command)
@@ -142,53 +136,27 @@ class Controller:
         self.state.missed += missed
         return dt_ns * S_PER_NS, (now_ns - due_ns) * S_PER_NS
 
-    def _report_arming(self) -> None:
-        """Keep the state of the arming and of the sources; report each arming, and refusals when the reason changes."""
-        state, arming, commands = self.state, self._law.arming, self._law.commands
-        before, answer = state.arm_answer, arming.answer
-        if answer != before and (not answer.refusal or answer.refusal != before.refusal):
-            self._report(f"arming is refused: {answer.refusal}" if answer.refusal else "armed by cmd/arm")
-        # `_count_stop` reports the end of a drive; a fault that comes while the wheels are at rest ends none.
-        if state.armed and arming.needs_request and state.reason:
-            self._report(f"disarmed while the wheels stand: {arming.reason}; {UNTIL_ARMED}")
-        state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, answer
-        state.needs_request = arming.needs_request
-        state.halts, state.halted_by = arming.halts, arming.halted_by
+    def _keep_state(self, reason: str) -> None:
+        """Keep what the law has decided, for the status; count and report what has changed since the last tick."""
+        state, law, before = self.state, self._law, copy(self.state)
+        # 1. What holds now.
+        state.reason = reason
+        arming, commands, monitor = law.arming, law.commands, law.collision
+        state.armed, state.disarmed_by, state.arm_answer = arming.armed, arming.reason, arming.answer
+        state.needs_request, state.halts, state.halted_by = arming.needs_request, arming.halts, arming.halted_by
         state.refused = commands.refused
-        state.source = "" if self._law.reason or commands.current is None else commands.current.source
-
-    def _report_slowing(self) -> None:
-        """Keep the reason to drive slowly; report the start of one that a person should examine."""
-        before, self.state.slowed_by = self.state.slowed_by, self._law.plausibility.slowed_by
-        self.state.slowed += bool(self.state.slowed_by and not before)
-        slowed_by = self.state.slowed_by
-        if slowed_by in (MOTION_DOUBTFUL, *WITNESSES) and slowed_by != before:
-            self._report(f"the wheels turn slowly: {slowed_by}{self._detail(slowed_by)}")
-
-    def _report_obstacles(self) -> None:
-        """Keep the collision monitor's reason to slow down or stop; count and report the stops."""
-        state, monitor = self.state, self._law.collision
-        was_blocked = state.blocked
-        state.obstacle = "" if self._law.reason else monitor.reason
+        state.source = "" if law.reason or commands.current is None else commands.current.source
+        state.slowed_by = law.plausibility.slowed_by
+        state.obstacle = "" if law.reason else monitor.reason
         state.blocked = bool(state.obstacle) and monitor.share == 0.0
-        if state.blocked and not was_blocked:
-            state.obstacle_stops += 1
-            self._report(f"the wheels stop: {state.obstacle}; {remedy(state.obstacle)}")
-
-    def _count_stop(self, reason: str) -> None:
-        """Keep the reason; count it where it cuts a drive short, and report it unless the end was asked for."""
-        before, self.state.reason = self.state.reason, reason
-        if reason not in ("", IDLE) and not before:
-            self.state.stops[reason] += 1
-            if reason != ENDS:
-                latched = f"; {UNTIL_ARMED}" if self._law.arming.needs_request else ""
-                advice = f"; {ADVICE}" if reason in DISAGREEMENTS else ""
-                self._report(f"the wheels stop: {reason}{self._detail(reason)}{advice}{latched}")
-
-    def _detail(self, reason: str) -> str:
-        """Return by how much images, wheels and gyro differ, where that is the reason."""
-        witness = self._law.plausibility.witness
-        return f" {witness.detail}" if witness.reason == reason and witness.detail else ""
+        # 2. How often it began.
+        state.slowed += bool(state.slowed_by and not before.slowed_by)
+        state.obstacle_stops += state.blocked and not before.blocked
+        if cuts_drive_short(before, state):
+            state.stops[reason] += 1
+        # 3. What a person should know of it.
+        for line in transitions(before, state, law.plausibility.witness):
+            self._report(line)
 
     def _send(self, command: VelocityCommand) -> MotorStatus | None:
         """Send the command; return the motor controller's answer, None where it gave none."""

@@ -5,16 +5,21 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from drivers.motion import WheelSample
 from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
-from omnid.core.control.safety_rules import IDLE
+from omnid.core.control.collision_monitor import remedy
+from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Witness
+from omnid.core.control.plausibility import MOTION_DOUBTFUL
+from omnid.core.control.safety_rules import ENDS, IDLE
 from omnid.engine.flow import nothing
 from omnid.engine.telemetry import Histogram, StageStats
+
+UNTIL_ARMED: Final = "they stay stopped until cmd/arm (`omnid arm`)"
 
 
 @dataclass(slots=True)
@@ -45,6 +50,41 @@ class ControllerState:
     lost_reports: int = 0  # reports of ticks that the daemon was too slow to take
     refused: Counter[str] = field(default_factory=Counter)  # commands, by reason
     stops: Counter[str] = field(default_factory=Counter)  # stops of wheels that turned, by reason
+
+
+def cuts_drive_short(before: ControllerState, after: ControllerState) -> bool:
+    """True if wheels that might turn before must stop now, other than for want of a command at the start."""
+    return not before.reason and after.reason not in ("", IDLE)
+
+
+def transitions(before: ControllerState, after: ControllerState, witness: Witness) -> Iterator[str]:
+    """Yield lines for the log that say what has changed from one tick to the next.
+
+    witness: how images, wheels and gyro differ, where they do.
+    """
+    # 1. Arming: each time, and a refusal where its reason is another one.
+    answer, last = after.arm_answer, before.arm_answer
+    if answer != last and (not answer.refusal or answer.refusal != last.refusal):
+        yield f"arming is refused: {answer.refusal}" if answer.refusal else "armed by cmd/arm"
+    # 2. A fault while the wheels are at rest, which ends no drive.
+    if before.armed and after.needs_request and before.reason:
+        yield f"disarmed while the wheels stand: {after.disarmed_by}; {UNTIL_ARMED}"
+    # 3. A reason to drive slowly that a person should examine.
+    if after.slowed_by != before.slowed_by and after.slowed_by in (MOTION_DOUBTFUL, *WITNESSES):
+        yield f"the wheels turn slowly: {after.slowed_by}{_detail(after.slowed_by, witness)}"
+    # 4. A stop by the collision monitor.
+    if after.blocked and not before.blocked:
+        yield f"the wheels stop: {after.obstacle}; {remedy(after.obstacle)}"
+    # 5. The end of a drive, unless it was asked for.
+    if cuts_drive_short(before, after) and after.reason != ENDS:
+        latched = f"; {UNTIL_ARMED}" if after.needs_request else ""
+        advice = f"; {ADVICE}" if after.reason in DISAGREEMENTS else ""
+        yield f"the wheels stop: {after.reason}{_detail(after.reason, witness)}{advice}{latched}"
+
+
+def _detail(reason: str, witness: Witness) -> str:
+    """Return by how much images, wheels and gyro differ, where that is the reason."""
+    return f" {witness.detail}" if witness.reason == reason and witness.detail else ""
 
 
 class TickReport(NamedTuple):
