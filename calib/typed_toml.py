@@ -112,7 +112,11 @@ def key_paths(section: Any, path: Path = ()) -> Iterator[Path]:
 
 
 def unknown_key(root: Any, section: Any, path: Path) -> ValueError:
-    """Return the error for a key that its section does not have; it proposes one with a similar name."""
+    """Return the error for a key that its section does not have; it proposes what a section's REMOVED names for it, or
+    a key with a similar name.
+    """
+    if instead := getattr(section, "REMOVED", {}).get(path[-1]):
+        return ValueError(f"{dotted(path)} was removed: {instead}")
     neighbours = [(*path[:-1], name) for name in types_of(section)]
     known = list(key_paths(root))
     for candidates in (neighbours, [other for other in known if other[0] == path[0]], known):

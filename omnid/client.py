@@ -24,7 +24,6 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.client_session import HERE, open_client, robots_there
 from omnid.transport.decode import (
     Cloud,
     Diagnostics,
@@ -41,7 +40,7 @@ from omnid.transport.driver import CONNECT_S, Driver
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.requests import Answer
 from omnid.transport.scan_codec import Scan, decode_scan
-from omnid.transport.session import Unreachable
+from omnid.transport.session import ALIVE, HERE, Unreachable, open_client, robots_there
 
 __all__ = [
     "CONNECT_S",
@@ -72,7 +71,6 @@ _DECODE: Final[dict[type[Any], tuple[str, Callable[[bytes, bytes], Any]]]] = {
 }
 # A query without an answer ends after this time, which a slow network must not exceed.
 _QUERY_TIMEOUT_S: Final = 1.0
-_BETWEEN_QUERIES_S: Final = 0.002  # twice the least time between two queries that `transport/session.py` lets through
 # The channel of a subscription has no wait with a timeout, so Subscription.wait polls: this is the delay that it adds.
 _POLL_S: Final = 0.002
 
@@ -143,15 +141,8 @@ def _attachment(sample: zenoh.Sample) -> bytes:
 
 
 def _queried(session: zenoh.Session, key: str) -> zenoh.Sample | None:
-    """Return the answer to a query for a key, if there is any.
-
-    A robot refuses a query that comes too soon after another for the same key: no reply at all, at once. Then it is
-    asked again.
-    """
+    """Return the answer to a query for a key, if there is any."""
     replies = list(session.get(key, timeout=_QUERY_TIMEOUT_S))
-    if not replies:
-        time.sleep(_BETWEEN_QUERIES_S)
-        replies = list(session.get(key, timeout=_QUERY_TIMEOUT_S))
     return next((reply.ok for reply in replies if reply.ok is not None), None)
 
 
@@ -177,7 +168,7 @@ class _Connection:
 class Robot(_Connection):
     """A connection to a robot, direct or through a router.
 
-    settings: for TLS, user and password; the same as section [bus] of omnid's configuration.
+    settings: section [bus] of omnid's configuration, for TLS and passwords, which its file `config` holds.
     """
 
     def __init__(
@@ -251,7 +242,7 @@ class Robot(_Connection):
             callback(sample.kind == zenoh.SampleKind.PUT)
 
         tokens = self._session.liveliness()
-        self._declared.append(tokens.declare_subscriber(f"{self.name}/alive", on_token, history=True))
+        self._declared.append(tokens.declare_subscriber(f"{self.name}/{ALIVE}", on_token, history=True))
 
     @property
     def robots_there(self) -> str:
@@ -261,7 +252,7 @@ class Robot(_Connection):
     @property
     def alive(self) -> bool:
         """True if the robot's daemon runs and can be reached."""
-        replies = self._session.liveliness().get(f"{self.name}/alive", timeout=_QUERY_TIMEOUT_S)
+        replies = self._session.liveliness().get(f"{self.name}/{ALIVE}", timeout=_QUERY_TIMEOUT_S)
         return any(reply.ok is not None for reply in replies)
 
 

@@ -219,16 +219,15 @@ def bus(config: BusConfig) -> Finding:
     except OmnidError as error:
         return Finding("error", "bus", str(error), "the daemon does not start with these settings")
     endpoints = ", ".join(endpoint for endpoint in (*config.listen, *config.connect) if not _is_local(endpoint))
-    accepted = ", ".join((*config.command_names, *config.command_users))
-    if endpoints and not accepted:
+    if endpoints and not config.config:
         return Finding(
             "warning",
             "bus",
             f"anyone who reaches {endpoints} can drive the robot",
-            "set bus.command_names or bus.command_users, or listen on tcp/127.0.0.1:7447 only",
+            "name a file with users in bus.config (omnid/transport/site.json5), or listen on tcp/127.0.0.1:7447 only",
         )
     if endpoints:
-        return Finding("ok", "bus", f"reachable at {endpoints}; commands are accepted from {accepted} only")
+        return Finding("ok", "bus", f"reachable at {endpoints}; who may command it is said in {config.config}")
     return Finding("ok", "bus", "reachable from this machine only")
 
 

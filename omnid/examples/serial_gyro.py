@@ -21,8 +21,8 @@ import serial  # type: ignore[import-untyped]
 
 from drivers.motion import GyroSample
 from omnid.transport.bus_config import BusConfig
-from omnid.transport.client_session import HERE, open_client
 from omnid.transport.motion_codec import gyro_cdr
+from omnid.transport.session import HERE, open_client
 
 PACKET = struct.Struct("<BB4hB")
 RADPS_PER_UNIT = math.radians(2000.0) / 32768

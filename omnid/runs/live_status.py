@@ -50,7 +50,7 @@ def add_terminal_ticker(
 
 def _ready(config: Config) -> str:
     """Return what to do now that the run is ready."""
-    endpoints = ", ".join(config.bus.connect if config.bus.mode == "client" else config.bus.listen)
+    endpoints = ", ".join(config.bus.connect if config.bus.is_client else config.bus.listen)
     wheels = ""
     if not config.motor.port:
         wheels = "; no motor"

@@ -30,6 +30,7 @@ from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
 
 BUS_END_S: Final = 3.0
+ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
 # They drop deadlines, not messages.
 TICKERS: Final = frozenset({"load", "motor", "progress", "router", "routes", "save", "status", "terminal", "watchdog"})
 
@@ -77,7 +78,7 @@ class Session:
         bus.serve("config", dump(self.config))
         bus.serve("rig", rig_toml(rig))
         if bus.needs_router:
-            self.graph.ticker("router", self.config.bus.retry_s, bus.connect)
+            self.graph.ticker("router", ROUTER_S, bus.connect)
         return bus
 
     def _close_bus(self, bus: Bus) -> None:

@@ -20,19 +20,18 @@ from omnid.transport.bus_config import BusConfig, checked
 from omnid.transport.codec import ERROR, OK, WARN
 from omnid.transport.command_intake import PERIOD_S, CommandIntake, RequestCallback
 from omnid.transport.intake import QUERY, Intake, floods
-from omnid.transport.namesakes import Namesakes
 from omnid.transport.open_requests import OpenRequests
 from omnid.transport.publishers import RosGraph, TopicPublisher
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Answer, Request
-from omnid.transport.session import EndpointTaken, open_session, reason, router_in_place
+from omnid.transport.session import ALIVE, EndpointTaken, open_session, reason, router_in_place
 from omnid.transport.stop_datagram import StopListener
 from omnid.transport.topics import CLOCK, PUBLISHED, STOP
 
 __all__ = ["Bus", "BusConfig"]
 
 QUERY_PERIOD_S: Final = 0.01
-SEARCH_S: Final = 5.0  # Time between two searches for a robot of the same name that was found behind a router.
+MOST_NAMESAKES: Final = 64  # Most that are distinguished; anyone may declare tokens where no users are configured.
 FLOOD_S: Final = 10.0  # The status warns of a flood for this time after its end.
 
 
@@ -53,8 +52,7 @@ class Bus:
         self._config, self._warn = checked(config), warn
         # A robot whose time is the computer's has none: programs that wait for it would believe to be in a simulation.
         self._topics = {name: topic for name, topic in PUBLISHED.items() if gives_time or name != CLOCK}
-        self._namesakes: Namesakes | None = None
-        self._searched_s = 0.0
+        self._namesakes: set[str] = set()  # liveliness tokens of other robots of this name
         self._warned = False
         self._session: zenoh.Session | None = None
         self._publishers: dict[str, TopicPublisher] = {}
@@ -79,7 +77,7 @@ class Bus:
     @property
     def needs_router(self) -> bool:
         """True for a client, whose `connect` must be called from time to time."""
-        return self._config.mode == "client"
+        return self._config.is_client
 
     def connect(self) -> None:
         """Try once to reach the router, unless it was reached before: zenoh reconnects by itself only after that."""
@@ -100,9 +98,9 @@ class Bus:
         if level == OK and time.monotonic() < self._flooded_s + FLOOD_S:
             level, message = WARN, f"more messages on {counts.most_common(1)[0][0]} than are taken: end their sender"
         values = {
-            "mode": self._config.mode,
+            "mode": "client" if self._config.is_client else "peer",
             "lost": str(self.lost),
-            status_names.SAME_NAME_COUNT: str(len(self._namesakes or ())),
+            status_names.SAME_NAME_COUNT: str(len(self._namesakes)),
             **{f"flooded, {key}": str(count) for key, count in sorted(counts.items())},
         }
         return DiagnosticStatus(status_names.BUS, level, message, values)
@@ -194,8 +192,7 @@ class Bus:
 
     def _open(self) -> None:
         session = open_session(self._config)
-        self._namesakes = Namesakes(session, self._config, self._report_same_name)
-        self._searched_s = time.monotonic()
+        self._watch_for_namesakes(session)
         self._graph = graph = RosGraph(session, self._config)
         self._publishers = {name: TopicPublisher(session, self._config, name, graph) for name in self._topics}
         for name in {*self._newest, *(name for name, topic in self._topics.items() if topic.latched)}:
@@ -207,6 +204,26 @@ class Bus:
             self._declare_subscribers(session, self._on_command)
         self._session = session
         self._pollers.append(Poller(self._answer_queries, QUERY_PERIOD_S, "bus queries"))
+
+    def _watch_for_namesakes(self, session: zenoh.Session) -> None:
+        """Declare the name, and watch for others: they keep this robot from being armed, never from starting."""
+        own = f"{self._config.robot}/{ALIVE}/{session.zid()}"
+
+        def on_token(sample: zenoh.Sample) -> None:
+            key, was_unique = str(sample.key_expr), self.is_unique
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._namesakes.discard(key)
+            elif key != own and len(self._namesakes) < MOST_NAMESAKES:
+                self._namesakes.add(key)
+                if was_unique:
+                    self._report_same_name()
+
+        tokens = session.liveliness()
+        self._declared += [
+            tokens.declare_token(own),
+            tokens.declare_subscriber(f"{self._config.robot}/{ALIVE}/*", on_token, history=True),
+            tokens.declare_token(f"{self._config.robot}/{ALIVE}"),
+        ]
 
     def _report_same_name(self) -> None:
         """Warn once, and stop the wheels: two robots that obey one operator are not what the operator expects."""
@@ -223,10 +240,7 @@ class Bus:
         self._queries[name] = Intake(f"queries for {name}", queryable.try_recv, QUERY)
 
     def _answer_queries(self) -> None:
-        """Answer the queries that have come, and the requests that are decided.
-
-        Search again for a robot of the same name behind a router.
-        """
+        """Answer the queries that have come, and the requests that are decided."""
         self._requests.send()
         for name, intake in list(self._queries.items()):
             for query in intake.messages():
@@ -234,9 +248,6 @@ class Bus:
                     payload, encoding, attachment = self._newest[name]
                     key = f"{self._config.robot}/{name.removeprefix('/')}"
                     query.reply(key, payload, encoding=encoding, attachment=attachment)
-        if self._namesakes and self._namesakes.behind_router and time.monotonic() > self._searched_s + SEARCH_S:
-            self._namesakes.search()
-            self._searched_s = time.monotonic()
 
     def _declare_subscribers(self, session: zenoh.Session, callback: RequestCallback) -> None:
         if not self.is_unique:

@@ -10,9 +10,9 @@ import zenoh
 
 from omnid.errors import OmnidError
 from omnid.transport import codec, ros2
-from omnid.transport.client_session import robots_there
 from omnid.transport.navigation_codec import PlanarGoal, goal_cdr, string_cdr
 from omnid.transport.requests import Answer, answer_of
+from omnid.transport.session import robots_there
 from omnid.transport.topics import ARM, GOAL, HEADING, MAP, NAVIGATION, ROUTE, SAVE_MAP, STOP, TWIST, request_key
 
 CONNECT_S: Final = 2.0  # A connection is complete within this time.
@@ -123,8 +123,8 @@ class Driver:
                 if reply.ok is not None and (answer := answer_of(reply.ok.payload.to_bytes())) is not None:
                     return answer
         raise OmnidError(
-            f"{self._robot} has not answered: either this program must not command it (bus.command_users, "
-            "bus.command_names), or it gives no poses; see `omnid listen`"
+            f"{self._robot} has not answered: either this program must not command it (access_control in "
+            "zenoh's file of the robot or router), or it gives no poses; see `omnid listen`"
         )
 
     def send(self, topic: str, payload: bytes) -> None:

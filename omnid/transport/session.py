@@ -1,46 +1,66 @@
-"""zenoh sessions with the settings of the configuration."""
+"""zenoh sessions with the settings of the configuration, and the rules that hold where it names no file of zenoh.
+
+Every connected program may subscribe, query, and stop the wheels; without rules of one's own it may command, too.
+Nothing else can be written, and only the robot answers requests. zenoh applies the rules where a link enters the
+session, so that refused messages never reach the daemon. Who may connect, and who may command, is said in zenoh's own
+file `bus.config`; `site.json5` is an example.
+"""
 
 from __future__ import annotations
 
 import json
 import os
 import re
-from collections.abc import Iterator
+import time
 from dataclasses import replace
 from typing import Any, Final
 
 import zenoh
 
 from omnid.errors import OmnidError
-from omnid.transport.access import access_control
-from omnid.transport.bus_config import BusConfig, set_knobs, text_of
-from omnid.transport.topics import PATH, PUBLISHED, REQUEST_TOPICS, SERVED, command_topics, request_key
+from omnid.plain_text import plain
+from omnid.transport.bus_config import BusConfig, checked, text_of_file
+from omnid.transport.topics import PATH, REQUEST_TOPICS, STOP, command_topics, request_key
 
+HERE: Final = "tcp/127.0.0.1:7447"
+ALIVE: Final = "alive"  # key of the liveliness token below the robot's name
 _OS_ERROR: Final = re.compile(r"\(os error (\d+)\)")
 _NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[.*\]\. Timeout!")
 _SOURCE_LINE: Final = re.compile(r"\s+at /\S+\.rs:\d+\.?")
 _PROTOCOLS: Final = "transport/link/protocols"
 _PROTOCOL: Final = re.compile(r'"([a-z0-9_-]+)/')
-_CONNECT_TIMEOUT_MS: Final = 1000  # a client that cannot reach its router opens no session
-_REAL_TIME_BATCHES: Final = 16  # the default of 2 is soon full on a busy host, and poses are dropped
-_MAX_RECEIVED_BYTES: Final = 1 << 20  # zenoh collects fragments up to its limit of 1 GiB before access rules apply
-# Connections that send nothing hold one of the places for the time-out: 1000 of them lock others out for 1 s at most.
-# zenoh's defaults are 100 places and 10 s.
-_MAX_PENDING: Final = 1000
-_ACCEPT_TIMEOUT_MS: Final = 1000
+_USERS: Final = "transport/auth/usrpwd/dictionary_file"
+_CERTIFICATES: Final = "transport/link/tls/enable_mtls"
+_RETRY_S: Final = 0.5  # between two attempts of a client to connect
+_ALIVE_TIMEOUT_S: Final = 1.0
+_NAMED: Final = 5  # Most robots that a message names.
 _MAX_COMMAND_BYTES: Final = 16_384  # Limit of all commands but paths.
 _MAX_SESSIONS: Final = 128  # each holds received fragments in memory
-# Limit for each link and key: zenoh ends each query that a ring drops by a message of its own, which takes time. A
-# refused query has an empty answer at once. A program that asks for one key in a loop over loopback (0.1 ms an answer)
-# is refused some, and must ask again, as `omnid.client` does.
-_MAX_QUERIES_HZ: Final = 1000.0
-_TLS: Final = {
-    "tls_ca": "root_ca_certificate",
-    "tls_listen_key": "listen_private_key",
-    "tls_listen_certificate": "listen_certificate",
-    "tls_connect_key": "connect_private_key",
-    "tls_connect_certificate": "connect_certificate",
+_DEFAULTS: Final[dict[str, Any]] = {  # where zenoh's own file leaves zenoh's
+    "connect/retry": {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2},
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,  # else a peer makes this one connect to endpoints of its choice
+    "transport/shared_memory/enabled": False,  # faster above 100 kB only, and leaves files behind
+    "transport/link/tx/queue/size/real_time": 16,  # 2 are soon full on a busy host, and poses are dropped
 }
+_GUARDS: Final[dict[str, Any]] = {
+    "transport/link/rx/max_message_size": 1 << 20,  # zenoh collects fragments up to 1 GiB before access rules apply
+    # Connections that send nothing hold one of the places for the time-out: they lock others out for 1 s at most.
+    # zenoh's defaults are 100 places and 10 s.
+    "transport/unicast/accept_pending": 1000,
+    "transport/unicast/accept_timeout": 1000,
+}
+_ALWAYS: Final = (
+    "declare_subscriber",
+    "declare_queryable",
+    "query",
+    "reply",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+)
+# A star does not match parts that begin with @; @adv is the history that zenoh keeps for ROS 2's late subscribers.
+_EVERYTHING: Final = ("**", "@/**", "@/*/@ros2_lv/**", "@ros2_lv/**", "**/@adv/**")
 
 
 class EndpointTaken(OmnidError):  # noqa: N818 - a state that may pass, as the errors of sockets
@@ -61,24 +81,46 @@ def open_session(config: BusConfig, *, guarded: bool = True) -> zenoh.Session:
     try:
         return zenoh.open(prepared)
     except zenoh.ZError as error:
-        raise _failure(config, reason(error)) from error
+        cause = reason(error)
+        if config.is_client:
+            raise Unreachable(
+                f"bus cannot reach {', '.join(config.connect)}: start the robot or router there, or change bus.connect "
+                f"({cause})"
+            ) from error
+        raise EndpointTaken(
+            f"bus cannot listen on {', '.join(config.listen)}: stop the other program there or change bus.listen "
+            f"({cause})"
+        ) from error
 
 
-def _failure(config: BusConfig, cause: str) -> OmnidError:
-    if config.mode == "client":
-        endpoints = ", ".join(config.connect)
-        return Unreachable(
-            f"bus cannot reach {endpoints}: start the robot or router there, or change bus.connect ({cause})"
-        )
-    endpoints = ", ".join(config.listen)
-    return EndpointTaken(
-        f"bus cannot listen on {endpoints}: stop the other program there or change bus.listen ({cause})"
-    )
+def open_client(given: BusConfig, timeout_s: float = 0.0) -> zenoh.Session:
+    """Open the session of a program that listens to robots and commands them; bus.listen does not count.
+
+    Raise Unreachable where no endpoint answers within timeout_s, OmnidError for wrong settings.
+    """
+    # Peers that only share a router exchange no messages, clients do.
+    config = checked(BusConfig(robot=given.robot, listen=(), connect=given.connect or (HERE,), config=given.config))
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        try:
+            return open_session(config, guarded=False)
+        except Unreachable:
+            if time.monotonic() >= deadline_s:
+                raise
+        time.sleep(_RETRY_S)
+
+
+def robots_there(session: zenoh.Session) -> str:
+    """Return the names of the robots that a session reaches, as a part of a sentence."""
+    replies = session.liveliness().get(f"**/{ALIVE}", timeout=_ALIVE_TIMEOUT_S)
+    names = sorted(str(reply.ok.key_expr).rpartition("/")[0] for reply in replies if reply.ok is not None)
+    more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
+    return plain(f"robots there: {', '.join([*names[:_NAMED], *more])}") if names else "no robot is there"
 
 
 def router_in_place(config: BusConfig) -> BusConfig | None:
     """Return the configuration of a client of the router that holds the endpoints of a peer; None without a router."""
-    client = replace(config, mode="client", listen=(), connect=config.listen)
+    client = replace(config, listen=(), connect=config.listen)
     try:
         session = open_session(client, guarded=False)
     except OmnidError:
@@ -90,115 +132,43 @@ def router_in_place(config: BusConfig) -> BusConfig | None:
 
 
 def zenoh_config(config: BusConfig, *, guarded: bool = True) -> zenoh.Config:
-    """Return zenoh's configuration: its own file first, omnid's defaults where that leaves zenoh's, then set knobs.
+    """Return zenoh's configuration: the endpoints of [bus], all else by its own file, else by omnid's defaults.
 
-    zenoh's defaults are replaced because they listen on all interfaces and use multicast. Shared memory is off: it is
-    faster above 100 kB only, and leaves files behind.
+    zenoh's defaults are replaced because they listen on all interfaces and use multicast.
     """
-    result, untouched, explicit = _of_file(config), zenoh.Config(), set_knobs(config)
-    for key, value, knob in _settings(config, guarded):
-        if knob == "mode" or knob in explicit or result.get_json(key) == untouched.get_json(key):
+    result, untouched = _of_file(config), zenoh.Config()
+    # 1. Who connects where is said in [bus].
+    endpoints: dict[str, Any] = {
+        "mode": "client" if config.is_client else "peer",
+        "listen/endpoints": list(config.listen),
+        "connect/endpoints": list(config.connect),
+        "connect/exit_on_failure": config.is_client,
+    }
+    if config.is_client:
+        endpoints["connect/timeout_ms"] = 1000  # a client that cannot reach its router opens no session
+    for key, value in endpoints.items():
+        result.insert_json5(key, json.dumps(value))
+    # 2. omnid's defaults, where the file says nothing.
+    defaults = dict(_DEFAULTS)
+    if guarded:
+        defaults |= _GUARDS
+        defaults["transport/unicast/max_sessions"] = _MAX_SESSIONS
+        defaults["low_pass_filter"] = _size_limits(config)
+        defaults["access_control"] = _access_control(config)
+    for key, value in defaults.items():
+        if result.get_json(key) == untouched.get_json(key):
             result.insert_json5(key, json.dumps(value))
-    _restrict_protocols(result)
+    # 3. No links of other protocols than those of the endpoints.
+    if json.loads(result.get_json(_PROTOCOLS)) is None:
+        used = _PROTOCOL.findall(json.dumps([*config.listen, *config.connect]))
+        result.insert_json5(_PROTOCOLS, json.dumps(sorted(set(used))))
     return result
 
 
-def _restrict_protocols(result: zenoh.Config) -> None:
-    """Allow no links of other protocols than those of the endpoints, unless zenoh's own file names protocols."""
-    endpoints = result.get_json("listen/endpoints") + result.get_json("connect/endpoints")
-    if json.loads(result.get_json(_PROTOCOLS)) is None:
-        result.insert_json5(_PROTOCOLS, json.dumps(sorted(set(_PROTOCOL.findall(endpoints)))))
-
-
-def _of_file(config: BusConfig) -> zenoh.Config:
-    if not config.config:
-        return zenoh.Config()
-    try:
-        return zenoh.Config.from_json5(text_of(config, "config"))
-    except zenoh.ZError as error:
-        message = f"bus.config: {config.config!r} is not a zenoh configuration: {reason(error)}; correct the file"
-        raise OmnidError(message) from error
-
-
-def _settings(config: BusConfig, guarded: bool) -> Iterator[tuple[str, Any, str]]:
-    """Yield zenoh's key, its value, and the knob that sets it."""
-    client = config.mode == "client"
-    yield "mode", config.mode, "mode"
-    yield "listen/endpoints", [] if client else list(config.listen), "listen"
-    yield "connect/endpoints", list(config.connect), "connect"
-    yield "connect/exit_on_failure", client, ""
-    yield (
-        "connect/retry",
-        {
-            "period_init_ms": min(500, round(1e3 * config.retry_s)),
-            "period_max_ms": round(1e3 * config.retry_s),
-            "period_increase_factor": 2,
-        },
-        "retry_s",
-    )
-    if client:
-        yield "connect/timeout_ms", _CONNECT_TIMEOUT_MS, ""
-    yield "scouting/multicast/enabled", False, ""
-    yield "scouting/gossip/enabled", False, ""  # else a peer makes this one connect to endpoints of its choice
-    yield "transport/shared_memory/enabled", False, ""
-    yield "transport/link/tx/queue/size/real_time", _REAL_TIME_BATCHES, ""
-    for knob, key in _TLS.items():
-        if getattr(config, knob):
-            yield f"transport/link/tls/{key}", getattr(config, knob), knob
-    if config.tls_mutual or config.tls_connect_certificate:  # zenoh sends no certificate unless it requires one, too
-        yield "transport/link/tls/enable_mtls", True, "tls_mutual"
-    yield from _users(config)
-    if guarded:
-        yield "transport/link/rx/max_message_size", _MAX_RECEIVED_BYTES, ""
-        yield "transport/unicast/accept_pending", _MAX_PENDING, ""
-        yield "transport/unicast/accept_timeout", _ACCEPT_TIMEOUT_MS, ""
-        yield "transport/unicast/max_sessions", _MAX_SESSIONS, ""
-        yield "low_pass_filter", _size_limits(config), ""
-        yield "downsampling", _query_rates(config), ""
-        yield "access_control", access_control(config), "command_names" if config.command_names else "command_users"
-
-
-def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
-    """Return the rule that bounds commands and requests in size: many of them wait at once."""
-    short = [f"{config.robot}/{topic}" for topic in command_topics(()) if topic != PATH]
-    plain = [*short, f"{config.robot}/cmd/*/*"]
-    ros = [f"{config.ros2_domain}/{key}/*/*" for key in plain] if config.ros2 == "rmw_zenoh" else []
-    requests = [f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS - {PATH})]
-    return [
-        {
-            "id": "commands",
-            "flows": ["ingress"],
-            "messages": ["put", "query"],
-            "key_exprs": plain + ros + requests,
-            "size_limit": _MAX_COMMAND_BYTES,
-        }
-    ]
-
-
-def _query_rates(config: BusConfig) -> list[dict[str, Any]]:
-    """Return the rules that bound how often a link may ask.
-
-    Each key has one: a rule refuses what comes sooner than the time between two messages, of any of the keys it covers.
-    """
-    kept = [name.removeprefix("/") for name, topic in PUBLISHED.items() if topic.latched]
-    asked = [*kept, *SERVED, *map(request_key, sorted(REQUEST_TOPICS))]
-    keys = [f"{config.robot}/{name}" for name in asked]
-    return [
-        {
-            "id": "queries",
-            "flows": ["ingress"],
-            "messages": ["query"],
-            "rules": [{"key_expr": key, "freq": _MAX_QUERIES_HZ} for key in keys],
-        }
-    ]
-
-
-def _users(config: BusConfig) -> Iterator[tuple[str, Any, str]]:
-    if config.users_file:
-        yield "transport/auth/usrpwd/dictionary_file", config.users_file, "users_file"
-    if config.user:
-        yield "transport/auth/usrpwd/user", config.user, "user"
-        yield "transport/auth/usrpwd/password", text_of(config, "password_file").strip(), "password_file"
+def needs_proof(config: BusConfig) -> bool:
+    """True if who connects must show a password or a certificate, by zenoh's own file."""
+    found = _of_file(config)
+    return json.loads(found.get_json(_USERS)) is not None or bool(json.loads(found.get_json(_CERTIFICATES)))
 
 
 def reason(error: zenoh.ZError) -> str:
@@ -207,3 +177,45 @@ def reason(error: zenoh.ZError) -> str:
     if by_system := _OS_ERROR.search(text):
         return os.strerror(int(by_system[1]))
     return "no answer" if _NO_ANSWER.fullmatch(text) else text
+
+
+def _of_file(config: BusConfig) -> zenoh.Config:
+    if not config.config:
+        return zenoh.Config()
+    try:
+        return zenoh.Config.from_json5(text_of_file(config.config))
+    except zenoh.ZError as error:
+        message = f"bus.config: {config.config!r} is not a zenoh configuration: {reason(error)}; correct the file"
+        raise OmnidError(message) from error
+
+
+def _size_limits(config: BusConfig) -> list[dict[str, Any]]:
+    """Return the rule that bounds commands and requests in size: many of them wait at once."""
+    short = [f"{config.robot}/{topic}" for topic in command_topics(()) if topic != PATH]
+    plain_keys = [*short, f"{config.robot}/cmd/*/*"]
+    ros = [f"{config.ros2_domain}/{key}/*/*" for key in plain_keys] if config.ros2 != "off" else []
+    requests = [f"{config.robot}/{request_key(topic)}" for topic in sorted(REQUEST_TOPICS - {PATH})]
+    rule = {"id": "commands", "flows": ["ingress"], "messages": ["put", "query"], "size_limit": _MAX_COMMAND_BYTES}
+    return [{**rule, "key_exprs": [*plain_keys, *ros, *requests]}]
+
+
+def _access_control(config: BusConfig) -> dict[str, Any]:
+    """Return the rules of a bus without a file of zenoh, as JSON."""
+    commands, stops, requests = f"{config.robot}/cmd/**", f"{config.robot}/{STOP}", f"{config.robot}/{request_key('*')}"
+    by_ros = [f"{config.ros2_domain}/{commands}", f"{config.ros2_domain}/{stops}/**"] if config.ros2 != "off" else []
+    rules = (
+        ("subscribe", "egress", (*_ALWAYS, "put", "delete"), [*_EVERYTHING, requests]),
+        ("query", "ingress", _ALWAYS, list(_EVERYTHING)),
+        ("command", "ingress", ("put",), [commands, stops, *by_ros]),
+        ("request", "ingress", ("query",), [requests]),
+    )
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": [
+            {"id": name, "permission": "allow", "flows": [flow], "messages": list(messages), "key_exprs": keys}
+            for name, flow, messages, keys in rules
+        ],
+        "subjects": [{"id": "everybody"}],
+        "policies": [{"id": "all", "rules": [name for name, *_ in rules], "subjects": ["everybody"]}],
+    }

@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from omnid.transport.bus_config import BusConfig
+from omnid.transport.session import needs_proof
 
 ASKED: Final = "asked"  # the daemon has passed the stop on
 STOPPED: Final = "stopped"  # the robot is disarmed by a stop
@@ -48,11 +49,11 @@ class StopListener:
     def __init__(self, config: BusConfig, on_stop: Callable[[], None], is_stopped: Callable[[], bool]) -> None:
         """on_stop: called for each request. is_stopped: True if the robot is disarmed by a stop."""
         self._robot, self._on_stop, self._is_stopped = config.robot.encode(), on_stop, is_stopped
-        needs_proof = bool(config.users_file or config.tls_mutual)
         self._sockets: list[socket.socket] = []
         self._poll = select.poll()
+        proves = needs_proof(config)
         for host, port in addresses(config.listen):
-            if needs_proof and not _is_loopback(host):
+            if proves and not _is_loopback(host):
                 host = "127.0.0.1"
             with suppress(OSError):
                 self._sockets.append(_bound(host, port))

@@ -70,7 +70,7 @@ class WheelCommands:
         if self._driver is None or not self._driver.connected:
             return "No robot of that name receives commands there: does its daemon run, with a motor?"
         return (
-            "Either this program must not command it (bus.command_users, bus.command_names), or the clocks differ; "
+            "Either this program must not command it (access_control in zenoh's file), or the clocks differ; "
             "see `refused` in the entry of the wheels"
         )
 

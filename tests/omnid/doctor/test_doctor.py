@@ -245,19 +245,18 @@ def test_checks_the_rig(scene: Path, tmp_path: Path) -> None:
         ("udp/robot.local:7447", False),
     ],
 )
-def test_warns_of_open_endpoints_without_command_users(endpoint: str, local: bool) -> None:
+def test_warns_of_open_endpoints_without_rules(endpoint: str, local: bool) -> None:
     for config in (BusConfig(listen=(endpoint,)), BusConfig(connect=(endpoint,))):
         found = bus(config)
-        assert (found.level == "ok") == local and local != ("bus.command_users" in found.advice)
+        assert (found.level == "ok") == local and local != ("bus.config" in found.advice)
 
 
-def test_names_the_users_that_may_command_and_finds_wrong_settings(tmp_path: Path) -> None:
-    users = tmp_path / "users"
-    users.write_text("anna:secret")
-    found = bus(BusConfig(listen=("tcp/0.0.0.0:7447",), users_file=str(users), command_users=("anna",)))
-    assert found.level == "ok" and "from anna only" in found.found
-    wrong = bus(BusConfig(command_users=("anna",)))
-    assert wrong.level == "error" and "bus.users_file" in wrong.found
+def test_names_the_file_that_says_who_may_command_and_finds_wrong_settings(tmp_path: Path) -> None:
+    (tmp_path / "site.json5").write_text("{}")
+    found = bus(BusConfig(listen=("tcp/0.0.0.0:7447",), config=str(tmp_path / "site.json5")))
+    assert found.level == "ok" and "site.json5" in found.found
+    wrong = bus(BusConfig(config="nowhere.json5"))
+    assert wrong.level == "error" and "bus.config" in wrong.found
 
 
 def test_the_command_runs_all_checks_and_returns_an_exit_code(

@@ -1,9 +1,10 @@
-"""Permissions on the bus: certificates made with openssl, users with passwords, real sessions."""
+"""Permissions on the bus: omnid's own rules, and those of the shipped site.json5 with TLS, users and certificates."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import subprocess
 import time
@@ -11,229 +12,225 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-import zenoh
 
 from omnid.client import Answer, Driver, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.bus import Bus, BusConfig
+from omnid.transport.codec import OK
 from omnid.transport.requests import Request
-from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
+from tests.omnid.transport.bus_fixtures import free_endpoint, odometry, script, session
 from tests.waiting import wait_until
 
 needs_openssl = pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+SITE = Path(__file__).parents[3] / "omnid" / "transport" / "site.json5"
+EC_KEY = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+USERS = ("one", "two", "ada", "bob")
+ZENOHD = """
+import sys, time, zenoh
+with zenoh.open(zenoh.Config.from_file(sys.argv[1])):
+    print("ready", flush=True)
+    time.sleep(1000)
+"""
 
 
-def openssl(*words: str) -> None:
-    subprocess.run(["openssl", *words], check=True, capture_output=True)
+def openssl(*words: object) -> None:
+    subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
 
 
 def authority(folder: Path, name: str) -> None:
-    openssl(
-        "req",
-        "-x509",
-        "-newkey",
-        "ec",
-        "-pkeyopt",
-        "ec_paramgen_curve:prime256v1",
-        "-nodes",
-        "-days",
-        "2",
-        "-subj",
-        f"/CN={name}",
-        "-keyout",
-        str(folder / f"{name}.key"),
-        "-out",
-        str(folder / f"{name}.pem"),
-    )
+    """Make a key and a certificate that is signed by itself."""
+    files = ("-keyout", folder / f"{name}.key", "-out", folder / f"{name}.pem")
+    openssl("req", "-x509", *EC_KEY, "-days", 2, "-subj", f"/CN={name}", *files)
 
 
 def certificate(folder: Path, name: str, signer: str) -> None:
-    request, extra = folder / f"{name}.csr", folder / f"{name}.ext"
+    """Make a key and a certificate for this machine that an authority signs."""
+    key, pem, request, extra = (folder / f"{name}.{suffix}" for suffix in ("key", "pem", "csr", "ext"))
     extra.write_text("subjectAltName=IP:127.0.0.1,DNS:localhost\n")
-    openssl(
-        "req",
-        "-newkey",
-        "ec",
-        "-pkeyopt",
-        "ec_paramgen_curve:prime256v1",
-        "-nodes",
-        "-subj",
-        f"/CN={name}",
-        "-keyout",
-        str(folder / f"{name}.key"),
-        "-out",
-        str(request),
-    )
-    openssl(
-        "x509",
-        "-req",
-        "-in",
-        str(request),
-        "-days",
-        "2",
-        "-CA",
-        str(folder / f"{signer}.pem"),
-        "-CAkey",
-        str(folder / f"{signer}.key"),
-        "-CAcreateserial",
-        "-extfile",
-        str(extra),
-        "-out",
-        str(folder / f"{name}.pem"),
-    )
+    openssl("req", *EC_KEY, "-subj", f"/CN={name}", "-keyout", key, "-out", request)
+    signed_by = ("-CA", folder / f"{signer}.pem", "-CAkey", folder / f"{signer}.key", "-CAcreateserial")
+    openssl("x509", "-req", "-in", request, "-days", 2, *signed_by, "-extfile", extra, "-out", pem)
 
 
 @pytest.fixture(scope="module")
-def credentials(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Keys and certificates of the robot, a driver and a guest, and of a stranger with another authority."""
-    folder = tmp_path_factory.mktemp("credentials")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a site: keys, certificates, users; of ada and eve with the files of clients; eve has no password.
+
+    `site.json5` is the shipped one with the names of these files; `certificates.json5` asks for certificates instead of
+    passwords.
+    """
+    folder = tmp_path_factory.mktemp("site")
     for name in ("ca", "other"):
         authority(folder, name)
-    for name, signer in (("robot", "ca"), ("driver", "ca"), ("guest", "ca"), ("stranger", "other")):
+    for name, signer in (("site", "ca"), ("driver", "ca"), ("guest", "ca"), ("stranger", "other")):
         certificate(folder, name, signer)
+    (folder / "users.txt").write_text("".join(f"{user}:secret of {user}\n" for user in USERS))
+    text = SITE.read_text().replace("/etc/omnid/", f"{folder}/")
+    (folder / "site.json5").write_text(text)
+    tls = f'tls: {{ root_ca_certificate: "{folder}/ca.pem", enable_mtls: true,'
+    text = text.replace("tls: {", tls).replace('usernames: ["ada"]', 'cert_common_names: ["driver"]')
+    (folder / "certificates.json5").write_text(re.sub("auth: {.*", "", text))
+    for user in (*USERS, "eve"):
+        password = f"secret of {user if user != 'eve' else 'ada?'}"
+        client_file(folder, user, {"auth": {"usrpwd": {"user": user, "password": password}}}, {})
+    client_file(folder, "nobody", {}, {})
+    for name in ("driver", "guest", "stranger"):
+        keys = {"connect_private_key": f"{folder}/{name}.key", "connect_certificate": f"{folder}/{name}.pem"}
+        client_file(folder, name, {}, {**keys, "enable_mtls": True})
     return folder
 
 
-def robot(credentials: Path, **more: object) -> BusConfig:
-    own = {
-        "tls_ca": credentials / "ca.pem",
-        "tls_listen_key": credentials / "robot.key",
-        "tls_listen_certificate": credentials / "robot.pem",
-    }
-    return BusConfig(listen=(free_endpoint("tls"),), tls_mutual=True, **{k: str(v) for k, v in own.items()}, **more)
+def client_file(folder: Path, name: str, transport: dict[str, object], tls: dict[str, object]) -> None:
+    """Write zenoh's file of a client."""
+    link = {"tls": {"root_ca_certificate": f"{folder}/ca.pem", **tls}}
+    (folder / f"{name}.json5").write_text(json.dumps({"transport": {**transport, "link": link}}))
 
 
-def visitor(credentials: Path, endpoint: str, name: str | None) -> BusConfig:
-    own = (
-        {}
-        if name is None
-        else {
-            "tls_connect_key": str(credentials / f"{name}.key"),
-            "tls_connect_certificate": str(credentials / f"{name}.pem"),
-        }
-    )
-    return BusConfig(connect=(endpoint,), tls_ca=str(credentials / "ca.pem"), **own)
-
-
-@pytest.mark.hazard("H44")
-@needs_openssl
-@pytest.mark.parametrize("name", ["stranger", None], ids=["wrong certificate", "no certificate"])
-def test_refuses_connections_without_a_valid_certificate(credentials: Path, name: str | None) -> None:
-    config = robot(credentials)
-    with contextlib.closing(Bus(config)) as bus:
-        bus.publish("odom", odometry(1))
-        with Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest:
-            assert guest.alive
-        with pytest.raises(Unreachable), Robot(settings=visitor(credentials, config.listen[0], name)) as intruder:
-            assert not intruder.alive  # a client of TLS 1.3 may learn of it a moment later only
-            raise Unreachable("connected, but receives nothing")
+def visitor(site: Path, endpoint: str, name: str, robot: str = "omnid") -> Robot:
+    """Return the connection of a program with the file of a user."""
+    return Robot(settings=BusConfig(robot=robot, connect=(endpoint,), config=str(site / f"{name}.json5")))
 
 
 @contextlib.contextmanager
-def commands_to(config: BusConfig) -> Iterator[list[str]]:
+def commands_to(config: BusConfig) -> Iterator[tuple[Bus, list[str]]]:
+    """Yield a robot that answers all requests, and the topics of what it receives."""
     received: list[str] = []
     with contextlib.closing(Bus(config)) as bus:
+        wait_until(lambda: bus.connect() is None and bus.status().message == "open")
 
         def take(request: Request) -> None:
             received.append(request.topic)
             bus.answer(request.id, Answer(True, "armed"))
 
         bus.subscribe_commands(take, {})
-        yield received
+        yield bus, received
 
 
 def asks_to_arm(driver: Driver) -> bool:
     """Return whether a program that asks to arm gets an answer."""
     try:
-        return driver.arm(timeout_s=2.0).done
+        return driver.arm(timeout_s=1.0).done
     except OmnidError:
         return False
 
 
+def expect_rights(received: list[str], accepted: Robot, refused: Robot) -> None:
+    """Expect that one program may drive and arm, that the other may look and stop only, and not answer requests."""
+    driver, looker = accepted.driver(), refused.driver()
+    wait_until(lambda: looker.stop() is None and "cmd/stop" in received)
+    wait_until(lambda: driver.twist(0.1, 0.0) is None and "cmd/twist" in received)
+    wait_until(lambda: asks_to_arm(driver))
+    time.sleep(0.3)
+    received.clear()
+    for _ in range(3):
+        looker.twist(1.0, 0.0)
+        looker.heading(1.0, 0.0)
+        refused.driver("planner").twist(1.0, 0.0)
+    assert not asks_to_arm(looker)
+    for everything in ("**", f"{refused.name}/**", "**/@request/*", f"{refused.name}/@request/arm"):
+        replies = refused._session.get(everything, payload=codec.header_cdr(time.time_ns()), timeout=1.0)
+        assert not any(reply.ok and "@request" in str(reply.ok.key_expr) for reply in replies)
+    key, forged = f"{refused.name}/@request/arm", '{"done": false, "text": "forged"}'
+    with refused._session.declare_queryable(key, lambda query: query.reply(key, forged)):
+        assert all(asks_to_arm(driver) for _ in range(3)), "a stranger answers no request"
+    assert set(received) == {"cmd/arm"} and len(received) == 3
+    assert refused.alive, "who may not drive can still look"
+
+
+@pytest.mark.hazard("H44")
+@needs_openssl
+@pytest.mark.parametrize("name", ["stranger", "nobody"], ids=["wrong certificate", "no certificate"])
+def test_refuses_connections_without_a_valid_certificate(site: Path, name: str) -> None:
+    endpoint = free_endpoint("tls")
+    with commands_to(BusConfig(listen=(endpoint,), config=str(site / "certificates.json5"))):
+        with visitor(site, endpoint, "guest") as guest:
+            assert guest.alive
+        with pytest.raises(Unreachable), visitor(site, endpoint, name) as intruder:
+            assert not intruder.alive  # a client of TLS 1.3 may learn of it a moment later only
+            raise Unreachable("connected, but receives nothing")
+
+
 @pytest.mark.hazard("H02")
 @needs_openssl
-def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(credentials: Path) -> None:
-    config = robot(credentials, command_names=("driver",))
+def test_everyone_may_stop_and_named_certificates_may_drive_and_arm(site: Path) -> None:
+    endpoint = free_endpoint("tls")
     with (
-        commands_to(config) as received,
-        Robot(settings=visitor(credentials, config.listen[0], "guest")) as guest,
-        Robot(settings=visitor(credentials, config.listen[0], "driver")) as driver,
+        commands_to(BusConfig(listen=(endpoint,), config=str(site / "certificates.json5"))) as (_, received),
+        visitor(site, endpoint, "driver") as driver,
+        visitor(site, endpoint, "guest") as guest,
     ):
-        refused, accepted = guest.driver(), driver.driver()
-        wait_until(lambda: refused.stop() is None and bool(received))
-        wait_until(lambda: asks_to_arm(accepted) and "cmd/arm" in received)
+        expect_rights(received, driver, guest)
+
+
+@pytest.mark.hazard("H44", "H48", "H49")
+@needs_openssl
+def test_users_need_their_password_and_the_permission_to_drive(site: Path) -> None:
+    endpoint = free_endpoint("tls")
+    with (
+        commands_to(BusConfig(listen=(endpoint,), config=str(site / "site.json5"))) as (bus, received),
+        visitor(site, endpoint, "ada") as ada,
+        visitor(site, endpoint, "bob") as bob,
+    ):
+        expect_rights(received, ada, bob)
+        held = bob._session.liveliness().declare_token("omnid/alive/x")
+        bob.driver().stop()
+        wait_until(lambda: "cmd/stop" in received)
+        assert bus.is_unique and bus.status().level == OK, "only the robot declares tokens below its name"
+        del held
+        for name in ("eve", "nobody"):
+            with pytest.raises(Unreachable):
+                visitor(site, endpoint, name)
+
+
+@pytest.mark.hazard("H48")
+@needs_openssl
+def test_behind_a_router_no_robot_speaks_for_another(site: Path) -> None:
+    endpoint = free_endpoint("tls")
+    (site / "router.json5").write_text((site / "site.json5").read_text().replace("tls/0.0.0.0:7447", endpoint))
+    config = BusConfig(robot="hall/one", listen=(), connect=(endpoint,), config=str(site / "one.json5"))
+    with (
+        script(ZENOHD, str(site / "router.json5")),
+        commands_to(config) as (bus, received),
+        visitor(site, endpoint, "ada", "hall/one") as ada,
+        visitor(site, endpoint, "bob", "hall/one") as bob,
+        visitor(site, endpoint, "two", "hall/one") as other,
+    ):
+        expect_rights(received, ada, other)
+        poses: list[bytes] = []
+        bob.on_message(lambda _, payload, __: poses.append(payload), "odom")
+
+        def publish_and_forge() -> bool:
+            other._session.put("hall/one/odom", b"forged")
+            bus.publish("odom", odometry(1))
+            return len(poses) > 5
+
+        wait_until(publish_and_forge)
+        held = other._session.liveliness().declare_token("hall/one/alive/x")
         time.sleep(0.3)
-        count = received.count("cmd/arm")
-        for _ in range(5):
-            refused.twist(1.0, 0.0)
-            refused.heading(1.0, 0.0)
-            assert not asks_to_arm(refused)
-        guest.driver("planner").twist(1.0, 0.0)
-        time.sleep(0.3)
-        assert set(received) == {"cmd/stop", "cmd/arm"} and received.count("cmd/arm") == count
-        assert guest.alive, "a client without the permission to drive can still subscribe"
-
-
-@pytest.mark.hazard("H44", "H49")
-def test_users_need_their_password_and_the_permission_to_drive(tmp_path: Path) -> None:
-    (tmp_path / "users").write_text("ada:countess\nbob:builder\n")
-    for name, password in (("ada", "countess"), ("bob", "builder"), ("eve", "builder")):
-        (tmp_path / name).write_text(f"{password}\n")
-    endpoint = free_endpoint()
-    config = BusConfig(listen=(endpoint,), users_file=str(tmp_path / "users"), command_users=("ada",))
-
-    def connected(name: str) -> Robot:
-        return Robot(settings=BusConfig(connect=(endpoint,), user=name, password_file=str(tmp_path / name)))
-
-    with commands_to(config) as received, connected("ada") as ada, connected("bob") as bob:
-        drivers = bob.driver(), ada.driver()
-        wait_until(lambda: not any(driver.twist(0.1, 0.0) for driver in drivers) and len(received) >= 3)
-        time.sleep(0.2)
-        count = len(received)
-        for _ in range(5):
-            drivers[0].twist(0.1, 0.0)
-            assert not asks_to_arm(drivers[0])
-        time.sleep(0.3)
-        assert len(received) == count and asks_to_arm(drivers[1])
-        for everything in ("**", "omnid/**", "**/@request/*", "omnid/@request/arm"):
-            assert not list(bob._session.get(everything, payload=codec.header_cdr(time.time_ns()), timeout=1.0))
-        assert len(received) == count + 1
-        key, forged = "omnid/@request/arm", '{"done": false, "text": "forged"}'
-        with bob._session.declare_queryable(key, lambda query: query.reply(key, forged)):
-            assert all(asks_to_arm(drivers[1]) for _ in range(5)), "a stranger answers no request"
-        wait_until(lambda: drivers[0].stop() is None and "cmd/stop" in received)
+        assert set(poses) == {odometry(1)} and bus.is_unique
+        del held
         with pytest.raises(Unreachable):
-            connected("eve")
-        with pytest.raises(Unreachable):
-            Robot(connect=(endpoint,))
+            visitor(site, endpoint, "eve", "hall/one")
 
 
 def test_drops_messages_that_others_publish_under_the_robots_name() -> None:
-    """A forged pose that is sent to the robot is not forwarded to its subscribers."""
-    config = BusConfig(listen=(free_endpoint(),))
-    with contextlib.closing(Bus(config)) as bus, Robot(connect=config.listen) as listener:
-        received: list[bytes] = []
-        listener.on_message(lambda topic, payload, _: received.append(payload))
-        with plain_client(config.listen[0]) as forger:
+    """A forged pose that is sent to the robot is not forwarded to its subscribers; unknown commands are counted."""
+    endpoint, poses = free_endpoint(), list[bytes]()
+    with (
+        commands_to(BusConfig(listen=(endpoint,))) as (bus, received),
+        Robot(connect=(endpoint,)) as listener,
+        session(mode="client", connect__endpoints=[endpoint]) as forger,
+    ):
+        listener.on_message(lambda _, payload, __: poses.append(payload))
 
-            def forge_and_publish() -> bool:
-                forger.put("omnid/odom", b"forged")
-                bus.publish("odom", odometry(1))
-                return len(received) > 5
+        def forge_and_publish() -> bool:
+            forger.put("omnid/odom", b"forged")
+            forger.put("omnid/cmd/dance", b"")
+            bus.publish("odom", odometry(1))
+            return len(poses) > 5 and "cmd/dance" in received
 
-            wait_until(forge_and_publish)
-    assert set(received) == {odometry(1)}
-
-
-def test_passes_unknown_commands_on_to_be_counted() -> None:
-    config = BusConfig(listen=(free_endpoint(),))
-    with commands_to(config) as received, plain_client(config.listen[0]) as sender:
-        wait_until(lambda: sender.put("omnid/cmd/dance", b"") is None and "cmd/dance" in received)
-
-
-def plain_client(endpoint: str) -> zenoh.Session:
-    config = zenoh.Config()
-    for key, value in (("mode", "client"), ("connect/endpoints", [endpoint]), ("scouting/multicast/enabled", False)):
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
+        wait_until(forge_and_publish)
+        everything = forger.get("**", payload=codec.header_cdr(time.time_ns()), timeout=1.0)
+        assert list(everything) and "cmd/arm" not in received
+    assert set(poses) == {odometry(1)}

@@ -198,7 +198,7 @@ def test_a_separate_program_lists_and_reads_the_topics(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
         stack.enter_context(script(ROUTER, endpoint))
-        config = BusConfig(listen=(free_endpoint(),), connect=(endpoint,), ros2="rmw_zenoh", retry_s=0.5)
+        config = BusConfig(listen=(free_endpoint(),), connect=(endpoint,), ros2="rmw_zenoh")
         bus = stack.enter_context(contextlib.closing(Bus(config)))
         bus.subscribe_commands(lambda *_: None, COMMANDS)
         wait_until(lambda: listed(endpoint) >= {f"{topic} [{schema}]" for topic, schema in TOPICS.items()})

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from omnid.transport.bus import Bus, BusConfig
-from omnid.transport.stop_datagram import ASKED, STOPPED, StopSender, addresses
+from omnid.transport.stop_datagram import ASKED, STOPPED, StopListener, StopSender, addresses
 from tests.omnid.transport.bus_fixtures import free_endpoint
 from tests.waiting import wait_until
 
@@ -45,14 +45,18 @@ def test_nothing_else_stops_and_no_answer_is_longer_than_its_request() -> None:
         assert answer.endswith(STOPPED.encode()) and len(answer) <= len(good) and commands == ["cmd/stop"]
 
 
-@pytest.mark.parametrize("proof", [False, True])
-def test_beyond_this_machine_only_without_users_and_certificates(tmp_path: Path, proof: bool) -> None:
+@pytest.mark.parametrize(
+    ("asked", "proof"),
+    [
+        ("", False),
+        ("auth: {usrpwd: {dictionary_file: 'users'}}", True),
+        ("link: {tls: {enable_mtls: true}}", True),
+    ],
+)
+def test_beyond_this_machine_only_without_users_and_certificates(tmp_path: Path, asked: str, proof: bool) -> None:
     port = int(free_endpoint().rpartition(":")[2])
-    users = tmp_path / "users"
-    users.write_text("ada:secret\n")
-    config = BusConfig(listen=(f"tcp/0.0.0.0:{port}",), users_file=str(users) if proof else "")
-    with contextlib.closing(Bus(config)) as bus:
-        bus.subscribe_commands(lambda *_: None, {})
-        assert bus._stop_listener is not None
-        hosts = [found.getsockname()[0] for found in bus._stop_listener._sockets]
-        assert hosts == ["127.0.0.1" if proof else "0.0.0.0"]
+    (tmp_path / "zenoh.json5").write_text(f"{{transport: {{{asked}}}}}")
+    config = BusConfig(listen=(f"tcp/0.0.0.0:{port}",), config=str(tmp_path / "zenoh.json5"))
+    listener = StopListener(config, lambda: None, lambda: False)
+    with contextlib.closing(listener):
+        assert [found.getsockname()[0] for found in listener._sockets] == ["127.0.0.1" if proof else "0.0.0.0"]
