@@ -123,8 +123,20 @@ def map_message(grid: Map) -> bytes:
         "cell_m": step * grid.cell_m,
         "x_m": grid.corner[0],
         "y_m": grid.corner[1],
+        "known": _known_part(cells, step * grid.cell_m, grid.corner),
     }
     return with_header(header, zlib.compress(cells.tobytes(), 1))
+
+
+def _known_part(
+    cells: np.ndarray[Any, np.dtype[np.uint8]], cell_m: float, corner: tuple[float, float]
+) -> list[float] | None:
+    """Return left, low, right and high of what is known, m; None without any: a grid is as wide as views may reach."""
+    rows, columns = np.nonzero(cells)
+    if not rows.size:
+        return None
+    (x_m, y_m), edges = corner, (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+    return [float(start_m + cell_m * edge) for start_m, edge in zip((x_m, y_m, x_m, y_m), edges, strict=True)]
 
 
 def no_map_message(frame: str) -> bytes:

@@ -8,16 +8,13 @@ export class Connection {
   // onMessage(message, body): body is the binary part, if there is one. onConnection(text): why there is no connection,
   // empty with one.
   constructor(onMessage, onConnection) {
-    this.onMessage = onMessage;
-    this.onConnection = onConnection;
-    this.wanted = new Set();
-    this.failures = 0;
-    this.newest = performance.now();
+    Object.assign(this, { onMessage, onConnection, wanted: new Set(), failures: 0, newest: performance.now() });
     setInterval(() => this.check(), 500);
+    this.open();
   }
 
   open() {
-    const address = new URL("live", location.href); // beside the page, which may be one of several robots
+    const address = new URL("live", location.href);
     address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
     const socket = new WebSocket(address);
     socket.binaryType = "arraybuffer";
@@ -25,7 +22,7 @@ export class Connection {
     this.newest = performance.now();
     socket.onopen = () => this.wanted.forEach((name) => socket.send(`show ${name}`));
     socket.onmessage = (event) => this.take(socket, event.data);
-    socket.onclose = (event) => this.closed(socket, event);
+    socket.onclose = (event) => this.closed(socket, event.reason);
   }
 
   async take(socket, data) {
@@ -44,27 +41,26 @@ export class Connection {
   request(name, wanted) {
     if (wanted) this.wanted.add(name);
     else this.wanted.delete(name);
-    if (this.socket?.readyState === WebSocket.OPEN) this.socket.send(`${wanted ? "show" : "hide"} ${name}`);
+    if (this.socket.readyState === WebSocket.OPEN) this.socket.send(`${wanted ? "show" : "hide"} ${name}`);
   }
 
-  closed(socket, event) {
+  closed(socket, reason) {
     if (socket !== this.socket) return;
-    const reason = event.reason ? `: ${event.reason}` : "";
-    this.onConnection(`No connection to the robot's page${reason}. What is shown is old. STOP may not work.`);
-    const wait = RETRY_MS[Math.min(this.failures, RETRY_MS.length - 1)];
+    this.onConnection(`No connection to the robot's page${reason ? `: ${reason}` : ""}. What is shown is old. STOP may not work.`);
+    setTimeout(() => this.open(), RETRY_MS[Math.min(this.failures, RETRY_MS.length - 1)]);
     this.failures += 1;
-    setTimeout(() => this.open(), wait);
+    this.socket = { readyState: WebSocket.CLOSED }; // until it is open again
   }
 
   // A network that has gone does not end the websocket for minutes.
   check() {
-    if (performance.now() - this.newest < SILENT_MS || this.socket === undefined) return;
-    if (this.socket.readyState > WebSocket.OPEN) return;
+    const silent_ms = performance.now() - this.newest;
+    if (silent_ms < SILENT_MS || this.socket.readyState > WebSocket.OPEN) return;
     this.onConnection("No answer from the robot's page. What is shown is old. STOP may not work.");
-    if (performance.now() - this.newest > 2 * SILENT_MS) {
-      const socket = this.socket;
+    if (silent_ms > 2 * SILENT_MS) {
+      const { socket } = this;
+      this.closed(socket, "");
       socket.close();
-      this.closed(socket, { reason: "" });
     }
   }
 }

@@ -1,25 +1,20 @@
 // Connects the elements of the page with the messages of the server. Text is only ever set as text, never as HTML.
-import { Connection } from "./connection.js";
-import { Plan } from "./plan.js";
-import { wireCommands } from "./commands.js";
 import { showCalibration } from "./calibration.js";
-import { wireRoutes } from "./routes.js";
-import { wireGoal } from "./goal.js";
+import { wireCommands } from "./commands.js";
+import { Connection } from "./connection.js";
+import { byId, degrees, element, fixed, inWords, tableRow } from "./elements.js";
+import { Plan } from "./plan.js";
+import { showMapFile, wireGoal, wireMap, wireRoutes } from "./requests.js";
 import { wireStick } from "./stick.js";
-import { inWords } from "./words.js";
-import { showMapFile, wireMap } from "./map.js";
-import { byId, element, fixed } from "./elements.js";
 
 const LEVELS = ["good", "warn", "bad", "warn"];
 const LEVEL_NAMES = ["good", "warning", "error", "no news"];
 const STATES = { tracking: "good", degraded: "warn", lost: "bad" };
 
 const plan = new Plan(byId("plan"));
-const connection = new Connection(onMessage, onConnection);
-const commands = wireCommands();
 const goal = wireGoal(plan);
-const stick = wireStick();
 const routes = wireRoutes();
+const shownByState = [wireCommands(), wireStick(), goal, routes];
 let imageUrl = "";
 let nearest = null; // distance in m and direction in degrees of the nearest obstacle
 
@@ -61,17 +56,14 @@ function showState(state) {
   setBadge("state", state.state, state.fresh ? STATES[state.state] ?? "warn" : "bad");
   byId("rate").textContent = state.fresh ? `${fixed(state.rate_hz, 1)} poses/s` : "";
   showWell(state);
-  showWheels(state.wheels, state.server_ms);
-  stick.show(state);
-  goal.show(state);
-  routes.show(state);
+  showWheels(state.wheels);
+  for (const part of shownByState) part.show(state);
   showWarnings(state.warnings);
   showPose(state);
   byId("no-pose").hidden = state.pose !== null;
   byId("panorama-note").hidden = state.panoramas > 0;
   plan.setMapInOdom(state.map_in_odom);
   plan.setPose(state.pose, state.fresh);
-  document.dispatchEvent(new CustomEvent("omnid-state", { detail: state }));
 }
 
 // One line that says whether all is well.
@@ -87,13 +79,12 @@ function showWell(state) {
     : `All is well. ${moves}`;
 }
 
-function showWheels(wheels, serverMs) {
+function showWheels(wheels) {
   const armed = wheels !== null && wheels.armed;
   setBadge("armed", wheels === null ? "" : armed ? "armed" : "not armed", armed ? "warn" : "rest");
   const source = wheels !== null && wheels.source ? `, commanded by ${wheels.source}` : "";
   byId("wheels").textContent = wheels === null ? "not reported: the robot has no motor, or is not there"
     : `${wheels.message}${source}`;
-  commands.setArmed(armed, wheels !== null, serverMs);
 }
 
 function showWarnings(warnings) {
@@ -108,7 +99,6 @@ function showWarnings(warnings) {
 
 function showPose(state) {
   const pose = state.pose;
-  const degrees = (radians) => radians === null ? null : radians * 180 / Math.PI;
   const rows = pose === null ? [] : [
     ["x, y, z", `${fixed(pose.x_m, 3)}, ${fixed(pose.y_m, 3)}, ${fixed(pose.z_m, 3)} m`],
     ["heading", `${fixed(degrees(pose.yaw_rad), 1)}°`],
@@ -122,8 +112,7 @@ function showPose(state) {
       : [["image to here, median and 99 %", `${fixed(state.age_ms[0], 0)} and ${fixed(state.age_ms[1], 0)} ms`]]),
     ["missed poses", `${state.missed}`],
   ];
-  byId("pose").replaceChildren(...rows.map(([name, value]) => element("tr", {}, element("td", {}, name),
-    element("td", {}, value))));
+  byId("pose").replaceChildren(...rows.map(([name, value]) => tableRow(name, value)));
 }
 
 // The direction of an angle counter-clockwise from ahead.
@@ -140,7 +129,7 @@ function showParts(parts) {
     const title = `${part.name}: ${part.message || LEVEL_NAMES[part.level]}`;
     const values = part.values.map(([key, value]) => {
       const [name, unit] = inWords(key);
-      return element("tr", {}, element("td", { title: key }, name), element("td", {}, unit ? `${value} ${unit}` : value));
+      return tableRow(name, unit ? `${value} ${unit}` : value, key);
     });
     const found = element("details", { open: open.has(part.name) },
       element("summary", { className: LEVELS[part.level] }, title), element("table", {}, ...values));
@@ -166,16 +155,17 @@ function setBadge(id, text, className) {
   badge.className = `badge ${className}`;
 }
 
-// The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
-const panorama = byId("panorama-box");
-const askForPanorama = () => connection.request("panorama", panorama.open && !document.hidden);
-panorama.addEventListener("toggle", askForPanorama);
-document.addEventListener("visibilitychange", askForPanorama);
-byId("panorama-note").textContent = "None comes yet: the robot publishes it unless bus.panorama_hz = 0.";
 byId("closer").addEventListener("click", () => plan.zoom(1.5));
 byId("wider").addEventListener("click", () => plan.zoom(1 / 1.5));
 byId("fit").addEventListener("click", () => plan.fit());
 plan.onFit = (fits) => byId("fit").setAttribute("aria-pressed", String(fits));
 wireMap();
-connection.open();
+byId("panorama-note").textContent = "None comes yet: the robot publishes it unless bus.panorama_hz = 0.";
+const connection = new Connection(onMessage, onConnection);
+
+// The panorama comes while it is open and the page is seen: it takes bandwidth that the robot may need.
+const panorama = byId("panorama-box");
+const askForPanorama = () => connection.request("panorama", panorama.open && !document.hidden);
+panorama.addEventListener("toggle", askForPanorama);
+document.addEventListener("visibilitychange", askForPanorama);
 askForPanorama();

@@ -10,34 +10,17 @@ const OBSTACLE_PX = 2.5;
 const AIM_PX = 18; // a finger that is drawn less far gives no heading
 const SCALES_M = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000];
 
-// Columns and rows between which cells are known, null without one: a grid is as wide as the views might reach.
-function knownPart(cells, width) {
-  const part = { left: width, right: -1, low: cells.length, high: -1 };
-  cells.forEach((cell, at) => {
-    if (!cell) return;
-    const [column, row] = [at % width, Math.floor(at / width)];
-    part.left = Math.min(part.left, column); part.right = Math.max(part.right, column);
-    part.low = Math.min(part.low, row); part.high = Math.max(part.high, row);
-  });
-  return part.right < 0 ? null : part;
-}
-
 export class Plan {
   constructor(canvas) {
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
-    this.points = [];
-    this.pose = null;
-    this.fresh = false;
-    this.map = null;
-    this.mapInOdom = null;
-    this.obstacles = [];
-    this.fits = true;
+    Object.assign(this, { points: [], obstacles: [], pose: null, fresh: false, map: null, mapInOdom: null, fits: true });
     this.goal = null; // {x, y, yaw}: where it is to drive; yaw null: as it comes
     this.onPick = null; // takes a goal that a finger points out, while one is looked for; null: fingers move the plan
     this.onFit = () => {};
     this.view = { x: 0, y: 0, scale: 50 }; // the centre in m, px per m
     this.pointers = new Map();
+    this.picked = null; // where the finger came down that points out a goal, px on the screen
     this.drawing = false;
     new ResizeObserver(() => this.draw()).observe(canvas);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.recolour());
@@ -46,7 +29,6 @@ export class Plan {
     for (const name of ["pointerup", "pointercancel"]) {
       canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     }
-    this.picked = null; // where the finger came down that points out a goal, px on the screen
     canvas.addEventListener("wheel", (event) => {
       event.preventDefault();
       this.zoom(Math.exp(-event.deltaY / 400));
@@ -79,15 +61,12 @@ export class Plan {
   // Cells of 0 unknown, 1 free, 2 occupied, deflated, row by row from low to high y.
   async setMap(header, body) {
     const { width, height } = header;
-    if (!width || !height) {
-      this.map = null;
-    } else {
+    this.map = null;
+    if (width && height) {
       const stream = new Blob([body]).stream().pipeThrough(new DecompressionStream("deflate"));
-      const cells = new Uint8Array(await new Response(stream).arrayBuffer());
-      this.map = { ...header, cells, image: null, known: knownPart(cells, width) };
-      this.recolour();
+      this.map = { ...header, cells: new Uint8Array(await new Response(stream).arrayBuffer()) };
     }
-    this.draw();
+    this.recolour();
   }
 
   recolour() {
@@ -102,16 +81,20 @@ export class Plan {
           image.data.set(colour, 4 * (row * width + column));
         }
       }
-      this.map.image = new OffscreenCanvas(width, height);
-      this.map.image.getContext("2d").putImageData(image, 0, 0);
+      this.map.canvas = new OffscreenCanvas(width, height);
+      this.map.canvas.getContext("2d").putImageData(image, 0, 0);
     }
     this.draw();
   }
 
   zoom(factor) {
     this.setFit(false);
-    this.view.scale = Math.min(NEAREST_PX, Math.max(WIDEST_PX, this.view.scale * factor));
+    this.setScale(this.view.scale * factor);
     this.draw();
+  }
+
+  setScale(pxPerMetre) {
+    this.view.scale = Math.min(NEAREST_PX, Math.max(WIDEST_PX, pxPerMetre));
   }
 
   fit() {
@@ -197,41 +180,36 @@ export class Plan {
     this.paintScale(width, height);
   }
 
+  // Show all points that are known: path, obstacles, robot, and the corners of the part of the map that is known.
   fitView(width, height) {
-    let [left, right, low, high] = [Infinity, -Infinity, Infinity, -Infinity];
-    const add = (x, y) => {
-      left = Math.min(left, x); right = Math.max(right, x);
-      low = Math.min(low, y); high = Math.max(high, y);
-    };
-    for (const point of this.points) add(point[0], point[1]);
-    for (const point of this.obstacles) add(point[0], point[1]);
-    if (this.pose !== null) add(this.pose.x_m, this.pose.y_m);
+    const shown = [...this.points, ...this.obstacles];
+    if (this.pose !== null) shown.push([this.pose.x_m, this.pose.y_m]);
     if (this.map !== null && this.map.known !== null) {
       const [x, y, yaw] = this.mapOrigin();
-      const { x_m: left, y_m: low, cell_m: cell, known } = this.map;
-      for (const u of [left + known.left * cell, left + (known.right + 1) * cell]) {
-        for (const v of [low + known.low * cell, low + (known.high + 1) * cell]) {
-          add(x + u * Math.cos(yaw) - v * Math.sin(yaw), y + u * Math.sin(yaw) + v * Math.cos(yaw));
-        }
+      const [left, low, right, high] = this.map.known;
+      for (const [u, v] of [[left, low], [left, high], [right, low], [right, high]]) {
+        shown.push([x + u * Math.cos(yaw) - v * Math.sin(yaw), y + u * Math.sin(yaw) + v * Math.cos(yaw)]);
       }
     }
-    if (left > right) return;
+    if (!shown.length) return;
+    const range = (axis) => shown.reduce(([low, high], point) => [Math.min(low, point[axis]), Math.max(high, point[axis])],
+      [Infinity, -Infinity]);
+    const [[left, right], [low, high]] = [range(0), range(1)];
     this.view.x = (left + right) / 2;
     this.view.y = (low + high) / 2;
-    this.view.scale = Math.min((width - 2 * MARGIN_PX) / Math.max(SMALLEST_M, right - left),
-      (height - 2 * MARGIN_PX) / Math.max(SMALLEST_M, high - low));
-    this.view.scale = Math.min(NEAREST_PX, Math.max(WIDEST_PX, this.view.scale));
+    this.setScale(Math.min((width - 2 * MARGIN_PX) / Math.max(SMALLEST_M, right - left),
+      (height - 2 * MARGIN_PX) / Math.max(SMALLEST_M, high - low)));
   }
 
   paintMap(toScreen) {
-    if (this.map === null || this.map.image === null) return;
+    if (this.map === null) return;
     const [x, y, yaw] = this.mapOrigin();
     const { view: { scale }, context, map } = this;
     context.save();
     context.translate(...toScreen(x, y));
     context.rotate(-yaw);
     context.imageSmoothingEnabled = false;
-    context.drawImage(map.image, map.x_m * scale, -(map.y_m + map.height * map.cell_m) * scale,
+    context.drawImage(map.canvas, map.x_m * scale, -(map.y_m + map.height * map.cell_m) * scale,
       map.width * map.cell_m * scale, map.height * map.cell_m * scale);
     context.restore();
   }
@@ -286,11 +264,13 @@ export class Plan {
       context.stroke();
       context.setLineDash([]);
     }
-    if (goal.yaw !== null) return this.paintRobot(toScreen, goal.x, goal.y, goal.yaw, "--goal");
-    context.beginPath();
-    context.arc(...at, 0.7 * ROBOT_PX, 0, 2 * Math.PI);
-    context.fill();
-    return undefined;
+    if (goal.yaw !== null) {
+      this.paintRobot(toScreen, goal.x, goal.y, goal.yaw, "--goal");
+    } else {
+      context.beginPath();
+      context.arc(...at, 0.7 * ROBOT_PX, 0, 2 * Math.PI);
+      context.fill();
+    }
   }
 
   paintRobot(toScreen, x_m, y_m, yaw_rad, colour) {

@@ -46,7 +46,7 @@ export function wireStick() {
     if (!wish[0] && !wish[1]) rest -= 1;
     sending = true;
     const body = `${wish[0].toFixed(3)} ${wish[1].toFixed(3)} ${state.server_ms} ${page}`.replaceAll("-0.000", "0.000");
-    const answer = await post("drive", 0, () => {}, body);
+    const answer = await post("drive", body);
     sending = false;
     byId("stick-answer").textContent = answer.text;
   }
