@@ -311,6 +311,6 @@ FIRST_SETTINGS: Final = (
     *(f"navigation.{key}" for key in ("goal_cm", "goal_deg", "clearance_m", "routes", "pursuit.velocity_mps")),
     *(f"motor.{key}" for key in ("port", "protocol", "baud", "watchdog_ms")),
     *(f"motor.drive.{key}" for key in ("track_m", "wheel_radius_m", "max_wheel_mps", "gear")),
-    *(f"bus.{key}" for key in ("robot", "listen", "connect", "ros2")),
+    *(f"bus.{key}" for key in ("robot", "listen", "connect", "config", "ros2")),
     *(f"record.{key}" for key in ("enabled", "folder", "keep_mb", "free_mb")),
 )

@@ -73,11 +73,9 @@ RULES = (
         excepted=(
             "omnid/transport/bus.py",
             "omnid/transport/command_intake.py",
-            "omnid/transport/namesakes.py",
             "omnid/transport/open_requests.py",
             "omnid/transport/publishers.py",
             "omnid/transport/session.py",
-            "omnid/transport/client_session.py",
             "omnid/transport/driver.py",
             "omnid/client.py",
         ),

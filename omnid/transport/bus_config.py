@@ -38,8 +38,8 @@ class BusConfig:
     robot: Annotated[str, "first part of every key, and of the topics of --record"] = "omnid"
     listen: Annotated[
         tuple[str, ...],
-        "zenoh endpoints to listen on; [] with an endpoint in connect: a client, all of whose traffic goes through that "
-        "router, which may be started later",
+        "zenoh endpoints to listen on; [] with an endpoint in connect: a client, all of whose traffic goes through "
+        "that router, which may be started later",
     ] = ("tcp/127.0.0.1:7447",)
     connect: Annotated[tuple[str, ...], "zenoh endpoints to connect to"] = ()
     config: Annotated[

@@ -122,7 +122,8 @@ def test_the_default_is_this_machine_only() -> None:
 def test_zenohs_own_file_says_all_but_the_endpoints(tmp_path: Path) -> None:
     path = tmp_path / "zenoh.json5"
     path.write_text("""{ // as zenohd reads it
-        mode: "router", listen: {endpoints: ["tcp/127.0.0.1:1"]}, access_control: {enabled: true, default_permission: "allow"},
+        mode: "router", listen: {endpoints: ["tcp/127.0.0.1:1"]},
+        access_control: {enabled: true, default_permission: "allow"},
         transport: {link: {protocols: ["udp"], tx: {lease: 1234}}} }""")
     config = BusConfig(config=str(path), connect=("tcp/127.0.0.1:3",))
     assert setting(config, "mode") == "peer" and setting(config, "listen/endpoints") == ["tcp/127.0.0.1:7447"]

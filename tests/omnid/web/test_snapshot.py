@@ -163,6 +163,7 @@ def test_a_map_is_sent_as_unknown_free_and_occupied_cells(frame: str) -> None:
         "cell_m": 0.05,
         "x_m": -1.0,
         "y_m": 2.0,
+        "known": [-1.0, 2.0, pytest.approx(-0.85), pytest.approx(2.1)],
     }
     assert list(zlib.decompress(content)) == [0, 1, 1, 2, 2, 1]
 
