@@ -239,8 +239,7 @@ def _write_root(root: Path, tree: Path, release: str, pins: list[str]) -> None:
     shutil.copytree(ROOTFS, root, dirs_exist_ok=True, ignore=shutil.ignore_patterns("init"))
     for name in MASKED:
         (root / "etc/systemd/system" / name).symlink_to("/dev/null")
-    for mount in ("job", "share"):
-        (root / "mnt" / mount).mkdir()
+    (root / "mnt" / "job").mkdir()
     (root / "etc/machine-id").write_text("0123456789abcdef0123456789abcdef\n", "ascii")
 
 

@@ -29,13 +29,12 @@ class GuestError(Exception):
 class Guest:
     """Configuration of a guest.
 
-    `files` are copied to /mnt/job; the folder `share` is mounted read-only at /mnt/share. /dev/ttyS1, ttyS2 and ttyS3
-    are connected to `serial`, as QEMU's -serial: "unix:/path" for a socket on which the caller listens, "pty", "null".
+    `files` are copied to /mnt/job. /dev/ttyS1, ttyS2 and ttyS3 are connected to `serial`, as QEMU's -serial:
+    "unix:/path" for a socket on which the caller listens, "pty", "null".
     """
 
     systemd: bool = False  # PID 1; else only udev runs
     files: Mapping[str, bytes] = field(default_factory=dict)
-    share: Path | None = None
     serial: Sequence[str] = ()
     timeout_s: float = 240.0
     memory_mb: int = 2048
@@ -77,8 +76,6 @@ def _write_job(job: Path, command: Sequence[str], guest: Guest) -> None:
     shutil.copy(Path(__file__).with_name("guest") / "job.sh", job / "start")
     (job / "command").write_text(f"exec {shlex.join(command)}\n", "utf-8")
     (job / "results").mkdir()
-    if guest.share:
-        (job / "share").touch()
     for name, data in guest.files.items():
         (job / name).write_bytes(data)
 
@@ -94,8 +91,6 @@ def _qemu(image: Image, job: Path, guest: Guest) -> list[str]:
     words += ["-drive", f"file={image.disk},format=raw,if=virtio,snapshot=on,cache=unsafe"]
     words += ["-append", KERNEL_OPTIONS + (" start=/lib/systemd/systemd" if guest.systemd else "")]
     words += ["-virtfs", f"local,path={job},mount_tag=job,security_model=none"]
-    if guest.share:
-        words += ["-virtfs", f"local,path={guest.share},mount_tag=share,security_model=none,readonly=on"]
     for port in guest.serial:
         words += ["-serial", port]
     return words

@@ -341,24 +341,6 @@ def test_controls_are_in_force_before_the_first_image(vivid: None) -> None:
     assert listed.splitlines() == ["gain: 33", "gain_automatic: 0", "brightness: 40", "hue: -7"]
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"gain": 300}, "300 was requested, it accepts 0 to 255"),
-        ({"exposure_us": 500}, "no control of its automatic exposure"),
-        ({"controls": ("sharpness=1",)}, "no control 'sharpness'. It has: brightness"),
-        ({"rate_hz": 13.0}, "at 13 Hz is not offered; the device sets GREY 320x180 at 1"),
-        ({"rate_hz": 90.0}, "is not offered; the device sets GREY 320x180 at "),
-        ({"pixel_format": "MJPG"}, "is not offered; the device sets "),
-        ({"width_px": 322}, "is not offered; the device sets GREY "),
-    ],
-)
-def test_refuses_settings_that_the_device_does_not_accept(vivid: None, fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(DriverError, match=message) as caught:
-        CameraReader(**fields)
-    assert str(caught.value).startswith(f"camera {LOWER}: ") and "\n" not in str(caught.value)
-
-
 def test_a_device_has_one_user(vivid: None) -> None:
     with CameraReader() as watched:
         watched.more(3)

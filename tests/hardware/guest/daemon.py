@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from calib import se3
 from drivers.cameras.log_camera import LogImages
 from tests.hardware.guest.loopback import load_loopback
+from tests.hardware.guest.probe import PORT, REPORT
 from tests.hardware.guest.sample_log import SAMPLE, GuestOperator, SampleLog
 from tests.hardware.guest.unit import DROP_INS, SYSTEMD, journal, restarted, run, show, until
 
@@ -38,7 +40,11 @@ sys.path.insert(0, "/opt/omnid")
 from omnid.cli import main
 sys.exit(main())
 """
+OPEN = "/etc/omnid", "/opt/omnid", "/dev/vda", "/dev/kmsg"  # to everybody: it is the unit that closes them
+FIFO, OTHER = os.SCHED_FIFO, os.SCHED_OTHER
 SLOW = """[Service]
+ExecStartPre=/usr/bin/python3 -m tests.hardware.guest.probe
+Environment=PYTHONPATH=/opt/omnid
 WatchdogSec=40
 TimeoutStartSec=400
 TimeoutStopSec=120
@@ -113,9 +119,10 @@ def journal_lines() -> list[str]:
 
 @pytest.fixture(scope="module", autouse=True)
 def unit() -> Iterator[None]:
-    """omnid as the README installs it."""
+    """omnid as the README installs it; the machine has a second address, at which it listens too."""
     load_loopback()
     run("busybox", "ip", "link", "set", "lo", "up")
+    run("busybox", "ip", "addr", "add", "192.168.1.5/24", "dev", "lo")
     run("useradd", "--system", "--no-create-home", "--shell", "/usr/sbin/nologin", "omnid")
     run("python3", "-m", "compileall", "-q", "/opt/omnid/omnid", "/opt/omnid/drivers", "/opt/omnid/calib")
     run("chmod", "-R", "a+rX", "/opt/omnid")
@@ -132,8 +139,10 @@ def unit() -> Iterator[None]:
     shutil.copy(SYSTEMD / "omnid.service", DROP_INS.parent)
     run("udevadm", "control", "--reload")
     run("udevadm", "trigger", "--settle", "--subsystem-match=video4linux", "--subsystem-match=tty")
+    run("chmod", "a+rwX", *OPEN)
     run("systemctl", "daemon-reload")
-    yield
+    with socket.create_server(("0.0.0.0", PORT), backlog=100):
+        yield
     (RESULTS / "journal").write_text("\n".join(journal_lines()))
 
 
@@ -158,6 +167,37 @@ def wheels() -> Wheels:
 def test_poses_flow_once_it_is_ready(operator: GuestOperator) -> None:
     assert show("ActiveState") == "active"
     assert {pose.state for pose in operator.more(8)} == {"tracking"}
+
+
+def test_the_unit_closes_all_but_its_folders_cameras_serial_ports_and_this_machine(operator: GuestOperator) -> None:
+    assert json.loads(REPORT.read_text()) == {
+        "written": {
+            "/etc/omnid": False,
+            "/opt/omnid": False,
+            "/var/lib": False,
+            "/var/lib/omnid": True,
+            "/run/omnid": True,
+        },
+        "opened": {"/dev/ttyS1": True, "/dev/video10": True, "/dev/vda": False, "/dev/kmsg": False},
+        "reached": {"127.0.0.1": True, "192.168.1.5": False},
+    }
+
+
+def test_memory_is_locked_and_only_three_threads_have_priority(operator: GuestOperator) -> None:
+    group = Path("/sys/fs/cgroup" + show("ControlGroup"))
+    threads = {}
+    for process in (group / "cgroup.procs").read_text().split():
+        for task in Path("/proc", process, "task").iterdir():
+            words = (task / "stat").read_text().rpartition(")")[2].split()
+            threads[(task / "comm").read_text().strip()] = (
+                int(words[38]),
+                int(words[37]),
+            )  # policy, priority (proc(5))
+    named = {name: threads.pop(name) for name in ("controller", "lower", "upper")}
+    assert named == {"controller": (FIFO, 20), "lower": (FIFO, 10), "upper": (FIFO, 10)}
+    assert "odometry" in threads and set(threads.values()) == {(OTHER, 0)}
+    status = Path("/proc", show("MainPID"), "status").read_text().splitlines()
+    assert next(int(line.split()[1]) for line in status if line.startswith("VmLck")) > 100_000
 
 
 def test_poses_match_the_log(operator: GuestOperator) -> None:
@@ -248,6 +288,14 @@ def test_stopping_the_unit_stops_the_wheels(operator: GuestOperator, wheels: Whe
     assert after["commanded_mps"] == after["fastest_mps"] == 0.0
     assert (show("ActiveState"), show("Result"), show("ExecMainStatus")) == ("inactive", "success", "0")
     assert after["unsafe_resumes"] == 0 and not any("Traceback" in text for text in journal_lines())
+
+
+def test_more_of_the_network_is_reached_where_that_is_allowed(operator: GuestOperator) -> None:
+    shutil.copy(SYSTEMD / "lan.conf", DROP_INS)
+    run("systemctl", "daemon-reload")
+    run("systemctl", "start", "omnid")
+    assert json.loads(REPORT.read_text())["reached"] == {"127.0.0.1": True, "192.168.1.5": True}
+    run("systemctl", "stop", "omnid")
 
 
 def test_records_a_log_from_the_cameras_alone(operator: GuestOperator, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
-"""`omnid run` under its unit: guest/daemon.py in one guest, each of its tests reported here.
+"""The camera driver on kernel devices, and `omnid run` under its unit: two guests, whose tests are reported here.
 
-The images of the sample log come from two loopback cameras; ttyS1 is connected to a simulated controller on the host.
+For the daemon the images of the sample log come from two loopback cameras; ttyS1 is connected to a simulated
+controller on the host.
 """
 
 from __future__ import annotations
@@ -8,8 +9,6 @@ from __future__ import annotations
 import json
 import select
 import socket
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -31,7 +30,6 @@ from tests.hardware.image import ROOT
 from tests.hardware.machine import Guest, Result
 
 pytestmark = pytest.mark.vm
-SCRIPT = "daemon.py"
 SAMPLE = ROOT / "omnid/sample/log.mcap"
 STEP_S = 0.01
 
@@ -122,31 +120,29 @@ def rig_of_the_sample() -> bytes:
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Result:
+def daemon(tmp_path_factory: pytest.TempPathFactory) -> Result:
     with simulated_board(tmp_path_factory.mktemp("ports")) as base:
         guest = Guest(systemd=True, files={"rig.toml": rig_of_the_sample()}, serial=base.serial, timeout_s=900)
-        return run_tests(SCRIPT, guest, "-x")
+        return run_tests("daemon.py", guest, "-x")
 
 
-@pytest.mark.parametrize("name", names_in(SCRIPT))
-def test_in_the_guest(result: Result, name: str) -> None:
-    passed(result, name)
+@pytest.fixture(scope="module")
+def cameras() -> Result:
+    return run_tests("cameras.py", Guest(timeout_s=400))
 
 
-def omnid(*words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "omnid", *map(str, words)]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+@pytest.mark.parametrize(
+    ("script", "name"), [(script, name) for script in ("cameras", "daemon") for name in names_in(f"{script}.py")]
+)
+def test_in_the_guest(request: pytest.FixtureRequest, script: str, name: str) -> None:
+    passed(request.getfixturevalue(script), name)
 
 
-def test_recovers_the_recording_of_a_killed_daemon(result: Result, tmp_path: Path) -> None:
-    """All images older than two seconds before the newest received pose are recovered."""
-    cut, whole = tmp_path / "killed.mcap.part", tmp_path / "killed.mcap"
-    cut.write_bytes(result.files["killed.mcap.part"])
-    assert omnid("log", "info", cut).returncode == 1
-    recovered = omnid("log", "recover", cut)
-    assert recovered.returncode == 0, recovered.stderr
-    assert omnid("log", "info", whole).returncode == 0
-    guest = json.loads(result.files["killed.json"])
-    found = LogImages.load(whole)
+def test_the_recording_of_a_killed_daemon_is_read(daemon: Result, tmp_path: Path) -> None:
+    """All images older than two seconds before the newest received pose are in it."""
+    cut = tmp_path / "killed.mcap"
+    cut.write_bytes(daemon.files["killed.mcap.part"])
+    guest = json.loads(daemon.files["killed.json"])
+    found = LogImages.load(cut)
     for images in (found.lower, found.upper):
         assert len(images) > 5 and guest["killed_ns"] - images[-1][1].stamp_ns < guest["newest_age_ns"] + 2_000_000_000
