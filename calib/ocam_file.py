@@ -1,22 +1,36 @@
-"""OCamCalib's `calib_results.txt`: one file per camera, without the transform between them."""
+"""OCamCalib's `calib_results.txt`: one file per camera. The transform between them has a file, or is straight up."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
+from msgspec import Struct
 
+from calib import se3
 from calib.errors import CalibError
+from calib.kalibr import load_yaml
 from calib.models.camera import Array
 from calib.models.ocam import MAX_COEFFICIENTS, OcamCamera, View
-from calib.rig import Rig
+from calib.rig import MIN_BASELINE_M, Rig
 from calib.rig_frame import rig_between
-from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, read_bytes, shown
+from calib.typed_toml import convert, shown, table_of
+from calib.validation import MAX_PIXELS, MAX_SIDE_PX, decode, is_image_size, read_bytes, transform_of
 
 # More than any file needs: one of the toolbox has about 2 kB.
 MAX_BYTES = 1 << 16
+
+
+KEY, INVERSE_KEY = "T_lower_upper", "T_upper_lower"
+
+
+class TransformTable(Struct, frozen=True):
+    """A file with the transform between two cameras."""
+
+    T_lower_upper: tuple[tuple[float, ...], ...] | None = None
+    T_upper_lower: tuple[tuple[float, ...], ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,3 +98,43 @@ def _size(line: _Line) -> tuple[int, int]:
     if not is_image_size(width, height) or (height, width) != (int(height), int(width)):
         line.fail(f"the image's height and width in whole pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all")
     return int(width), int(height)
+
+
+def read_transform(path: Path) -> Array:
+    """Read T_lower_upper (4, 4): TOML or YAML with that key (or T_upper_lower), or a text of its 16 numbers."""
+    data, name = read_bytes(path, MAX_BYTES), str(path)
+    try:
+        if path.suffix == ".toml":
+            return _named(table_of(data))
+        if path.suffix in (".yaml", ".yml"):
+            return _named({str(key): value for key, value in load_yaml(data, name).items()})
+        words = " ".join(line.partition("#")[0] for line in decode(data, name).splitlines()).replace(",", " ").split()
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError as error:
+            raise CalibError(f"expected 16 numbers, the rows of {KEY}: {error}") from error
+        if not np.isfinite(numbers).all():
+            raise CalibError(f"{KEY}: expected 16 finite numbers")
+        return transform_of([numbers[start : start + 4] for start in range(0, len(numbers), 4)], KEY)
+    except (CalibError, ValueError) as error:
+        raise error if str(error).startswith(f"{name}: ") else CalibError(f"{name}: {error}") from error
+
+
+def _named(values: dict[str, Any]) -> Array:
+    """Return the transform of a file with its name."""
+    found = convert(TransformTable, values)
+    if (found.T_lower_upper is None) == (found.T_upper_lower is None):
+        raise CalibError(f"expected either {KEY} or {INVERSE_KEY}")
+    if found.T_lower_upper is not None:
+        return transform_of(found.T_lower_upper, KEY)
+    return se3.inverse(transform_of(found.T_upper_lower, INVERSE_KEY))
+
+
+def straight_up(baseline_m: float) -> Array:
+    """Return T_lower_upper of an upper camera straight above the lower one, equally oriented, both looking up.
+
+    A lens that looks up, and a camera that looks up into its mirror, both have their z axis pointing down.
+    """
+    if not (np.isfinite(baseline_m) and baseline_m >= MIN_BASELINE_M):
+        raise CalibError(f"--baseline: expected metres, {MIN_BASELINE_M} or more, found {baseline_m}")
+    return se3.transform(np.eye(3), (0.0, 0.0, -baseline_m))

@@ -1,38 +1,147 @@
 """The rig as text: `rig.toml`, schema 1, strict. Rotations are restored exactly, translations to a picometre.
 
 Transforms are stored as T_rig_lower and T_rig_upper (p_rig = T_rig_lower @ p_lower): the poses of the cameras. The
-optional table [covariance] has a version of its own: see covariance_table.py and rig_covariance.py. The optional table
-[times] has the times of exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined],
-which earlier versions of omnid wrote, is ignored.
+optional table [covariance] has a version of its own: see rig_covariance.py. The optional table [times] has the times of
+exposure that `omnid calibrate drive` found: upper_delay_s, line_time_s. The table [refined], which earlier versions of
+omnid wrote, is ignored.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import os
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, Final, Literal, TypeAlias
 
+import cv2
 import numpy as np
+from msgspec import Struct, defstruct
+from msgspec.structs import asdict, astuple
+from numpy.typing import NDArray
 
 from calib import se3
-from calib.camera_table import camera_text, intrinsics_text, mask_text, number_text, read_camera_table
-from calib.covariance_table import covariance_text, read_covariance
 from calib.errors import CalibError
-from calib.models.camera import Array
-from calib.png import png
+from calib.models.camera import Mask, OmniCamera
+from calib.models.equirectangular import EquirectangularCamera
+from calib.models.lens import LENS_KEYS, LensCamera, lens_camera, lens_parameters
+from calib.models.names import model_name
+from calib.models.ocam import (
+    ASTIGMATISM_NAMES,
+    DISTANCE_M,
+    MAX_COEFFICIENTS,
+    NO_WAVEFRONT,
+    TANGENTIAL_NAMES,
+    OcamCamera,
+    View,
+)
+from calib.models.unified import OMNI_NAMES, UnifiedCamera
+from calib.models.wavefront import WAVEFRONT_NAMES
 from calib.rig import MountedCamera, Rig, ShutterTimes
-from calib.validation import ValidatedTable, read_bytes, require_schema, toml_table
+from calib.rig_covariance import MAX_PARAMETERS, TRANSFORM_NAMES, RigCovariance
+from calib.typed_toml import convert, shown, table_of
+from calib.validation import MAX_PIXELS, MAX_SIDE_PX, is_image_size, read_bytes, transform_of
 
-SCHEMA = 1  # the first: it rises when an earlier program would misread the file
-SIDES = ("lower", "upper")
-LOG_BEGINNINGS = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG")
-OTHER_CALIBRATIONS = (".yaml", ".yml", ".json", ".txt")  # as of Kalibr, Basalt, OCamCalib
-TIME_KEYS = ("upper_delay_s", "line_time_s")
+SCHEMA: Final = 1  # the first: it rises when an earlier program would misread the file
+COVARIANCE_VERSION: Final = 1  # the same for the table [covariance]
+SIDES: Final = ("lower", "upper")
+LOG_BEGINNINGS: Final = (b"\x89MCAP", b"SQLite format 3", b"#ROSBAG")
+OTHER_CALIBRATIONS: Final = (".yaml", ".yml", ".json", ".txt")  # as of Kalibr, Basalt, OCamCalib
 # Translations are rounded to 1e-12 m: two inversions round differently, and rounding makes the text reproducible.
-TRANSLATION_DECIMALS = 12
+TRANSLATION_DECIMALS: Final = 12
+# Signature, length and name of the first chunk, then width and height. Source: PNG 1.2, sections 3.1 and 4.1.1.
+PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+EMBEDDED: Final = "data:image/png;base64,"
+
+# 1. The tables of the file.
+Size: TypeAlias = tuple[int, int]
+Matrix: TypeAlias = tuple[tuple[float, ...], ...]
+Model: TypeAlias = Literal["omni", "ocam", "ds", "eucm", "equidistant", "equirectangular"]
 
 
+class OcamIntrinsics(Struct, frozen=True):
+    """OCamCalib's numbers, with optional tangential terms [1/px], astigmatism [1/px^2], and wavefront [m]."""
+
+    polynomial: tuple[float, ...]
+    center_row: float
+    center_column: float
+    c: float
+    d: float
+    e: float
+    p1: float | None = None
+    p2: float | None = None
+    s1: float | None = None
+    s2: float | None = None
+    wavefront: tuple[float, float, float, float, float] | None = None
+    distance_m: float | None = None  # at which the central model is exact
+
+
+PINHOLE_KEYS: Final = ("fu", "fv", "pu", "pv")
+# Numbers of the other models, in the order of the file.
+KEYS: Final[Mapping[str, tuple[str, ...]]] = {
+    "omni": OMNI_NAMES,
+    **{model: (*keys, *PINHOLE_KEYS) for model, keys in LENS_KEYS.items()},
+    "equirectangular": PINHOLE_KEYS,
+}
+INTRINSICS: Final[Mapping[str, type[Struct]]] = {
+    "ocam": OcamIntrinsics,
+    **{model: defstruct(f"{model}_intrinsics", [(key, float) for key in keys]) for model, keys in KEYS.items()},
+}
+
+
+class MaskTable(Struct, frozen=True):
+    """The ring between two circles, and an image of the camera's size: embedded, or the name of a file."""
+
+    center: tuple[float, float]
+    inner_px: float = 0.0
+    outer_px: float | None = None
+    image: str | None = None
+
+
+class CameraTable(Struct, frozen=True):
+    """One camera; intrinsics: see INTRINSICS."""
+
+    model: Model
+    size: Size
+    intrinsics: dict[str, Any]
+    view: View | None = None  # of an ocam camera
+    topic: str = ""
+    T_rig_lower: Matrix | None = None
+    T_rig_upper: Matrix | None = None
+    mask: MaskTable | None = None
+
+
+class TimesTable(Struct, frozen=True):
+    """Times of exposure."""
+
+    upper_delay_s: float = 0.0
+    line_time_s: float = 0.0
+
+
+class CovarianceTable(Struct, frozen=True):
+    """Names, standard deviations, and correlations: row k has the k numbers left of the diagonal."""
+
+    version: int
+    parameters: tuple[str, ...]
+    sigma: tuple[float, ...]
+    correlation: Matrix
+
+
+class RigTable(Struct, frozen=True):
+    """The whole file."""
+
+    schema: int
+    lower: CameraTable
+    upper: CameraTable
+    T_base_rig: Matrix | None = None
+    times: TimesTable | None = None
+    covariance: CovarianceTable | None = None
+    refined: dict[str, Any] | None = None
+
+
+# 2. Reading.
 def read_rig(path: str | os.PathLike[str]) -> Rig:
     """Read the rig of a `rig.toml`; a mask's image is read from the same folder. CalibError says what to do."""
     path = Path(path)
@@ -52,33 +161,151 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
 
 def parse_rig(text: str | bytes, folder: Path | None = None, name: str = "rig.toml") -> Rig:
     """Parse the rig of a `rig.toml`'s text; folder contains its mask images, None permits embedded ones only."""
-    table = toml_table(text, name)
-    require_schema(table, SCHEMA)
-    table.allow_only(("schema", "T_base_rig", "covariance", "times", "refined", *SIDES))
-    lower, upper = (table.table(side) for side in SIDES)
-    T_base_rig = table.transform("T_base_rig") if table.has("T_base_rig") else np.eye(4)
-    topics = [side.text("topic") if side.has("topic") else "" for side in (lower, upper)]
-    mounted = [_mounted(side, folder, f"T_rig_{side.path}") for side in (lower, upper)]
-    cameras = (mounted[0].camera, mounted[1].camera)
-    covariance = read_covariance(table.table("covariance"), cameras) if table.has("covariance") else None
-    times = _times(table.table("times")) if table.has("times") else ShutterTimes()
-    return Rig(mounted[0], mounted[1], T_base_rig, (topics[0], topics[1]), covariance, times)
+    with _within(f"{name}: "):
+        values = table_of(text.encode() if isinstance(text, str) else text)
+        _require_version("schema", values.get("schema"), SCHEMA)  # first, as another one has other keys
+        table = convert(RigTable, values)
+        lower, upper = (_mounted(side, getattr(table, side), folder) for side in SIDES)
+        with _within("times: "):
+            times = ShutterTimes(*astuple(table.times or TimesTable()))
+        return Rig(
+            lower,
+            upper,
+            np.eye(4) if table.T_base_rig is None else transform_of(table.T_base_rig, "T_base_rig"),
+            (table.lower.topic, table.upper.topic),
+            None if table.covariance is None else _covariance(table.covariance, table),
+            times,
+        )
 
 
-def _times(table: ValidatedTable) -> ShutterTimes:
-    table.allow_only(TIME_KEYS)
-    delay_s, line_s = (table.number(key) if table.has(key) else 0.0 for key in TIME_KEYS)
+@contextmanager
+def _within(place: str) -> Iterator[None]:
+    """Turn errors into CalibError, with the place before their message."""
     try:
-        return ShutterTimes(delay_s, line_s)
-    except CalibError as error:
-        raise CalibError(f"{table.file}: {table.path}: {error}") from error
+        yield
+    except (CalibError, ValueError) as error:
+        raise CalibError(f"{place}{error}") from error
 
 
-def _mounted(table: ValidatedTable, folder: Path | None, transform: str) -> MountedCamera:
-    camera, mask = read_camera_table(table, folder, [transform])
-    return MountedCamera(camera, se3.inverse(table.transform(transform)), mask)
+def _require_version(key: str, found: object, version: int) -> None:
+    if type(found) is not int or found != version:
+        raise CalibError(f"{key}: expected version {version}, found {'nothing' if found is None else shown(found)}")
 
 
+def _mounted(side: str, table: CameraTable, folder: Path | None) -> MountedCamera:
+    """Return the camera of a table."""
+    T_rig_cam, other = table.T_rig_lower, table.T_rig_upper
+    if side == "upper":
+        T_rig_cam, other = other, T_rig_cam
+    if other is not None:
+        raise CalibError(f"{side}: expected T_rig_{side}, found that of the other camera")
+    if not is_image_size(*table.size):
+        raise CalibError(
+            f"{side}.size: expected [width, height] in pixels, 1 to {MAX_SIDE_PX}, at most {MAX_PIXELS} in all, found "
+            f"{list(table.size)}"
+        )
+    if (table.view is not None) != (table.model == "ocam"):
+        raise CalibError(f"{side}.view: expected mirror or direct for the model ocam, and no view for others")
+    intrinsics = convert(INTRINSICS[table.model], table.intrinsics, (side, "intrinsics"))
+    with _within(f"{side}.intrinsics: "):
+        camera = _camera(table, intrinsics)
+    mask = None if table.mask is None else _mask(f"{side}.mask", table.mask, table.size, folder)
+    return MountedCamera(camera, se3.inverse(transform_of(T_rig_cam, f"{side}.T_rig_{side}")), mask)
+
+
+def _camera(table: CameraTable, i: Struct) -> OmniCamera:
+    """Return the camera of a table and its intrinsics."""
+    if isinstance(i, OcamIntrinsics):
+        return OcamCamera(
+            i.polynomial,
+            (i.center_row, i.center_column),
+            (i.c, i.d, i.e),
+            table.size,
+            table.view or "mirror",
+            (i.p1 or 0.0, i.p2 or 0.0),
+            (i.s1 or 0.0, i.s2 or 0.0),
+            i.wavefront or NO_WAVEFRONT,
+            DISTANCE_M if i.distance_m is None else i.distance_m,
+        )
+    if table.model == "omni":
+        xi, fu, fv, pu, pv, k1, k2, p1, p2 = astuple(i)
+        return UnifiedCamera(xi, (fu, fv), (pu, pv), table.size, (k1, k2, p1, p2))
+    *parameters, fu, fv, pu, pv = astuple(i)
+    if table.model == "equirectangular":
+        return EquirectangularCamera((fu, fv), (pu, pv), table.size)
+    return lens_camera(table.model, parameters, (fu, fv), (pu, pv), table.size)
+
+
+def _mask(path: str, table: MaskTable, size: Size, folder: Path | None) -> Mask:
+    outer_px = np.inf if table.outer_px is None else table.outer_px
+    if not 0 <= table.inner_px < outer_px:
+        raise CalibError(f"{path}.inner_px: expected 0 <= inner_px < outer_px, found {table.inner_px:g}")
+    with _within(f"{path}.image: "):
+        image = None if table.image is None else _mask_image(table.image, size, folder)
+    return Mask(table.center, table.inner_px, float(outer_px), image)
+
+
+def _mask_image(source: str, size: Size, folder: Path | None) -> NDArray[np.uint8]:
+    """Return the image of a mask (H, W), whose size is that of the camera's images.
+
+    The header's size is checked first, since few bytes of a PNG can describe an image that fills the memory. An
+    embedded image may come with a log of unknown origin: it must be a PNG. A file may have any format of OpenCV.
+    """
+    is_embedded = source.startswith(EMBEDDED)
+    if is_embedded:
+        try:
+            data = base64.b64decode(source[len(EMBEDDED) :], validate=True)
+        except (binascii.Error, ValueError):
+            raise CalibError("expected base64 after its prefix") from None
+    elif folder is None or "\0" in source:
+        raise CalibError("expected an embedded image, because there is no folder to read a file from")
+    else:
+        data = read_bytes(folder / source)
+    if data.startswith(PNG_HEAD):
+        _require_size(size, (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")))
+    elif is_embedded:
+        raise CalibError("expected a PNG")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if data else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise CalibError("expected an image")
+    _require_size(size, image.shape[::-1])
+    return image.astype(np.uint8, copy=False)
+
+
+def _require_size(size: Size, found: tuple[int, ...]) -> None:
+    if found != size:
+        raise CalibError(f"expected {size} pixels (width, height) like the camera's images, found {found}")
+
+
+def _covariance(table: CovarianceTable, rig: RigTable) -> RigCovariance:
+    """Return the covariance of the parameters of both cameras and of the transform between them."""
+    _require_version("covariance.version", table.version, COVARIANCE_VERSION)
+    ocam = ("center_row", "center_column", "c", "d", *TANGENTIAL_NAMES, *ASTIGMATISM_NAMES, *WAVEFRONT_NAMES)
+    known, names = {*TRANSFORM_NAMES}, table.parameters
+    for side, camera in (("lower", rig.lower), ("upper", rig.upper)):
+        coefficients = [f"a{power}" for power in range(MAX_COEFFICIENTS)]
+        own = (*coefficients, *ocam) if camera.model == "ocam" else OMNI_NAMES
+        known |= {f"{side} {name}" for name in own}
+    if not (1 <= len(names) <= MAX_PARAMETERS and known.issuperset(names)):
+        raise CalibError(
+            f"covariance.parameters: expected 1 to {MAX_PARAMETERS} names of the cameras' parameters and of the "
+            f"transform's, found {shown(list(names))}"
+        )
+    if [len(row) for row in table.correlation] != [*range(len(names))]:
+        raise CalibError(
+            f"covariance.correlation: expected {len(names)} rows of 0, 1, 2 ... numbers, those left of the diagonal"
+        )
+    correlation = np.eye(len(names))
+    for k, row in enumerate(table.correlation):
+        correlation[k, :k] = correlation[:k, k] = row
+    with _within("covariance: "):
+        return RigCovariance(names, np.array(table.sigma), correlation)
+
+
+# 3. Writing.
 def write_rig(path: Path, rig: Rig) -> None:
     """Write `rig.toml`, and mask images in the same folder as `<stem>.lower.png` and `<stem>.upper.png`."""
     masks = {side: mounted.mask for side, mounted in zip(SIDES, (rig.lower, rig.upper), strict=True)}
@@ -119,30 +346,89 @@ def _open_no_link(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 
+def png(image: NDArray[np.uint8]) -> bytes:
+    """Return an image (H, W) or (H, W, 3) uint8 as the bytes of a PNG."""
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
 def rig_toml(rig: Rig, images: Mapping[str, str] | None = None) -> str:
     """Return the text of a `rig.toml`; images: file names of mask images by side, others are embedded."""
-    parts = [f"schema = {SCHEMA}\n"]
+    text = f"schema = {SCHEMA}\n"
     if not np.array_equal(rig.T_base_rig, np.eye(4)):  # else it is not stated
-        parts.append(f"T_base_rig = {_matrix(rig.T_base_rig)}\n")
+        text += f"T_base_rig = {_value(rig.T_base_rig.tolist())}\n"
     for side, mounted, topic in zip(SIDES, (rig.lower, rig.upper), rig.topics, strict=True):
-        parts.append(camera_text(side, mounted.camera, topic))
-        parts.append(f"T_rig_{side} = {_matrix(_on_grid(se3.inverse(mounted.T_cam_rig)))}\n")
-        parts.append(intrinsics_text(side, mounted.camera))
+        camera, T_rig_cam = mounted.camera, se3.inverse(mounted.T_cam_rig)
+        T_rig_cam[:3, 3] = np.round(T_rig_cam[:3, 3], TRANSLATION_DECIMALS)
+        head = {
+            "model": model_name(camera),
+            "size": [int(pixels) for pixels in camera.size],
+            "view": camera.view if isinstance(camera, OcamCamera) else None,
+            "topic": topic or None,
+            f"T_rig_{side}": T_rig_cam.tolist(),
+        }
+        text += _table_text(side, head) + _table_text(f"{side}.intrinsics", _intrinsics(camera))
         if mounted.mask is not None:
-            parts.append(mask_text(side, mounted.mask, (images or {}).get(side, "")))
+            text += _table_text(f"{side}.mask", _mask_values(mounted.mask, (images or {}).get(side)))
     if rig.times != ShutterTimes():
-        values = (rig.times.upper_delay_s, rig.times.line_time_s)
-        parts.append("\n[times]\n")
-        parts += [f"{key} = {number_text(value)}\n" for key, value in zip(TIME_KEYS, values, strict=True)]
-    if rig.covariance is not None:
-        parts.append(covariance_text(rig.covariance))
-    return "".join(parts)
+        text += _table_text("times", asdict(TimesTable(rig.times.upper_delay_s, rig.times.line_time_s)))
+    return text if rig.covariance is None else text + covariance_toml(rig.covariance)
 
 
-def _on_grid(T: Array) -> Array:
-    return se3.transform(T[:3, :3], np.round(T[:3, 3], TRANSLATION_DECIMALS))
+def _intrinsics(camera: OmniCamera) -> Mapping[str, object]:
+    """Return the intrinsics of a camera by their keys; optional terms of an ocam camera that are 0 are None."""
+    if isinstance(camera, OcamCamera):
+        p1, p2 = camera.tangential if any(camera.tangential) else (None, None)
+        s1, s2 = camera.astigmatism if any(camera.astigmatism) else (None, None)
+        a, b, x, y, s = camera.wavefront
+        waves = ((a, b, x, y, s), camera.distance_m) if any(camera.wavefront) else (None, None)
+        return asdict(
+            OcamIntrinsics(camera.polynomial, *camera.center_row_column, *camera.affine, p1, p2, s1, s2, *waves)
+        )
+    values: tuple[float, ...]
+    if isinstance(camera, UnifiedCamera):
+        values = (camera.xi, *camera.focal, *camera.center, *camera.distortion)
+    elif isinstance(camera, LensCamera):
+        values = (*lens_parameters(camera), *camera.focal, *camera.center)
+    elif isinstance(camera, EquirectangularCamera):
+        values = (*camera.focal, *camera.center)
+    else:
+        raise CalibError(f"rig file: expected a camera of a known model, found {type(camera).__name__}")
+    return dict(zip(KEYS[model_name(camera)], values, strict=True))
 
 
-def _matrix(T: Array) -> str:
-    rows = [f"    [{', '.join(map(number_text, row))}]," for row in T]
-    return "\n".join(["[", *rows, "]"])
+def _mask_values(mask: Mask, name: str | None) -> Mapping[str, object]:
+    image = name
+    if mask.image is not None and not name:
+        image = EMBEDDED + base64.b64encode(png(mask.image)).decode()
+    outer_px = mask.outer_px if np.isfinite(mask.outer_px) else None
+    return asdict(MaskTable(mask.center, mask.inner_px, outer_px, image))
+
+
+def covariance_toml(covariance: RigCovariance) -> str:
+    """Return the table of a covariance, which parses to the same numbers."""
+    correlation = tuple(tuple(row[:k]) for k, row in enumerate(covariance.correlation.tolist()))
+    sigmas = tuple(covariance.sigmas.tolist())
+    return _table_text("covariance", asdict(CovarianceTable(COVARIANCE_VERSION, covariance.names, sigmas, correlation)))
+
+
+def _table_text(name: str, values: Mapping[str, object]) -> str:
+    """Return a table of TOML without the keys whose value is None."""
+    lines = [f"{key} = {_value(value)}" for key, value in values.items() if value is not None]
+    return "\n".join(["", f"[{name}]", *lines]) + "\n"
+
+
+def _value(value: object) -> str:
+    """Return a value as TOML text; a number parses to the same bits, but -0 is written as 0.
+
+    CalibError for a file's name with bytes that are no UTF-8, as TOML holds none.
+    """
+    if isinstance(value, list | tuple):
+        if value and isinstance(value[0], list | tuple):
+            return "\n".join(["[", *(f"    {_value(row)}," for row in value), "]"])
+        return f"[{', '.join(map(_value, value))}]"
+    if not isinstance(value, str):
+        return repr(value) if type(value) is int else repr(float(value) + 0.0)  # type: ignore[arg-type]
+    if any("\ud800" <= c <= "\udfff" for c in value):
+        raise CalibError(f"a calibration file holds UTF-8 text, found {value!a}: give the file another name")
+    escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'

@@ -13,14 +13,25 @@ of what is wrong.
 from __future__ import annotations
 
 import difflib
-import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import is_dataclass
 from functools import cache
 from os import PathLike
-from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
+from types import MappingProxyType, NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import msgspec
 from msgspec import Meta
@@ -38,6 +49,7 @@ _NAMES: Final = MappingProxyType(
     }
 )
 _SHOWN: Final = 60  # characters of a value in a message
+MAX_NUMBER: Final = 1e300  # larger numbers overflow in products
 
 
 def bytes_of(path: str | PathLike[str], most: int) -> bytes:
@@ -62,13 +74,16 @@ def table_of(data: bytes) -> dict[str, Any]:
         raise ValueError(f"expected TOML, found: {' '.join(str(error).split())}") from None
 
 
-def convert(root: type[T], table: dict[str, Any]) -> T:
-    """Return the struct of a table. Raise ValueError for an unknown or missing key and for an unfit value."""
-    _check(root, root, table, ())
+def convert(root: type[T], table: dict[str, Any], path: Path = ()) -> T:
+    """Return the struct of a table. Raise ValueError for an unknown or missing key and for an unfit value.
+
+    path: of the table within its file.
+    """
+    _check(root, root, table, path)
     try:
         return msgspec.convert(table, root)
     except msgspec.ValidationError as error:
-        raise ValueError(_explained(root, table, str(error))) from None
+        raise ValueError(_explained(root, table, path, str(error))) from None
 
 
 def dotted(path: Sequence[str]) -> str:
@@ -99,7 +114,14 @@ def types_of(section: Any) -> dict[str, Any]:
 
 @cache
 def _hints(section: Any) -> dict[str, Any]:
-    return get_type_hints(section, include_extras=True)
+    hints = get_type_hints(section, include_extras=True)
+    return {name: _unless_absent(kind) for name, kind in hints.items() if get_origin(kind) is not ClassVar}
+
+
+def _unless_absent(kind: Any) -> Any:
+    """Return the type of a value that is there, for a key that may be absent (X | None)."""
+    present = [part for part in get_args(kind) if part is not NoneType]
+    return present[0] if get_origin(kind) in (Union, UnionType) and len(present) == 1 else kind
 
 
 def key_paths(section: Any, path: Path = ()) -> Iterator[Path]:
@@ -129,13 +151,17 @@ def unknown_key(root: Any, section: Any, path: Path) -> ValueError:
 def described(kind: Any) -> str:
     """Return type and range of a key in words."""
     kind, bounds = _bounded(kind)
+    if get_origin(kind) is dict:
+        return "a section"
     if get_origin(kind) is Literal:
         return "one of " + ", ".join(repr(choice) for choice in get_args(kind))
     if get_origin(kind) is tuple:
         elements = get_args(kind)
         length = "" if elements[-1] is Ellipsis else f"{len(elements)} "
-        element, bounds = _bounded(elements[0])
-        return f"a list of {length}{_NAMES.get(element, ('', 'tables'))[1]}{bounds}"
+        if get_origin(elements[0]) is tuple:
+            return f"{length}rows of {_NAMES[get_args(elements[0])[0]][1]}{bounds}"
+        element, each = _bounded(elements[0])
+        return f"a list of {length}{_NAMES.get(element, ('', 'tables'))[1]}{each}{bounds}"
     return _NAMES.get(kind, ("another type", ""))[0] + bounds
 
 
@@ -145,6 +171,8 @@ def _bounded(kind: Any) -> tuple[Any, str]:
         return kind, ""
     bare, meta = get_args(kind)[0], next((found for found in get_args(kind)[1:] if isinstance(found, Meta)), Meta())
     low, high = (meta.ge if meta.gt is None else meta.gt), meta.le
+    if meta.max_length is not None:
+        return bare, f", {meta.min_length or 0} to {meta.max_length} of them"
     if low is None:
         return bare, "" if high is None else f" of at most {high}"
     if high is None:
@@ -175,15 +203,15 @@ def _is_finite(value: object) -> bool:
     """True if all numbers in a value, which may be a list, are finite."""
     if isinstance(value, list):
         return all(map(_is_finite, value))
-    return not isinstance(value, float) or math.isfinite(value)
+    return not isinstance(value, int | float) or abs(value) < MAX_NUMBER
 
 
-def _explained(root: Any, table: dict[str, Any], message: str) -> str:
+def _explained(root: Any, table: dict[str, Any], within: Path, message: str) -> str:
     """Return an error of msgspec as it is shown: with the dotted path, what is expected there, and what is found."""
     text, _, where = message.partition(" - at `$")
     kind: Any
     value: Any
-    kind, value, path = root, table, ""
+    kind, value, path = root, table, dotted(within)
     for part in re.findall(r"\w+|\[\d+\]", where):
         if part.startswith("["):
             element = get_args(_bounded(kind)[0])[0]

@@ -16,10 +16,9 @@ from calib.kalibr import import_kalibr
 from calib.models.camera import field_of_view
 from calib.models.names import model_name
 from calib.models.ocam import VIEWS, OcamCamera
-from calib.ocam_file import import_ocam
+from calib.ocam_file import import_ocam, read_transform, straight_up
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import write_rig
-from calib.transform_file import read_transform, straight_up
 from omnid.commands.calibrate_options import HEIGHT, height_of, with_height
 from omnid.commands.options import command, exclusive, option
 from omnid.errors import OmnidError

@@ -161,8 +161,7 @@ class _Progress:
 
 
 def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:
-    from calib.png import png
-    from calib.rig_file import write_file
+    from calib.rig_file import png, write_file
 
     for side, image in zip(("lower", "upper"), pair, strict=True):
         write_file(folder / f"{side}_{number:03d}.png", png(image))

@@ -14,18 +14,17 @@ posters_per_m = 0.5
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
-from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, Literal, TypeAlias
 
 import numpy as np
+from msgspec import Meta, Struct
 
-from calib.errors import CalibError
 from calib.models.camera import Array
-from calib.validation import ValidatedTable, decode, read_bytes, require_schema, toml_table
+from calib.typed_toml import bytes_of, convert, table_of
 from omnid.errors import OmnidError
 from omnid.simulation.people import Person
 from omnid.simulation.rendering import textures
@@ -33,18 +32,109 @@ from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, pai
 from omnid.simulation.rendering.surfaces import Rectangle
 from omnid.simulation.world import World
 
-SCHEMA: Final = 1
 MAX_BYTES: Final = 1 << 18
-MOST_WALLS, MOST_BOXES, MOST_PEOPLE, MOST_POINTS, MOST_DOORS = 200, 200, 20, 100, 8
 LARGEST_M: Final = 60.0  # side of a world: its textures must fit into memory
 LARGEST_AREA_M2: Final = 1200.0  # of all painted surfaces, without posters
 PX_PER_M, FLOOR_PX_PER_M = 200.0, 120.0  # Textures of walls, and of floor and ceiling.
 ROUNDING_M: Final = 1e-6
-PERSON_M: Final = (0.25, 0.45, 1.7)  # depth, width, height
-RANDOM: Final = "random"
 KINDS: Final = ("brick", "plaster", "granite", "plaster")  # Textures of a random wall.
-TEXTURES: Final = (*textures.PAINTERS, RANDOM)
-BOX_TEXTURES: Final = ("poster", *textures.PAINTERS)
+Side: TypeAlias = Annotated[float, Meta(ge=0.02, le=20.0)]  # m
+Size: TypeAlias = tuple[Side, Side, Side]
+Path: TypeAlias = Annotated[tuple[Point, ...], Meta(min_length=2, max_length=100)]
+Painted: TypeAlias = Literal["brick", "plaster", "granite", "tiles", "plain", "white"]
+
+
+class Door(Struct, frozen=True, order=True):
+    """An opening in a wall, by its distance from the wall's beginning."""
+
+    at_m: Annotated[float, Meta(ge=0.0, le=LARGEST_M)]
+    width_m: Annotated[float, Meta(ge=0.3, le=10.0)]
+    height_m: Annotated[float, Meta(ge=0.3, le=20.0)] = 2.1
+
+
+class Wall(Struct, frozen=True):
+    """A wall along a polyline; doors are in the first part of it."""
+
+    points: Path
+    texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "random"] = "random"
+    height_m: Annotated[float, Meta(ge=0.05, le=20.0)] | None = None  # None: up to the ceiling
+    posters_per_m: Annotated[float, Meta(ge=0.0, le=4.0)] = 0.0
+    poster_sides: Literal["front", "both"] = "front"
+    doors: Annotated[tuple[Door, ...], Meta(max_length=8)] = ()
+
+    def height_below(self, ceiling_m: float) -> float:
+        """Return the height [m]."""
+        return ceiling_m if self.height_m is None else self.height_m
+
+    def area_m2(self, ceiling_m: float) -> float:
+        """Return the area of a wall, of which doors are a part."""
+        return self.height_below(ceiling_m) * sum(math.dist(a, b) for a, b in pairwise(self.points))
+
+
+class Box(Struct, frozen=True):
+    """A box on the floor."""
+
+    at: Point
+    size_m: Size
+    yaw_deg: float = 0.0
+    texture: Literal["brick", "plaster", "granite", "tiles", "plain", "white", "poster"] = "poster"
+
+
+class Walker(Struct, frozen=True):
+    """A box that walks along a polyline."""
+
+    path: Path
+    speed_mps: Annotated[float, Meta(ge=0.0, le=5.0)] = 1.0
+    repeat: Literal["once", "loop", "back and forth"] = "once"
+    start_s: Annotated[float, Meta(ge=0.0, le=1e5)] = 0.0
+    starts_within_m: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
+    waits_within_m: Annotated[float, Meta(ge=0.0, le=100.0)] = 0.0
+    size_m: Size = (0.25, 0.45, 1.7)  # depth, width, height
+
+
+class Space(Struct, frozen=True):
+    """Floor and ceiling."""
+
+    low: Point
+    high: Point
+    ceiling_m: Annotated[float, Meta(ge=1.5, le=20.0)] = CEILING_M
+    floor: Painted = "tiles"
+    ceiling: Painted = "tiles"
+    finish: Literal["matt", "polished"] = "matt"
+
+    @property
+    def sides_m(self) -> Point:
+        """Sizes along x and y."""
+        return self.high[0] - self.low[0], self.high[1] - self.low[1]
+
+    def contains(self, point: Point) -> bool:
+        """True if a point lies within the space, or on its border."""
+        return all(
+            low - ROUNDING_M <= value <= high + ROUNDING_M
+            for low, value, high in zip(self.low, point, self.high, strict=True)
+        )
+
+    def floor_and_ceiling(self, rng: Random) -> list[Rectangle]:
+        """Return the painted floor and ceiling."""
+        (x0, y0), (_, y1), (width, depth) = self.low, self.high, self.sides_m
+        along, across = np.array([width, 0.0, 0.0]), np.array([0.0, depth, 0.0])
+        floor, ceiling = (painted(rng, kind, self.sides_m, FLOOR_PX_PER_M) for kind in (self.floor, self.ceiling))
+        return [
+            Rectangle(np.array([x0, y1, 0.0]), along, -across, floor, "floor"),
+            Rectangle(np.array([x0, y0, self.ceiling_m]), along, across, ceiling, "ceiling"),
+        ]
+
+
+class WorldTable(Struct, frozen=True):
+    """The whole file."""
+
+    schema: Literal[1]  # it rises when an earlier program would misread the file
+    start: tuple[float, float, float]
+    space: Space
+    light: Annotated[float, Meta(ge=0.05, le=3.0)] = 1.0
+    wall: Annotated[tuple[Wall, ...], Meta(max_length=200)] = ()
+    box: Annotated[tuple[Box, ...], Meta(max_length=200)] = ()
+    person: Annotated[tuple[Walker, ...], Meta(max_length=20)] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,182 +163,110 @@ def load_world(name: str, seed: int = 0, options: WorldOptions | None = None) ->
     """Return a shipped world or that of a file (a name that ends in .toml); raise OmnidError for wrong ones."""
     try:
         if name in shipped_worlds():
-            text = (files("omnid.simulation.worlds") / f"{name}.toml").read_text("utf-8")
+            data = (files("omnid.simulation.worlds") / f"{name}.toml").read_bytes()
         elif name.endswith(".toml"):
-            text = decode(read_bytes(Path(name), MAX_BYTES), name)
+            data = bytes_of(name, MAX_BYTES)
         else:
             raise OmnidError(
                 f"world {name!r} is not known; name a file *.toml, or one of {', '.join(shipped_worlds())}"
             )
-        return parse_world(text, name, seed, options or WorldOptions())
-    except CalibError as error:
-        raise OmnidError(str(error)) from None
+        return parse_world(data.decode(errors="surrogateescape"), name, seed, options or WorldOptions())
+    except ValueError as error:
+        raise OmnidError(f"{name}: {error}") from None
 
 
 def parse_world(text: str, name: str, seed: int, options: WorldOptions) -> World:
-    """Return the world of a text; same text, seed and options, same world. Raises CalibError for a wrong text."""
-    top = toml_table(text, name)
-    top.allow_only(("schema", "start", "light", "space", "wall", "box", "person"))
-    require_schema(top, SCHEMA)
+    """Return the world of a text; same text, seed and options, same world. Raises ValueError for a wrong text."""
+    world = convert(WorldTable, table_of(text.encode(errors="surrogateescape")))
+    space, (x_m, y_m, heading_deg) = world.space, world.start
     rng = np.random.default_rng([seed, 41])
-    space = _Space.of(top.table("space"))
-    walls, boxes, persons = (
-        top.tables(key, most) for key, most in (("wall", MOST_WALLS), ("box", MOST_BOXES), ("person", MOST_PEOPLE))
-    )
-    x_m, y_m, heading_deg = top.numbers("start", 3)
     # 1. Refuse what cannot be, before textures are painted, which takes time and memory.
-    if not space.contains((x_m, y_m)):
-        top.fail("start", "a place within the space")
-    for table in boxes:
-        _check_box(table, space, (x_m, y_m))
-    area_m2 = (
-        space.area_m2
-        + sum(_wall_area_m2(table, space.ceiling_m) for table in walls)
-        + sum(_box_area_m2(_size(table)) for table in boxes)
-        + sum(_box_area_m2(_person_size(table)) for table in persons)
-    )
-    if area_m2 > LARGEST_AREA_M2:
-        raise CalibError(f"{name}: the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}")
+    for error in _errors(world):
+        raise ValueError(error)
     # 2. Paint the surfaces, always in the same order, because each takes its random numbers from the same generator.
     surfaces = space.floor_and_ceiling(rng)
-    for table in walls:
-        surfaces += _wall(rng, table, space.ceiling_m)
-    for table in boxes:
-        surfaces += _box(rng, table)
-    people = tuple(_person(rng, table) for table in persons)
+    for wall in world.wall:
+        surfaces += _wall(rng, wall, wall.height_below(space.ceiling_m))
+    for entry in world.box:
+        surfaces += _box(rng, entry)
+    people = tuple(_person(rng, walker) for walker in world.person)
     if options.other_posters:
         surfaces = _exchanged(surfaces, options)
-    brightness = options.brightness * _within(top, "light", 0.05, 3.0, 1.0)
     start = x_m, y_m, math.radians(heading_deg)
-    return World(name, tuple(surfaces), people if options.people else (), start, brightness, space.is_polished)
+    is_polished = space.finish == "polished"
+    return World(
+        name,
+        tuple(surfaces),
+        people if options.people else (),
+        start,
+        options.brightness * world.light,
+        is_polished,
+    )
 
 
-@dataclass(frozen=True, slots=True)
-class _Space:
-    """Floor and ceiling."""
-
-    low: Point
-    high: Point
-    ceiling_m: float
-    kinds: tuple[str, str]
-    is_polished: bool
-
-    @staticmethod
-    def of(table: ValidatedTable) -> _Space:
-        table.allow_only(("low", "high", "ceiling_m", "floor", "ceiling", "finish"))
-        (x0, y0), (x1, y1) = table.numbers("low", 2), table.numbers("high", 2)
-        if not (0.5 <= x1 - x0 <= LARGEST_M and 0.5 <= y1 - y0 <= LARGEST_M):
-            table.fail("high", f"a corner 0.5 to {LARGEST_M:g} m beyond low")
-        ceiling_m = _within(table, "ceiling_m", 1.5, 20.0, CEILING_M)
-        kinds = (
-            _choice(table, "floor", textures.PAINTERS, "tiles"),
-            _choice(table, "ceiling", textures.PAINTERS, "tiles"),
-        )
-        is_polished = _choice(table, "finish", ("matt", "polished"), "matt") == "polished"
-        return _Space((x0, y0), (x1, y1), ceiling_m, kinds, is_polished)
-
-    @property
-    def area_m2(self) -> float:
-        (x0, y0), (x1, y1) = self.low, self.high
-        return 2 * (x1 - x0) * (y1 - y0)
-
-    def contains(self, point: Point) -> bool:
-        return all(
-            low - ROUNDING_M <= value <= high + ROUNDING_M
-            for low, value, high in zip(self.low, point, self.high, strict=True)
-        )
-
-    def floor_and_ceiling(self, rng: Random) -> list[Rectangle]:
-        (x0, y0), (x1, y1) = self.low, self.high
-        along, across = np.array([x1 - x0, 0.0, 0.0]), np.array([0.0, y1 - y0, 0.0])
-        floor, ceiling = (painted(rng, kind, (x1 - x0, y1 - y0), FLOOR_PX_PER_M) for kind in self.kinds)
-        return [
-            Rectangle(np.array([x0, y1, 0.0]), along, -across, floor, "floor"),
-            Rectangle(np.array([x0, y0, self.ceiling_m]), along, across, ceiling, "ceiling"),
+def _errors(world: WorldTable) -> Iterator[str]:
+    """Yield why there can be no such world."""
+    space, start = world.space, world.start[:2]
+    if not all(0.5 <= side <= LARGEST_M for side in space.sides_m):
+        yield f"space.high: expected a corner 0.5 to {LARGEST_M:g} m beyond low, found {space.high}"
+    if not space.contains(start):
+        yield f"start: expected a place within the space, found {start}"
+    for number, entry in enumerate(world.box):
+        yaw_rad = math.radians(entry.yaw_deg)
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        (x_m, y_m), (along_m, across_m) = entry.at, (side / 2 for side in entry.size_m[:2])
+        corners = [
+            (x_m + c * i * along_m - s * j * across_m, y_m + s * i * along_m + c * j * across_m)
+            for i in (-1, 1)
+            for j in (-1, 1)
         ]
+        if not all(map(space.contains, corners)):
+            yield f"box[{number}].at: expected a place where the whole box is within the space, found {entry.at}"
+        dx_m, dy_m = start[0] - x_m, start[1] - y_m
+        if abs(c * dx_m + s * dy_m) <= along_m and abs(c * dy_m - s * dx_m) <= across_m:
+            yield f"box[{number}].at: expected a place where the robot does not start inside the box, found {entry.at}"
+    area_m2 = (
+        2 * math.prod(space.sides_m)
+        + sum(wall.area_m2(space.ceiling_m) for wall in world.wall)
+        + sum(_box_area_m2(entry.size_m) for entry in world.box)
+        + sum(_box_area_m2(walker.size_m) for walker in world.person)
+    )
+    if area_m2 > LARGEST_AREA_M2:
+        yield f"the surfaces are {area_m2:.0f} m2; expected at most {LARGEST_AREA_M2:g}"
 
 
-def _check_box(table: ValidatedTable, space: _Space, start: Point) -> None:
-    """Check that a box lies within the space, and that the robot does not start in it."""
-    x_m, y_m, yaw_rad = _box_pose(table)
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    along_m, across_m = (side / 2 for side in _size(table)[:2])
-    corners = [
-        (x_m + c * i * along_m - s * j * across_m, y_m + s * i * along_m + c * j * across_m)
-        for i in (-1, 1)
-        for j in (-1, 1)
-    ]
-    if not all(map(space.contains, corners)):
-        table.fail("at", "a place where the whole box is within the space")
-    dx_m, dy_m = start[0] - x_m, start[1] - y_m
-    if abs(c * dx_m + s * dy_m) <= along_m and abs(c * dy_m - s * dx_m) <= across_m:
-        table.fail("at", "a place where the robot does not start inside the box")
-
-
-def _box_pose(table: ValidatedTable) -> tuple[float, float, float]:
-    x_m, y_m = table.numbers("at", 2)
-    return x_m, y_m, math.radians(table.number("yaw_deg")) if table.has("yaw_deg") else 0.0
-
-
-def _box_area_m2(size_m: tuple[float, float, float]) -> float:
+def _box_area_m2(size_m: Size) -> float:
     x_m, y_m, z_m = size_m
     return 2 * (x_m + y_m) * z_m + x_m * y_m
 
 
-def _wall_area_m2(table: ValidatedTable, ceiling_m: float) -> float:
-    """Return the area of a wall, of which doors are a part."""
-    return _wall_height_m(table, ceiling_m) * sum(
-        math.dist(a, b) for a, b in pairwise(table.points("points", 2, MOST_POINTS))
-    )
-
-
-def _wall_height_m(table: ValidatedTable, ceiling_m: float) -> float:
-    return _within(table, "height_m", 0.05, 20.0, ceiling_m)
-
-
-def _wall(rng: Random, table: ValidatedTable, ceiling_m: float) -> list[Rectangle]:
-    """Return the parts of a wall along a polyline, with its posters; doors are in the first part of the polyline."""
-    table.allow_only(("points", "texture", "height_m", "posters_per_m", "poster_sides", "doors"))
-    points = table.points("points", 2, MOST_POINTS)
-    height_m = _wall_height_m(table, ceiling_m)
-    kind = _choice(table, "texture", TEXTURES, RANDOM)
-    per_m = _within(table, "posters_per_m", 0.0, 4.0, 0.0)
-    both = _choice(table, "poster_sides", ("front", "both"), "front") == "both"
-    doors = [_door(door) for door in table.tables("doors", MOST_DOORS)]
+def _wall(rng: Random, wall: Wall, height_m: float) -> list[Rectangle]:
+    """Return the parts of a wall along its polyline, with its posters."""
     parts: list[Rectangle] = []
-    for number, (a, b) in enumerate(pairwise(points)):
-        chosen = str(rng.choice(KINDS)) if kind == RANDOM else kind
-        parts += _pieces(rng, chosen, a, b, height_m, doors if number == 0 else [])
+    for number, (a, b) in enumerate(pairwise(wall.points)):
+        chosen = str(rng.choice(KINDS)) if wall.texture == "random" else wall.texture
+        parts += _pieces(rng, chosen, a, b, height_m, wall.doors if number == 0 else ())
     hung: list[Rectangle] = []
     for part in parts:
         if height_m >= CEILING_M - 0.2 and part.height_m > 0.8 * height_m and part.width_m > 0.6:
-            for side in (part, _other_side(part))[: 1 + both]:
-                hung += posters(rng, side, round(per_m * part.width_m), len(hung))
+            for side in (part, _other_side(part))[: 2 if wall.poster_sides == "both" else 1]:
+                hung += posters(rng, side, round(wall.posters_per_m * part.width_m), len(hung))
     return parts + hung
 
 
-def _door(table: ValidatedTable) -> tuple[float, float, float]:
-    """Return the distance from the wall's beginning, width and height [m] of a door."""
-    table.allow_only(("at_m", "width_m", "height_m"))
-    return (
-        _within(table, "at_m", 0.0, LARGEST_M),
-        _within(table, "width_m", 0.3, 10.0),
-        _within(table, "height_m", 0.3, 20.0, 2.1),
-    )
-
-
 def _pieces(
-    rng: Random, kind: str, left: Point, right: Point, height_m: float, doors: list[tuple[float, float, float]]
+    rng: Random, kind: str, left: Point, right: Point, height_m: float, doors: tuple[Door, ...]
 ) -> list[Rectangle]:
     """Return a straight wall between two points, left and right as seen from its front, without its doors."""
     a, b = np.array([*left, 0.0]), np.array([*right, 0.0])
     length_m = float(np.linalg.norm(b - a))
     along = (b - a) / max(length_m, 1e-9)
     pieces, begin_m = [], 0.0
-    for at_m, width_m, door_m in sorted(doors):
-        pieces.append((begin_m, at_m, 0.0))
-        pieces.append((at_m, at_m + width_m, door_m))
-        begin_m = at_m + width_m
+    for door in sorted(doors):
+        end_m = door.at_m + door.width_m
+        pieces.append((begin_m, door.at_m, 0.0))
+        pieces.append((door.at_m, end_m, door.height_m))
+        begin_m = end_m
     pieces.append((begin_m, length_m, 0.0))
     return [
         _upright(rng, kind, a + begin_m * along, a + min(end_m, length_m) * along, low_m, height_m)
@@ -269,52 +287,23 @@ def _other_side(side: Rectangle) -> Rectangle:
     return Rectangle(side.origin + side.edge_u, -side.edge_u, side.edge_v, side.texture, side.name)
 
 
-def _box(rng: Random, table: ValidatedTable) -> list[Rectangle]:
-    table.allow_only(("at", "size_m", "yaw_deg", "texture"))
-    x_m, y_m, yaw_rad = _box_pose(table)
-    faces = box(rng, (x_m, y_m), _size(table), yaw_rad)
-    kind = _choice(table, "texture", BOX_TEXTURES, "poster")
-    if kind == "poster":
+def _box(rng: Random, entry: Box) -> list[Rectangle]:
+    faces = box(rng, entry.at, entry.size_m, math.radians(entry.yaw_deg))
+    if entry.texture == "poster":
         return faces
-    return [replace(face, texture=painted(rng, kind, (face.width_m, face.height_m))) for face in faces]
+    return [replace(face, texture=painted(rng, entry.texture, (face.width_m, face.height_m))) for face in faces]
 
 
-def _person(rng: Random, table: ValidatedTable) -> Person:
-    table.allow_only(("path", "speed_mps", "repeat", "start_s", "starts_within_m", "waits_within_m", "size_m"))
+def _person(rng: Random, walker: Walker) -> Person:
     return Person(
-        tuple(box(rng, (0.0, 0.0), _person_size(table), 0.0)),
-        tuple(table.points("path", 2, MOST_POINTS)),
-        _within(table, "speed_mps", 0.0, 5.0, 1.0),
-        _choice(table, "repeat", ("once", "loop", "back and forth"), "once"),
-        _within(table, "start_s", 0.0, 1e5, 0.0),
-        _within(table, "starts_within_m", 0.0, 100.0, 0.0),
-        _within(table, "waits_within_m", 0.0, 100.0, 0.0),
+        tuple(box(rng, (0.0, 0.0), walker.size_m, 0.0)),
+        walker.path,
+        walker.speed_mps,
+        walker.repeat,
+        walker.start_s,
+        walker.starts_within_m,
+        walker.waits_within_m,
     )
-
-
-def _person_size(table: ValidatedTable) -> tuple[float, float, float]:
-    return _size(table) if table.has("size_m") else PERSON_M
-
-
-def _size(table: ValidatedTable) -> tuple[float, float, float]:
-    x_m, y_m, z_m = table.numbers("size_m", 3)
-    if not all(0.02 <= side <= 20.0 for side in (x_m, y_m, z_m)):
-        table.fail("size_m", "three sides of 0.02 to 20 m")
-    return x_m, y_m, z_m
-
-
-def _within(table: ValidatedTable, key: str, low: float, high: float, default: float | None = None) -> float:
-    """Return the number under a key, from low to high; default: None where the key is required."""
-    if default is not None and not table.has(key):
-        return default
-    value = table.number(key)
-    if not low <= value <= high:
-        table.fail(key, f"a number from {low:g} to {high:g}")
-    return value
-
-
-def _choice(table: ValidatedTable, key: str, options: Collection[str], default: str) -> str:
-    return table.choice(key, options) if table.has(key) else default
 
 
 def _exchanged(surfaces: list[Rectangle], options: WorldOptions) -> list[Rectangle]:

@@ -10,8 +10,7 @@ import pytest
 from calib import se3
 from calib.errors import CalibError
 from calib.models.ocam import OcamCamera
-from calib.ocam_file import import_ocam, parse_ocam
-from calib.transform_file import straight_up
+from calib.ocam_file import import_ocam, parse_ocam, read_transform, straight_up
 
 # The layout of the toolbox's own export, with own numbers.
 TEXT = """#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB). Used by cam2world
@@ -108,3 +107,38 @@ def test_baseline_is_vertical_for_upward_cameras(tmp_path: Path, view: str) -> N
     for baseline in (0.0, -0.2, float("nan")):
         with pytest.raises(CalibError, match="--baseline"):
             straight_up(baseline)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("t.toml", f"T_lower_upper = {T_LOWER_UPPER.tolist()}"),
+        ("t.toml", f"T_upper_lower = {se3.inverse(T_LOWER_UPPER).tolist()}"),
+        ("t.yaml", f"T_lower_upper: {T_LOWER_UPPER.tolist()}"),
+        ("t.txt", "# rows\n" + "\n".join(" ".join(map(repr, map(float, row))) for row in T_LOWER_UPPER)),
+        ("t.csv", ",".join(map(repr, map(float, T_LOWER_UPPER.ravel())))),
+    ],
+)
+def test_reads_a_transform_in_every_format(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    np.testing.assert_allclose(read_transform(tmp_path / name), T_LOWER_UPPER, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("t.toml", "T_x = 3", "unknown key T_x"),
+        ("t.toml", "", "expected either T_lower_upper or T_upper_lower"),
+        ("t.toml", "[", "expected TOML"),
+        ("t.yml", "T_lower_upper: 3", "expected rows of numbers"),
+        ("t.yml", "[", "YAML"),
+        ("t.txt", "1 0 0 0", "4 rows"),
+        ("t.txt", "one", "expected 16 numbers"),
+        ("t.txt", "1 " * 16, "expected a rotation"),
+        ("t.txt", "nan " * 16, "finite"),
+    ],
+)
+def test_refuses_invalid_transform_files(tmp_path: Path, name: str, text: str, message: str) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibError, match=message):
+        read_transform(tmp_path / name)

@@ -92,7 +92,7 @@ def test_terms_are_restored_from_a_file(ocam_rig: Rig) -> None:
     for old, new, message in (
         ("distance_m = 2.5", "distance_m = 0.0", "expected distance_m of 0.05"),
         ("wavefront = [0.0002", "wavefront = [2.0", "a wavefront of 5 lengths below 0.1"),
-        ("wavefront = [0.0002, ", "wavefront = [", "expected 5 finite numbers"),
+        ("wavefront = [0.0002, ", "wavefront = [", "wavefront: expected a list of 5 numbers"),
     ):
         assert old in text
         with pytest.raises(CalibError, match=message):

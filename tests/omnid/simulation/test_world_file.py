@@ -73,12 +73,16 @@ def test_posters_are_exchanged() -> None:
     ("old", "new", "message"),
     [
         ("schema = 1", "schema = 2", "schema"),
-        ('texture = "white"', 'texture = "whit"', "wall\\[0\\].texture: expected"),
+        ('texture = "white"', 'texture = "whit"', "wall\\[0\\].texture: expected one of"),
         ("at_m = 0.5", "at = 0.5", "unknown key"),
         ("high = [4.0, 2.0]", "high = [400.0, 2.0]", "space.high"),
         ("size_m = [0.4, 0.2, 0.5]", "size_m = [0.4, 0.2]", "box\\[0\\].size_m"),
-        ("path = [[3.0, 1.5], [3.0, 0.5]]", "path = [[3.0, 1.5]]", "2 to 100 points"),
-        ("[space]", "[space", "not a TOML file"),
+        (
+            "path = [[3.0, 1.5], [3.0, 0.5]]",
+            "path = [[3.0, 1.5]]",
+            "person\\[1\\].path: expected rows of numbers, 2 to 100 of them",
+        ),
+        ("[space]", "[space", "expected TOML"),
         (
             "at = [0.0, 1.0]",
             "at = [0.15, 0.0]",
