@@ -189,10 +189,8 @@ def test_memory_is_locked_and_only_three_threads_have_priority(operator: GuestOp
     for process in (group / "cgroup.procs").read_text().split():
         for task in Path("/proc", process, "task").iterdir():
             words = (task / "stat").read_text().rpartition(")")[2].split()
-            threads[(task / "comm").read_text().strip()] = (
-                int(words[38]),
-                int(words[37]),
-            )  # policy, priority (proc(5))
+            policy, priority = int(words[38]), int(words[37])  # proc(5)
+            threads[(task / "comm").read_text().strip()] = (policy, priority)
     named = {name: threads.pop(name) for name in ("controller", "lower", "upper")}
     assert named == {"controller": (FIFO, 20), "lower": (FIFO, 10), "upper": (FIFO, 10)}
     assert "odometry" in threads and set(threads.values()) == {(OTHER, 0)}

@@ -15,7 +15,7 @@ from omnid import replay
 from omnid.formats.tum import read_tum
 from tests.bench.honesty import too_fast
 from tests.conftest import PAIRS
-from tests.drivers.logs.mcap_logs import IMAGE, LOWER, UPPER, Entry, image_message, write_log
+from tests.drivers.logs.mcap_logs import LOWER, UPPER
 from tests.replay.command import Command
 from tests.replay.edited import dark, images, save
 from tests.simulation import corridor, make_rig
@@ -137,15 +137,6 @@ def test_pairs_of_a_frozen_camera_give_no_pose(
     assert moved_m == pytest.approx(np.linalg.norm(truth.T[19, :3, 3] - truth.T[7, :3, 3]), abs=0.03)
 
 
-def test_one_repeated_image_warns_of_nothing(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = images(scene / "log.mcap")
-    last = {image.camera: image.jpeg for image in taken if image.pair == 7}
-    repeated = [replace(p, jpeg=last[p.camera]) if (p.camera, p.pair) == ("upper", 8) else p for p in taken]
-    result = omnid.replay(save(tmp_path / "log.mcap", repeated), rig=scene / "rig.toml")
-    assert result.code == 0 and result.err == "" and "tracking 100.0%" in result.out
-    assert result.count("repeated_upper") == 1 and result.count("poses") == PAIRS - 1
-
-
 @pytest.mark.parametrize(("apart_ns", "expected"), [(12_000_000, "ms apart"), (3600 * 10**9, "clocks")])
 def test_warns_of_stamps_that_are_apart(
     omnid: Command, tmp_path: Path, scene: Path, apart_ns: int, expected: str
@@ -156,34 +147,11 @@ def test_warns_of_stamps_that_are_apart(
     assert result.count("unpaired_lower") == result.count("unpaired_upper") == PAIRS
 
 
-def test_warns_if_most_images_have_no_partner(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    taken = [
-        replace(p, stamp_ns=p.stamp_ns + 30_000_000 * (p.camera == "upper" and p.pair % 3 > 0))
-        for p in images(scene / "log.mcap")
-    ]
-    result = omnid.replay(save(tmp_path / "log.mcap", taken), "--set", "pair.tolerance_ms=10", rig=scene / "rig.toml")
-    assert result.code == 0 and result.count("pairs") == PAIRS // 3 and "pair.tolerance_ms" in result.err
-
-
 def test_warns_if_the_pose_is_always_lost(omnid: Command, tmp_path: Path, scene: Path) -> None:
     log = save(tmp_path / "log.mcap", map(dark, images(scene / "log.mcap")))
     result = omnid.replay(log, rig=scene / "rig.toml")
     assert result.code == 1 and f"lost in {PAIRS} of {PAIRS} pairs" in result.err
     assert f"too dark in {PAIRS} of {PAIRS} pairs" in result.err
-
-
-def test_names_an_unknown_encoding(omnid: Command, tmp_path: Path, scene: Path) -> None:
-    plain = np.zeros((256, 256, 2), np.uint8)
-    topics = {"lower": "/lower/image_raw", "upper": "/upper/image_raw"}
-    log = write_log(
-        tmp_path / "log.mcap",
-        [
-            Entry(topics[p.camera], IMAGE, image_message(p.stamp_ns, "bayer_rggb8", plain), 1)
-            for p in images(scene / "log.mcap")
-        ],
-    )
-    result = omnid.replay(log, rig=scene / "rig.toml")
-    assert result.code == 1 and "'bayer_rggb8'" in result.err and "rgb8" in result.err
 
 
 def test_warns_of_a_rim_that_is_not_found(omnid: Command, tmp_path: Path, scene: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from omnid.diagnostics.load_ladder import OBSERVATIONS_DOWN, OBSERVATIONS_UP, LoadLadder
 from omnid.engine.telemetry import StageStats
 from omnid.load_level import LoadLevel
-from omnid.transport.codec import OK, WARN
-from omnid.transport.status_names import LOAD, Key
 
 
 class Observed:
@@ -56,12 +54,3 @@ def test_it_waits_longer_each_time_that_was_too_soon() -> None:
         waits.append(next(k for k in range(1, 1000) if observed.level_after(1, dropped=0) == 0))
     assert waits[:3] == [OBSERVATIONS_DOWN, 2 * OBSERVATIONS_DOWN, 4 * OBSERVATIONS_DOWN]
     assert waits[-1] == waits[-2] == 320
-
-
-def test_the_status_tells_the_level() -> None:
-    observed = Observed()
-    quiet = observed.ladder.status()
-    observed.level_after(OBSERVATIONS_UP, dropped=30)
-    loud = observed.ladder.status()
-    assert (quiet.name, quiet.level, quiet.values[Key.LEVEL]) == (LOAD, OK, "0")
-    assert (loud.level, loud.values[Key.LEVEL]) == (WARN, "1") and "map" in loud.message

@@ -24,12 +24,6 @@ def test_counts_the_pairs_that_were_dropped_too() -> None:
     assert line(49, 50).startswith("omnid: 50/99 ") and "dropped" not in line(49, 50)
 
 
-def test_shows_nothing_before_the_first_pose() -> None:
-    stream = io.StringIO()
-    Progress(RunStatistics(), 99, stream)()
-    assert stream.getvalue() == ""
-
-
 def test_fits_a_narrow_terminal() -> None:
     screen, terminal = os.openpty()
     termios.tcsetwinsize(terminal, (24, 30))

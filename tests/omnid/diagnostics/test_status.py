@@ -22,7 +22,7 @@ from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.control.heading_controller import Setpoint
 from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.diagnostics.status import TIMEOUT_S, Latency, StatusCollector, StatusSources, StatusTick
+from omnid.diagnostics.status import TIMEOUT_S, Latency, StatusCollector, StatusSources
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.lockstep_drive import controller_pose
@@ -33,7 +33,7 @@ from omnid.transport.commands import CommandReceiver
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.requests import Request
 from omnid.transport.stamps import StampRule
-from omnid.transport.status_names import ODOMETRY, Key, landmark_counts, short_name
+from omnid.transport.status_names import Key, landmark_counts, short_name
 from tests.omnid.small_pair import small_depth
 from tests.simulation import build
 
@@ -151,23 +151,6 @@ def test_level_follows_the_tracking_state(daemon: Daemon, state: str, level: int
     assert 0.0 <= float(status.values["capture_to_pose_max_ms"]) < 1e5
 
 
-def test_an_old_pose_is_stale_in_every_state(daemon: Daemon) -> None:
-    daemon.pose(age_s=TIMEOUT_S + 0.5)
-    status = daemon.collected()["odometry"]
-    assert (status.level, status.message) == (STALE, "no new pose")
-    assert float(status.values[Key.AGE_S]) == pytest.approx(TIMEOUT_S + 0.5, abs=0.2)
-
-
-def test_synchronised_cameras(daemon: Daemon) -> None:
-    daemon.collected()
-    daemon.shoot("lower", "upper")
-    entries = daemon.collected()
-    pairing = entries["pairing"]
-    assert (pairing.level, pairing.message, pairing.values["pairs"]) == (OK, "synchronised", "1")
-    assert {entries[f"{name} camera"].level for name in ("lower", "upper")} == {OK}
-    assert entries["lower camera"].message == "streaming" and float(entries["lower camera"].values["rate_hz"]) > 0
-
-
 def test_a_camera_without_images_is_named(daemon: Daemon) -> None:
     daemon.shoot("lower")
     daemon.shoot("upper", age_s=TIMEOUT_S + 2)
@@ -176,13 +159,6 @@ def test_a_camera_without_images_is_named(daemon: Daemon) -> None:
     assert (entries["upper camera"].level, entries["upper camera"].message) == (ERROR, "no new image")
     assert float(entries["upper camera"].values[Key.AGE_S]) == pytest.approx(TIMEOUT_S + 2, abs=0.2)
     assert entries["lower camera"].level == OK
-
-
-def test_a_lost_camera_has_the_reason(daemon: Daemon) -> None:
-    daemon.shoot("lower", "upper")
-    daemon.cameras["lower"].status, daemon.cameras["lower"].problem = "lost", "it was unplugged"
-    status = daemon.collected()["lower camera"]
-    assert (status.level, status.message) == (ERROR, "it was unplugged")
 
 
 def test_images_without_a_partner_and_images_that_cannot_be_decoded(daemon: Daemon) -> None:
@@ -262,9 +238,3 @@ def test_collects_while_other_threads_change_counters(daemon: Daemon) -> None:
     finally:
         halt.set()
         thread.join()
-
-
-def test_tick_passes_the_report_to_all_consumers(daemon: Daemon) -> None:
-    received: list[list[DiagnosticStatus]] = []
-    StatusTick(daemon.report, received.append, received.append)()
-    assert len(received) == 2 and received[0] is received[1] and received[0][0].name == ODOMETRY

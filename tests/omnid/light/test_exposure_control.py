@@ -93,14 +93,6 @@ def test_the_exposure_stays_below_the_period_of_the_images(area: UsefulArea) -> 
     assert float(status.values["exposure_ms"]) == pytest.approx(45.0)
 
 
-def test_two_stamps_close_to_each_other_do_not_limit_the_exposure(area: UsefulArea) -> None:
-    """A driver hands out at the start what it had buffered."""
-    robot = Robot(area, 0.03)
-    for seconds in (15.0, 0.5):
-        robot.drive(0.006, period_ns=3_000_000)
-        assert float(robot.drive(seconds).values["exposure_ms"]) == 20.0
-
-
 def test_the_exposure_is_shortened_where_images_come_faster_than_at_first(area: UsefulArea) -> None:
     """Pairs are skipped while a computer is busy; images as long as two periods would come at half the rate."""
     robot = Robot(area, 0.01, CamerasConfig(exposure_limit_ms=500.0))
@@ -108,14 +100,6 @@ def test_the_exposure_is_shortened_where_images_come_faster_than_at_first(area: 
     assert float(robot.drive(1.0).values["exposure_ms"]) == pytest.approx(45.0)
     in_force = {state.exposure and state.exposure.in_force for state in robot.cameras.values()}
     assert robot.unequal == 0 and [found.exposure_us for found in in_force if found] == [45_000]
-
-
-def test_images_that_come_more_slowly_do_not_lengthen_the_exposure(area: UsefulArea) -> None:
-    """They may be slow because of their exposure: both would grow to the limit."""
-    robot = Robot(area, 0.01, CamerasConfig(exposure_limit_ms=500.0))
-    robot.drive(15.0)
-    robot.light /= 4
-    assert float(robot.drive(15.0, period_ns=2 * PERIOD_NS).values["exposure_ms"]) == pytest.approx(45.0)
 
 
 def test_says_when_it_is_too_dark_or_too_bright_and_what_to_do(area: UsefulArea) -> None:

@@ -114,9 +114,3 @@ def test_notices_cameras_that_do_not_answer_but_not_a_covered_lens() -> None:
     covered = ExposureLaw(RANGES, ExposureSetting(100, 0), 20_000)
     run(covered, Sensor(0.0), 20.0)
     assert covered.state == "too dark"
-
-
-def test_values_that_a_control_accepts() -> None:
-    steps = ValueRange(3, 2047, 4)
-    assert [steps.nearest(value) for value in (0.0, 6.0, 9.0, 5000.0)] == [3, 7, 11, 2047]
-    assert ValueRange(0, 100, 5).common(ValueRange(10, 255)) == ValueRange(10, 100, 5)

@@ -19,9 +19,3 @@ def test_a_run_is_ready_once_and_ends_with_a_summary() -> None:
     terminal.close()
     assert shown[-1] == ""
     assert reported[-1] == "ended: 4 poses, 12.35 m, 1 resets; tracking 75.0%, lost 25.0%"
-
-
-def test_a_run_without_a_pose_has_a_summary() -> None:
-    reported = list[str]()
-    TerminalStatus(lambda _: None, str, reported.append, RunStatistics(), "").close()
-    assert reported == ["ended: 0 poses, 0.00 m, 0 resets"]

@@ -21,7 +21,7 @@ import pytest
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
-from omnid.runs.systemd import Service, notify, print_stacks_when_killed, stalled_stages, watchdog_s
+from omnid.runs.systemd import Service, notify, stalled_stages, watchdog_s
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
@@ -60,14 +60,6 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Manager
 def test_notifies_systemd_of_a_state(manager: Manager) -> None:
     assert notify("READY=1\nSTATUS=all is well")
     assert manager.received() == ["READY=1", "STATUS=all is well"]
-
-
-def test_notifies_an_abstract_socket(monkeypatch: pytest.MonkeyPatch) -> None:
-    address = f"@omnid-test-{os.getpid()}-{time.monotonic_ns()}"
-    monkeypatch.setenv("NOTIFY_SOCKET", address)
-    manager = Manager(address)
-    assert notify("READY=1") and manager.received() == ["READY=1"]
-    manager.close()
 
 
 @pytest.mark.parametrize("address", ["", "relative", "/nowhere/notify", "@nosuch", "/" + "x" * 200, "vsock:2:1"])
@@ -119,16 +111,6 @@ def test_sends_ready_once_then_watchdog_then_stopping(manager: Manager) -> None:
     assert manager.received() == ["READY=1", "WATCHDOG=1", "STATUS=3 poses READY=1"]
     assert manager.received() == ["WATCHDOG=1", "STATUS=3 poses READY=1"]
     assert manager.received() == ["STOPPING=1", "STATUS=stopping"]
-
-
-def test_repeats_ready_until_it_is_received(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "late"))
-    service = Service(Telemetry(), str, 1.0)
-    service()
-    late = Manager(str(tmp_path / "late"))
-    service()
-    assert late.received()[0] == "READY=1"
-    late.close()
 
 
 class Valve:
@@ -199,15 +181,6 @@ def test_a_stalled_stage_stops_the_watchdog_and_is_logged_once(
     assert "stage 'valve' goes on" in caplog.text
 
 
-def test_the_watchdog_is_fed_without_images(manager: Manager, running: SimpleNamespace) -> None:
-    running.valve.open.set()
-    running.tap.left = 3
-    wait_until(lambda: running.graph.telemetry.stages[2].processed)
-    time.sleep(0.1)
-    Service(running.graph.telemetry, str, 0.05)()
-    assert "WATCHDOG=1" in manager.received()
-
-
 def test_a_run_notifies_systemd_from_its_first_tick_to_its_end(manager: Manager) -> None:
     graph, tap = Graph(policy=NEWEST), Tap()
     graph.sink("sink", SimpleNamespace(process=lambda number: None), graph.source("tap", tap.numbers, wake=tap.close))
@@ -221,10 +194,6 @@ def test_a_run_notifies_systemd_from_its_first_tick_to_its_end(manager: Manager)
     while messages[-1][0] != "STOPPING=1":
         messages.append(manager.received())
     assert manager.is_empty()
-
-
-def test_does_not_raise_where_stderr_is_no_file(capsys: pytest.CaptureFixture[str]) -> None:
-    print_stacks_when_killed()
 
 
 @pytest.mark.parametrize("number", [signal.SIGABRT, signal.SIGXCPU], ids=lambda number: number.name)
