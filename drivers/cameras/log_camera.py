@@ -14,7 +14,7 @@ from drivers.cameras.camera_state import CameraState
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from drivers.logs.log_reader import LogReader
-from drivers.logs.topic_choice import MotionTopics
+from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 
 MAX_LOG_BYTES: Final = 1 << 30

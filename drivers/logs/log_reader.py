@@ -8,16 +8,15 @@ import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import Camera, Frame
-from drivers.logs.image_log import LoggedImage, LoggedMotion
-from drivers.logs.log_formats import open_image_log
-from drivers.logs.mcap_records import RecordError
-from drivers.logs.reorder_buffer import ReorderBuffer
-from drivers.logs.ros_image import RosImage
+from drivers.logs.log import LoggedMessage, RecordError
+from drivers.logs.open_log import open_log
+from drivers.logs.ros_messages import RosImage
 from drivers.logs.sample_bits import SampleBits
-from drivers.logs.topic_choice import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
+from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
 _WARNINGS = {
@@ -30,6 +29,7 @@ _WARNINGS = {
     "broken_records": "skipped {} corrupt chunks or records of the file",
 }
 MAX_WAITING_SAMPLES = 65_536  # Samples of wheels and IMU that wait for the next images: some minutes.
+MAX_HELD_BYTES = 256 * 2**20  # of the images that wait for earlier ones
 _COUNTERS = ("lower", "upper", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
 
@@ -37,10 +37,10 @@ WHOLE = (0.0, math.inf)  # span of all of a log [s]
 class LogReader:
     """A FrameSource that streams a log once per call of frames().
 
-    path: as for `open_image_log`. lower, upper: topics, where their names do not identify the cameras. window: number
-    of frames that are held back to sort them by stamp. span_s: the part of the log that is read, from and until so many
-    seconds after the stamp of its first image. Raises DriverError where the path is no such log, or the topics
-    of the two cameras are ambiguous. motion: topics of wheels and IMU; None: their samples are not read.
+    path, rate_hz: as for `open_log`. lower, upper: topics, where their names do not identify the cameras. window:
+    number of frames that are held back to sort them by stamp. span_s: the part of the log that is read, from and until
+    so many seconds after the stamp of its first image. motion: topics of wheels and IMU; None: their samples are not
+    read. Raises DriverError where the path is no such log, or the topics of the two cameras are ambiguous.
 
     During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate',
     'unstamped' (log time used), 'broken' (messages without a valid image), 'broken_motion' and 'broken_records' (chunks
@@ -57,9 +57,10 @@ class LogReader:
         window: int = 32,
         span_s: tuple[float, float] = WHOLE,
         motion: MotionTopics | None = None,
+        rate_hz: float = 0.0,
     ) -> None:
         self._window, self._closed, self._span_s = window, False, span_s
-        self._log = open_image_log(path)
+        self._log = open_log(path, rate_hz)
         self._motion = MotionChoice(frozenset())
         self._joints = motion.joints if motion else None
         try:
@@ -90,17 +91,17 @@ class LogReader:
             self._report()
 
     def _sorted(self) -> Iterator[Frame | MotionSample]:
-        buffer, samples = ReorderBuffer(self._window, self.counts), _Samples()
-        for logged in self._log.messages():
-            if isinstance(logged, LoggedMotion):
-                sample = self._sample(logged) if logged.topic in self._motion.names else None
+        buffer, samples = _ReorderBuffer(self._window, self.counts), _Samples()
+        cameras = {topic: camera for camera, topic in self._cameras.items()}
+        for message in self._log.messages({*cameras, *self._motion.names}):
+            if self._closed:
+                return
+            if message.topic not in cameras:
+                sample = self._sample(message)
                 if sample is not None:
                     yield from samples.push(sample)
-                continue
-            camera = next((camera for camera, topic in self._cameras.items() if topic == logged.topic), None)
-            image = None if camera is None else self._image(logged)
-            if camera is not None and image is not None:
-                for frame in buffer.push(camera, image):
+            elif (image := self._image(message)) is not None:
+                for frame in buffer.push(cameras[message.topic], image):
                     yield from samples.until(frame.stamp_ns)
                     yield frame
         if not self._closed:
@@ -155,13 +156,13 @@ class LogReader:
         self._other_joints = 0  # messages of joints without the wheels
         self._spans: dict[str, tuple[int, int]] = {}  # first and last stamp of images, wheels and gyro
 
-    def _image(self, logged: LoggedImage) -> RosImage | None:
+    def _image(self, logged: LoggedMessage) -> RosImage | None:
         """Return an image, None of a broken one.
 
         The image is copied out of its chunk, so that a frame that is held back does not keep the chunk in memory.
         """
         try:
-            image = self._bits.applied(logged.topic, logged.read())
+            image = self._bits.applied(logged.topic, logged.image())
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken"] += 1
             self._fault = self._fault or str(error)
@@ -171,10 +172,10 @@ class LogReader:
         self._widen("images", stamp_ns)
         return replace(image, stamp_ns=stamp_ns, data=memoryview(bytes(image.data)))
 
-    def _sample(self, logged: LoggedMotion) -> MotionSample | None:
+    def _sample(self, logged: LoggedMessage) -> MotionSample | None:
         """Return a sample, None of a broken one."""
         try:
-            reading = logged.read(self._joints)
+            reading = logged.motion(self._joints)
             if not reading.rates:
                 self._other_joints += 1
                 return None
@@ -233,3 +234,54 @@ class _Samples:
         """Yield the samples up to a stamp."""
         while self._heap and self._heap[0][0] <= stamp_ns:
             yield heapq.heappop(self._heap)[2]
+
+
+class _WaitingImage(NamedTuple):
+    """An image in the window; sorts by stamp, then lower before upper, then by arrival, so the order is unique."""
+
+    stamp_ns: int
+    camera: Camera
+    arrival: int
+    image: RosImage
+
+
+class _ReorderBuffer:
+    """Sorts the frames of two cameras: holds up to `window` and 256 MiB of them, and yields the oldest beyond that.
+
+    A frame older than one already delivered is dropped and counted as 'late'; one with the same stamp as the frame
+    before of its camera as 'duplicate'; 'lower' and 'upper' count the delivered frames.
+    """
+
+    def __init__(self, window: int, counts: Counter[str]) -> None:
+        self._window = window
+        self._counts = counts
+        self._heap: list[_WaitingImage] = []
+        self._held_bytes = 0
+        self._arrivals = 0
+        self._newest_ns = 0
+        self._last_ns: dict[Camera, int] = {}
+
+    def push(self, camera: Camera, image: RosImage) -> Iterator[Frame]:
+        """Add an image, whose data must not change afterwards; yield the frames that are due."""
+        heapq.heappush(self._heap, _WaitingImage(image.stamp_ns, camera, self._arrivals, image))
+        self._arrivals += 1
+        self._held_bytes += len(image.data)
+        while self._heap and (len(self._heap) > self._window or self._held_bytes > MAX_HELD_BYTES):
+            yield from self._pop()
+
+    def drain(self) -> Iterator[Frame]:
+        """Yield all remaining frames."""
+        while self._heap:
+            yield from self._pop()
+
+    def _pop(self) -> Iterator[Frame]:
+        oldest = heapq.heappop(self._heap)
+        self._held_bytes -= len(oldest.image.data)
+        if self._last_ns.get(oldest.camera) == oldest.stamp_ns:
+            self._counts["duplicate"] += 1
+        elif oldest.stamp_ns < self._newest_ns:
+            self._counts["late"] += 1
+        else:
+            self._newest_ns = self._last_ns[oldest.camera] = oldest.stamp_ns
+            self._counts[oldest.camera] += 1
+            yield oldest.image.frame(oldest.camera, self._counts[oldest.camera] - 1)

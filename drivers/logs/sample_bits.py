@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from drivers.errors import FrameDecodeError
 from drivers.frame import FILE_BITS, bits_of_camera, deep_samples, upper_eight_bits
-from drivers.logs.ros_image import RosImage
+from drivers.logs.ros_messages import RosImage
 
 
 class SampleBits:

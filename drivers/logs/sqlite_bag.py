@@ -1,36 +1,33 @@
-"""The images of a bag of ROS 2 in SQLite (.db3), as `ros2 bag record -s sqlite3` writes it.
+"""A bag of ROS 2 in SQLite (.db3), as `ros2 bag record -s sqlite3` writes it, read by Python's sqlite3.
 
 Layout: rosbag2_storage_sqlite3, versions 1 to 4: table topics (id, name, type, serialization_format, ...) and table
-messages (id, topic_id, timestamp [ns], data). A message may be compressed by zstd.
+messages (id, topic_id, timestamp [ns], data). A write-ahead log beside the file counts, as a recorder that was killed
+leaves it. rosbags reads neither that, nor a bag without metadata.yaml, nor messages that are compressed one by one.
 
-Each row has bytes of its own in a file that is whole. So a file of N bytes has at most N / 8 rows with N bytes of data,
-and what has more is damaged: its pages are named more than once.
+Each row has bytes of its own in a file that is whole. So a file of N bytes, with its write-ahead log, has at most N / 8
+rows with N bytes of data, and what has more is damaged: its pages are named more than once.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Generator, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-import zstandard
-
 from drivers.bounded_sqlite import bound_work, open_bounded
 from drivers.errors import DriverError
-from drivers.logs.image_log import LogDamage, LoggedImage, LoggedMotion, logged_message
-from drivers.logs.mcap_records import MAX_RECORD_BYTES, RecordError
-from drivers.logs.ros_image import IMAGE_TYPES
-from drivers.logs.ros_motion import MOTION_TYPES
+from drivers.logs.log import MAX_RECORD_BYTES, LogDamage, LoggedMessage
 
 MAGIC: Final = b"SQLite format 3\0"
 _MAX_TOPICS: Final = 4096
 _MAX_REASON: Final = 120  # characters
-_LEAST_LIMIT: Final = 2**16  # bytes of a value or a query
-_ZSTD: Final = b"\x28\xb5\x2f\xfd"  # first bytes of a frame, RFC 8878
+_LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
+_ROW_INSTRUCTIONS: Final = 100  # Instructions of SQLite that a row may take; it needs 10 to 20, sorted twice as many.
+_FEWEST_INSTRUCTIONS: Final = 1_000_000
 _TABLES: Final = (
     "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND name IN ('topics', 'messages') "
     "AND sql LIKE 'CREATE TABLE%'"
@@ -38,49 +35,54 @@ _TABLES: Final = (
 # The pragma lists no computed columns. The small columns come first, so that reading them never reads a whole row.
 _COLUMNS: Final = "SELECT name FROM pragma_table_info('messages') LIMIT 4"
 _EXPECTED: Final = ["id", "topic_id", "timestamp", "data"]
-_LEAST_ROW_BYTES: Final = 8  # pointer, sizes, number, and the types of four columns
-_ROW_INSTRUCTIONS: Final = 100  # Instructions of SQLite that a row may take; it needs 10 to 20.
-_FEWEST_INSTRUCTIONS: Final = 1_000_000
 _TOPICS: Final = (
     f"SELECT id, substr(name, 1, 256), substr(type, 1, 256), serialization_format FROM topics LIMIT {_MAX_TOPICS}"
 )
-# In the order of writing, which needs neither index nor sorting: that of the time is by the stamps of the images.
-_MESSAGES: Final = (
-    "SELECT topic_id, timestamp, data FROM messages WHERE typeof(topic_id) = 'integer' "
-    "AND topic_id IN ({}) ORDER BY rowid"
+# Indexes are not used: a damaged one would leave rows out without an error.
+_TIMES: Final = "SELECT topic_id, timestamp FROM messages NOT INDEXED ORDER BY rowid"
+_AS_WRITTEN: Final = (
+    "SELECT topic_id, timestamp, CASE WHEN topic_id IN ({ids}) THEN data END FROM messages NOT INDEXED ORDER BY rowid"
 )
-_TOPIC_OF_EACH: Final = "SELECT topic_id FROM messages WHERE typeof(topic_id) = 'integer' ORDER BY rowid"
+_BY_TIME: Final = (  # sorted on the disk where it does not fit the memory
+    "SELECT topic_id, timestamp, rowid FROM messages NOT INDEXED WHERE topic_id IN ({ids}) ORDER BY timestamp, rowid"
+)
+_DATA: Final = "SELECT data FROM messages WHERE rowid = ?"
 _TOO_MANY: Final = "it has more rows than its size allows"
 
 
+@dataclass(slots=True)
+class _Times:
+    """What a look at the times of all messages has found."""
+
+    counts: Counter[object] = field(default_factory=Counter)  # by topic
+    span_ns: tuple[int, int] | None = None
+    in_order: bool = True
+    complete: bool = False  # False: the file is damaged
+
+
 class SqliteBag:
-    """An ImageLog of one .db3 file; raises DriverError where it is no bag."""
+    """A Log of one .db3 file; raises DriverError where it is no bag."""
 
     def __init__(self, path: Path) -> None:
-        self.name = str(path)
-        self._damage = LogDamage()
-        self._closed = False
+        self.name, self._path = str(path), path
+        self._damage, self._closed = LogDamage(), False
+        self._found: _Times | None = None
         try:
-            self._bytes = path.stat().st_size
-            self._bag = open_bounded(path, max(_LEAST_LIMIT, min(MAX_RECORD_BYTES, self._bytes)))
-            self._bag.text_factory = _text
+            self._bag = open_bounded(path, MAX_RECORD_BYTES)
+            self._bag.text_factory = partial(str, encoding="utf-8", errors="replace")
+            # A file that is shorter than it states is read up to its end in this mode only; nothing is written.
+            self._bag.execute("PRAGMA writable_schema = ON")
             self._bound_work()
             is_bag = (
                 self._bag.execute(_TABLES).fetchone()[0] == 2
                 and [name for (name,) in self._bag.execute(_COLUMNS)] == _EXPECTED
             )
-            self._topics = (
-                {}
-                if not is_bag
-                else {
-                    _integer(key): (str(name), str(kind) if encoding == "cdr" else "")
-                    for key, name, kind, encoding in self._bag.execute(_TOPICS)
-                }
-            )
+            rows = self._bag.execute(_TOPICS).fetchall() if is_bag else []
         except (sqlite3.Error, OSError, OverflowError, ValueError) as error:
+            log = Path(f"{path}-wal").exists()
+            advice = "copy it with its -wal file to a folder that can be written" if log else "`sqlite3 FILE .recover`"
             raise DriverError(
-                f"cannot read the bag {self.name!r}: {_line(error)}; if the recording was cut, try "
-                "`sqlite3 FILE .recover`"
+                f"cannot read the bag {self.name!r}: {_line(error)}; if the recording was cut, try: {advice}"
             ) from error
         if not is_bag:
             self.close()
@@ -88,6 +90,11 @@ class SqliteBag:
                 f"{self.name!r} is an SQLite file, but no bag of ROS 2: it has no tables topics and "
                 "messages as one has; give the .db3 file that `ros2 bag record` wrote"
             )
+        self._topics = {
+            key: (str(name), str(kind) if encoding == "cdr" else "")
+            for key, name, kind, encoding in rows
+            if isinstance(key, int)
+        }
 
     def topics(self) -> Mapping[str, str]:
         """Return name -> type of all topics."""
@@ -95,51 +102,37 @@ class SqliteBag:
 
     def counts(self) -> Mapping[str, int] | None:
         """Return the number of messages of each topic; None where the file is damaged."""
-        try:
-            with closing(self._rows(_TOPIC_OF_EACH)) as rows:
-                found = Counter(key for (key,) in rows)
-        except sqlite3.Error:
-            return None
-        return {name: found[key] for key, (name, _) in self._topics.items()}
+        found = self._times()
+        return {name: found.counts[key] for key, (name, _) in self._topics.items()} if found.complete else None
 
-    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
-        """Yield the messages in the order in which they were written."""
-        wanted = {key: topic for key, topic in self._topics.items() if topic[1] in (*IMAGE_TYPES, *MOTION_TYPES)}
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return the first and last log time; None without messages, and where the file is damaged."""
+        found = self._times()
+        return found.span_ns if found.complete else None
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
+        """Yield the messages of these topics in the order of log time."""
+        wanted = {key: topic for key, topic in self._topics.items() if topics is None or topic[0] in topics}
+        in_order = self._times().in_order
+        query = (_AS_WRITTEN if in_order else _BY_TIME).format(ids=", ".join(map(str, wanted)))
         broken, count = 0, 0
         try:
-            with closing(self._rows(_MESSAGES.format(", ".join(map(str, wanted))))) as rows:
-                for key, time_ns, data in rows:
-                    count += 1
-                    logged = None
-                    if isinstance(data, bytes) and isinstance(time_ns, int):
-                        logged = logged_message(*wanted[key], time_ns, partial(_unpacked, data))
-                    if logged is not None:
-                        yield logged
-                    else:
-                        broken += 1
-                    if self._closed:
-                        return
+            for key, time_ns, found in self._rows(query):
+                if self._closed:
+                    return
+                if key not in wanted:
+                    continue
+                count += 1
+                data = found if in_order else self._bag.execute(_DATA, (found,)).fetchone()[0]
+                if isinstance(data, bytes) and isinstance(time_ns, int):
+                    yield LoggedMessage(*wanted[key], time_ns, partial(bytes, data))
+                else:
+                    broken += 1
             self._damage = LogDamage(broken)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OverflowError) as error:
             if not self._closed:
-                self._damage = LogDamage(
-                    broken,
-                    f"the bag {self.name!r} is cut or corrupt after {count} messages "
-                    f"({_line(error)}): used those before",
-                )
-
-    def _rows(self, query: str) -> Generator[tuple[Any, ...], None, None]:
-        """Yield the rows of a query, as many and as large as the file can hold; then raise sqlite3.DatabaseError."""
-        self._bound_work()
-        rows_left, bytes_left = self._bytes // _LEAST_ROW_BYTES, self._bytes
-        for row in self._bag.execute(query):
-            rows_left, bytes_left = rows_left - 1, bytes_left - sum(len(v) for v in row if isinstance(v, bytes))
-            if rows_left < 0 or bytes_left < 0:
-                raise sqlite3.DatabaseError(_TOO_MANY)
-            yield row
-
-    def _bound_work(self) -> None:
-        bound_work(self._bag, max(_FEWEST_INSTRUCTIONS, self._bytes // _LEAST_ROW_BYTES * _ROW_INSTRUCTIONS))
+                line = f"is cut or corrupt after {count} messages ({_line(error)}): used those before"
+                self._damage = LogDamage(broken, f"the bag {self.name!r} {line}")
 
     def attachments(self) -> dict[str, bytes]:
         """Return none: a bag has no attachments."""
@@ -150,31 +143,50 @@ class SqliteBag:
         return self._damage
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file; may be called twice."""
         self._closed = True
         self._bag.close()
 
+    def _times(self) -> _Times:
+        """Return counts, span and order of the messages, as far as they can be read."""
+        if self._found is None:
+            found = self._found = _Times()
+            try:
+                for key, time_ns in self._rows(_TIMES):
+                    found.counts[key] += 1
+                    if isinstance(time_ns, int):
+                        first_ns, last_ns = found.span_ns or (time_ns, time_ns)
+                        found.in_order = found.in_order and time_ns >= last_ns
+                        found.span_ns = min(first_ns, time_ns), max(last_ns, time_ns)
+                found.complete = True
+            except (sqlite3.Error, OverflowError):
+                # A sorted reading would end at the damage, before its first message.
+                found.in_order = True
+        return self._found
 
-def _unpacked(data: bytes) -> memoryview:
-    """Return a message that may be compressed; raise RecordError where it does not unpack."""
-    if not data.startswith(_ZSTD):
-        return memoryview(data)
-    try:
-        return memoryview(zstandard.ZstdDecompressor().stream_reader(data).read(MAX_RECORD_BYTES))
-    except (zstandard.ZstdError, MemoryError) as error:
-        raise RecordError(f"a compressed message does not unpack: {error}") from error
+    def _rows(self, query: str) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query, as many and as large as the file can hold; then raise sqlite3.DatabaseError."""
+        self._bound_work()
+        rows = total_bytes = 0
+        for row in self._bag.execute(query):
+            rows, total_bytes = rows + 1, total_bytes + sum(len(value) for value in row if isinstance(value, bytes))
+            if max(rows * _LEAST_ROW_BYTES, total_bytes) > self._bytes and (
+                max(rows * _LEAST_ROW_BYTES, total_bytes) > self._measured_bytes()
+            ):
+                raise sqlite3.DatabaseError(_TOO_MANY)
+            yield row
+
+    def _measured_bytes(self) -> int:
+        """Return the size of the file and of its write-ahead log; both grow while it is recorded."""
+        log = Path(f"{self._path}-wal")
+        self._bytes = self._path.stat().st_size + (log.stat().st_size if log.exists() else 0)
+        return self._bytes
+
+    def _bound_work(self) -> None:
+        rows = self._measured_bytes() // _LEAST_ROW_BYTES
+        bound_work(self._bag, max(_FEWEST_INSTRUCTIONS, rows * _ROW_INSTRUCTIONS))
 
 
 def _line(error: Exception) -> str:
     """Return an error in one line: SQLite quotes the file, which may contain anything."""
     return " ".join(str(error).split())[:_MAX_REASON]
-
-
-def _text(value: bytes) -> str:
-    return value.decode("utf-8", "replace")
-
-
-def _integer(value: object) -> int:
-    if not isinstance(value, int):
-        raise ValueError(f"a topic has the id {value!r}")
-    return value

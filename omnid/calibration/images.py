@@ -21,8 +21,8 @@ from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
 from drivers.frame import FILE_BITS, MAX_PIXELS, Frame, bits_of_camera, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES
-from drivers.logs.log_formats import LOG_SUFFIXES
 from drivers.logs.log_reader import LogReader
+from drivers.logs.open_log import LOG_SUFFIXES
 from omnid.errors import OmnidError
 
 Image = NDArray[np.uint8]

@@ -13,7 +13,7 @@ from omnid.commands.options import JSON, command, option
 from omnid.utc import utc
 
 if TYPE_CHECKING:
-    from drivers.logs.mcap_info import LogInfo
+    from drivers.logs.log import LogInfo
 
 MAX_COLUMN = 60  # Most characters of a topic or a type, so that a line of the table fits a terminal.
 _MEND = "`mcap recover`, of mcap's own command line"
@@ -34,8 +34,8 @@ MAX_LINE = 5000  # Most characters of a line: it may contain the path of a file.
 def info(args: argparse.Namespace) -> int:
     """Print the content of each log; return 1 if one is broken, 2 if one is no log."""
     from drivers.errors import DriverError
-    from drivers.logs.log_formats import log_info
-    from drivers.logs.mcap_info import LogState
+    from drivers.logs.log import LogState
+    from drivers.logs.open_log import log_info
 
     code, logs = 0, []
     for number, path in enumerate(args.logs):
@@ -71,7 +71,7 @@ def _described(found: LogInfo) -> Iterator[str]:
 
 
 def _state(found: LogInfo) -> str:
-    from drivers.logs.mcap_info import LogState
+    from drivers.logs.log import LogState
 
     if found.state is LogState.BROKEN and found.path.suffix not in (".mcap", ".part"):
         return f"cut or corrupt, with {found.broken} corrupt records: what can be read is used"

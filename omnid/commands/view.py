@@ -176,14 +176,14 @@ def _free_port() -> int:
 def _log(sink: RerunSink, config: Config, args: argparse.Namespace) -> int:
     """Draw the recorded poses of a log, else what is computed from its images."""
     from drivers.errors import FrameDecodeError
-    from drivers.logs.mcap_info import read_log_info
+    from drivers.logs.open_log import log_info
     from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose, odometry_topics
     from omnid.recordings.recording_reader import CLOUD, ODOMETRY, STATUS, RecordingReader
     from omnid.runs.replay import ReplayOptions
     from omnid.transport.records import OdometryRecord
     from omnid.transport.topics import MAP_POSE, SCAN
 
-    found = read_log_info(args.log)
+    found = log_info(args.log)
     if args.replay or not (args.topic or args.robot or odometry_topics(found)):
         options = ReplayOptions(
             rig=args.rig,

@@ -12,8 +12,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from drivers.logs.mcap_info import LogInfo
-from drivers.logs.ros_image import IMAGE_TYPES
+from drivers.logs.log import LogInfo
+from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.errors import OmnidError
 from omnid.transport.codec import ODOMETRY_SCHEMA
 

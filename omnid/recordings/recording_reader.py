@@ -1,6 +1,6 @@
-"""The reader of recorded runs: messages of one robot, decoded one by one in the order of the file.
+"""The reader of recorded runs: messages of one robot, decoded one by one in the order of log time.
 
-Any MCAP log with a topic of nav_msgs/msg/Odometry can be read. The robot's other topics have the same name up to the
+Any log with a topic of nav_msgs/msg/Odometry can be read. The robot's other topics have the same name up to the
 last slash, and the last part under which omnid publishes them.
 """
 
@@ -14,12 +14,9 @@ from functools import partial
 from typing import Final, NamedTuple, TypeAlias
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.mcap_catalog import Catalog, LogTopic
-from drivers.logs.mcap_index import read_attachments, read_summary
-from drivers.logs.mcap_info import LogInfo
-from drivers.logs.mcap_messages import DataSection, LogMessage
-from drivers.logs.mcap_records import LogFile, RecordError
-from drivers.logs.ros_image import IMAGE_TYPES, RosImage, parse_image
+from drivers.logs.log import LoggedMessage, LogInfo, RecordError
+from drivers.logs.open_log import open_log
+from drivers.logs.ros_messages import IMAGE_TYPES, RosImage
 from omnid.errors import OmnidError
 from omnid.transport.codec import (
     DIAGNOSTICS_SCHEMA,
@@ -45,7 +42,7 @@ IMAGES: Final = (PANORAMA, "lower/image_raw/compressed", "lower/image_raw")  # i
 MAX_MESSAGE_BYTES: Final = 64 * 2**20
 
 Content: TypeAlias = OdometryRecord | PoseInMap | Diagnostics | Cloud | Scan | TwistRecord | RosImage
-Decoder: TypeAlias = Callable[[memoryview], Content]
+Decoder: TypeAlias = Callable[[LoggedMessage], Content]
 
 
 class RecordedMessage(NamedTuple):
@@ -69,8 +66,8 @@ class RecordingReader:
         self.info, self.topic = found, odometry_topic
         self.unreadable: Counter[str] = Counter()
         self.corrupt = self.damaged = 0
-        with closing(LogFile(found.path)) as file:
-            self.attachments: Mapping[str, bytes] = read_attachments(file, read_summary(file))
+        with closing(open_log(found.path)) as log:
+            self.attachments: Mapping[str, bytes] = log.attachments()
 
     @property
     def robot(self) -> str:
@@ -88,51 +85,54 @@ class RecordingReader:
     def messages(self, names: Iterable[str]) -> Iterator[RecordedMessage]:
         """Yield the messages of topics with these names."""
         wanted = {self.topic_name(name): name for name in names if name}
-        with closing(LogFile(self.info.path)) as file:
-            section = DataSection(file, Catalog())
-            for message in section.messages():
-                topic = section.catalog.topic(message.channel_id)
-                name = None if topic is None else wanted.get(topic.name)
-                decoder = None if topic is None or name is None else _decoder(name, topic)
-                if topic is not None and name is not None and decoder is not None:
-                    content = self._decoded(topic.name, message, decoder)
-                    if content is not None:
-                        yield RecordedMessage(name, message.log_time_ns, content)
-            self.corrupt = section.broken
-            self.damaged = section.broken + (not section.ended)
+        with closing(open_log(self.info.path)) as log:
+            for message in log.messages(wanted.keys()):
+                name = wanted[message.topic]
+                decoder = _decoder(name, message.kind)
+                content = None if decoder is None else self._decoded(message, decoder)
+                if content is not None:
+                    yield RecordedMessage(name, message.log_time_ns, content)
+            damage = log.damage()
+            self.corrupt = damage.broken
+            self.damaged = damage.broken + bool(damage.cut)
 
-    def _decoded(self, topic: str, message: LogMessage, decoder: Decoder) -> Content | None:
+    def _decoded(self, message: LoggedMessage, decoder: Decoder) -> Content | None:
         """Return the content of a message; None, and count it, where it cannot be decoded."""
         try:
-            if message.record.size > MAX_MESSAGE_BYTES:
-                raise OmnidError(f"a message of {message.record.size} bytes: expected at most {MAX_MESSAGE_BYTES}")
-            return decoder(message.data())
+            return decoder(message)
         except (OmnidError, FrameDecodeError, RecordError):
-            self.unreadable[topic] += 1
+            self.unreadable[message.topic] += 1
             return None
 
 
-def _decoder(name: str, topic: LogTopic) -> Decoder | None:
+def _decoder(name: str, kind: str) -> Decoder | None:
     """Return the decoder of messages of a topic; None where they are of another type than expected."""
-    if name in IMAGES and topic.type in IMAGE_TYPES:
-        return partial(parse_image, topic.type, aligned=topic.aligned)
-    expected, decoder = DECODERS.get(name, ("", None))
-    return decoder if topic.type == expected else None
+    if name in IMAGES and kind in IMAGE_TYPES:
+        return LoggedMessage.image
+    expected, decode = DECODERS.get(name, ("", None))
+    return partial(_of_bytes, decode) if decode is not None and kind == expected else None
 
 
-def _finite_twist(data: memoryview) -> TwistRecord:
-    twist = twist_from_cdr(bytes(data))
+def _of_bytes(decode: Callable[[bytes], Content], message: LoggedMessage) -> Content:
+    data = message.data()
+    if len(data) > MAX_MESSAGE_BYTES:
+        raise OmnidError(f"a message of {len(data)} bytes: expected at most {MAX_MESSAGE_BYTES}")
+    return decode(bytes(data))
+
+
+def _finite_twist(data: bytes) -> TwistRecord:
+    twist = twist_from_cdr(data)
     if not (math.isfinite(twist.velocity_mps) and math.isfinite(twist.yaw_rate_radps)):
         raise OmnidError(f"a command of {twist.velocity_mps} m/s and {twist.yaw_rate_radps} rad/s: expected numbers")
     return twist
 
 
-DECODERS: Final[Mapping[str, tuple[str, Decoder]]] = {
-    ODOMETRY: (ODOMETRY_SCHEMA, lambda data: odometry_from_cdr(bytes(data))),
-    MAP_POSE: (MAP_POSE_SCHEMA, lambda data: decode_map_pose(bytes(data))),
-    STATUS: (DIAGNOSTICS_SCHEMA, lambda data: decode_diagnostics(bytes(data))),
-    CLOUD: (POINT_CLOUD_SCHEMA, lambda data: decode_cloud(bytes(data))),
-    SCAN: (SCAN_SCHEMA, lambda data: decode_scan(bytes(data))),
+DECODERS: Final[Mapping[str, tuple[str, Callable[[bytes], Content]]]] = {
+    ODOMETRY: (ODOMETRY_SCHEMA, odometry_from_cdr),
+    MAP_POSE: (MAP_POSE_SCHEMA, decode_map_pose),
+    STATUS: (DIAGNOSTICS_SCHEMA, decode_diagnostics),
+    CLOUD: (POINT_CLOUD_SCHEMA, decode_cloud),
+    SCAN: (SCAN_SCHEMA, decode_scan),
     DRIVE: (TWIST_SCHEMA, _finite_twist),
     TWIST_COMMAND: (TWIST_SCHEMA, _finite_twist),
 }

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.logs.mcap_info import LogState
+from drivers.logs.log import LogState
 from omnid.errors import OmnidError
 from omnid.formats.plan import drawn_heights
 from omnid.formats.tum import Trajectory

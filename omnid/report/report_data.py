@@ -16,8 +16,9 @@ from calib import se3
 from calib.errors import CalibError
 from calib.rig import Rig
 from calib.rig_file import parse_rig
-from drivers.logs.mcap_info import LogInfo, read_log_info
-from drivers.logs.ros_image import IMAGE_TYPES
+from drivers.logs.log import LogInfo
+from drivers.logs.open_log import log_info
+from drivers.logs.ros_messages import IMAGE_TYPES
 from omnid.formats.tum import POSITION_LIMIT_M
 from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose
 from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
@@ -111,7 +112,7 @@ def collect_report_data(path: Path, topic: str | None = None, keep_poses: bool =
 
     Raise OmnidError where there is no odometry in it, DriverError where there is no log.
     """
-    found = read_log_info(path)
+    found = log_info(path)
     reader = RecordingReader(found, choose_odometry_topic(found, topic))
     rig, fault = _rig(reader.attachments)
     events = Events()

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Protocol
 
-from drivers.logs.joint_wheels import JointWheels
-from drivers.logs.topic_choice import MotionTopics
+from drivers.logs.ros_messages import JointWheels
+from drivers.logs.topics import MotionTopics
 from drivers.motion import MotionSample
 from omnid.config import Config
 from omnid.controller.link import DriveLink

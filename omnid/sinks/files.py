@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from drivers.logs.file_lock import is_locked, lock
 from drivers.logs.image_folder import IMAGE_SUFFIXES
-from drivers.logs.log_formats import LOG_SUFFIXES
+from drivers.logs.open_log import LOG_SUFFIXES
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.errors import OmnidError
 from omnid.formats.plan import NO_LOOPS, drawn_heights, plan_view

@@ -1,7 +1,7 @@
 """Frames as image messages of ROS 2, on topics that ROS tools and `omnid replay` recognise.
 
 CDR is written here (OMG RTPS 2.2, 10.2: little-endian, numbers aligned to their size), not by rosbags: images are
-nearly all of a recording, and this copies each of them once. drivers.logs.ros_image reads it.
+nearly all of a recording, and this copies each of them once. drivers.logs.ros_messages reads it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.frame import Frame
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE
 from omnid.transport.codec import ros_time
 
 COMPRESSED: Final = ("jpeg", "png")

@@ -8,8 +8,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
-from drivers.logs.ros_motion import BASE_FRAME, IMU, ODOMETRY, parse_motion
+from drivers.logs.ros_messages import BASE_FRAME, IMU, JOINT_STATE, ODOMETRY, JointWheels, parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.errors import OmnidError
 from omnid.transport import ros_types as ros

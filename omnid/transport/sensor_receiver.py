@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
-from drivers.logs.joint_wheels import JointWheels
+from drivers.logs.ros_messages import JointWheels
 from drivers.motion import MotionSample
 from omnid.errors import OmnidError
 from omnid.transport.motion_codec import sample_from_cdr

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from drivers.frame import gray
-from drivers.logs.ros_image import COMPRESSED_IMAGE, RosImage, parse_image
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, RosImage, parse_image
 from omnid.core.frames import base_pose
 from omnid.core.odometry.stereo_frame import Features
 from omnid.messages import OdometryUpdate, PlaceUpdate
@@ -92,7 +92,7 @@ def decoded(topic: str, payload: bytes, attachment: bytes, received_ns: int) -> 
         return decode_pose(payload, attachment, received_ns)
     if topic == PANORAMA:
         return parse_image(COMPRESSED_IMAGE, memoryview(payload))
-    return DECODERS[topic][1](memoryview(payload)) if topic in DECODERS else None
+    return DECODERS[topic][1](payload) if topic in DECODERS else None
 
 
 class RerunSink:

@@ -15,7 +15,7 @@ from contextlib import suppress
 from typing import Final
 
 from drivers.errors import FrameDecodeError
-from drivers.logs.ros_image import COMPRESSED_IMAGE, parse_image
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, parse_image
 from omnid.client import Diagnostics, Map, NavigationReport, Robot, Unreachable
 from omnid.errors import OmnidError
 from omnid.monitor.robot_state import Inbox, RobotState

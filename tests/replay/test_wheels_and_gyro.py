@@ -16,10 +16,9 @@ from rosbags.typesys import Stores, get_typestore
 from calib import se3
 from calib.rig_file import read_rig
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.logs.joint_wheels import JOINT_STATE
 from drivers.logs.log_reader import LogReader
-from drivers.logs.ros_motion import IMU, ODOMETRY, parse_motion
-from drivers.logs.topic_choice import MotionTopics
+from drivers.logs.ros_messages import IMU, JOINT_STATE, ODOMETRY, parse_motion
+from drivers.logs.topics import MotionTopics
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.config import load_config
 from omnid.errors import OmnidError

@@ -1,19 +1,28 @@
-"""Small bags of ROS 2 (SQLite) and ROS 1 for the tests, written by rosbags."""
+"""Small logs in all other formats for the tests: bags of ROS 2 (SQLite) and ROS 1, written by rosbags, and folders."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import cv2
+import zstandard
+from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from tests.drivers.logs.mcap_logs import STORE, Entry
+from tests.drivers.logs.mcap_logs import LOWER, STORE, Entry, write_log
 
 ROS1: Any = get_typestore(Stores.ROS1_NOETIC)
+PAGE_BYTES, LEVELS = 4096, 6
+CHILDREN = 500  # of an interior page of SQLite: cells of 6 bytes and pointers of 2
 
 
 def write_db3(folder: Path, entries: Sequence[Entry], zstd: bool = False) -> Path:
@@ -28,6 +37,24 @@ def write_db3(folder: Path, entries: Sequence[Entry], zstd: bool = False) -> Pat
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, entry.data)
     return next(folder.glob("*.db3"))
+
+
+def write_killed_db3(folder: Path, entries: Sequence[Entry]) -> Path:
+    """Write the file that a recorder leaves when it is killed: all messages are in its write-ahead log."""
+    whole, killed = write_db3(folder, entries), folder / "killed"
+    killed.mkdir()
+    with closing(sqlite3.connect(whole)) as bag:
+        rows = bag.execute("SELECT * FROM messages").fetchall()
+        bag.execute("DELETE FROM messages")
+        bag.commit()
+        bag.execute("VACUUM")
+        bag.execute("PRAGMA journal_mode = WAL")
+        bag.execute("PRAGMA wal_autocheckpoint = 0")
+        bag.executemany("INSERT INTO messages VALUES (?, ?, ?, ?)", rows)
+        bag.commit()
+        for suffix in ("", "-wal"):
+            shutil.copy(f"{whole}{suffix}", f"{killed / whole.name}{suffix}")
+    return killed / whole.name
 
 
 def ros1_bytes(entry: Entry) -> bytes:
@@ -49,3 +76,68 @@ def write_bag(path: Path, entries: Sequence[Entry], compression: str = "") -> Pa
         for entry in entries:
             writer.write(connections[entry.topic], entry.log_time_ns, ros1_bytes(entry))
     return path
+
+
+def write_ros1_mcap(path: Path, entries: Sequence[Entry]) -> Path:
+    """Write an MCAP file as it is converted from a bag of ROS 1, with one message of an IMU."""
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("ros1", "test")
+        schema = writer.register_schema("sensor_msgs/CompressedImage", "ros1msg", b"")
+        imu = writer.register_channel("/imu", "ros1", writer.register_schema("sensor_msgs/Imu", "ros1msg", b""))
+        channels = {topic: writer.register_channel(topic, "ros1", schema) for topic in {e.topic for e in entries}}
+        for entry in entries:
+            writer.add_message(channels[entry.topic], entry.log_time_ns, ros1_bytes(entry), entry.log_time_ns)
+        rates = struct.pack("<IIII37d", 1, 100, 0, 0, *[0.0] * 13, 0.1, 0.2, 0.3, *[0.0] * 21)
+        writer.add_message(imu, entries[0].log_time_ns, rates, entries[0].log_time_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def write_zstd_mcap(path: Path, entries: Sequence[Entry]) -> Path:
+    """Write an MCAP file as `ros2 bag record -s mcap --compression-mode message` does: each message is compressed."""
+    compressed = [entry._replace(data=zstandard.compress(entry.data)) for entry in entries]
+    return write_log(path, compressed, chunk_size=700)
+
+
+def write_folders(top: Path, entries: Sequence[Entry], names: Callable[[int], str] = str, suffix: str = ".jpg") -> Path:
+    """Write a folder of images for each camera; names: file names of log times."""
+    for entry in entries:
+        folder = top / ("lower" if entry.topic == LOWER else "upper")
+        folder.mkdir(parents=True, exist_ok=True)
+        data = STORE.deserialize_cdr(entry.data, entry.type).data
+        if suffix != ".jpg":
+            data = cv2.imencode(suffix, cv2.imdecode(data, cv2.IMREAD_GRAYSCALE))[1]
+        (folder / f"{names(entry.log_time_ns)}{suffix}").write_bytes(data.tobytes())
+    return top
+
+
+def repeat_pages(path: Path) -> None:
+    """Make an SQLite bag whose interior pages name one leaf again and again: more rows than a disk holds.
+
+    The root of the messages becomes a tower of interior pages (SQLite file format, section 1.6) over the old one.
+    """
+    with closing(sqlite3.connect(path)) as bag:
+        bag.execute("VACUUM")
+        (root,) = bag.execute("SELECT rootpage FROM sqlite_master WHERE name = 'messages'").fetchone()
+        (size,) = bag.execute("PRAGMA page_size").fetchone()
+    assert size == PAGE_BYTES
+    data = bytearray(path.read_bytes())
+    child = len(data) // PAGE_BYTES + 1
+    data += data[(root - 1) * PAGE_BYTES : root * PAGE_BYTES]  # the old root
+    for _ in range(LEVELS - 1):
+        data += _interior(child)
+        child += 1
+    data[(root - 1) * PAGE_BYTES : root * PAGE_BYTES] = _interior(child)
+    data[28:32] = (len(data) // PAGE_BYTES).to_bytes(4, "big")  # pages in the header
+    path.write_bytes(data)
+
+
+def _interior(child: int) -> bytes:
+    """Return an interior page of a table, all of whose cells name one child."""
+    cell = struct.pack(">IB", child, 1)
+    cells = cell * CHILDREN
+    start = PAGE_BYTES - len(cells)
+    pointers = b"".join(struct.pack(">H", start + len(cell) * number) for number in range(CHILDREN))
+    head = struct.pack(">BHHHBI", 5, 0, CHILDREN, start, 0, child) + pointers
+    return head + bytes(start - len(head)) + cells

@@ -20,9 +20,7 @@ from mcap.reader import make_reader
 from drivers.errors import DriverError
 from drivers.logs.file_lock import is_locked
 from drivers.logs.log_folder import LogFolder, RotationSettings
-from drivers.logs.mcap_catalog import Catalog
-from drivers.logs.mcap_messages import DataSection
-from drivers.logs.mcap_records import LogFile
+from drivers.logs.mcap_file import McapFile
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLog
 from tests.drivers.logs.mcap_logs import COMPRESSED, LOWER, START_NS, image
@@ -223,7 +221,7 @@ def test_a_full_disk_stops_the_recording_until_there_is_room(small_disk: Path, b
     assert [level for level, _ in recording.events] == [logging.WARNING, logging.INFO]
     assert recording.events[1][1].endswith(f"; {recording.state.lost} messages were lost")
     whole = sum(counted(path) for path in recording.folder.glob("*.mcap"))
-    saved = len(list(DataSection(LogFile(recording.folder / recording.names()[0]), Catalog()).messages()))
+    saved = len(list(McapFile(recording.folder / recording.names()[0]).messages()))
     assert saved >= 25 and whole >= 50 and recording.state.stops == 1
     assert recording.state.messages == saved + whole + recording.state.lost
 
@@ -261,8 +259,8 @@ print(state.status, state.messages, state.lost, state.stops, len(recording.event
     status, *numbers = done.stdout.split()
     messages, lost, stops, reports, files = map(int, numbers)
     assert (status, messages, stops, reports, files) == ("stopped", 200, 1, 1, kept) and 170 <= lost <= 200
-    parts = [LogFile(path) for path in (tmp_path / "log").iterdir()]
-    assert sum(len(list(DataSection(part, Catalog()).messages())) for part in parts) == messages - lost
+    parts = [McapFile(path) for path in (tmp_path / "log").iterdir()]
+    assert sum(len(list(part.messages())) for part in parts) == messages - lost
 
 
 def test_detects_a_removed_folder_and_its_return(bench: Callable[..., Bench], tmp_path: Path) -> None:
@@ -316,7 +314,7 @@ def test_counts_the_persisted_messages_at_any_time(tmp_path: Path) -> None:
     with LogWriter(path, chunk_bytes=3000) as log:
         for n in range(100):
             log.write(*image(LOWER, START_NS + n * TICK_NS))
-            kept = len(list(DataSection(LogFile(path), Catalog()).messages()))
+            kept = len(list(McapFile(path).messages()))
             assert log.persisted == kept and log.messages == n + 1
         assert n - log.persisted < 15 and log.size_bytes == path.stat().st_size
         log.sync()

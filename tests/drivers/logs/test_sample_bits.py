@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.frame import gray
-from drivers.logs.ros_image import RosImage
+from drivers.logs.ros_messages import RosImage
 from drivers.logs.sample_bits import SampleBits
 
 

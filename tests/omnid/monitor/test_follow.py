@@ -17,7 +17,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from calib import se3
-from drivers.logs.mcap_records import MAGIC
+from drivers.logs.mcap_file import MAGIC
 from omnid.client import Robot
 from omnid.formats.tum import read_tum
 from omnid.monitor import follow

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.logs.mcap_info import read_log_info
 from drivers.logs.mcap_writer import LogWriter
+from drivers.logs.open_log import log_info
 from omnid.cli import main
 from omnid.errors import OmnidError
 from omnid.recordings.odometry_topic import choose_odometry_topic
@@ -59,7 +59,7 @@ def test_the_report_has_the_topic_of_the_rule(tmp_path: Path, capsys: pytest.Cap
 
 
 def test_a_robot_stands_for_its_topic(tmp_path: Path) -> None:
-    found = read_log_info(recording(tmp_path / "log.mcap", ("/rover/odom", "/site/digger/odom")))
+    found = log_info(recording(tmp_path / "log.mcap", ("/rover/odom", "/site/digger/odom")))
     assert choose_odometry_topic(found, robot="rover") == "/rover/odom"
     assert choose_odometry_topic(found, robot="site/digger") == "/site/digger/odom"
     with pytest.raises(OmnidError, match="'/crane/odom'"):

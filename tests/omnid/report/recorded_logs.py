@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
-from mcap.opcode import Opcode
+from mcap.reader import make_reader
 
 from calib import se3
-from drivers.logs.mcap_records import MAGIC, LogFile, records
 from drivers.logs.mcap_writer import LogWriter
 from omnid.transport import codec, map_codec
 from omnid.transport.records import DiagnosticStatus
@@ -84,10 +82,10 @@ def save(path: Path, entries: Iterable[Entry], attachments: dict[str, bytes] | N
 def corrupt_chunks(path: Path) -> None:
     """Change a byte in the second and the third chunk of a log; its index stays."""
     data = bytearray(path.read_bytes())
-    with closing(LogFile(path)) as file:
-        chunks = [record for record in records(file, len(MAGIC), file.size) if record.opcode == Opcode.CHUNK]
+    with path.open("rb") as file:
+        chunks = make_reader(file).get_summary().chunk_indexes  # type: ignore[union-attr]
     for chunk in chunks[1:3]:
-        data[chunk.offset + chunk.size - 20] ^= 0xFF
+        data[chunk.chunk_start_offset + chunk.chunk_length - 20] ^= 0xFF
     path.write_bytes(data)
 
 

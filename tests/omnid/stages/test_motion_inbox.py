@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from drivers.logs.ros_motion import parse_motion
+from drivers.logs.ros_messages import parse_motion
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.stages.motion_inbox import MotionInbox
 from omnid.transport.motion_codec import IMU_SCHEMA, gyro_cdr

@@ -7,7 +7,7 @@ import random
 import numpy as np
 import pytest
 
-from drivers.logs.joint_wheels import JointWheels
+from drivers.logs.ros_messages import JointWheels
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.transport.motion_codec import gyro_cdr, wheel_cdr
 from omnid.transport.sensor_receiver import SensorReceiver

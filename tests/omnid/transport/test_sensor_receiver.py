@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rosbags.typesys.stores import ros2_humble as ros
 
-from drivers.logs.joint_wheels import JointWheels
+from drivers.logs.ros_messages import JointWheels
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.transport.codec import header_message, message_cdr
 from omnid.transport.motion_codec import IMU_SCHEMA, JOINT_SCHEMA, gyro_cdr, wheel_cdr

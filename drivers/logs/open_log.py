@@ -1,11 +1,12 @@
-"""Choice of the reader for a log, by its first bytes or by what its folder contains."""
+"""Choice of the reader for a log, by its first bytes or by what its folder contains; the contents of any log."""
 
 from __future__ import annotations
 
 import os
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Final
 
@@ -13,9 +14,8 @@ from drivers.errors import DriverError
 from drivers.logs import ros1_bag, sqlite_bag
 from drivers.logs.file_lock import is_locked
 from drivers.logs.image_folder import ImageFolder, image_folders
-from drivers.logs.image_log import ImageLog, LogDamage, LoggedImage, LoggedMotion, images_of
-from drivers.logs.mcap_image_log import McapImageLog
-from drivers.logs.mcap_info import LogInfo, LogState, read_log_info
+from drivers.logs.log import Log, LogDamage, LoggedMessage, LogInfo, LogState
+from drivers.logs.mcap_file import McapFile
 from drivers.logs.ros1_bag import Ros1Bag
 from drivers.logs.sqlite_bag import SqliteBag
 
@@ -27,35 +27,44 @@ _PART: Final = re.compile(r"(.+?)(_\d{8}T\d{6}Z|_\d{4}(?:-\d{2}){5})?_(\d{1,9})(
 _WHOLE_OR_CUT: Final = (*LOG_SUFFIXES, ".mcap.part")  # A recording has the latter until it is complete.
 
 
-def open_image_log(path: str | os.PathLike[str]) -> ImageLog:
-    """Open a log of images. Raise DriverError, which names the supported kinds, for anything else.
+def open_log(path: str | os.PathLike[str], rate_hz: float = 0.0) -> Log:
+    """Open a log. Raise DriverError, which names the supported kinds, for anything else.
 
     path: an MCAP file, an SQLite bag of ROS 2 (.db3), a bag of ROS 1 (.bag), a folder with one of these or with the
-    parts of one, or a folder with a folder of images for each camera (see `ImageFolder`).
+    parts of one, or a folder with a folder of images for each camera. rate_hz: see `ImageFolder`.
     """
     given = Path(path)
-    return _open_folder(given) if given.is_dir() else _open_file(given)
+    return _open_folder(given, rate_hz) if given.is_dir() else _open_file(given)
 
 
 def log_info(path: str | os.PathLike[str]) -> LogInfo:
-    """Return the contents of a log of any format; all but MCAP are read to the end. Raise DriverError without a log.
+    """Return the contents of a log of any format; one without an index is read to its end.
 
-    The time of the others is that of their images.
+    Raise DriverError without a log.
     """
-    log = open_image_log(path)
-    try:
-        if isinstance(log, McapImageLog):
-            return read_log_info(path)
-        times_ns = [(image.topic, image.log_time_ns) for image in images_of(log)]
-        counts = log.counts() or Counter(topic for topic, _ in times_ns)
-        topics = {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())}
-        damage, size_bytes = log.damage(), _size_bytes(Path(path))
-        state = LogState.BROKEN if damage.cut or damage.broken else LogState.WHOLE
-        span_ns = (min(t for _, t in times_ns), max(t for _, t in times_ns)) if times_ns else None
-        attachments = {name: len(data) for name, data in log.attachments().items()}
-        return LogInfo(Path(path), size_bytes, state, size_bytes, damage.broken, topics, span_ns, attachments)
-    finally:
-        log.close()
+    locked = is_locked(path)  # before it is read: the writer may end in the meantime
+    with closing(open_log(path)) as log:
+        counts, span_ns = log.counts(), log.span_ns()
+        is_indexed = counts is not None
+        if counts is None or log.damage().cut:
+            counts, span_ns = Counter[str](), None
+            for message in log.messages():
+                counts[message.topic] += 1
+                first_ns, last_ns = span_ns or (message.log_time_ns, message.log_time_ns)
+                span_ns = min(first_ns, message.log_time_ns), max(last_ns, message.log_time_ns)
+        broken, cut, readable_bytes = log.damage()
+        state = LogState.BROKEN if cut or broken else LogState.WHOLE if is_indexed else LogState.UNINDEXED
+        size_bytes = _size_bytes(Path(path))
+        return LogInfo(
+            Path(path),
+            size_bytes,
+            LogState.WRITTEN if locked else state,
+            size_bytes if readable_bytes is None else readable_bytes,
+            broken,
+            {name: (kind, counts.get(name, 0)) for name, kind in sorted(log.topics().items())},
+            span_ns,
+            {name: len(data) for name, data in log.attachments().items()},
+        )
 
 
 def _size_bytes(path: Path) -> int:
@@ -63,21 +72,20 @@ def _size_bytes(path: Path) -> int:
     return sum(file.stat().st_size for file in files if file.is_file())
 
 
-def _open_file(path: Path) -> ImageLog:
+def _open_file(path: Path) -> Log:
     try:
-        if path.is_file():
-            with path.open("rb") as file:
-                start = file.read(max(len(sqlite_bag.MAGIC), len(ros1_bag.MAGIC)))
-            if start.startswith(sqlite_bag.MAGIC):
-                return SqliteBag(path)
-            if start.startswith(ros1_bag.MAGIC):
-                return Ros1Bag(path)
+        if path.exists() and not path.is_file():
+            raise DriverError(f"cannot read the log {str(path)!r}: it is no regular file; give a log of {LOG_SUFFIXES}")
+        with path.open("rb") as file:
+            start = file.read(max(len(sqlite_bag.MAGIC), len(ros1_bag.MAGIC)))
     except OSError as error:
         raise DriverError(f"cannot read the log {str(path)!r}: {error.strerror}") from error
-    return McapImageLog(path)
+    if start.startswith(sqlite_bag.MAGIC):
+        return SqliteBag(path)
+    return Ros1Bag(path) if start.startswith(ros1_bag.MAGIC) else McapFile(path)
 
 
-def _open_folder(path: Path) -> ImageLog:
+def _open_folder(path: Path, rate_hz: float) -> Log:
     try:
         logs = logs_in(path)
     except OSError as error:
@@ -87,7 +95,7 @@ def _open_folder(path: Path) -> ImageLog:
     if parts := parts_in_order(logs):
         return _open_parts(path, parts)
     if not logs and (folders := image_folders(path)):
-        return ImageFolder(path, folders)
+        return ImageFolder(path, folders, rate_hz)
     names = ", ".join(log.name for log in logs[:_MAX_LISTED]) or "none"
     raise DriverError(
         f"{str(path)!r} must contain one log ({' '.join(LOG_SUFFIXES)}), the numbered parts of one, or a "
@@ -98,7 +106,7 @@ def _open_folder(path: Path) -> ImageLog:
 def logs_in(folder: Path) -> list[Path]:
     """Return the logs in a folder by their names. Raise OSError where it is unreadable.
 
-    A recording that was cut is one of them, unless it was recovered, or is being written.
+    A recording that was cut is one of them, unless it was completed, or is being written.
     """
     found = sorted(file for file in folder.iterdir() if file.name.endswith(_WHOLE_OR_CUT) and file.is_file())
     return [
@@ -121,24 +129,19 @@ def parts_in_order(logs: list[Path]) -> list[Path]:
     return [log for _, _, log in numbered] if len(names) == 1 and follows and times == sorted(times) else []
 
 
-def _open_parts(path: Path, parts: list[Path]) -> ImageLog:
+def _open_parts(path: Path, parts: list[Path]) -> Log:
     if len(parts) > MAX_PARTS:
         raise DriverError(f"{str(path)!r} contains {len(parts)} parts of a log; at most {MAX_PARTS} can be read as one")
-    opened: list[ImageLog] = []
-    try:
-        for part in parts:
-            opened.append(_open_file(part))
-    except DriverError:
-        for log in opened:
-            log.close()
-        raise
-    return SplitLog(str(path), opened)
+    with ExitStack() as opened:
+        logs = [opened.enter_context(closing(_open_file(part))) for part in parts]
+        opened.pop_all()
+    return SplitLog(str(path), logs)
 
 
 class SplitLog:
-    """An ImageLog of parts, which it closes."""
+    """A Log of parts, which it closes."""
 
-    def __init__(self, name: str, parts: Sequence[ImageLog]) -> None:
+    def __init__(self, name: str, parts: Sequence[Log]) -> None:
         """parts: in the order of time."""
         self.name = name
         self._parts = parts
@@ -153,18 +156,18 @@ class SplitLog:
 
     def counts(self) -> Mapping[str, int] | None:
         """Return the number of messages of each topic; None where a part does not state it."""
-        total = Counter[str]()
-        for part in self._parts:
-            counts = part.counts()
-            if counts is None:
-                return None
-            total.update(counts)
-        return total
+        counts = [part.counts() for part in self._parts]
+        return None if None in counts else sum((Counter(found) for found in counts if found), Counter[str]())
 
-    def messages(self) -> Iterator[LoggedImage | LoggedMotion]:
+    def span_ns(self) -> tuple[int, int] | None:
+        """Return the first and last log time of the parts that have messages."""
+        spans = [span_ns for part in self._parts if (span_ns := part.span_ns()) is not None]
+        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[LoggedMessage]:
         """Yield the messages of one part after the other."""
         for part in self._parts:
-            yield from part.messages()
+            yield from part.messages(topics)
 
     def attachments(self) -> dict[str, bytes]:
         """Return the attachments of the first part that has some."""

@@ -8,9 +8,7 @@ from typing import NamedTuple
 
 from drivers.errors import DriverError
 from drivers.frame import CAMERAS, Camera
-from drivers.logs.joint_wheels import JOINT_STATE, JointWheels
-from drivers.logs.ros_image import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES
-from drivers.logs.ros_motion import IMU, ODOMETRY
+from drivers.logs.ros_messages import COMPRESSED_IMAGE, IMAGE, IMAGE_TYPES, IMU, JOINT_STATE, ODOMETRY, JointWheels
 
 _WORDS: dict[str, Camera] = {
     "lower": "lower",

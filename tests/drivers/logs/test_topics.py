@@ -7,9 +7,9 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.frame import Camera
-from drivers.logs.joint_wheels import JointWheels
 from drivers.logs.log_reader import LogReader
-from drivers.logs.topic_choice import MotionTopics, choose_motion_topics, choose_topics
+from drivers.logs.ros_messages import JointWheels
+from drivers.logs.topics import MotionTopics, choose_motion_topics, choose_topics
 from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, IMAGE, START_NS, Entry, pairs, text, write_log
 
 CHATTER = Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)

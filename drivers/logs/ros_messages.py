@@ -1,0 +1,204 @@
+"""Images, wheels and gyros in the messages of ROS 2 (CDR) and ROS 1.
+
+Images are nearly all of a log, so they are decoded here without a copy: the members of a message follow each other, in
+CDR (OMG, RTPS 2.2, 10.2) after a header of 4 bytes and each number aligned to its own size, in ROS 1 little-endian and
+without both. The small messages of wheels and gyros are decoded by rosbags.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, NamedTuple
+
+from rosbags.typesys import Stores, get_typestore
+
+from drivers.errors import FrameDecodeError
+from drivers.frame import Camera, Frame
+from drivers.motion import GyroSample, MotionSample, WheelSample
+
+IMAGE: Final = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE: Final = "sensor_msgs/msg/CompressedImage"
+IMAGE_TYPES: Final = (IMAGE, COMPRESSED_IMAGE)
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
+IMU: Final = "sensor_msgs/msg/Imu"
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+MOTION_TYPES: Final = (ODOMETRY, IMU, JOINT_STATE)
+BASE_FRAME: Final = "base_link"  # Frame of messages whose axes are those of the base (REP 105), as omnid records them.
+NOT_MEASURED: Final = -1.0  # first number of the covariance of what an IMU does not measure (sensor_msgs/msg/Imu)
+
+# cv_bridge's names for images without declared colours, in OpenCV's order bgr, and image_encodings.hpp's names of YUV
+_SYNONYMS: Final = {
+    "8UC1": "mono8",
+    "8UC3": "bgr8",
+    "8UC4": "bgra8",
+    "16UC1": "mono16",
+    "yuv422_yuy2": "yuyv",
+    "yuv422": "uyvy",
+}
+_MAGIC: Final = {b"\xff\xd8\xff": "jpeg", b"\x89PN": "png"}
+_CDR_HEADER_BYTES: Final = 4
+_MAX_TEXT: Final = 256  # bytes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RosImage:
+    """One image message; the fields after data are 0 for compressed images."""
+
+    stamp_ns: int  # stamp of the header, 0 if unset
+    encoding: str  # as in drivers.frame.Frame
+    data: memoryview
+    width: int = 0  # px
+    height: int = 0  # px
+    step: int = 0  # bytes from row to row
+    bigendian: bool = False
+
+    def frame(self, camera: Camera = "lower", seq: int = 0) -> Frame:
+        """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters."""
+        layout = self.width, self.height, self.step, self.bigendian
+        return Frame(seq, self.stamp_ns, camera, self.encoding, self.data, *layout)
+
+
+def parse_image(kind: str, message: memoryview, *, aligned: bool = True) -> RosImage:
+    """Return the image in a message of type IMAGE or COMPRESSED_IMAGE; raise FrameDecodeError where it is invalid.
+
+    aligned: True for CDR (ROS 2), False for the serialisation of ROS 1.
+    """
+    try:
+        members = _Members(message, aligned)
+        if not aligned:
+            members.number("I")  # the sequence number that a header has in ROS 1
+        stamp_ns = _stamp_ns(members.number("i"), members.number("I"))
+        members.text()  # the frame: the topic identifies the camera
+        if kind == IMAGE:
+            height, width, encoding = members.number("I"), members.number("I"), members.text()
+            bigendian, step = bool(members.number("B")), members.number("I")
+            encoding = _SYNONYMS.get(encoding, encoding)
+            return RosImage(stamp_ns, encoding, members.octets(), width, height, step, bigendian)
+        encoding, data = members.text(), members.octets()
+    except struct.error as error:
+        raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated") from error
+    # The first bytes decide the encoding, else the format, which is free text such as 'bgr8; jpeg compressed bgr8'.
+    encoding = next((name for name, part in (("jpeg", "jp"), ("png", "png")) if part in encoding.lower()), encoding)
+    return RosImage(stamp_ns, image_encoding(data, encoding), data)
+
+
+def image_encoding(data: memoryview | bytes, otherwise: str = "") -> str:
+    """Return jpeg or png by the first bytes of an image file, `otherwise` where it is neither."""
+    return _MAGIC.get(bytes(data[:3]), otherwise)
+
+
+class JointWheels(NamedTuple):
+    """The joints of the driven wheels in a JointState, and the geometry of the base."""
+
+    left: str
+    right: str
+    radius_m: float
+    track_m: float
+
+    def rates(self, velocities_radps: Mapping[str, float]) -> tuple[float, ...]:
+        """Return forward velocity [m/s] and yaw rate [rad/s] from velocities by joint; empty where neither is named.
+
+        Raise FrameDecodeError where one is missing or not finite.
+        """
+        if self.left not in velocities_radps and self.right not in velocities_radps:
+            return ()  # other joints have messages of their own
+        left, right = (self.radius_m * velocities_radps.get(name, math.nan) for name in (self.left, self.right))
+        if not (math.isfinite(left) and math.isfinite(right)):
+            raise FrameDecodeError(f"a {JOINT_STATE} has no velocity of {self.left} or of {self.right}")
+        return (left + right) / 2, (right - left) / self.track_m
+
+
+class MotionReading(NamedTuple):
+    """Rates in one message: forward velocity and yaw rate of wheels, or three angular velocities of an IMU."""
+
+    stamp_ns: int  # stamp of the header, 0 if unset
+    rates: tuple[float, ...]  # m/s and rad/s; empty: it is of other joints
+    frame: str = ""  # frame of the header
+
+    def sample(self, log_time_ns: int) -> MotionSample:
+        """Return the sample; log_time_ns: its stamp where the header has none."""
+        stamp_ns = self.stamp_ns or log_time_ns
+        if len(self.rates) == 2:
+            return WheelSample(stamp_ns, *self.rates)
+        x, y, z = self.rates
+        return GyroSample(stamp_ns, x, y, z, of_base=self.frame == BASE_FRAME)
+
+
+def parse_motion(
+    kind: str, message: memoryview, *, aligned: bool = True, joints: JointWheels | None = None
+) -> MotionReading:
+    """Return the rates in a message of type ODOMETRY, IMU or JOINT_STATE; raise FrameDecodeError where it is invalid.
+
+    aligned: True for CDR (ROS 2), False for the serialisation of ROS 1. joints: the wheels in a JOINT_STATE.
+    """
+    found = _decoded(kind, message, aligned)
+    stamp_ns, frame = _stamp_ns(found.header.stamp.sec, found.header.stamp.nanosec), found.header.frame_id
+    if kind == JOINT_STATE:
+        velocities = dict.fromkeys(found.name, math.nan) | dict(zip(found.name, found.velocity.tolist(), strict=False))
+        return MotionReading(stamp_ns, joints.rates(velocities) if joints is not None else (), frame)
+    if kind == ODOMETRY:
+        rates: tuple[float, ...] = found.twist.twist.linear.x, found.twist.twist.angular.z
+    else:
+        rates = found.angular_velocity.x, found.angular_velocity.y, found.angular_velocity.z
+        if found.angular_velocity_covariance[0] == NOT_MEASURED:
+            raise FrameDecodeError(f"a {IMU} has no angular velocity: its covariance begins with -1")
+    must_be_known = rates[:1] if kind == ODOMETRY else rates  # wheels may not report their turn
+    if not all(map(math.isfinite, must_be_known)) or any(map(math.isinf, rates)):
+        raise FrameDecodeError(f"a {kind} has rates that are not finite")
+    return MotionReading(stamp_ns, rates, frame)
+
+
+def _decoded(kind: str, message: memoryview, aligned: bool) -> Any:
+    """Return a message as rosbags decodes it; raise FrameDecodeError for other bytes."""
+    store = _typestore(Stores.ROS2_HUMBLE if aligned else Stores.ROS1_NOETIC)
+    try:
+        return store.deserialize_cdr(message, kind) if aligned else store.deserialize_ros1(message, kind)
+    except Exception as error:  # of any kind, as it trusts the lengths in the bytes
+        raise FrameDecodeError(f"a {kind} of {len(message)} bytes is truncated or invalid") from error
+
+
+_typestore = cache(get_typestore)
+
+
+def _stamp_ns(seconds: int, nanoseconds: int) -> int:
+    if seconds < 0 or nanoseconds >= 10**9:
+        raise FrameDecodeError(f"a message has the invalid stamp {seconds} s {nanoseconds} ns")
+    return seconds * 10**9 + nanoseconds
+
+
+class _Members:
+    """Reads the members of a message in order; raises struct.error at the end of the bytes."""
+
+    def __init__(self, message: memoryview, aligned: bool) -> None:
+        """Raise FrameDecodeError where a message has no CDR header."""
+        self._order, self._body, self._aligned, self._offset = "<", message, aligned, 0
+        if aligned:
+            head = bytes(message[:_CDR_HEADER_BYTES])
+            if head[:2] not in (b"\0\0", b"\0\1") or len(head) < _CDR_HEADER_BYTES:
+                raise FrameDecodeError(f"a message starts with {head.hex()}, not with a CDR header")
+            self._order, self._body = "<" if head[1] else ">", message[_CDR_HEADER_BYTES:]
+
+    def number(self, code: str) -> int:
+        """Return a number; code: its format in struct."""
+        size = struct.calcsize("=" + code)
+        self._offset += -self._offset % size if self._aligned else 0
+        value: int = struct.unpack_from(self._order + code, self._body, self._offset)[0]
+        self._offset += size
+        return value
+
+    def octets(self) -> memoryview:
+        """Return a view of a sequence of bytes, which starts with its length."""
+        size = self.number("I")
+        block = self._body[self._offset : self._offset + size]
+        if len(block) < size:
+            raise struct.error(f"{size} bytes expected, {len(block)} found")
+        self._offset += size
+        return block
+
+    def text(self) -> str:
+        """Return a string, truncated to 256 bytes."""
+        return bytes(self.octets()[:_MAX_TEXT]).rstrip(b"\0").decode("utf-8", "replace")

@@ -1,0 +1,382 @@
+"""The same content reads alike in every format: frames, order of time, contents; parts, damage and hostile files."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import random
+import sqlite3
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from mcap.writer import CompressionType
+
+from drivers.errors import DriverError
+from drivers.frame import Frame
+from drivers.logs.log import LogInfo, LogState
+from drivers.logs.log_reader import LogReader
+from drivers.logs.mcap_file import MAGIC
+from drivers.logs.open_log import log_info, logs_in, open_log
+from drivers.logs.topics import MotionTopics
+from drivers.motion import GyroSample
+from tests.drivers.logs.bags import (
+    repeat_pages,
+    write_bag,
+    write_db3,
+    write_folders,
+    write_killed_db3,
+    write_ros1_mcap,
+    write_zstd_mcap,
+)
+from tests.drivers.logs.mcap_logs import BARE, COMPRESSED, LOWER, START_NS, UPPER, Entry, jpeg, pairs, text, write_log
+
+PAIRS = 12
+Contents = list[tuple[str, int, int, bytes]]
+Write = Callable[[Path, Sequence[Entry]], Path]
+
+
+def mcap(**options: Any) -> Write:
+    return lambda folder, entries: write_log(folder / "log.mcap", entries, [("rig.toml", b"version = 1")], **options)
+
+
+SMALL: Final = {"chunk_size": 700}
+# Format -> a function that writes entries to a folder and returns the path to open.
+FORMATS: Final[dict[str, Write]] = {
+    "mcap": mcap(),
+    "mcap, lz4": mcap(compression=CompressionType.LZ4, **SMALL),
+    "mcap, zstd": mcap(compression=CompressionType.ZSTD, **SMALL),
+    "mcap, small chunks": mcap(**SMALL),
+    "mcap without chunks": mcap(use_chunking=False),
+    "mcap without index": mcap(**(BARE | SMALL)),
+    "mcap without both": mcap(**(BARE | {"use_chunking": False})),
+    "mcap, compressed messages": lambda folder, entries: write_zstd_mcap(folder / "log.mcap", entries),
+    "mcap of ROS 1": lambda folder, entries: write_ros1_mcap(folder / "log.mcap", entries),
+    "db3": lambda folder, entries: write_db3(folder / "bag", entries).parent,
+    "db3 without metadata": lambda folder, entries: write_db3(folder / "bag", entries).rename(folder / "log.db3"),
+    "db3, compressed messages": lambda folder, entries: write_db3(folder / "bag", entries, zstd=True),
+    "db3 of a killed recorder": lambda folder, entries: write_killed_db3(folder / "bag", entries),
+    "bag": lambda folder, entries: write_bag(folder / "log.bag", entries),
+    "bag, bz2": lambda folder, entries: write_bag(folder / "log.bag", entries, "BZ2"),
+    "bag, lz4": lambda folder, entries: write_bag(folder / "log.bag", entries, "LZ4"),
+    "folder": lambda folder, entries: write_folders(folder / "images", entries),
+}
+MCAP_LAYOUTS: Final = [name for name in FORMATS if name.startswith("mcap") and name not in ("mcap", "mcap of ROS 1")]
+WITHOUT_INDEX: Final = ("mcap without index", "mcap without both")
+
+
+def contents(frames: Sequence[Frame]) -> Contents:
+    return [(frame.camera, frame.seq, frame.stamp_ns, bytes(frame.data)) for frame in frames]
+
+
+def expected(count: int) -> Contents:
+    """Return what is read of the pairs of images."""
+    stamps = [START_NS + number * 10**8 for number in range(count)]
+    cameras = (("lower", 0), ("upper", 10**6))
+    return [(c, n, s + late, jpeg(s // 10**8)) for n, s in enumerate(stamps) for c, late in cameras]
+
+
+def read(path: Path, **options: Any) -> tuple[Contents, LogReader]:
+    with closing(LogReader(path, **options)) as reader:
+        return contents(list(reader.frames())), reader
+
+
+def survivors(path: Path) -> tuple[Contents, LogReader] | None:
+    """Return the frames and the reader of a log that may be damaged, None where it is refused in one line."""
+    try:
+        with closing(LogReader(path)) as reader:
+            reader.attachments()
+            reader.pair_estimate()
+            return contents(list(reader.frames())), reader
+    except DriverError as error:
+        assert str(error) and str(error).isprintable()
+        return None
+
+
+# Whole logs
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_frames_and_contents_are_the_same_in_every_format(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path, pairs(PAIRS))
+    found, reader = read(path)
+    assert found == expected(PAIRS)
+    assert not reader.warnings and not reader.truncated and reader.counts["lower"] == PAIRS
+    with closing(LogReader(path)) as again:
+        assert again.pair_estimate() == (None if name in WITHOUT_INDEX else PAIRS)
+        assert contents(list(again.frames())) == contents(list(again.frames())) == found
+    info: LogInfo = log_info(path)
+    images = {topic: entry for topic, entry in info.topics.items() if topic != "/imu"}
+    assert [*images.values()] == [(COMPRESSED, PAIRS)] * 2
+    assert info.span_ns == (START_NS, START_NS + (PAIRS - 1) * 10**8 + 10**6)
+    assert info.state is (LogState.UNINDEXED if name in WITHOUT_INDEX else LogState.WHOLE)
+    assert info.size_bytes > 1000 and info.broken == 0 and info.readable_bytes <= info.size_bytes
+
+
+@pytest.mark.parametrize("order", ["camera by camera", "backwards", "shuffled"])
+@pytest.mark.parametrize("name", [name for name in FORMATS if name != "folder"])
+def test_a_log_is_read_in_the_order_of_time_however_it_was_written(tmp_path: Path, name: str, order: str) -> None:
+    """As by a writer that put all images of one camera first: 60 pairs, more than the window sorts."""
+    entries = pairs(60)
+    if order == "camera by camera":
+        entries.sort(key=lambda entry: entry.topic)
+    elif order == "backwards":
+        entries.reverse()
+    else:
+        random.Random(4).shuffle(entries)
+    found, reader = read(FORMATS[name](tmp_path, entries), window=4)
+    assert found == expected(60) and not reader.warnings
+
+
+def test_an_mcap_of_ros1_has_the_samples_of_its_imu(tmp_path: Path) -> None:
+    path = write_ros1_mcap(tmp_path / "log.mcap", pairs(2))
+    with closing(LogReader(path, motion=MotionTopics(imu="/imu"))) as reader:
+        samples = [message for message in reader.messages() if not isinstance(message, Frame)]
+    assert samples == [GyroSample(100 * 10**9, 0.1, 0.2, 0.3)]
+
+
+def test_a_log_that_is_written_says_so(tmp_path: Path) -> None:
+    path = write_log(tmp_path / "log.mcap", pairs(2))
+    with path.open("rb") as file:
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
+        assert log_info(path).state is LogState.WRITTEN
+    assert log_info(path).state is LogState.WHOLE
+
+
+def test_a_growing_database_is_read_as_far_as_it_is_written(tmp_path: Path) -> None:
+    path = write_db3(tmp_path / "bag", pairs(2))
+    with closing(sqlite3.connect(path)) as writer, closing(open_log(path)) as log:
+        writer.execute("PRAGMA journal_mode = WAL")
+        rows = writer.execute("SELECT topic_id, timestamp, data FROM messages").fetchall()
+        for _ in range(200):
+            writer.executemany("INSERT INTO messages (topic_id, timestamp, data) VALUES (?, ?, ?)", rows)
+        writer.commit()
+        assert len(list(log.messages())) == 4 * 201 and not log.damage().cut
+
+
+# Folders and parts
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "db3", "bag"])
+def test_the_parts_of_a_split_log_are_read_as_one(tmp_path: Path, suffix: str) -> None:
+    folder, entries = tmp_path / "split", pairs(3 * 11)
+    folder.mkdir()
+    for part in range(11):  # more than ten: 10 follows 9, not 1
+        some = entries[6 * part : 6 * part + 6]
+        path = folder / f"bag_{part}.{suffix}"
+        if suffix == "mcap":
+            write_log(path, some)
+        elif suffix == "bag":
+            write_bag(path, some)
+        else:
+            write_db3(tmp_path / f"part{part}", some).rename(path)
+    found, reader = read(folder)
+    assert found == expected(33) and not reader.warnings
+    assert log_info(folder).messages == 66 and log_info(folder).state is LogState.WHOLE
+    (folder / f"bag_5.{suffix}").unlink()
+    with pytest.raises(DriverError, match=rf"bag_0\.{suffix}, bag_1\.{suffix}.* give one file"):
+        LogReader(folder)
+
+
+def test_omnids_own_recordings_of_one_run_are_parts(tmp_path: Path) -> None:
+    """The last one was cut; one that is being written, or was completed since, is not read, or not twice."""
+    entries = pairs(6)
+    first = write_log(tmp_path / "omnid_20261122T050000Z_001.mcap", entries[:4], [("rig.toml", b"one")])
+    last = write_log(tmp_path / "omnid_20261122T051000Z_002.mcap.part", entries[4:], [("rig.toml", b"two")])
+    last.write_bytes(last.read_bytes()[:-500])
+    found, reader = read(tmp_path)
+    assert len(found) > 4 and reader.truncated and "_002.mcap.part" in reader.warnings[0]
+    assert log_info(tmp_path).state is LogState.BROKEN
+    with closing(LogReader(tmp_path)) as again:
+        assert again.attachments() == {"rig.toml": b"one"}
+    with last.open("rb") as writer:
+        fcntl.flock(writer.fileno(), fcntl.LOCK_EX)
+        assert logs_in(tmp_path) == [first]
+    write_log(last.with_suffix(""), entries[4:])
+    assert len(logs_in(tmp_path)) == 2 and read(tmp_path)[0] == expected(6)
+
+
+def test_recordings_of_two_runs_are_not_one_log(tmp_path: Path) -> None:
+    """Of the first run the oldest files are gone, by the limit of their number."""
+    write_log(tmp_path / "omnid_20260202T023000Z_002.mcap", pairs(2))
+    write_log(tmp_path / "omnid_20260203T023000Z_001.mcap", pairs(2))
+    with pytest.raises(DriverError, match="give one file"):
+        LogReader(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "it is empty"),
+        (MAGIC[:5], "starts with"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(50), r"starts with b'\\x89PNG"),
+        (b"SQLite format 3\0" + bytes(50), "file is not a database"),
+        (b"#ROSBAG V2.0\n" + bytes(50), "`rosbag reindex`"),
+        (b"\x28\xb5\x2f\xfd" + bytes(50), "zstd -d"),
+        (b"\x1f\x8b" + bytes(50), "gzip -d"),
+        (b"PK\x03\x04" + bytes(50), "unzip"),
+        (MAGIC, "`omnid log info`"),
+    ],
+)
+def test_refuses_other_files_in_one_line(tmp_path: Path, data: bytes, message: str) -> None:
+    path = tmp_path / "log.mcap"
+    path.write_bytes(data)
+    with pytest.raises(DriverError, match=message) as caught:
+        LogReader(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_refuses_unreadable_paths(tmp_path: Path) -> None:
+    with pytest.raises(DriverError, match="No such file"):
+        LogReader(tmp_path / "nowhere.mcap")
+    with pytest.raises(DriverError, match="none"):
+        LogReader(tmp_path)
+    (tmp_path / "bag_0.db3").touch()
+    with pytest.raises(DriverError, match="it is empty"):
+        LogReader(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(DriverError, match="no regular file"):
+        LogReader(tmp_path / "pipe")
+
+
+# Damage
+
+
+@pytest.mark.parametrize("name", MCAP_LAYOUTS)
+@pytest.mark.parametrize("step", [7, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_truncated_mcap_gives_the_frames_before(tmp_path: Path, step: int, name: str) -> None:
+    """Cut at every seventh byte: lengths and numbers of records have 2, 4 or 8 bytes."""
+    path = FORMATS[name](tmp_path, pairs(2))
+    counts = []
+    for size in reversed(range(0, path.stat().st_size, step)):
+        os.truncate(path, size)
+        found = survivors(path)
+        if found is not None:
+            frames, reader = found
+            assert frames == expected(2)[: len(frames)]
+            assert reader.truncated and "cut or corrupt after byte" in reader.warnings[0]
+        counts.append(0 if found is None else len(found[0]))
+    assert counts == sorted(counts, reverse=True) and set(counts) >= {0, 2, 4}
+
+
+def test_a_cut_mcap_that_was_written_topic_by_topic_is_read_in_the_order_of_time(tmp_path: Path) -> None:
+    entries = sorted(pairs(60), key=lambda entry: entry.topic)
+    path = write_log(tmp_path / "log.mcap", entries, **SMALL)
+    os.truncate(path, path.stat().st_size - 100)  # its index is gone
+    found, reader = read(path, window=4)
+    assert found == expected(60) and reader.truncated
+
+
+def mutated(data: bytes, chance: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(chance.randint(1, 12)):
+        at = chance.randrange(len(changed))
+        changed[at : at + 1] = chance.choice([bytes([chance.randrange(256)]), b"", b"\xff" * 4, bytes(8)])
+        changed = changed or bytearray(b"x")
+    return bytes(changed[: chance.randint(1, len(changed))]) if chance.random() < 0.2 else bytes(changed)
+
+
+@pytest.mark.parametrize("name", [*MCAP_LAYOUTS, "db3 without metadata", "bag, lz4"])
+def test_damaged_logs_give_frames_or_one_line(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path, pairs(4))
+    whole, chance = path.read_bytes(), random.Random(5)
+    refused = complete = 0
+    for _ in range(150):
+        path.write_bytes(mutated(whole, chance))
+        found = survivors(path)
+        refused += found is None
+        complete += found is not None and len(found[0]) == 8
+    assert refused and (complete or name.startswith("mcap"))
+
+
+@pytest.mark.parametrize("name", MCAP_LAYOUTS)
+def test_flipped_bits_change_no_frame_of_a_chunk(tmp_path: Path, name: str) -> None:
+    path = FORMATS[name](tmp_path, pairs(2))
+    whole, chance, readable = path.read_bytes(), random.Random(5), 0
+    for _ in range(300):
+        data = bytearray(whole)
+        for _ in range(chance.choice((1, 1, 1, 4))):
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+        path.write_bytes(data)
+        found = survivors(path)
+        readable += found is not None
+        if found is not None and "without chunks" not in name and "without both" not in name:
+            images = {(camera, stamp_ns, data) for camera, _, stamp_ns, data in expected(2)}
+            assert {(camera, stamp_ns, data) for camera, _, stamp_ns, data in found[0]} <= images
+    assert readable > 30
+
+
+def test_a_cut_or_unclosed_ros1_bag_is_refused_with_advice(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "log.bag", pairs(PAIRS))
+    path.write_bytes(path.read_bytes()[:-3000])
+    with pytest.raises(DriverError, match="`rosbag reindex` mends it"):
+        LogReader(path)
+
+
+def test_a_corrupt_chunk_ends_a_ros1_bag(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "log.bag", pairs(1), "BZ2")
+    path.write_bytes(path.read_bytes().replace(b"BZh9", b"BZh0"))
+    found, reader = read(path)
+    assert found == [] and reader.truncated and "corrupt after 0 messages" in reader.warnings[0]
+
+
+@pytest.mark.parametrize("part", [0.5, 0.8])
+def test_a_cut_database_is_read_up_to_its_end(tmp_path: Path, part: float) -> None:
+    path = write_db3(tmp_path / "bag", pairs(60))
+    os.truncate(path, int(part * path.stat().st_size))
+    found = survivors(path)
+    assert found is not None
+    assert 0 < len(found[0]) < 120 and found[1].truncated and "cut or corrupt" in found[1].warnings[0]
+    assert log_info(path).state is LogState.BROKEN
+
+
+SQL_OF_OTHER_TABLES: Final = {
+    "no bag": ["DROP TABLE messages"],
+    "columns in another order": [
+        "DROP TABLE messages",
+        "CREATE TABLE messages (data, topic_id, timestamp, id INTEGER PRIMARY KEY)",
+    ],
+    "a computed column": [
+        "DROP TABLE messages",
+        "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id AS (1), timestamp, data)",
+    ],
+    "an endless view": [
+        "DROP TABLE messages",
+        "CREATE VIEW messages AS WITH RECURSIVE n(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM n) "
+        "SELECT id, 1 AS topic_id, 0 AS timestamp, zeroblob(1000) AS data FROM n",
+    ],
+}
+
+
+@pytest.mark.parametrize("case", SQL_OF_OTHER_TABLES)
+def test_a_database_of_other_tables_is_no_bag(tmp_path: Path, case: str) -> None:
+    path = write_db3(tmp_path / "bag", pairs(1))
+    with closing(sqlite3.connect(path)) as bag:
+        for statement in SQL_OF_OTHER_TABLES[case]:
+            bag.execute(statement)
+        bag.commit()
+    with pytest.raises(DriverError, match="no bag of ROS 2"):
+        LogReader(path)
+
+
+def test_a_database_whose_pages_are_named_again_and_again_ends(tmp_path: Path) -> None:
+    """It has 500**6 times the rows of one leaf."""
+    path = write_db3(tmp_path / "bag", [Entry(LOWER, COMPRESSED, b"\0\1\0\0", START_NS)] * 8)
+    repeat_pages(path)
+    assert path.stat().st_size < 100_000
+    with closing(open_log(path)) as bag:
+        assert bag.counts() is None
+        for topics in ([LOWER], ["/another"]):
+            assert len(list(bag.messages(topics))) <= path.stat().st_size // 8
+            assert "more rows than its size allows" in bag.damage().cut
+    assert log_info(path).state is LogState.BROKEN
+
+
+@pytest.mark.parametrize("name", ["mcap", "db3"])
+def test_other_topics_and_broken_messages_are_left_out(tmp_path: Path, name: str) -> None:
+    noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS + n) for n in range(50)]
+    junk = Entry(UPPER, COMPRESSED, b"\0\1\0\0junk", START_NS + 1)
+    found, reader = read(FORMATS[name](tmp_path, [*noise, *pairs(4), junk]))
+    assert found == expected(4) and reader.counts["broken"] == 1 and "no valid image" in reader.warnings[0]

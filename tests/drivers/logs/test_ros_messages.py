@@ -1,0 +1,152 @@
+"""Images, wheels and gyros in the bytes of ROS messages, as rosbags writes them, and damaged ones."""
+
+from __future__ import annotations
+
+import math
+import random
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.errors import FrameDecodeError
+from drivers.logs.ros_messages import (
+    IMU,
+    JOINT_STATE,
+    ODOMETRY,
+    JointWheels,
+    MotionReading,
+    image_encoding,
+    parse_image,
+    parse_motion,
+)
+from drivers.motion import GyroSample, WheelSample
+from tests.drivers.logs.mcap_logs import COMPRESSED, IMAGE, LOWER, STORE, TYPES, header, image, image_message
+
+VECTOR, QUATERNION, ZEROS = TYPES["geometry_msgs/msg/Vector3"], TYPES["geometry_msgs/msg/Quaternion"], np.zeros(36)
+WHEELS = JointWheels("left", "right", 0.1, 0.4)
+
+
+@pytest.mark.parametrize("little_endian", [True, False])
+def test_images_agree_with_rosbags_at_every_alignment(little_endian: bool) -> None:
+    texts = ("jpeg", "", "mono8", "bgr8; jpeg compressed bgr8")
+    for frame_id, text, size in product(("", "a", "abc", "lower_optical_frame"), texts, (0, 1, 6, 1001)):
+        data = np.random.default_rng(size).integers(0, 256, size, np.uint8)
+        stamped = header(1_700_000_000_123_456_789, frame_id)
+        messages = {
+            COMPRESSED: TYPES[COMPRESSED](stamped, text, data),
+            IMAGE: TYPES[IMAGE](stamped, 480, 2**31 + 5, text, 1, 2**32 - 1, data),
+        }
+        for kind, message in messages.items():
+            cdr = memoryview(STORE.serialize_cdr(message, kind, little_endian=little_endian))
+            expected, found = STORE.deserialize_cdr(cdr, kind), parse_image(kind, cdr)
+            assert found.stamp_ns == expected.header.stamp.sec * 10**9 + expected.header.stamp.nanosec
+            assert bytes(found.data) == expected.data.tobytes()
+            if kind == IMAGE:
+                sizes = (expected.width, expected.height, expected.step, expected.encoding)
+                assert (found.width, found.height, found.step, found.encoding) == sizes and found.bigendian
+
+
+@pytest.mark.parametrize("kind", [COMPRESSED, IMAGE])
+def test_damaged_images_raise_only_decode_errors(kind: str) -> None:
+    chance = random.Random(8)
+    pixels = np.zeros((4, 5), np.uint8)
+    whole = image(LOWER, 10**18).data if kind == COMPRESSED else image_message(10**18, "mono8", pixels)
+    for size in range(len(whole)):
+        with pytest.raises(FrameDecodeError):
+            parse_image(kind, memoryview(whole[:size]))
+    for _ in range(2000):
+        data = bytearray(whole)
+        data[chance.randrange(min(80, len(data)))] = chance.randrange(256)
+        try:
+            assert parse_image(kind, memoryview(bytes(data))).stamp_ns >= 0
+        except FrameDecodeError as error:
+            assert "\n" not in str(error)
+
+
+def test_encodings_have_one_name() -> None:
+    pixels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    found = parse_image(IMAGE, memoryview(image_message(10**18 + 5, "8UC3", pixels)))
+    assert (found.encoding, found.width, found.height, found.step, found.stamp_ns) == ("bgr8", 4, 2, 12, 10**18 + 5)
+    for data, otherwise, encoding in ((b"\xff\xd8\xff\xe0", "png", "jpeg"), (b"\x89PNG", "", "png"), (b"", "x", "x")):
+        assert image_encoding(data, otherwise) == encoding
+
+
+def odometry(velocity_mps: float, yaw_rate_radps: float) -> bytes:
+    pose = TYPES["geometry_msgs/msg/Pose"](
+        TYPES["geometry_msgs/msg/Point"](9.0, 9.0, 9.0), QUATERNION(9.0, 9.0, 9.0, 9.0)
+    )
+    twist = TYPES["geometry_msgs/msg/Twist"](VECTOR(velocity_mps, 9.0, 9.0), VECTOR(9.0, 9.0, yaw_rate_radps))
+    parts = (
+        TYPES["geometry_msgs/msg/PoseWithCovariance"](pose, ZEROS),
+        TYPES["geometry_msgs/msg/TwistWithCovariance"](twist, ZEROS),
+    )
+    return serialised(TYPES[ODOMETRY](header(5, "odom"), "base_link", *parts), ODOMETRY)
+
+
+def imu(rates: tuple[float, float, float], frame: str = "imu", covariance: float = 0.0) -> bytes:
+    nine = np.zeros(9)
+    nine[0] = covariance
+    rest = VECTOR(9.0, 9.0, 9.0), np.zeros(9)
+    message = TYPES[IMU](header(5, frame), QUATERNION(9.0, 9.0, 9.0, 9.0), np.zeros(9), VECTOR(*rates), nine, *rest)
+    return serialised(message, IMU)
+
+
+def joints(names: list[str], velocities: list[float]) -> bytes:
+    message = TYPES[JOINT_STATE](header(5), names, np.full(len(names), 9.0), np.array(velocities), np.zeros(0))
+    return serialised(message, JOINT_STATE)
+
+
+def serialised(message: Any, kind: str) -> bytes:
+    return bytes(STORE.serialize_cdr(message, kind))
+
+
+def read(kind: str, data: bytes) -> MotionReading:
+    return parse_motion(kind, memoryview(data), joints=WHEELS)
+
+
+def test_the_rates_are_those_of_the_base() -> None:
+    assert read(ODOMETRY, odometry(0.3, -0.2)).sample(7) == WheelSample(5, 0.3, -0.2)
+    assert read(IMU, imu((0.1, 0.2, 0.3))).sample(7) == GyroSample(5, 0.1, 0.2, 0.3)
+    assert read(IMU, imu((0.1, 0.2, 0.3), "base_link")).sample(7) == GyroSample(5, 0.1, 0.2, 0.3, of_base=True)
+    assert read(JOINT_STATE, joints(["arm", "left", "right"], [9.0, 2.0, 4.0])).rates == pytest.approx((0.3, 0.5))
+    assert read(JOINT_STATE, joints(["arm"], [9.0])).rates == ()
+    assert MotionReading(0, (0.3, 0.1)).sample(7).stamp_ns == 7, "the log time stands for a missing stamp"
+    assert math.isnan(read(ODOMETRY, odometry(0.3, math.nan)).rates[1]), "wheels may not report their turn"
+
+
+@pytest.mark.parametrize(
+    ("kind", "data", "reason"),
+    [
+        (ODOMETRY, odometry(math.nan, 0.1), "not finite"),
+        (ODOMETRY, odometry(0.1, math.inf), "not finite"),
+        (IMU, imu((0, 0, math.nan)), "not finite"),
+        (IMU, imu((0.0, 0.0, 0.0), covariance=-1.0), "covariance begins with -1"),
+        (JOINT_STATE, joints(["left"], [1.0]), "no velocity of left or of right"),
+        (JOINT_STATE, joints(["left", "right"], [1.0]), "no velocity of left or of right"),
+        (JOINT_STATE, joints(["left", "right"], [1.0, math.inf]), "no velocity of left or of right"),
+        (ODOMETRY, imu((0.0, 0.0, 0.0)), "truncated or invalid"),
+    ],
+)
+def test_rates_that_are_none_are_refused(kind: str, data: bytes, reason: str) -> None:
+    with pytest.raises(FrameDecodeError, match=reason):
+        read(kind, data)
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [(ODOMETRY, odometry(1.0, 1.0)), (IMU, imu((1.0, 1.0, 1.0))), (JOINT_STATE, joints(["left", "right"], [1.0, 2.0]))],
+)
+def test_damaged_messages_of_motion_raise_only_decode_errors(kind: str, data: bytes) -> None:
+    chance = random.Random(3)
+    for size in range(0, len(data) // 2, 3):
+        with pytest.raises(FrameDecodeError):
+            read(kind, data[:size])
+    for _ in range(500):
+        changed = bytearray(data)
+        changed[chance.randrange(len(data))] = chance.randrange(256)
+        try:
+            read(kind, bytes(changed))
+        except FrameDecodeError as error:
+            assert "\n" not in str(error)
