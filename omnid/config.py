@@ -34,6 +34,11 @@ class LogConfig:
     reorder_frames: Annotated[
         int, Meta(ge=1, le=1000), "images sorted by their stamps: how late one may be in the log"
     ] = 32
+    rate_hz: Annotated[
+        float,
+        Meta(ge=0, le=1000),
+        "images per second of folders; 0: their names or times.txt state when they were taken",
+    ] = 0.0
 
 
 @dataclass(frozen=True, slots=True)

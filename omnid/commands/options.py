@@ -181,6 +181,13 @@ SECONDS: Final = option("--seconds", type=float, metavar="N", help="end after N 
 
 # A log, its cameras and its rig.
 RIG: Final = option("--rig", type=Path, help="the rig.toml of the cameras; default: that attached to the log")
+RATE: Final = option(
+    "--rate",
+    type=float,
+    metavar="HZ",
+    setting="log.rate_hz",
+    help="images per second of folders of images; default: by their names in nanoseconds, or the seconds in times.txt",
+)
 TRUTH: Final = option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
 
 

@@ -9,7 +9,7 @@ from shutil import get_terminal_size
 from typing import TYPE_CHECKING, NamedTuple
 
 from omnid.commands.json_output import print_json
-from omnid.commands.options import JSON, MAP, QUIET, RIG, SETTINGS, cameras, command, group, option, settings_of
+from omnid.commands.options import JSON, MAP, QUIET, RATE, RIG, SETTINGS, cameras, command, group, option, settings_of
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
@@ -28,6 +28,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     ),
     RIG,
     *cameras(),
+    RATE,
     option("--start-s", type=float, default=0.0, metavar="S", help="leave out the first S seconds"),
     option("--seconds", type=float, metavar="S", help="read so many seconds only; default: to the end"),
     group(

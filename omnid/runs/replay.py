@@ -186,8 +186,14 @@ class _Replay:
         """Open the log; the topics are those of the options, else of the rig, else found by their names."""
         lower, upper = self._options.topics
         rig, motion = self._options.rig, motion_topics(self._config)
+        log = self._config.log
         open_log = partial(
-            LogReader, self._log, window=self._config.log.reorder_frames, span_s=self._options.span_s, motion=motion
+            LogReader,
+            self._log,
+            window=log.reorder_frames,
+            span_s=self._options.span_s,
+            motion=motion,
+            rate_hz=log.rate_hz,
         )
         named = ("", "")
         if rig and not (lower and upper):
