@@ -16,7 +16,7 @@ from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.estimates import OdometryLimits
 from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.limits import PlaceLimits

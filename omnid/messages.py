@@ -15,11 +15,10 @@ from drivers.jpeg import Steps
 from drivers.motion import MotionSample
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import AGREE, Witness
-from omnid.core.mapping.keyframe_grid import KeyframeScans
-from omnid.core.mapping.occupancy_grid import Grid
+from omnid.core.mapping.scan_grid import Grid, KeyframeScans
 from omnid.core.mapping.voxel_map import MapPoints
 from omnid.core.navigation.requests import TaughtRoute
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.stereo_frame import Features

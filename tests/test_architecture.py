@@ -226,7 +226,7 @@ def test_rooms_keep_clear_of_modules_that_are_not_theirs(rule: Rule) -> None:
         ("calib/a.py", "def f():\n    import omnid.engine.graph as g", {"calib.a": {"omnid.engine"}}),
         ("omnid/engine/a.py", "from ..core import stereo", {"omnid.engine": {"omnid.core.stereo"}}),
         ("omnid/engine/a.py", "from omnid.engine.graph import Graph\nimport numpy", {"omnid.engine": set()}),
-        ("omnid/a.py", "from omnid.core.stereo.sad import X", {"omnid.a": {"omnid.core.stereo"}}),
+        ("omnid/a.py", "from omnid.core.stereo.semiglobal import X", {"omnid.a": {"omnid.core.stereo"}}),
     ],
 )
 def test_an_arrow_is_found(tmp_path: Path, name: str, text: str, found: dict[str, set[str]]) -> None:

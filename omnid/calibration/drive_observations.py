@@ -18,10 +18,9 @@ from calib.se2_arrays import wrapped
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.images import open_log
 from omnid.config import Config
-from omnid.core.rig.column_matches import match
+from omnid.core.rig.column_finding import RigState, match
 from omnid.core.rig.drive_landmarks import LANDMARKS, DriveLandmarks, PanoramaObservations, View, image_pixels
 from omnid.core.rig.rig_health import RigHealth
-from omnid.core.rig.rig_state import RigState
 from omnid.core.stereo.triangulation import triangulate
 from omnid.errors import OmnidError
 from omnid.messages import FramePair, OdometryUpdate

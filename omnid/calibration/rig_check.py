@@ -17,10 +17,18 @@ from drivers.logs.log_reader import LogReader
 from omnid.calibration.drive_observations import Topics, tracked_updates
 from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired
 from omnid.config import Config, PanoramaConfig
-from omnid.core.rig.column_finding import DRIFTED_PX, MIN_MATCHES, RigFinding, judge
-from omnid.core.rig.column_matches import Matches, is_motion_unknown, match, together
+from omnid.core.rig.column_finding import (
+    DRIFTED_PX,
+    MIN_MATCHES,
+    Matches,
+    RigFinding,
+    RigState,
+    is_motion_unknown,
+    judge,
+    match,
+    together,
+)
 from omnid.core.rig.rig_health import RigHealth
-from omnid.core.rig.rig_state import RigState
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
 from omnid.stages.decoder import Decoder

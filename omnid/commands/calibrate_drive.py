@@ -139,7 +139,7 @@ def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
 def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
     """Return the rig, with its upper camera's pose corrected if it is to be written, and whether it had drifted."""
     from omnid.calibration.rig_check import check_log, with_upper_corrected
-    from omnid.core.rig.rig_state import RigState
+    from omnid.core.rig.column_finding import RigState
 
     found, pairs = check_log(args.logs[0], rig, (args.lower, args.upper))
     print(found)

@@ -13,13 +13,13 @@ from drivers.motor import MotorDriver, MotorStatus, VelocityCommand
 from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.statistics import ControllerState, TickReport, cuts_drive_short, transitions
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUS, MOTOR, ContactState
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import Motion
-from omnid.core.control.plausibility import MotorReport
+from omnid.core.control.trust import MotorReport
 from omnid.core.control.velocity_limits import STOP
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing

@@ -15,10 +15,10 @@ from omnid.controller.ipc import NO_MESSAGE, Channel, socket_pair
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.flow import nothing
 from omnid.engine.process import python, python_environment

@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 
 from omnid.controller.motor_settings import MotorSettings
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT, ContactState
 from omnid.core.control.control_law import ControllerPose, ControllerSettings
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.engine.realtime import RealtimeSettings
 
 # The wheels are ramped down when the daemon ends. Wheels that still turn after this time are stopped at once, so that

@@ -19,9 +19,9 @@ from omnid.controller.ipc import NO_MESSAGE, Channel
 from omnid.controller.messages import LONGEST_RAMP_S, ControllerStart, ControllerUpdate, LogRecord, StartFailed
 from omnid.controller.motor import open_motor
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.engine.process import STOP_SIGNALS
 from omnid.engine.realtime import RealtimeSettings, ThreadStart, prepare

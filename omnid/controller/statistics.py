@@ -14,8 +14,8 @@ from drivers.motor import VelocityCommand
 from omnid.core.control.arming import NO_ANSWER, STARTED, ArmAnswer
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.motion_monitor import ADVICE, DISAGREEMENTS, WITNESSES, Witness
-from omnid.core.control.plausibility import MOTION_DOUBTFUL
 from omnid.core.control.safety_rules import ENDS, IDLE
+from omnid.core.control.trust import MOTION_DOUBTFUL
 from omnid.engine.flow import nothing
 from omnid.engine.telemetry import Histogram, StageStats
 

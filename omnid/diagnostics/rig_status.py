@@ -5,9 +5,8 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Final
 
-from omnid.core.rig.driving_views import VIEWS
-from omnid.core.rig.rig_health import RigHealth
-from omnid.core.rig.rig_state import RigState
+from omnid.core.rig.column_finding import RigState
+from omnid.core.rig.rig_health import VIEWS, RigHealth
 from omnid.transport.codec import ERROR, OK, WARN
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import RIG, Key

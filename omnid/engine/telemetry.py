@@ -63,7 +63,7 @@ class Histogram:
         rank = max(1, math.ceil(q * ranks[-1]))
         if rank >= ranks[-1]:
             return self.max_s
-        centre_s = _LOW_S * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / _BINS_PER_OCTAVE)
+        centre_s: float = _LOW_S * 2.0 ** ((bisect_left(ranks, rank) + 0.5) / _BINS_PER_OCTAVE)
         return min(centre_s, self.max_s)
 
 

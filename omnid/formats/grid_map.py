@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid
+from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
 from omnid.errors import OmnidError
 from omnid.formats.whole_file import replacement
 

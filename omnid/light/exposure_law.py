@@ -2,7 +2,7 @@
 
 The exposure time is raised first, to its limit, because gain magnifies the noise; the gain is lowered first. Both
 cameras have the same values, so that a point has the same brightness in both. Steps are rare and bounded: images on
-either side of one are compared by patches with a gain of their own (`core/odometry/patch_fit.py`).
+either side of one are compared by patches with a gain of their own (`core/odometry/plane_patches.py`).
 """
 
 from __future__ import annotations

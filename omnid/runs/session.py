@@ -15,7 +15,7 @@ from drivers.frame import Frame
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
-from omnid.core.control.collision_settings import STOP
+from omnid.core.control.collision_monitor import STOP
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.obstacles.column import FLOOR_FOCAL_PX
 from omnid.diagnostics.run_statistics import RunStatistics

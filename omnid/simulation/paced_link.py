@@ -12,10 +12,10 @@ from drivers.motor import VelocityCommand
 from omnid.controller.controller import Controller
 from omnid.controller.statistics import ControllerStatistics, TickReport
 from omnid.core.control.arming import ArmRequest
+from omnid.core.control.collision_monitor import ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import NO_CONTACT
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.engine.flow import nothing
 from omnid.engine.telemetry import StageStats
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.mapping.keyframe_grid import KeyframeGrid
+from omnid.core.mapping.scan_grid import KeyframeGrid
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import GridUpdate, PlaceUpdate
 

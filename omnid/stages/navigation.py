@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from calib import se3
 from calib.se2_arrays import planar
 from omnid.core.control.collision_geometry import Outline, sector_edges_m
-from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.control.unknown_ends import unknown_ends
+from omnid.core.control.collision_monitor import CollisionSettings, unknown_ends
 from omnid.core.frames import base_pose, in_outer_axes, of_base
 from omnid.core.mapping.range_scan import azimuths
-from omnid.core.navigation.drive import Navigation
 from omnid.core.navigation.follower import STAND
 from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.local_planner import room_ahead
-from omnid.core.navigation.navigator import RESUME, Navigator
+from omnid.core.navigation.navigator import RESUME, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import (
     GoalRequest,

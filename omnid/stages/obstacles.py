@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
-from omnid.core.control.controller_ring import ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import ObstacleRing, OdometryUpdate
 from omnid.stages.dense_depths import DenseDepths

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.config import OdometryConfig
 from omnid.core.control.motion_monitor import AGREE, Witness
-from omnid.core.odometry.contradiction import Contradiction, contradiction_after
 from omnid.core.odometry.earlier_view import EarlierView
 from omnid.core.odometry.estimates import OdometryEstimate
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.odometry.motion_agreement import MotionAgreement
+from omnid.core.odometry.motion_agreement import Contradiction, MotionAgreement, contradiction_after
 from omnid.core.odometry.motion_sensors import BIAS, MotionSensors
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame

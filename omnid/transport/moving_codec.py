@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.transport.map_codec import packed_cloud_cdr
 
 # m, m/s; sigma and sigma_v: of position and velocity along the axis in which they are largest.

@@ -26,7 +26,7 @@ from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.core.floor import Floor
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
+from omnid.core.mapping.scan_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.core.places.place_views import grid
 from omnid.engine.telemetry import Telemetry
 from omnid.formats.tum import read_tum

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
+from omnid.core.odometry.estimates import OdometryLimits
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.config import load_config
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, Grid
+from omnid.core.mapping.scan_grid import FREE, OCCUPIED, Grid
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate

@@ -21,8 +21,7 @@ from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.calibration.rig_check import check_rig, read_rig_pairs
 from omnid.config import PanoramaConfig
-from omnid.core.rig.column_finding import RigFinding
-from omnid.core.rig.rig_state import RigState
+from omnid.core.rig.column_finding import RigFinding, RigState
 from tests.bench.results import Column, ResultTable
 from tests.bench.seeds import role_of
 from tests.simulation import corridor, paths, write_log

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from calib import se3
 from calib.rig_file import read_rig, write_rig
 from omnid.config import Config
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED
+from omnid.core.mapping.scan_grid import FREE, OCCUPIED
 from omnid.formats.tum import read_tum
 from omnid.recordings.evaluation import evaluate
 from omnid.runs.replay import ReplayOptions, run_log

@@ -9,7 +9,11 @@ Unknown directions are not free. Plain Python: it runs in the process that steer
 from __future__ import annotations
 
 import math
-from typing import Final, NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, NamedTuple
+
+from msgspec import Meta
 
 from calib.se2 import Point, Pose2, along_arc, composed, seen_from
 from omnid.core.control.collision_geometry import (
@@ -18,15 +22,105 @@ from omnid.core.control.collision_geometry import (
     Outline,
     contact_s,
     driven_over,
+    long_runs,
     sector_directions,
     sector_edges_m,
     within_reach,
 )
-from omnid.core.control.collision_settings import IGNORE, STOP, CollisionSettings
-from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.control.heading_controller import Twist
-from omnid.core.control.unknown_ends import unknown_ends
 from omnid.core.nanoseconds import S_PER_NS
+
+STOP: Final = "stop"
+SLOW: Final = "slow"
+IGNORE: Final = "ignore"
+
+
+@dataclass(frozen=True, slots=True)
+class CollisionSettings:
+    """Outline of the base, distances and times at which it stops and slows down before obstacles."""
+
+    check: Annotated[bool, "slow down and stop before obstacles, whatever the source of the command"] = True
+    front_m: Annotated[
+        float, Meta(ge=0, le=5), "outline of the base: its front, m ahead of the origin of base_link"
+    ] = 0.25
+    rear_m: Annotated[float, Meta(ge=0, le=5), "outline of the base: its rear, m behind the origin"] = 0.25
+    half_width_m: Annotated[float, Meta(ge=0.01, le=5), "outline of the base: half its width, m"] = 0.22
+    stop_m: Annotated[float, Meta(ge=0.01, le=5), "the base stops so far before an obstacle, m"] = 0.15
+    side_m: Annotated[float, Meta(ge=0, le=5), "free space that it needs at its sides, m"] = 0.04
+    time_s: Annotated[
+        float,
+        Meta(ge=0.2, le=10),
+        "time to collision that it keeps: its speed is at most the distance to where it must stop, divided by this, s",
+    ] = 1.5
+    slow_m: Annotated[float, Meta(ge=0, le=10), "an obstacle nearer than this ahead slows it down to slow_mps, m"] = 0.5
+    slow_side_m: Annotated[float, Meta(ge=0, le=10), "the same beside its way, m"] = 0.12
+    slow_mps: Annotated[float, Meta(ge=0.01, le=10), "speed near obstacles and into the unknown, m/s"] = 0.2
+    unknown: Annotated[
+        Literal["stop", "slow", "ignore"],
+        "at the end of the floor that was seen, where nothing is known: stop; slow drives on at "
+        "slow_mps, also into a plain wall",
+    ] = STOP
+    stale: Annotated[
+        Literal["stop", "slow", "ignore"],
+        "when nothing fresh is known of the way: the newest ring of obstacles is older than "
+        "stale_s, there is none, or its images are frozen, dark or dirty there",
+    ] = STOP
+    stale_s: Annotated[
+        float,
+        Meta(ge=0.1, le=10),
+        "no motion without evidence: the base drives by what its images of so long ago, or "
+        "newer ones, showed, whatever the pose says, s",
+    ] = 0.5
+
+
+class MovingPoint(NamedTuple):
+    """A moving obstacle in the base frame of its ring, whose axes do not move; m, m/s."""
+
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+    radius_m: float
+    sigma_m: float = 0.0  # standard deviation of the place
+    sigma_mps: float = 0.0  # standard deviation of the velocity
+
+
+class ControllerRing(NamedTuple):
+    """The part of an obstacle ring that the monitor needs; sector k is about azimuth -pi + (k + 0.5) 2 pi / N."""
+
+    stamp_ns: int  # time of the capture
+    ranges_m: tuple[float, ...]  # (N,) inf: free, NaN: unknown
+    free_m: tuple[float, ...] = ()  # (N,) up to which a direction was seen to be free; empty: the range, 0 if unknown
+    moving: tuple[MovingPoint, ...] = ()
+    unwatched: tuple[bool, ...] = ()  # (N,) the images show nothing to rely on there; empty: they do everywhere
+
+
+# Floor that is seen so far is open; a ring may end nearer than that, and nothing is known beyond.
+FAR_M: Final = 5.0
+UNKNOWN_SECTORS: Final = 5  # consecutive ones that make a direction unknown; by trial on development seeds
+
+
+class UnknownEnd(NamedTuple):
+    """End of the floor that was seen in a sector of a ring."""
+
+    sector: int
+    free_m: float
+    is_gap: bool  # a surface is seen beyond it
+
+
+def unknown_ends(ranges_m: Sequence[float], free_m: Sequence[float], stop_m: float) -> list[UnknownEnd]:
+    """Return the sectors in which nothing is known beyond the floor that was seen.
+
+    ranges_m (N,): of obstacles, inf: free, NaN: unknown; free_m (N,): up to which floor was seen, empty: the range, 0
+    where that is unknown. stop_m: length without floor before a surface that belongs to the surface.
+    """
+    free = free_m if len(free_m) == len(ranges_m) else [r if math.isfinite(r) else 0.0 for r in ranges_m]
+    # A surface that is seen past a place that is not, such as a wall behind a plain pole, makes that no freer.
+    has_gap = [math.isfinite(r) and r - f > stop_m for r, f in zip(ranges_m, free, strict=True)]
+    parts = zip(ranges_m, free, has_gap, strict=True)
+    unknown = [gap or math.isnan(r) or (math.isinf(r) and 0.0 < f < FAR_M) for r, f, gap in parts]
+    return [UnknownEnd(k, free[k], has_gap[k]) for k in long_runs(unknown, UNKNOWN_SECTORS)]
+
 
 LEAST_MPS: Final = 0.02  # slower than this the base stops; by trial on development seeds
 # A way that approaches an unknown region at its side by no more than this slope runs along it, because a correction of

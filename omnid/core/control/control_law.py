@@ -13,11 +13,9 @@ from typing import Annotated, Final, Literal, NamedTuple
 from msgspec import Meta
 
 from omnid.core.control.arming import AUTOMATIC, MANUAL, Arming, ArmRequest
-from omnid.core.control.collision_monitor import CollisionMonitor
-from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerRing
 from omnid.core.control.command_sources import CommandSelector, SourceSettings, TimedSetpoint
 from omnid.core.control.contacts import Contacts
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import (
     LONGEST_TICK_S,
     HeadingController,
@@ -28,9 +26,8 @@ from omnid.core.control.heading_controller import (
 )
 from omnid.core.control.heading_goal import HeadingGoal
 from omnid.core.control.motion_monitor import AGREE, Motion, MotionSettings, Witness
-from omnid.core.control.plausibility import Plausibility
 from omnid.core.control.safety_rules import FAULTS, IDLE, Deadlines, SafetyInputs, stop_reason
-from omnid.core.control.trust import TrustSettings
+from omnid.core.control.trust import Plausibility, TrustSettings
 from omnid.core.control.velocity_limits import STOP, VelocityLimits
 from omnid.core.nanoseconds import S_PER_NS
 

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 
 Array = NDArray[np.float64]
 

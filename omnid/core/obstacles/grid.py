@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,28 +18,119 @@ from calib import se3
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles import grid_kernels as kernels
 from omnid.core.obstacles.cell_kernels import (
+    ABOVE,
+    BELOW,
     FLOOR,
+    FLOOR_LOW,
+    FLOOR_PRIOR,
     LIMIT,
     MOST_RATIO,
     SURFACE,
+    SURFACE_PRIOR,
     TAKEN_ODDS,
     UNSEEN_SURFACE,
     VISIBLE,
+    VISIBLE_PRIOR,
     add_pair,
 )
 from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
-from omnid.core.obstacles.grid_layers import FLOORS, PRIOR, cells_of
-from omnid.core.obstacles.grid_ring import GridRing, RingView, circle_from, ring_of
-from omnid.core.obstacles.near_field import NearField, lose_before
+from omnid.core.obstacles.near_field import FLOORS, NearField, lose_before
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN
+from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN, free_cells
 from omnid.core.obstacles.usual_floor import Arrivals, Hidden, UsualFloor, arrivals_at
-from omnid.core.obstacles.watch import FRESH_NS, Watch
+from omnid.core.obstacles.watch import FRESH_NS, NARROW_CELLS, Watch
+
+Floats = NDArray[np.float32]
+Bytes = NDArray[np.uint8]
+
+# Log-odds of the layers where nothing was seen: steps up and down are even, because nothing speaks for either.
+PRIOR: Final = (FLOOR_PRIOR, 0.0, 0.0, SURFACE_PRIOR, VISIBLE_PRIOR)
+WIDE_CELLS: Final = 3  # Side of the mean that shows floor or a low object, because single cells are noisy.
+# The same of an edge: a hole into which a base falls is wide. With 3, by trial, bases stood before joints of tiles.
+EDGE_CELLS: Final = 5
+
+
+def cells_of(odds: Floats, shown: Floats) -> Bytes:
+    """Return the cells (H, W) by their log-odds (5, H, W): 0 unknown, 1 free (by all layers), 2 taken.
+
+    shown (H, W): mean surface of single pairs.
+    """
+    floor, cells = mean_over(odds[FLOOR], WIDE_CELLS), np.empty(shown.shape, np.uint8)
+    free_cells(odds, shown, floor, level_odds(odds), cells)
+    return cells
+
+
+def level_odds(odds: Floats) -> Floats:
+    """Return the least log-odds (H, W) against steps up and down, which are wider than a cell.
+
+    An edge is remembered by lower log-odds than FLOOR_LOW, but a few such cells are not as wide as one.
+    """
+    return np.minimum(mean_over(odds[ABOVE], WIDE_CELLS), mean_over(np.maximum(odds[BELOW], FLOOR_LOW), EDGE_CELLS))
+
+
+def mean_over(odds: Floats, cells: int) -> Floats:
+    """Return the mean (H, W) of log-odds over a patch with a side of so many cells."""
+    return np.asarray(cv2.blur(odds, (cells, cells)), np.float32)
+
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
+
+# Distance kept before the end of the free floor, because at the foot of an object patches show both.
+END_M: Final = 0.1
+# Share of the longest range from which on a direction is open, because few pairs show the last cells.
+OPEN_SHARE: Final = 0.9
+
+
+class GridRing(NamedTuple):
+    """Nearest obstacles and free floor around the base, by the grid."""
+
+    ranges_m: Floats  # (SECTORS,) nearest surface; inf: floor up to the longest range; NaN: unknown
+    sigma_m: Floats  # (SECTORS,) of the ranges, NaN without one
+    free_m: Floats  # (SECTORS,) up to which the way is free
+    arrivals: Arrivals  # of this pair
+
+
+class RingView(NamedTuple):
+    """Directions from a place in the grid, and the gaps in the floor that are passed."""
+
+    place: Array  # (2,) in cells
+    angles: Array  # (N,) of the directions, in the axes of the grid
+    cell_m: float
+    max_range_m: float
+    nearest_m: Array  # (N,) of the floor in view
+    gap_share: float  # of the range, that what is lower than an obstacle may hide: such gaps are passed
+    gap_m: float  # least gap that is passed
+
+
+def circle_from(directions: Array, middle_m: Array, radius_m: float) -> Array:
+    """Return the way (N,) from the origin along directions (N, 2) to a circle around it, whose middle lies off it."""
+    along_m = directions @ middle_m
+    return np.asarray(along_m + np.sqrt(np.maximum(radius_m**2 - middle_m @ middle_m + along_m**2, 0.0)))
+
+
+def ring_of(cells: Bytes, view: RingView, arrivals: Arrivals) -> GridRing:
+    """Return the ring by the cells (H, W): 0 unknown, 1 free, 2 taken."""
+    first, hit, free = np.empty((3, len(view.angles)))
+    # 1. Up to the first taken cell, and to the end of the free floor.
+    origin = np.array(
+        [*view.place, view.cell_m / 2, view.max_range_m, view.cell_m, view.gap_share, view.gap_m], np.float64
+    )
+    kernels.march(cells, origin, view.angles, first, free)
+    # Too near for floor, a part of a surface that shows nothing, such as a white margin, is no opening.
+    kernels.close_openings(first, free, view.nearest_m, NARROW_CELLS * view.cell_m, END_M + view.cell_m, hit)
+    # 2. A direction between cells may belong to either side.
+    around = np.concatenate([free[-1:], free, free[:1]])
+    free = np.minimum(free, np.minimum(around[:-2], around[2:]))
+    is_open = np.isinf(hit) & (free >= OPEN_SHARE * view.max_range_m)
+    ranges = np.where(np.isfinite(hit), hit, np.where(is_open, np.inf, np.nan))
+    sigma = np.where(np.isfinite(ranges), view.cell_m / 2, np.nan)
+    # 3. What stands at an end may be nearer: in view, by its foot; an end nearer than that, found before, by a cell.
+    end_m = np.where(free > view.nearest_m, np.minimum(END_M, free - view.nearest_m + view.cell_m), view.cell_m)
+    free = np.where(free < hit, np.maximum(free - end_m, 0.0), hit)
+    return GridRing(ranges.astype(np.float32), sigma.astype(np.float32), free.astype(np.float32), arrivals)
+
+
 Flags = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 
 CELL_M: Final = 0.05  # Side of a cell.
 CELLS: Final = 256  # Cells of a side, because they hold twice the largest range, and the way until the square is moved.

@@ -15,8 +15,20 @@ from numpy.typing import NDArray
 
 from omnid.core.kalman_filter import kalman_filter
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
 from omnid.core.obstacles.usual_floor import Arrivals
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MovingObstacle:
+    """Position and velocity of an obstacle that moves, in odom."""
+
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+    covariance: NDArray[np.float64]  # (4, 4) of x, y, vx, vy
+    radius_m: float
+
 
 Array = NDArray[np.float64]
 

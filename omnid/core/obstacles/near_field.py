@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 
 from omnid.core.obstacles import near_field_kernels as kernels
 from omnid.core.obstacles.cell_kernels import FLOOR, SURFACE, TAKEN_ODDS
-from omnid.core.obstacles.grid_layers import FLOORS
 from omnid.core.obstacles.state_kernels import FREE_ODDS
 from omnid.core.obstacles.watch import LEAST_FRESH, NARROW_CELLS, Watch
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
+
+FLOORS: Final = slice(FLOOR, SURFACE)  # layers of the odds: all that say a cell is floor
 Flags = NDArray[np.bool_]
 
 # Sectors on either side that see past a place which is not in view itself. Measured: 2 to 4 are alike.

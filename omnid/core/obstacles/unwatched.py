@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.grid_ring import GridRing
+from omnid.core.obstacles.grid import GridRing
 from omnid.core.stereo.tiles import tile_columns
 
 Array = NDArray[np.float64]

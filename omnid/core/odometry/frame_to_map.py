@@ -14,7 +14,7 @@ from omnid.core.odometry.corners import pixels_in_upper
 from omnid.core.odometry.estimates import PoseEstimate
 from omnid.core.odometry.exposure_times import AssumedMotion, Exposure, ViewShift
 from omnid.core.odometry.local_map import LocalMap, Tracks
-from omnid.core.odometry.patch_alignment import align_rows, view_noise
+from omnid.core.odometry.plane_patches import align_rows, view_noise
 from omnid.core.odometry.pose_estimation import CONVERGED, GaussNewtonResult, SharedError, gauss_newton, ransac
 from omnid.core.odometry.pose_kernels import KERNEL_WIDTH
 from omnid.core.odometry.stereo_frame import StereoFrame

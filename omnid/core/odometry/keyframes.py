@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.odometry.corners import clear_around, corners
-from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.first_depths import FirstDepths
-from omnid.core.odometry.landmarks import Keyframe
-from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.landmarks import Keyframe, located
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.new_landmarks import located
-from omnid.core.odometry.patch_fit import WINDOW_PX
+from omnid.core.odometry.plane_patches import WINDOW_PX
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.stereo_model import StereoModel

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.estimates import PoseEstimate
+from omnid.core.odometry.exposure_times import RigVelocity
 from omnid.core.odometry.first_depths import FirstDepths
-from omnid.core.odometry.landmarks import Keyframe, LandmarkStore
-from omnid.core.odometry.late_depths import LateDepths
-from omnid.core.odometry.patch_alignment import AlignedPatches, align
-from omnid.core.odometry.plane_patches import moved_slopes, plane_templates
+from omnid.core.odometry.landmarks import Keyframe, LandmarkStore, NewLandmarks
+from omnid.core.odometry.plane_patches import AlignedPatches, align, moved_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
@@ -161,3 +160,45 @@ class LocalMap:
         A = se3.adjoint(se3.inverse(estimate.T_odom_rect) @ poses)
         weighted = np.array(list(shares.values()))[:, None, None] * A
         return np.asarray((weighted @ covariance @ np.swapaxes(A, 1, 2)).sum(axis=0))
+
+
+class LateDepths:
+    """Measurements of the last frame of the landmarks in a store; at most one frame waits."""
+
+    def __init__(self, store: LandmarkStore) -> None:
+        self._store = store
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what waits."""
+        self._seen: tuple[Indices, PoseEstimate] | None = None
+        self._added: tuple[Indices, NewLandmarks] | None = None
+
+    def seen(self, ids: Indices, estimate: PoseEstimate) -> None:
+        """Correct the depths of the landmarks (N,) of an estimate, at once or when the velocity is known."""
+        if estimate.assumed.is_final:
+            disparity = estimate.views[:, 2] - estimate.views[:, 1]
+            self._store.update_depths(estimate.landmarks, disparity, estimate.variance, estimate.T_odom_rect)
+        else:
+            self._seen = ids, estimate
+
+    def added(self, ids: Indices, new: NewLandmarks) -> None:
+        """Correct the landmarks of a new keyframe, whose ids are (N,), when the velocity is known."""
+        self._added = None if new.assumed.is_final else (ids, new)
+
+    def settle(self, velocity: RigVelocity | None) -> None:
+        """Correct the map by what waits, with the velocity at that frame; None: no better one than was assumed."""
+        if self._added is not None and velocity is not None:
+            ids, new = self._added
+            assumed, J = new.assumed
+            views = new.views + J @ (velocity.twist - assumed.twist)
+            self._store.replace_views(ids, views, new.noise + J @ velocity.covariance @ np.swapaxes(J, 1, 2))
+        if self._seen is not None:
+            ids, estimate = self._seen
+            assumed, J = estimate.assumed
+            known = assumed if velocity is None else velocity
+            disparity = estimate.views[:, 2] - estimate.views[:, 1] + J @ (known.twist - assumed.twist)
+            variance = estimate.variance + np.einsum("ni,ij,nj->n", J, known.covariance, J)
+            rows, kept = self._store.rows(ids)
+            self._store.update_depths(rows, disparity[kept], variance[kept], estimate.T_odom_rect)
+        self.clear()

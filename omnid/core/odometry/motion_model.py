@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.exposure_times import RigVelocity
-from omnid.core.odometry.exposure_velocity import ExposureVelocity
-from omnid.core.odometry.limits import OdometryLimits
-from omnid.core.odometry.motion_filter import MotionFilter
-from omnid.core.odometry.sensed_motion import SensedMotion
+from omnid.core.odometry.estimates import OdometryLimits
+from omnid.core.odometry.exposure_times import ExposureVelocity, RigVelocity
+from omnid.core.odometry.motion_filter import MotionFilter, SensedMotion
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from calib import se3
 from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.kalman_filter import kalman_filter
 from omnid.core.nanoseconds import SecondsSinceFirst
-from omnid.core.odometry.sensed_motion import RateHistory, RateIntegral, SensedMotion
+from omnid.core.odometry.motion_filter import RateHistory, RateIntegral, SensedMotion
 
 Array = NDArray[np.float64]
 

@@ -14,21 +14,19 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.corners import corners
-from omnid.core.odometry.estimates import GapStep, OdometryEstimate, PoseEstimate, bounded, supports
+from omnid.core.odometry.estimates import GapStep, OdometryEstimate, OdometryLimits, PoseEstimate, bounded, supports
 from omnid.core.odometry.exposure_times import Exposure, RigVelocity
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
 from omnid.core.odometry.keyframes import KeyframeLocaliser, KeyframeRequest, Keyframes
-from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_model import MotionModel
 from omnid.core.odometry.pose_search import LastFrame, PoseSearch
-from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, doubt_after
+from omnid.core.odometry.runner_up_motions import REACH_SIGMAS, Doubt, UntrackedMotion, doubt_after
 from omnid.core.odometry.static_mask import StaticMask
 from omnid.core.odometry.stereo_frame import Features, StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
-from omnid.core.odometry.untracked_motion import UntrackedMotion
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 

@@ -13,19 +13,58 @@ Zisserman 2004, 13.1), here between cylinders.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry import plane_kernels, slope_kernels
-from omnid.core.odometry.patch_fit import TEMPLATE_PX
+from omnid.core.odometry import patch_kernels, plane_kernels, slope_kernels
+from omnid.core.odometry.patch_kernels import cut
+from omnid.core.stereo.triangulation import triangulate
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
 Image = NDArray[np.uint8]
+Flags = NDArray[np.bool_]
 Indices = NDArray[np.intp]
+
+WINDOW_PX = patch_kernels.WINDOW_PX
+TEMPLATE_PX = WINDOW_PX + 2  # holds the window and the border that the gradient's 3x3 operator needs
+
+
+@dataclass(frozen=True, slots=True)
+class PatchFit:
+    """Result for N patches."""
+
+    shift: Array  # (N, 2) px from the prediction
+    covariance: Array  # (N, 2, 2) px^2 that the noise of both images leaves
+    fits: Flags  # (N,) textured, and moved less than the reach
+
+
+def fit_patches(templates: Image, cells: Image, groups: Indices, noise_grey: float) -> PatchFit:
+    """Fit templates (N, T, T) to the current image's cells (N, C, C), cut where they are predicted.
+
+    The centre of a template is its pixel T // 2, T is TEMPLATE_PX or more. C is WINDOW_PX + 2 reach: a patch that has
+    to move by the reach or farther was predicted wrongly, and does not fit.
+    groups (N,): patches of one image have one number, and nearly one gain. noise_grey: standard deviation of the
+    noise of both images.
+    """
+    count = len(templates)
+    found = PatchFit(np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count, bool))
+    patch_kernels.fit(
+        np.ascontiguousarray(templates),
+        np.ascontiguousarray(cells),
+        groups,
+        noise_grey,
+        found.shift,
+        found.covariance,
+        found.fits,
+    )
+    return found
+
+
+Floats = NDArray[np.float32]
 
 # Half the side of the window in which the slope of the dense disparity is taken.
 SLOPE_REACH_PX = 8
@@ -145,3 +184,74 @@ def fitted_slopes(
 def _padded(panorama: PaddedPanorama, pixels: Array) -> Array:
     """Return pixels (N, 2) of the padded image."""
     return np.column_stack([panorama.padded(pixels[:, 0]), pixels[:, 1]])
+
+
+# Reach of patches whose pose and depth are known well, the least there is, because cells have whole pixels.
+REACH_PX = 1
+# By which a patch may move sideways in the upper panorama from where it was tracked to.
+CROSS_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class AlignedPatches:
+    """Positions of N patches in a panorama."""
+
+    pixels: Array  # (N, 2)
+    covariance: Array  # (N, 2, 2) px^2 that the noise leaves
+    found: NDArray[np.bool_]  # (N,) textured, and near the prediction
+
+    @staticmethod
+    def of(fit: PatchFit, predicted: Array) -> AlignedPatches:
+        """Return the pixels of patches that were cut at predicted (N, 2)."""
+        return AlignedPatches(predicted + fit.shift, fit.covariance, fit.fits)
+
+
+def align(
+    templates: Image, current: PaddedPanorama, predicted: Array, groups: Indices, reach_px: int = REACH_PX
+) -> AlignedPatches:
+    """Align templates (N, TEMPLATE, TEMPLATE), centred on predicted (N, 2), with the current panorama.
+
+    groups (N,): patches that come from one image have one number. reach_px: a patch that has to move this far was
+    predicted wrongly.
+    """
+    cells = _cut(current, np.rint(predicted), WINDOW_PX + 2 * reach_px)
+    return AlignedPatches.of(fit_patches(templates, cells, groups, current.noise_grey), predicted)
+
+
+def align_rows(
+    pair: tuple[PaddedPanorama, PaddedPanorama], points: Array, near: Array, slopes: Array, model: StereoModel
+) -> tuple[Array, Array]:
+    """Align patches of the lower panorama at points (N, 2) with the upper one near pixels (N, 2), NaN where unknown.
+
+    slopes (N, 2) of the disparity. Returns the rows (N,), NaN where no patch fits, and their variances (N,) [px^2] by
+    the noise. Gain and offset of the two cameras may differ.
+    """
+    known = np.flatnonzero(near[:, 1] > points[:, 1])
+    pixels, predicted = points[known], near[known]
+    in_space = triangulate(np.column_stack([pixels, predicted[:, 1]]), model.cylinder, model.baseline_m)
+    one, still = np.zeros(len(known), np.intp), np.tile(np.eye(4), (len(known), 1, 1))
+    templates = plane_templates(
+        {0: pair[0]}, one, pixels, (in_space, slopes[known]), still, model, predicted, upper=True
+    )
+    found = align(templates, pair[1], predicted, one)
+    fits = found.found & (np.abs(found.pixels[:, 0] - predicted[:, 0]) < CROSS_PX)
+    aligned, variance = np.full(len(points), np.nan), np.zeros(len(points))
+    aligned[known[fits]], variance[known[fits]] = found.pixels[fits, 1], found.covariance[fits, 1, 1]
+    return aligned, variance
+
+
+def view_noise(covariance: Array, row_variance: Array) -> Array:
+    """Return covariances (N, 3, 3) [px^2] of views whose upper row is the lower row plus a disparity.
+
+    covariance (N, 2, 2) or (2, 2) of the pixels in the lower panorama, row_variance (N,) of the disparities.
+    """
+    noise = np.broadcast_to(covariance, (len(row_variance), 2, 2))[:, [0, 1, 1]][:, :, [0, 1, 1]]
+    noise[:, 2, 2] += row_variance
+    return noise
+
+
+def _cut(panorama: PaddedPanorama, centres: Array, side_px: int) -> Image:
+    """Return cells (N, side, side) around whole pixels (N, 2), also across the seam; the border is repeated."""
+    cells = np.empty((len(centres), side_px, side_px), np.uint8)
+    cut(panorama.image, np.column_stack([panorama.padded(centres[:, 0]), centres[:, 1]]), cells)
+    return cells

@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import PoseEstimate, with_more_inliers
+from omnid.core.odometry.estimates import OdometryLimits, PoseEstimate, with_more_inliers
 from omnid.core.odometry.exposure_times import Exposure
 from omnid.core.odometry.frame_exposures import FrameExposures
 from omnid.core.odometry.frame_to_map import FrameToMap
-from omnid.core.odometry.limits import OdometryLimits
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.runner_up_motions import displacements, likeliest
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.yaw_search import correlation_peaks, steps
+from omnid.core.odometry.tracking import correlation_peaks, steps
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel
 

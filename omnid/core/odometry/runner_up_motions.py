@@ -17,14 +17,14 @@ steps differ by the ratio of the depths. The second one is estimated from the ou
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import SAME_M, PoseEstimate
+from omnid.core.odometry.estimates import SAME_M, GapStep, PoseEstimate
 from omnid.core.odometry.local_map import LocalMap
 from omnid.core.odometry.motion_filter import JERK_PSD, START_ACCELERATION_VARIANCE
 from omnid.core.stereo.triangulation import view
@@ -245,3 +245,41 @@ def _normalised(patches: Array) -> tuple[Array, NDArray[np.bool_]]:
     length = np.sqrt((patches**2).sum(axis=1))
     textured = length > MIN_PATCH_GREY * SAMPLES
     return patches / np.maximum(length, 1e-9)[:, None], textured
+
+
+# Sigma of the velocity while poses are refused [m/s, rad/s], because indoor vehicles are seldom faster than twice that.
+UNTRACKED_SPEED_SIGMA = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class UntrackedMotion:
+    """Motion since the last accepted pose."""
+
+    T_at_fix: Array  # (4, 4) that pose
+    too_fast: Array = field(default_factory=lambda: np.zeros(3))  # [m/s] in odom: that of the fastest refused pose
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation (6,) of the velocity [m/s, rad/s]."""
+        return np.repeat([max(UNTRACKED_SPEED_SIGMA, float(np.linalg.norm(self.too_fast))), UNTRACKED_SPEED_SIGMA], 3)
+
+    def keeps_view(self, T_odom_rect: Array) -> bool:
+        """Return whether a pose (4, 4) has the same landmarks in view as the last accepted one."""
+        return GapStep.between(self.T_at_fix, T_odom_rect).keeps_view
+
+    def refused(self, T_odom_rect: Array, since_s: float) -> UntrackedMotion:
+        """Return the motion after a pose that was refused for its speed, since_s after the last accepted one."""
+        velocity = (T_odom_rect[:3, 3] - self.T_at_fix[:3, 3]) / since_s
+        return replace(self, too_fast=max(self.too_fast, velocity, key=lambda v: float(np.linalg.norm(v))))
+
+    def in_doubt(self, estimate: PoseEstimate, since_s: float) -> PoseEstimate:
+        """Return an estimate with the motion at the refused speed as its runner-up, if there was one."""
+        if not self.too_fast.any():
+            return estimate
+        aside = self.T_at_fix[:3, 3] + self.too_fast * since_s - estimate.T_odom_rect[:3, 3]
+        other = np.concatenate([estimate.T_odom_rect[:3, :3].T @ aside, np.zeros(3)])
+        return replace(estimate, runner_up=max((other, estimate.runner_up), key=_length), through_gap=True)
+
+
+def _length(step: Array | None) -> float:
+    return 0.0 if step is None else float(np.linalg.norm(step[:3]))

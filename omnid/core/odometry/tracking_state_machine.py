@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.estimates import OdometryLimits
 from omnid.tracking_state import TrackingState
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.mapping.keyframe_grid import KeyframeScans
+from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.core.places.ageing import Ageing
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance

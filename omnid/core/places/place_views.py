@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.mapping.occupancy_grid import Grid
-from omnid.core.mapping.scan_grid import scan_grid
+from omnid.core.mapping.scan_grid import Grid, scan_grid
 from omnid.core.mapping.voxel_map import MapPoints, VoxelMap
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.places.place_rig import PlaceRig

@@ -2,19 +2,186 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Final
+from enum import StrEnum
+from typing import Final, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.fit.rig_drift import RigDrift, estimate_rig_drift
 from calib.fit.robust_scale import SIGMA_PER_MAD
-from calib.panorama import Cylinder
-from omnid.core.rig.column_matches import Matches
-from omnid.core.rig.rig_state import RigState
+from calib.panorama import Cylinder, at_scale
+from omnid.core.odometry.corners import corners
+from omnid.core.odometry.exposure_times import Exposure
+from omnid.core.odometry.tracking import KltSettings, track
+from omnid.core.types.panorama import PaddedPanorama
+from omnid.core.types.pixel_times import PixelTimes
+
+
+class RigState(StrEnum):
+    """State of a rig by the images; ARCHITECTURE.md has a figure of the transitions."""
+
+    UNCHECKED = "unchecked"  # The images show too little, or nothing was checked yet.
+    FITS = "fits"
+    DRIFTED = "drifted"  # The rig is off by some tenths of a degree: poses are less accurate.
+    EXCHANGED = "exchanged"  # The lower camera was taken for the upper one.
+    BROKEN = "broken"  # The rig is off by degrees: a mirror was knocked, a camera covered, or it is of other cameras.
+
+    @property
+    def is_contradicted(self) -> bool:
+        """True if the images cannot be of this rig, so that no pose of them is to be relied on."""
+        return self in (RigState.EXCHANGED, RigState.BROKEN)
+
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+# Corners per pair, so that a round of two pairs has the matches of a finding (120) where four corners in ten are found.
+POINTS: Final = 160
+# The coarse search works on images reduced by this factor, because its cost falls with the fourth power, and the
+# tracker that follows converges from two reduced pixels away (MAX_STEP_PX).
+COARSE: Final = 4
+# Half the side of a patch, in the reduced image: 36 px of the panorama, some ten degrees at 1300 columns. At all
+# scales, because fewer pixels match by chance.
+PATCH_PX: Final = 4
+# Search range to either side, in the reduced image at scale 1: five degrees of a panorama of 1300 columns, because a
+# rig that is wrong by more finds chance matches only, which `column_finding` recognises by their number.
+ASIDE_PX: Final = 5
+# Search range downwards, in the reduced image at scale 1, because a point at one and a half baselines is so far below.
+DOWN_PX: Final = 30
+# Least correlation of a coarse match, because the search is wide, and a lower one lets more chance matches pass.
+MIN_CORRELATION: Final = 0.8
+# Largest step from the coarse match to the tracked point, px, because two reduced pixels are the error of the coarse
+# search.
+MAX_STEP_PX: Final = 2 * COARSE
+# Points at infinity have no disparity, and so less than this, because noise makes it negative for some of them, as
+# exchanged cameras do for all.
+MIN_DISPARITY_PX: Final = 0.5
+# Two levels are enough: half a window reaches 7 px, and 28 px on the second level, farther than MAX_STEP_PX.
+KLT: Final = KltSettings(window_px=15, levels=2, max_error_px=0.3)
+# Standard deviation of a coarse patch with contrast, grey levels, because noise alone, averaged over COARSE^2 pixels,
+# has less.
+CONTRAST_GREY: Final = 6.0
+
+
+class PanoramaPair(Protocol):
+    """Both panoramas of a pair, as the messages between the stages have them."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Stamp of the pair."""
+
+    @property
+    def lower(self) -> PaddedPanorama:
+        """Panorama of the lower camera."""
+
+    @property
+    def upper(self) -> PaddedPanorama:
+        """Panorama of the upper camera."""
+
+    @property
+    def visible(self) -> Flags:
+        """Flags (H, W) of the pixels where both cameras see the world."""
+
+    @property
+    def times(self) -> PixelTimes:
+        """Times of exposure of the pixels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """Points of the lower panorama found in the upper one: (column, row) (N, 2) each.
+
+    tried: number of points searched; clear: number of these with contrast.
+    """
+
+    lower: Array
+    upper: Array
+    tried: int
+    clear: int
+
+
+def is_motion_unknown(pair: PanoramaPair, exposure: Exposure | None) -> bool:
+    """True if a pair has several exposures and the unknown motion in between would be taken for a drift."""
+    return not pair.times.is_at_once and (exposure is None or not exposure.is_known)
+
+
+def together(found: Iterable[Matches]) -> Matches:
+    """Return the matches of several pairs as one."""
+    parts = [Matches(np.zeros((0, 2)), np.zeros((0, 2)), 0, 0), *found]
+    lower, upper = (np.concatenate([getattr(part, side) for part in parts]) for side in ("lower", "upper"))
+    return Matches(lower, upper, sum(part.tried for part in parts), sum(part.clear for part in parts))
+
+
+def match(lower: PaddedPanorama, upper: PaddedPanorama, visible: Flags, exposure: Exposure | None = None) -> Matches:
+    """Return the corners of the lower panorama found in the upper one, by coarse search and tracking.
+
+    exposure: the motion between the exposures of the pair, for which the pixels are corrected; None: none.
+    """
+    # 1. Corners of the lower panorama, and the best place of each in the reduced upper one.
+    points = corners(lower, visible, POINTS)
+    guess, likely, clear = _coarse(lower, upper, points)
+    # 2. Track from there, to parts of a pixel.
+    there, good = track(lower, upper, points, guess, KLT)
+    # 3. Keep those that stay near the coarse place and lie lower in the upper panorama than in the lower one.
+    step = there - guess
+    step[:, 0] = lower.apart(step[:, 0])
+    good &= likely & (np.abs(step).max(axis=1) < MAX_STEP_PX) & (there[:, 1] > points[:, 1] + MIN_DISPARITY_PX)
+    found = Matches(points[good], there[good], len(points), clear)
+    # 4. Views at the stamp of the pair, where its images were exposed at several times.
+    return found if exposure is None else _at_stamp(found, exposure)
+
+
+def _at_stamp(found: Matches, exposure: Exposure) -> Matches:
+    """Return matches as they would be seen if both images were exposed at the stamp of the pair."""
+    views, _ = exposure.corrected(found.lower, found.upper[:, 1])
+    columns, _ = exposure.upper_columns(found.lower, found.upper[:, 1])
+    known = np.isfinite(columns)
+    upper = found.upper[known]
+    shift = exposure.model.cylinder.wrap(views[known, 0] - columns[known])
+    return Matches(views[known, :2], np.column_stack([upper[:, 0] + shift, views[known, 2]]), found.tried, found.clear)
+
+
+def _coarse(lower: PaddedPanorama, upper: PaddedPanorama, points: Array) -> tuple[Array, Flags, int]:
+    """Return the best positions (N, 2) of points in the upper panorama, to COARSE pixels, and flags of good ones (N,).
+
+    Also the number of points with contrast.
+    """
+    small_lower, small_upper = (_reduced(wrapped.image) for wrapped in (lower, upper))
+    (height, width), scale = small_upper.shape, lower.scale
+    aside, down_most = at_scale(ASIDE_PX, scale), at_scale(DOWN_PX, scale)
+    guess, likely, clear = points.copy(), np.zeros(len(points), bool), 0
+    padded = points + np.array([lower.pad_px, 0])
+    for index, (column, row) in enumerate((padded / COARSE).round().astype(int).tolist()):
+        left, right, top = column - PATCH_PX, column + PATCH_PX + 1, row - PATCH_PX
+        low, high = max(0, left - aside), min(width, right + aside)
+        strip = small_upper[max(0, top) : min(height, row + PATCH_PX + 1 + down_most), low:high]
+        patch = small_lower[max(0, top) : row + PATCH_PX + 1, max(0, left) : right]
+        if left < 0 or top < 0 or right > width or patch.shape[0] != 2 * PATCH_PX + 1 or strip.shape[0] < len(patch):
+            continue
+        _, best, _, (right, down) = cv2.minMaxLoc(cv2.matchTemplate(strip, patch, cv2.TM_CCOEFF_NORMED))
+        guess[index] += COARSE * (low + right - left), COARSE * down
+        likely[index] = best >= MIN_CORRELATION
+        clear += _contrast_grey(patch) > CONTRAST_GREY
+    return guess, likely, clear
+
+
+def _contrast_grey(patch: Image) -> float:
+    """Return patch.std(), in half of its time."""
+    apart = patch - np.add.reduce(patch, None, float) / patch.size
+    return math.sqrt(np.add.reduce(apart * apart, None) / patch.size)
+
+
+def _reduced(image: Image) -> Image:
+    width, height = image.shape[1] // COARSE, image.shape[0] // COARSE
+    whole = image[: height * COARSE, : width * COARSE]
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+
 
 # Matches for a finding: ten in each sector of azimuth, so that a tilt and a shift can be distinguished.
 MIN_MATCHES: Final = 120

@@ -17,8 +17,7 @@ from calib import se3
 from calib.panorama import Cylinder
 from calib.rig import Rig
 from omnid.core.odometry.corners import APART_PX, clear_around, corners, nearby_disparity
-from omnid.core.odometry.patch_alignment import align
-from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes, plane_templates
+from omnid.core.odometry.plane_patches import align, disparity_slopes, fitted_slopes, plane_templates
 from omnid.core.odometry.tracking import KltSettings, track
 from omnid.core.stereo.triangulation import triangulate, view
 from omnid.core.types.panorama import PaddedPanorama

@@ -18,9 +18,19 @@ from typing import Final
 from calib.panorama import Cylinder
 from omnid.core.nanoseconds import S_PER_NS
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.rig.column_finding import BROKEN_DEG, DRIFTED_DEG, MIN_MATCHES, RigFinding, judge
-from omnid.core.rig.column_matches import Matches, PanoramaPair, is_motion_unknown, match, together
-from omnid.core.rig.rig_state import RigState
+from omnid.core.rig.column_finding import (
+    BROKEN_DEG,
+    DRIFTED_DEG,
+    MIN_MATCHES,
+    Matches,
+    PanoramaPair,
+    RigFinding,
+    RigState,
+    is_motion_unknown,
+    judge,
+    match,
+    together,
+)
 
 # Pairs of a round, and the most where matches are few, so that a start is checked within a second.
 ROUND_PAIRS: Final = 2

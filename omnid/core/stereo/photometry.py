@@ -2,8 +2,8 @@
 
 Two images are only compared at the same brightness. The exposure of a camera changes from image to image and differs
 between the two cameras; in the dark both are dim. So an image below a level is multiplied up to it, and the dimmer one
-of a pair up to the other one where they clearly differ. What is left of gain and offset, `core/odometry/patch_fit.py`
-finds for each patch.
+of a pair up to the other one where they clearly differ. What is left of gain and offset,
+`core/odometry/plane_patches.py` finds for each patch.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.stereo.tile_sums import TileSums
+from omnid.core.stereo.tiles import TileSums
 
 Image = NDArray[np.uint8]
 Flags = NDArray[np.bool_]

@@ -15,8 +15,7 @@ from calib.models.camera import Array
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.paper.paper_odometry import turned_track
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import KltSettings, flow
-from omnid.core.odometry.yaw_search import correlation_peaks
+from omnid.core.odometry.tracking import KltSettings, correlation_peaks, flow
 from tests.bench.paper.scenes import MOVED_TURNS_DEG, TURNS_DEG
 from tests.bench.paper.truth import Flags, cast, sees
 from tests.bench.paper.views import Experiment, Views, load_views

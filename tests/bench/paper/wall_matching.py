@@ -13,7 +13,7 @@ import numpy as np
 from calib import se3
 from calib.models.camera import Array
 from omnid.config import Config
-from omnid.core.stereo.edges import edge_pixels, smooth
+from omnid.core.stereo.matcher import edge_pixels, smooth
 from omnid.messages import Panoramas
 from omnid.stages.dense_stereo import DenseStereo
 from omnid.stages.geometry import Geometry

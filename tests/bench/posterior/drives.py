@@ -16,9 +16,7 @@ from omnid.config import Config
 from omnid.core.mapping.range_scan import azimuths
 from omnid.core.obstacles.cell_kernels import FLOOR, VISIBLE
 from omnid.core.obstacles.column import NEAREST_M, Columns, floor_plane
-from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
-from omnid.core.obstacles.grid_layers import level_odds
-from omnid.core.obstacles.grid_ring import GridRing
+from omnid.core.obstacles.grid import CELL_M, CELLS, GridRing, ObstacleGrid, level_odds
 from omnid.core.obstacles.pair_views import FOCAL_PX
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import FramePair, Panoramas

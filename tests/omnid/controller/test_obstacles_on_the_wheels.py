@@ -12,11 +12,9 @@ from pathlib import Path
 import pytest
 
 from omnid.controller.link import ControllerLink
-from omnid.core.control.collision_monitor import BLOCKED, REMEDY, RING_STALE
-from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.collision_monitor import BLOCKED, REMEDY, RING_STALE, CollisionSettings, ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControllerSettings
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.engine.telemetry import StageStats
 from tests.omnid.controller.test_link import DEADLINES, pose, start_message

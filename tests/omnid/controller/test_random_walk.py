@@ -18,12 +18,19 @@ from drivers.motors.serial_motor import LateReplyError
 from omnid.controller.controller import Controller
 from omnid.core.control import safety_rules
 from omnid.core.control.arming import AUTOMATIC, MANUAL, ArmRequest
-from omnid.core.control.collision_monitor import BLOCKED, MOVING, NEAR, RING_STALE, UNKNOWN
-from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.collision_monitor import (
+    BLOCKED,
+    MOVING,
+    NEAR,
+    RING_STALE,
+    UNKNOWN,
+    CollisionSettings,
+    ControllerRing,
+    MovingPoint,
+)
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF, NO_CONTACT
 from omnid.core.control.control_law import ControllerPose
-from omnid.core.control.controller_ring import ControllerRing, MovingPoint
 from omnid.core.control.heading_controller import LONGEST_TICK_S, Setpoint, Twist, wrap_angle
 from omnid.core.control.heading_goal import longest_lead_rad
 from omnid.core.control.motion_monitor import AGREE, WITNESSES, Witness

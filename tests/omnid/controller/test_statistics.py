@@ -8,9 +8,7 @@ from dataclasses import replace
 import pytest
 
 from omnid.controller.statistics import ControllerState
-from omnid.core.control.collision_monitor import BLOCKED
-from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.control.controller_ring import ControllerRing
+from omnid.core.control.collision_monitor import BLOCKED, CollisionSettings, ControllerRing
 from tests.omnid.controller.bench import (
     SETTINGS,
     UNATTENDED,

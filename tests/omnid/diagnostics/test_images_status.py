@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from omnid.config import Config
-from omnid.core.stereo.tile_sums import TILE_COLUMNS, TILE_ROWS
-from omnid.core.stereo.tiles import ALL_LIVE, TileStates
+from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.diagnostics.images_status import LIVE, ImagesStatus
 from omnid.diagnostics.run_statistics import RunStatistics
 from omnid.messages import OdometryUpdate, StereoDepth

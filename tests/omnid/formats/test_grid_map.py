@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
+from omnid.core.mapping.scan_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.errors import OmnidError
 from omnid.formats.grid_map import write_grid
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from omnid.config import load_config
-from omnid.core.mapping.occupancy_grid import FREE, UNKNOWN
+from omnid.core.mapping.scan_grid import FREE, UNKNOWN
 from omnid.core.places.place_views import grid
 from omnid.formats.place_file import read_places
 from omnid.simulation.lockstep import simulate

@@ -14,7 +14,7 @@ from drivers.logs.log_reader import LogReader
 from drivers.motion import WheelSample
 from omnid.config import Config
 from omnid.core.odometry.exposure_times import Exposure
-from omnid.core.rig.column_matches import PanoramaPair
+from omnid.core.rig.column_finding import PanoramaPair
 from omnid.core.rig.rig_health import RigHealth
 from omnid.formats.tum import read_tum
 from omnid.messages import FramePair, Panoramas

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from omnid.core.mapping.keyframe_grid import KeyframeScans
+from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.load_level import LoadLevel
 from omnid.messages import PlaceUpdate
 from omnid.stages.grid import MapGrid

@@ -12,8 +12,7 @@ import pytest
 
 from calib import se3
 from calib.se2_arrays import planar, transform
-from omnid.core.control.collision_monitor import UNKNOWN
-from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.collision_monitor import UNKNOWN, CollisionSettings
 from omnid.core.navigation.local_planner import CROSSES
 from omnid.core.navigation.requests import (
     GoalRequest,
@@ -28,7 +27,7 @@ from omnid.core.navigation.requests import (
 from omnid.core.navigation.route import KeyframePose
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState

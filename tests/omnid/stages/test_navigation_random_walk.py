@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, transform
 from omnid.core.control.arming import MANUAL, ArmRequest
-from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
 from omnid.core.control.command_sources import OPERATOR, PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.motion_monitor import MotionSettings
 from omnid.core.navigation.requests import (
@@ -36,7 +35,7 @@ from omnid.core.navigation.requests import (
 )
 from omnid.core.navigation.settings import NavigationSettings
 from omnid.core.navigation.situation import WheelState
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.formats.route_file import RouteFolder
 from omnid.messages import NavigationUpdate, ObstacleRing, OdometryUpdate, PlaceUpdate
 from omnid.navigation_state import NavigationState

@@ -11,8 +11,7 @@ import pytest
 from calib import se3
 from omnid.core.obstacles.cell_kernels import SURFACE
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.stereo.tile_sums import TILE_COLUMNS, TILE_ROWS
-from omnid.core.stereo.tiles import TileStates
+from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.stages.floor import CameraFloor

@@ -19,8 +19,7 @@ from drivers.logs.log_reader import LogReader
 from omnid import Odometry
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import NOT_COMMANDED, NOT_SEEN, Motion, MotionSettings
-from omnid.core.control.plausibility import MotorReport, Plausibility
-from omnid.core.control.trust import TrustSettings
+from omnid.core.control.trust import MotorReport, Plausibility, TrustSettings
 from omnid.formats.tum import read_tum
 from omnid.stages.lockstep_drive import controller_pose
 from tests.conftest import PAIRS

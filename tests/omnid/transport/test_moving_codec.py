@@ -7,7 +7,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.stores import ros2_humble as ros
 
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.errors import OmnidError
 from omnid.transport import codec
 from omnid.transport.moving_codec import FIELDS, moving_cdr

@@ -19,8 +19,7 @@ from omnid.core.odometry.estimates import OdometryEstimate, bounded
 from omnid.core.odometry.motion_filter import MotionFilter
 from omnid.core.odometry.paper.registration import Registration, consensus, register
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.odometry.tracking import KltSettings, flow, track
-from omnid.core.odometry.yaw_search import steps
+from omnid.core.odometry.tracking import KltSettings, flow, steps, track
 from omnid.core.stereo.triangulation import triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 from omnid.errors import OmnidError

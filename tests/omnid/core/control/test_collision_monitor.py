@@ -10,9 +10,7 @@ import pytest
 
 from omnid.core.control import collision_monitor as monitor_module
 from omnid.core.control.collision_geometry import MOST_MOTIONS
-from omnid.core.control.collision_monitor import CollisionMonitor
-from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.control.controller_ring import ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import CollisionMonitor, CollisionSettings, ControllerRing, MovingPoint
 from omnid.core.control.heading_controller import Twist
 
 S = 1_000_000_000

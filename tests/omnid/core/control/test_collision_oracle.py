@@ -15,9 +15,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from omnid.core.control.collision_monitor import MOVING, CollisionMonitor
-from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.control.controller_ring import ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import (
+    MOVING,
+    CollisionMonitor,
+    CollisionSettings,
+    ControllerRing,
+    MovingPoint,
+)
 from omnid.core.control.heading_controller import Twist
 from tests.omnid.core.control import swept_outline
 from tests.omnid.core.control.swept_outline import Box

@@ -9,10 +9,9 @@ import random
 import pytest
 
 from omnid.core.control.arming import AUTOMATIC
-from omnid.core.control.collision_settings import CollisionSettings
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
-from omnid.core.control.controller_ring import ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import IDLE, POSE_JUMPED
 from omnid.core.control.velocity_limits import VelocityLimits

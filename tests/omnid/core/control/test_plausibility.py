@@ -6,8 +6,7 @@ import pytest
 
 from omnid.core.control.heading_controller import Twist
 from omnid.core.control.motion_monitor import Motion, MotionSettings
-from omnid.core.control.plausibility import POSE_DEGRADED, Plausibility
-from omnid.core.control.trust import TrustSettings
+from omnid.core.control.trust import POSE_DEGRADED, Plausibility, TrustSettings
 from omnid.core.control.velocity_limits import VelocityLimits
 
 LIMITS = VelocityLimits(velocity_mps=0.8, yaw_rate_radps=1.5)

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from omnid.core.control.unknown_ends import UNKNOWN_SECTORS, unknown_ends
+from omnid.core.control.collision_monitor import UNKNOWN_SECTORS, unknown_ends
 
 COUNT = 36
 

@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnid.core.mapping.keyframe_grid import MAX_CELLS, KeyframeGrid, KeyframeScans
-from omnid.core.mapping.occupancy_grid import OCCUPIED, UNKNOWN, Grid, known_part
+from omnid.core.mapping.scan_grid import (
+    MAX_LIVE_CELLS,
+    OCCUPIED,
+    UNKNOWN,
+    Grid,
+    KeyframeGrid,
+    KeyframeScans,
+    known_part,
+)
 from tests.omnid.core.mapping.rooms import OPEN, box, pose, scan_of
 from tests.omnid.core.mapping.test_scan_grid import PATH, ROOM, grid_of, near
 
@@ -62,7 +69,7 @@ def test_it_grows_and_is_bounded() -> None:
     assert (nothing.cells == UNKNOWN).all()
     far = np.array([PATH[0], pose(3000.0, 4000.0, 0.0) @ PATH[0]])
     found = grid.draw(of({0: SCANS[0], 1: SCANS[0]}, far), T_BASE_RECT)
-    assert found.cell_m > 0.05 and found.cells.size <= MAX_CELLS and grid.redrawn == 2
+    assert found.cell_m > 0.05 and found.cells.size <= MAX_LIVE_CELLS and grid.redrawn == 2
     small = scan_of(box((-1, -1), (1, 1)), PATH[0]).astype(np.float16)
     assert same(
         grid.draw(of({0: SCANS[0], 1: SCANS[0], 2: small}, np.array([*far, far[0]])), T_BASE_RECT),

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED, UNKNOWN, Grid
 from omnid.core.mapping.range_scan import SECTORS, RangeScan, azimuths, seen_from
-from omnid.core.mapping.scan_grid import MAX_CELLS, scan_grid
+from omnid.core.mapping.scan_grid import FREE, MAX_CELLS, OCCUPIED, UNKNOWN, Grid, scan_grid
 from tests.omnid.core.mapping.rooms import OPEN, Array, box, pose, scan_of
 
 ROOM = box((-3.0, -2.0), (4.0, 2.5))

@@ -14,8 +14,7 @@ from omnid.core.control.arming import AUTOMATIC
 from omnid.core.control.command_sources import PLANNER, TimedSetpoint
 from omnid.core.control.control_law import ControlLaw, ControllerPose, ControllerSettings
 from omnid.core.control.motion_monitor import MotionSettings
-from omnid.core.navigation.drive import Navigation
-from omnid.core.navigation.navigator import Navigator
+from omnid.core.navigation.navigator import Navigation, Navigator
 from omnid.core.navigation.situation import MapPosition, Situation, WheelState
 from omnid.tracking_state import MapState, TrackingState
 

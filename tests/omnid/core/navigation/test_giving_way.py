@@ -8,9 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from omnid.core.navigation.drive import Navigation
 from omnid.core.navigation.giving_way import REST_S, RETRY_S, Phase, Trail, give_way
-from omnid.core.navigation.navigator import GIVES_WAY, Navigator
+from omnid.core.navigation.navigator import GIVES_WAY, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings

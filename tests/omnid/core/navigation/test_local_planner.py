@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, predicted, relative
-from omnid.core.control.collision_settings import CollisionSettings
-from omnid.core.control.controller_ring import ControllerRing
+from omnid.core.control.collision_monitor import CollisionSettings, ControllerRing
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.navigation.forecast import forecast
 from omnid.core.navigation.local_planner import ARC_S, ARC_STEPS, MARGIN_M, NEARER_M, LocalPlanner
@@ -19,7 +18,7 @@ from omnid.core.navigation.path import DrivePath, drive_path, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings, PursuitSettings
 from omnid.core.navigation.situation import Situation
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
+from omnid.core.obstacles.moving_tracker import MovingObstacle
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.driven_base import DrivenBase
 

@@ -10,14 +10,13 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.se2_arrays import relative
-from omnid.core.control.controller_ring import ControllerRing, MovingPoint
+from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
 from omnid.core.navigation.forecast import Forecast, forecast
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.situation import Situation
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
-from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.moving_tracker import MovingObstacle, MovingTracker
 from omnid.core.obstacles.usual_floor import Arrivals
 from omnid.navigation_state import NavigationState
 from tests.omnid.core.navigation.test_local_planner import AZIMUTHS, OUTLINE, SETTINGS, BaseAmongBoxes, Boxes

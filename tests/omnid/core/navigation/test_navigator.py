@@ -13,8 +13,7 @@ from omnid.core.control.arming import ArmRequest
 from omnid.core.control.command_sources import OPERATOR, TimedSetpoint
 from omnid.core.control.heading_controller import Setpoint
 from omnid.core.control.safety_rules import ASKED
-from omnid.core.navigation.drive import Navigation
-from omnid.core.navigation.navigator import AROUND, GIVES_WAY, STOPS, WAITS, Navigator
+from omnid.core.navigation.navigator import AROUND, GIVES_WAY, STOPS, WAITS, Navigation, Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame
 from omnid.core.navigation.settings import NavigationSettings

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnid.core.control.collision_monitor import UNKNOWN
-from omnid.core.control.controller_ring import ControllerRing
-from omnid.core.control.unknown_ends import unknown_ends
+from omnid.core.control.collision_monitor import UNKNOWN, ControllerRing, unknown_ends
 from omnid.core.navigation.navigator import Navigator
 from omnid.core.navigation.path import DrivePath, straight_leg
 from omnid.core.navigation.requests import NavigationFrame

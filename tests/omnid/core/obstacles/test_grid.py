@@ -13,9 +13,7 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.cell_kernels import ABOVE, FLOOR, LEAST_VISIBLE, SURFACE
 from omnid.core.obstacles.cell_kernels import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
-from omnid.core.obstacles.grid import CELL_M, CELLS, ObstacleGrid
-from omnid.core.obstacles.grid_layers import PRIOR
-from omnid.core.obstacles.grid_ring import GridRing
+from omnid.core.obstacles.grid import CELL_M, CELLS, PRIOR, GridRing, ObstacleGrid
 from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.near_field import lose_before
 from omnid.core.obstacles.pair_views import DIRECTIONS

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.grid_ring import END_M, GridRing, RingView, circle_from, ring_of
+from omnid.core.obstacles.grid import END_M, GridRing, RingView, circle_from, ring_of
 from omnid.core.obstacles.usual_floor import Arrivals
 
 CELLS, CELL_M, MAX_RANGE_M = 120, 0.05, 2.5

@@ -9,8 +9,7 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.moving_obstacle import MovingObstacle
-from omnid.core.obstacles.moving_tracker import MovingTracker, surfaces
+from omnid.core.obstacles.moving_tracker import MovingObstacle, MovingTracker, surfaces
 from omnid.core.obstacles.usual_floor import Arrivals
 
 S = 1_000_000_000

@@ -7,10 +7,10 @@ import numpy as np
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.range_scan import SECTORS
-from omnid.core.obstacles.grid_ring import GridRing
+from omnid.core.obstacles.grid import GridRing
 from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.core.obstacles.usual_floor import Arrivals
-from omnid.core.stereo.tile_sums import TILE_COLUMNS
+from omnid.core.stereo.tiles import TILE_COLUMNS
 
 CYLINDER = Cylinder(width=900, height=250, row0=80.0)
 AHEAD = np.zeros(TILE_COLUMNS, bool)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.control.motion_monitor import AGREE, GYRO_DIFFERS, IMAGES_OR_WHEELS, WHEELS_DIFFER, Difference, Witness
-from omnid.core.odometry.contradiction import Contradiction, contradiction_after
+from omnid.core.odometry.motion_agreement import Contradiction, contradiction_after
 from tests.omnid.core.odometry.test_motion_agreement import BEGINS_S, Errors, driven
 
 Array = NDArray[np.float64]

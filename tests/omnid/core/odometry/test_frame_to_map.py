@@ -11,8 +11,7 @@ from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.estimates import PoseEstimate
-from omnid.core.odometry.exposure_times import Exposure, RigVelocity
-from omnid.core.odometry.exposure_velocity import UNKNOWN_VELOCITY
+from omnid.core.odometry.exposure_times import UNKNOWN_VELOCITY, Exposure, RigVelocity
 from omnid.core.odometry.frame_to_map import FrameToMap
 from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.local_map import LocalMap

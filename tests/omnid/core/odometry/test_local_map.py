@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from calib import se3
 from omnid.core.odometry.corners import corners
 from omnid.core.odometry.local_map import LocalMap
-from omnid.core.odometry.patch_alignment import AlignedPatches
+from omnid.core.odometry.plane_patches import AlignedPatches
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.odometry.test_landmarks import MODEL, POSE, keyframe, views

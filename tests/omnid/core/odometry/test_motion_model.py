@@ -9,10 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.odometry.estimates import OdometryEstimate
-from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits
+from omnid.core.odometry.motion_filter import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
-from omnid.core.odometry.sensed_motion import SensedMotion
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from omnid.core.odometry.patch_fit import WINDOW_PX, PatchFit, fit_patches
+from omnid.core.odometry.plane_patches import WINDOW_PX, PatchFit, fit_patches
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.7, -0.45])  # of the current patches, px

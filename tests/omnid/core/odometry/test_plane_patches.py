@@ -8,9 +8,14 @@ from numpy.typing import NDArray
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.patch_alignment import align
-from omnid.core.odometry.patch_fit import TEMPLATE_PX
-from omnid.core.odometry.plane_patches import disparity_slopes, fitted_slopes, moved_slopes, plane_templates
+from omnid.core.odometry.plane_patches import (
+    TEMPLATE_PX,
+    align,
+    disparity_slopes,
+    fitted_slopes,
+    moved_slopes,
+    plane_templates,
+)
 from omnid.core.stereo.triangulation import view
 from omnid.core.types.panorama import PaddedPanorama
 from omnid.core.types.stereo_model import StereoModel

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry import pose_search
-from omnid.core.odometry.estimates import OdometryEstimate, PoseEstimate
-from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.estimates import OdometryEstimate, OdometryLimits, PoseEstimate
+from omnid.core.odometry.motion_filter import SensedMotion
 from omnid.core.odometry.odometry import VisualOdometry
 from omnid.core.odometry.runner_up_motions import CLEAR_STEPS, Doubt, doubt_after, likeliest
-from omnid.core.odometry.sensed_motion import SensedMotion
 from omnid.core.odometry.tracking import KltSettings
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.tracking_state import TrackingState

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calib import se3
-from omnid.core.odometry.sensed_motion import LONGEST_GAP_S, MOST_SAMPLES, RateHistory, SensedMotion
+from omnid.core.odometry.motion_filter import LONGEST_GAP_S, MOST_SAMPLES, RateHistory, SensedMotion
 
 
 def history(times_s: list[float], rates: list[float]) -> RateHistory:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from omnid.core.odometry.limits import OdometryLimits
+from omnid.core.odometry.estimates import OdometryLimits
 from omnid.core.odometry.tracking_state_machine import FrameFacts, FrameOutcome, TrackingStatus, next_status
 from omnid.tracking_state import TrackingState
 

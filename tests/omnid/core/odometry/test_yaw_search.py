@@ -10,7 +10,7 @@ import pytest
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.odometry.yaw_search import correlation_peaks, steps
+from omnid.core.odometry.tracking import correlation_peaks, steps
 from tests.omnid.core.scenery import texture, turned
 
 ALL = np.ones((120, 480), bool)

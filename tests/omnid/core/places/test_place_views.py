@@ -8,7 +8,7 @@ import numpy as np
 
 from calib import se3
 from calib.panorama import Cylinder
-from omnid.core.mapping.occupancy_grid import FREE, OCCUPIED
+from omnid.core.mapping.scan_grid import FREE, OCCUPIED
 from omnid.core.places.place_features import PlaceFeatures
 from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig

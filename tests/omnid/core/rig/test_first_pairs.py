@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.first_pairs import MOST_ROUND_PAIRS, PATIENT_PAIRS, RETRY_S, ROUND_PAIRS, FirstPairs
-from omnid.core.rig.rig_state import RigState
 from omnid.core.types.pixel_times import PixelTimes
 from tests.omnid.core.rig.shown_pairs import ShownPair
 from tests.omnid.core.scenery import RenderedCameras

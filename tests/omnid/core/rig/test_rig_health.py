@@ -16,10 +16,8 @@ from calib.rig_file import read_rig
 from drivers.logs.log_reader import LogReader
 from omnid.camera_config import PairConfig
 from omnid.config import Config, PanoramaConfig
-from omnid.core.rig.column_matches import POINTS
-from omnid.core.rig.driving_views import MIN_PLACES, VIEWS
-from omnid.core.rig.rig_health import RigHealth
-from omnid.core.rig.rig_state import RigState
+from omnid.core.rig.column_finding import POINTS, RigState
+from omnid.core.rig.rig_health import MIN_PLACES, VIEWS, RigHealth
 from omnid.diagnostics.rig_status import rig_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph

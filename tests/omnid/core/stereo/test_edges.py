@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnid.core.stereo.edges import edge_pixels, smooth
+from omnid.core.stereo.matcher import edge_pixels, smooth
 from tests.omnid.core.scenery import texture
 
 EVERYWHERE = np.ones((60, 80), bool)

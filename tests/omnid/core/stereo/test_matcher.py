@@ -8,8 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.stereo.edges import smooth
-from omnid.core.stereo.matcher import METHODS, Matcher, MatchingSettings
+from omnid.core.stereo.matcher import METHODS, Matcher, MatchingSettings, smooth
 from omnid.core.stereo.semiglobal import ColumnShift
 from tests.omnid.core.scenery import PAD_PX, RenderedCameras, texture, turned
 from tests.simulation import make_rig, room

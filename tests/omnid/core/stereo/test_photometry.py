@@ -16,7 +16,7 @@ from omnid.core.stereo.photometry import (
     noise_sigma,
     pair_gains,
 )
-from omnid.core.stereo.tile_sums import TileSampler, TileSums
+from omnid.core.stereo.tiles import TileSampler, TileSums
 from tests.omnid.core.scenery import texture
 
 SHAPE = (160, 640)

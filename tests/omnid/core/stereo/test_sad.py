@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.sad import NO_MATCH, SadVolume, local_minima, subpixel
+from omnid.core.stereo.semiglobal import NO_MATCH, SadVolume, local_minima, subpixel
 from tests.omnid.core.scenery import texture
 
 Image = NDArray[np.uint8]

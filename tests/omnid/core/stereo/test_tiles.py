@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from omnid.core.stereo.tile_sums import TILE_COLUMNS, TILE_ROWS
 from omnid.core.stereo.tiles import (
     ALL_LIVE,
     BLACK_GREY,
     IN_A_ROW,
     SIDES,
+    TILE_COLUMNS,
+    TILE_ROWS,
     Side,
     TileMonitor,
     TileStates,
