@@ -108,14 +108,25 @@ def is_section(kind: Any) -> bool:
 
 
 def types_of(section: Any) -> dict[str, Any]:
-    """Return the types of the keys of a section, with their annotations."""
+    """Return the types of the keys of a section, with their annotations.
+
+    A field of a dataclass without a text in its annotation is no key: a parameter of a method that files do not set.
+    """
     return _hints(section)
 
 
 @cache
 def _hints(section: Any) -> dict[str, Any]:
     hints = get_type_hints(section, include_extras=True)
-    return {name: _unless_absent(kind) for name, kind in hints.items() if get_origin(kind) is not ClassVar}
+    present = {name: _unless_absent(kind) for name, kind in hints.items() if get_origin(kind) is not ClassVar}
+    if not is_dataclass(section):
+        return present
+    return {name: kind for name, kind in present.items() if is_section(kind) or _has_text(kind)}
+
+
+def _has_text(kind: Any) -> bool:
+    """True for an annotation with a text."""
+    return get_origin(kind) is Annotated and any(isinstance(found, str) for found in get_args(kind)[1:])
 
 
 def _unless_absent(kind: Any) -> Any:

@@ -47,13 +47,10 @@ class CamerasConfig:
         "other controls by their names in v4l2-ctl --list-ctrls; best with a fixed focus, as each one has another "
         "calibration: 'focus_automatic_continuous=0', 'focus_absolute=20'",
     ] = ()
-    buffers: Annotated[int, Meta(ge=2, le=32), "image buffers of the kernel"] = 4
-    timeout_s: Annotated[float, Meta(ge=0.05, le=60), "a camera without an image for so long is opened again, s"] = 2.0
-    retry_s: Annotated[float, Meta(ge=0.05, le=60), "longest wait between two tries to open a lost camera, s"] = 2.0
 
     def settings(self, camera: str) -> V4l2Settings:
         """Return the settings of the lower or the upper camera; DriverError if they contradict each other."""
-        shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if entry.name != "device"}
+        shared = {entry.name: getattr(self, entry.name) for entry in fields(V4l2Settings) if hasattr(self, entry.name)}
         return V4l2Settings(device=self.lower if camera == "lower" else self.upper, **shared)
 
     def require_two_devices(self) -> None:

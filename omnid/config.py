@@ -46,10 +46,8 @@ class LiveConfig:
     """Reports of `omnid run`."""
 
     status_s: Annotated[float, Meta(ge=0.1, le=60), "period of the status, s"] = 1.0
+
     cloud_s: Annotated[float, Meta(ge=0, le=3600), "period of the maps on the bus, s; 0: only at the end"] = 2.0
-    cloud_points: Annotated[
-        int, Meta(ge=0, le=10_000_000), "largest number of map points on the bus: the most confident ones"
-    ] = 50_000
     shed_load: Annotated[bool, "give up the map, then half the landmarks, while the computer is too slow"] = True
 
 
@@ -61,9 +59,7 @@ class RigConfig:
         Literal["refuse", "warn", "off"],
         "if the first images contradict the rig: end with an error, warn only, or do not check",
     ] = "refuse"
-    check_s: Annotated[
-        float, Meta(ge=0, le=3600), "time between two views that a live run compares with the rig, s; 0: none"
-    ] = 5.0
+    check_s: float = 5.0  # time between two views that a live run compares with the rig
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,16 +67,14 @@ class PanoramaConfig:
     """Size and borders of the panoramas."""
 
     width_px: Annotated[int, Meta(ge=0, le=65536), "columns of a full turn, px; 0: the images' own resolution"] = 0
-    scale: Annotated[
-        float, Meta(ge=0.25, le=1), "where width_px is 0: columns as a share of the images' own resolution"
-    ] = 1.0
+    scale: Annotated[float, Meta(ge=0.25, le=1), "columns as a share of the images' own resolution"] = 1.0
     elevation_deg: Annotated[
         tuple[Annotated[float, Meta(ge=-80, le=80)], Annotated[float, Meta(ge=-80, le=80)]],
         "lowest and highest elevation, deg",
     ] = (-50.0, 40.0)
-    pad_px: Annotated[int, Meta(ge=16, le=256), "columns more on either side, so that windows run across the seam"] = 48
-    rim_margin_px: Annotated[float, Meta(ge=0, le=100), "margin along rim and hub in the images, px"] = 4.0
-    margin_px: Annotated[int, Meta(ge=0, le=100), "margin along the border of the common view of both cameras, px"] = 7
+    pad_px: int = 48  # columns more on either side, so that windows run across the seam
+    rim_margin_px: float = 4.0  # margin along rim and hub in the images, px
+    margin_px: int = 7  # margin along the border of the common view of both cameras, px
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +82,7 @@ class StereoConfig:
     """Depth by matching along the columns of the panoramas."""
 
     min_range_m: Annotated[float, Meta(ge=0.01, le=100), "distance of the nearest points from the rig's axis, m"] = 0.65
-    noise_px: Annotated[
-        float, Meta(ge=0.01, le=10), "sigma of a disparity, px: sets the weight of a point in the map"
-    ] = 0.5
+    noise_px: float = 0.5  # sigma of a disparity, px: sets the weight of a point in the map
     matching: MatchingSettings = field(default_factory=MatchingSettings)
 
 
@@ -101,7 +93,7 @@ class OdometryConfig:
     method: Annotated[Literal["default", "paper"], "method of the odometry"] = "default"
     tracker: Annotated[Literal["improved", "klt"], "feature tracker of the paper's method"] = "improved"
     reference: Annotated[Literal["previous", "keyframe"], "reference frame of the paper's method"] = "previous"
-    noise_px: Annotated[float, Meta(ge=0.01, le=10), "sigma of a tracked corner, px"] = 0.1
+    noise_px: float = 0.1  # sigma of a tracked corner, px
     klt: KltSettings = field(default_factory=KltSettings)
     limits: OdometryLimits = field(default_factory=OdometryLimits)
 
@@ -133,16 +125,10 @@ class MappingConfig:
         "keyframes only while no client receives and no log records the cloud of a live run",
     ] = 5.0
     voxel_m: Annotated[float, Meta(ge=0.001, le=10), "edge of a voxel, m"] = 0.05
-    log2_voxels: Annotated[int, Meta(ge=10, le=24), "the map holds up to 0.7 * 2^n voxels of 52 bytes"] = 18
-    max_sigma_m: Annotated[float, Meta(ge=0.001, le=100), "largest sigma of a point that enters the map, m"] = 0.15
-    min_frames: Annotated[
-        int, Meta(ge=1, le=1000), "frames that must have observed a voxel that is written; fewer in a short run"
-    ] = 6
-    path_poses: Annotated[
-        int,
-        Meta(ge=100, le=10_000_000),
-        "vertices of the path in the plan view; when full, every second one is dropped",
-    ] = 10_000
+    log2_voxels: int = 18  # the map holds up to 0.7 * 2^n voxels of 52 bytes
+    max_sigma_m: float = 0.15  # largest sigma of a point that enters the map, m
+    min_frames: int = 6  # frames that must have observed a voxel that is written; fewer in a short run
+    path_poses: int = 10_000  # vertices of the path in the plan view; when full, every second one is dropped
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,37 +147,18 @@ class RecordConfig:
     enabled: Annotated[bool, "omnid run records images and results"] = False
     folder: Annotated[str, "folder of the recordings; it is made if it is missing"] = "recordings"
     file_mb: Annotated[int, Meta(ge=1, le=1_000_000), "size at which a new file begins, MB"] = 500
-    file_s: Annotated[float, Meta(ge=1, le=86_400), "duration at which a new file begins, s"] = 600.0
-    keep_files: Annotated[int, Meta(ge=1, le=100_000), "number of files kept; the oldest are deleted"] = 1000
     keep_mb: Annotated[int, Meta(ge=2, le=1_000_000_000), "total size of all files, MB; the oldest are deleted"] = (
         20_000
     )
     free_mb: Annotated[
         int, Meta(ge=0, le=1_000_000), "free space left on the disk, MB; with less nothing is recorded"
     ] = 1000
-    sync_s: Annotated[
-        float, Meta(ge=0.1, le=3600), "period of syncing the files to the disk, s: a power cut loses no more"
-    ] = 3.0
-    queue: Annotated[
-        int, Meta(ge=1, le=1000), "messages of each kind that may wait for the disk; more drop the oldest"
-    ] = 20
-    cloud_points: Annotated[
-        int, Meta(ge=0, le=10_000_000), "largest number of map points in the log: the most confident ones"
-    ] = 200_000
 
     def rotation(self) -> RotationSettings:
         """Return these settings in the units of the driver."""
         return RotationSettings(
-            self.file_mb * 10**6, self.file_s, self.keep_files, self.keep_mb * 10**6, self.free_mb * 10**6, self.sync_s
+            file_bytes=self.file_mb * 10**6, keep_bytes=self.keep_mb * 10**6, free_bytes=self.free_mb * 10**6
         )
-
-
-@dataclass(frozen=True, slots=True)
-class GraphConfig:
-    """Inboxes and threads of the stages."""
-
-    depth: Annotated[int, Meta(ge=1, le=100), "messages that may wait in front of a stage"] = 2
-    opencv_threads: Annotated[int, Meta(ge=1, le=64), "threads OpenCV may use within a stage"] = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,7 +192,6 @@ class Config:
     live: LiveConfig = field(default_factory=LiveConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
-    graph: GraphConfig = field(default_factory=GraphConfig)
     realtime: RealtimeSettings = field(default_factory=RealtimeSettings)
     service: ServiceConfig = field(default_factory=ServiceConfig)
 
@@ -257,14 +223,12 @@ USED_ONLY_BY: Final[Mapping[str, str]] = MappingProxyType(
         "controller.arming": "run",
         "controller.setpoint": "replay",
         "controller.sources": "run",
-        "graph.depth": "replay",
         "live": "run",
         "log": "replay",
         "places.save_s": "run",
         "navigation": "run",
         "realtime": "run",
         "record": "run",
-        "record.cloud_points": "",
         "rig": "run",
         "rig.check": "",
         "service": "run",

@@ -148,7 +148,7 @@ def _insert(table: dict[str, Any], path: Path, value: object) -> None:
 def _dumped(settings: Any, default: Any, path: Path) -> Iterator[str]:
     """Yield the lines of a section and of those within it; keys come first, because TOML wants them before tables."""
     types = types_of(type(settings))
-    if path:
+    if path and not all(map(is_section, types.values())):
         yield from ("", f"[{'.'.join(path)}]")
     for name, kind in types.items():
         if not is_section(kind):

@@ -23,7 +23,7 @@ _WARNINGS = {
     "late": "dropped {} frames older than others read before: record with less delay or raise log.reorder_frames",
     "duplicate": "dropped {} frames with the same stamp as the frame before of the same camera",
     "broken_motion": "skipped {} messages of wheels or IMU that are not valid; the first: {motion_fault}",
-    "no_joints": "none of {} messages of joints names the wheels: see motion.left_joint and motion.right_joint",
+    "no_joints": "none of {} messages of joints names the wheels: see motion.wheel_joints",
     "broken": "skipped {} messages of the cameras' topics that hold no valid image; the first: {fault}",
     "unstamped": "{} frames have no stamp in their header: used the time of logging",
     "broken_records": "skipped {} corrupt chunks or records of the file",

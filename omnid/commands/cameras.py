@@ -115,7 +115,7 @@ def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, 
 
 
 def _of_device(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
-    """Yield frames once the exposure has adapted; they end when the camera gives none within cameras.timeout_s."""
+    """Yield frames once the exposure has adapted; they end when the camera gives none within the driver's time."""
     from itertools import islice
 
     from drivers.cameras.v4l2_camera import V4l2Camera

@@ -32,6 +32,7 @@ LOCK_ADVICE: Final = (
     "realtime.lock_memory = false"
 )
 FILES: Final = 4096  # open at once
+SWITCH_INTERVAL_S: Final = 1e-3  # time after which Python switches threads
 _PR_SET_NAME: Final = 15
 _NAME_BYTES: Final = 15
 # MCL_CURRENT | MCL_FUTURE | MCL_ONFAULT; without the last one, untouched stacks take 400 MB.
@@ -45,10 +46,6 @@ class RealtimeSettings:
     """Requests to the kernel and to Python, so that deadlines hold."""
 
     lock_memory: Annotated[bool, "lock all memory against swapping; needs LimitMEMLOCK=infinity"] = True
-    freeze_gc: Annotated[bool, "exclude what exists at the start from garbage collection"] = True
-    switch_interval_ms: Annotated[
-        float, Meta(ge=0, le=100), "time after which Python switches threads, ms; 0: Python's default, 5 ms"
-    ] = 1.0
     motor_priority: Annotated[
         int, Meta(ge=0, le=99), "SCHED_FIFO priority of the controller's tick, needs LimitRTPRIO; 0: none"
     ] = 20
@@ -62,11 +59,9 @@ class RealtimeSettings:
 
 def prepare(config: RealtimeSettings) -> list[str]:
     """Apply the settings of the process, after the wiring and before the run; return a line per refused setting."""
-    if config.switch_interval_ms > 0:
-        sys.setswitchinterval(config.switch_interval_ms * 1e-3)
-    if config.freeze_gc:
-        gc.collect()
-        gc.freeze()
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()  # what exists at the start is not examined again
     limit_realtime_runs(config.longest_run_ms)
     refused = lock_memory() if config.lock_memory else ""
     return [refused] if refused else []

@@ -2,7 +2,7 @@
 
 Reads an IMU of WitMotion (WT61, WT901 ...) and publishes each angular velocity as sensor_msgs/msg/Imu on `cmd/imu`, as
 any program may do for any other gyro. Set the IMU to 115200 baud and 100 Hz with its maker's program, and state its
-orientation on the base by motion.imu_roll_deg, imu_pitch_deg and imu_yaw_deg of the robot's settings.
+orientation on the base by motion.imu_rpy_deg of the robot's settings.
 
 The IMU sends packets of 11 bytes unasked: 0x55, a type, four little-endian numbers of 16 bits, and the sum of the ten
 bytes before. Type 0x52 holds the angular velocities about x, y, z in units of 2000 / 32768 degrees per second.

@@ -23,7 +23,7 @@ from omnid.engine.realtime import ThreadStart, give_back_code, name_thread, prep
 from omnid.engine.threads import started
 from omnid.errors import OmnidError
 from omnid.runs.live_robot import LiveRobot
-from omnid.runs.session import Session
+from omnid.runs.session import OPENCV_THREADS, Session
 from omnid.runs.systemd import print_stacks_when_killed
 from omnid.stages.geometry import Geometry
 
@@ -41,7 +41,7 @@ class LiveRun:
     ) -> None:
         """rig: None for that of the configuration. show: rewrites a line of the terminal; None without a terminal."""
         self._config, self._robot, self._report, self._rig, self._show = config, robot, report, rig, show
-        self._graph = _graph_that_waits(config) if robot.waits else _graph_in_time(config, report)
+        self._graph = _graph_that_waits() if robot.waits else _graph_in_time(config, report)
         self._connected = False
 
     def run(self) -> int:
@@ -73,7 +73,7 @@ class LiveRun:
                 from omnid.runs.live_status import add_terminal_ticker
 
                 add_terminal_ticker(session, self._show, self._report, self._robot.words)
-            cv2.setNumThreads(self._config.graph.opencv_threads)
+            cv2.setNumThreads(OPENCV_THREADS)
             if not self._robot.waits:
                 for refused in prepare(self._config.realtime):
                     session.warn(refused)
@@ -107,9 +107,9 @@ def _graph_in_time(config: Config, report: Report) -> Graph:
     return Graph(policy=NEWEST, depth=1, on_thread=ThreadStart(priorities(config.realtime, *CAMERAS), report))
 
 
-def _graph_that_waits(config: Config) -> Graph:
+def _graph_that_waits() -> Graph:
     """Return a graph that drops nothing, in threads as others are: the robot's time waits for it."""
-    return Graph(policy=LOSSLESS, depth=config.graph.depth, sinks_wait=True, on_thread=name_thread)
+    return Graph(policy=LOSSLESS, sinks_wait=True, on_thread=name_thread)
 
 
 def _load() -> None:

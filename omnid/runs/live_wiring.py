@@ -33,11 +33,11 @@ from omnid.runs.live_status import add_status_tickers
 from omnid.runs.map_saver import MapSaver
 from omnid.runs.pipeline import NavigationParts, RecordingSink, RunParts, Sinks, WiredStages, wheel_state, wire
 from omnid.runs.place_maps import RunPlaces
-from omnid.runs.record import open_recorder
+from omnid.runs.record import WAITING_RECORDS, open_recorder
 from omnid.runs.rig_checks import RigViews
 from omnid.runs.route_files import RouteFiles
 from omnid.runs.sensor_sources import SensorSources
-from omnid.runs.session import TICKERS, Session
+from omnid.runs.session import BUS_POINTS, LOG_POINTS, TICKERS, Session
 from omnid.sinks.bus_sink import BusSink, PanoramaSink
 from omnid.sinks.drive import LiveDrive, PlannerDrive, RingToController
 from omnid.sinks.recorder import Recorder
@@ -132,10 +132,10 @@ class LiveWiring:
             counters={"statistics": session.statistics, "latency": self._latency},
             bus=BusSink(
                 bus,
-                session.encoder(self._geometry.rig, config.live.cloud_points),
+                session.encoder(self._geometry.rig, BUS_POINTS),
                 clock=VelocityCommand if self._robot.waits else None,  # ticks of its wheels give the time
             ),
-            recording=RecordingSink(recorder, tuple(frames), config.record.queue) if recorder else None,
+            recording=RecordingSink(recorder, tuple(frames), WAITING_RECORDS) if recorder else None,
         )
 
     def _add_status(
@@ -191,7 +191,7 @@ class LiveWiring:
 
     def _open_recorder(self) -> Recorder:
         session, rig = self._session, self._geometry.rig
-        encode = session.encoder(rig, session.config.record.cloud_points)
+        encode = session.encoder(rig, LOG_POINTS)
         recorder = open_recorder(
             session.config, rig_toml(rig), self._report, encode=encode, offset_ns=session.offset_ns
         )

@@ -21,6 +21,9 @@ from omnid.sinks.recorder import Recorder
 
 PERIOD_S: Final = 15.0  # Time between two lines about the progress.
 
+# Messages of each kind that may wait for the disk; more drop the oldest.
+WAITING_RECORDS: Final = 20
+
 
 def open_recorder(
     config: Config, rig: str, report: EventCallback, *, encode: Encoder | None = None, offset_ns: int = 0
@@ -40,7 +43,7 @@ def record(sources: Mapping[Camera, FrameSource], config: Config, rig: str, repo
     """Record frames with stamps of CLOCK_MONOTONIC until the sources end or a signal comes; return the recorder."""
     offset_ns = time.time_ns() - time.monotonic_ns()
     recorder = open_recorder(config, rig, report, offset_ns=offset_ns)
-    graph = Graph(policy=NEWEST, depth=config.record.queue)
+    graph = Graph(policy=NEWEST, depth=WAITING_RECORDS)
     frames = [graph.source(name, source.frames, wake=source.close) for name, source in sources.items()]
     graph.sink("record", recorder, *frames)
 

@@ -38,7 +38,7 @@ from omnid.runs.rig_checks import examined_rig
 from omnid.runs.run_report import RunReport
 from omnid.runs.run_result import RunFailedError, RunResult
 from omnid.runs.sensor_sources import motion_topics
-from omnid.runs.session import Session
+from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
 from omnid.sinks.drive import ReplayDrive
@@ -136,9 +136,8 @@ class _Replay:
         graph = Graph(
             policy=NEWEST if self._options.drops else LOSSLESS,
             threaded=not self._options.inline,
-            depth=self._config.graph.depth,
         )
-        with opencv_threads(self._config.graph.opencv_threads), ExitStack() as outputs:
+        with opencv_threads(OPENCV_THREADS), ExitStack() as outputs:
             session = Session(self._config, graph, outputs, self._warnings.append)
             reader = self._reader()
             outputs.callback(reader.close)
@@ -274,12 +273,12 @@ class _Replay:
                 raise
             session.warn(f"the run goes on without a bus: {error}")
             return None
-        return BusSink(bus, session.encoder(geometry.rig, self._config.record.cloud_points), clock=OdometryUpdate)
+        return BusSink(bus, session.encoder(geometry.rig, LOG_POINTS), clock=OdometryUpdate)
 
     def _recorder(self, session: Session, geometry: Geometry, path: Path) -> Recorder:
         config = self._config
         attachments = {"rig.toml": rig_toml(geometry.rig).encode(), "omnid.toml": dump(config).encode()}
-        encode = session.encoder(geometry.rig, config.record.cloud_points)
+        encode = session.encoder(geometry.rig, LOG_POINTS)
         recorder = Recorder(SingleLog(path, attachments), config.bus.robot, encode)
         session.outputs.callback(recorder.close)
         return recorder

@@ -31,15 +31,13 @@ def motion_topics(config: Config) -> MotionTopics:
 
 def joint_wheels(config: Config) -> JointWheels | None:
     """Return the wheels as joints, None where they are an Odometry. Raise OmnidError where only one is named."""
-    left, right = config.motion.left_joint, config.motion.right_joint
-    if not left and not right:
+    joints = config.motion.wheel_joints
+    if not joints:
         return None
-    if not (left and right) or left == right:
-        raise OmnidError(
-            f"motion.left_joint = {left!r}, motion.right_joint = {right!r}: expected the names of two joints, or none"
-        )
+    if len(joints) != 2 or len(set(joints)) != 2:
+        raise OmnidError(f"motion.wheel_joints = {list(joints)}: expected the names of two joints, or none")
     drive = config.motor.drive.geometry()
-    return JointWheels(left, right, drive.wheel_radius_m, drive.track_m)
+    return JointWheels(*joints, drive.wheel_radius_m, drive.track_m)
 
 
 class MotionSource(Protocol):

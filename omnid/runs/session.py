@@ -31,6 +31,10 @@ from omnid.transport.bus import Bus
 
 BUS_END_S: Final = 3.0
 ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.
+OPENCV_THREADS: Final = 1  # within a stage: the stages are threads themselves
+# Largest number of points of the map, the most confident ones, in one message on the bus and in a log.
+BUS_POINTS: Final = 50_000
+LOG_POINTS: Final = 200_000
 # They drop deadlines, not messages.
 TICKERS: Final = frozenset({"load", "motor", "progress", "router", "routes", "save", "status", "terminal", "watchdog"})
 

@@ -46,7 +46,7 @@ class Dewarp:
         if self._visible.mean() < MIN_SHARED_PART:
             raise OmnidError(
                 f"the cameras share {self._visible.mean():.1%} of the panorama, less than {MIN_SHARED_PART:.0%}: check "
-                "the rig's transforms and masks, panorama.rim_margin_px and panorama.margin_px"
+                "the rig's transforms and masks"
             )
 
     def process(self, pair: FramePair) -> Panoramas:

@@ -43,7 +43,7 @@ class SensorReceiver:
         """Handle one message."""
         try:
             if key not in self._topics:
-                raise OmnidError("it is not used: see motion.wheels, motion.left_joint and motion.imu")
+                raise OmnidError("it is not used: see motion.wheels, motion.wheel_joints and motion.imu")
             if len(payload) > LONGEST_PAYLOAD:
                 raise OmnidError(f"it has {len(payload)} bytes, more than {LONGEST_PAYLOAD}")
             sample = sample_from_cdr(payload, SENSOR_TOPICS[key], self._offset_ns, self._joints)

@@ -29,6 +29,7 @@ from omnid.engine.graph import Graph
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire
+from omnid.runs.session import OPENCV_THREADS
 from omnid.sinks.files import MapFile, TrajectoryFile
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
@@ -98,7 +99,7 @@ def measure(folder: Path, pairs: int, hz: float, overrides: Sequence[str]) -> di
     config, clock = load_config(None, overrides), StageClock()
     frames = list(LogReader(folder / "log.mcap").frames())
     place = geometry(with_rims(rig_of(folder), frames), config.panorama)
-    cv2.setNumThreads(config.graph.opencv_threads)
+    cv2.setNumThreads(OPENCV_THREADS)
     with TemporaryDirectory() as work, clock.timed_stages():
         graph = Graph(threaded=False)
         trajectory, cloud = TrajectoryFile(Path(work) / "t"), MapFile(Path(work) / "m")

@@ -60,7 +60,6 @@ def test_the_table_of_unused_settings_names_keys_that_exist(path: str) -> None:
 @pytest.mark.parametrize(
     ("command", "override"),
     [
-        ("run", "graph.depth=3"),
         ("run", " controller.setpoint . velocity_mps=0.0"),
         ("run", "log.reorder_frames=8"),
         ("replay", "cameras.width_px=640"),
@@ -75,8 +74,8 @@ def test_refuses_an_override_that_the_command_ignores(command: str, override: st
 
 
 def test_warns_in_one_line_of_settings_in_the_file_that_a_replay_ignores() -> None:
-    config = load_config(None, ["cameras.width_px=640", "service.stall_timeout_s=5", "record.cloud_points=7"])
-    (warning,) = unused_settings(config, "replay", ["record.cloud_points=7"])
+    config = load_config(None, ["cameras.width_px=640", "service.stall_timeout_s=5"])
+    (warning,) = unused_settings(config, "replay", [])
     assert warning == "`omnid replay` does not use these settings: cameras.width_px, service.stall_timeout_s"
     assert unused_settings(config, "run", []) == []
 

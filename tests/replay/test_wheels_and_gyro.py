@@ -166,7 +166,7 @@ def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[Moti
         return Entry("/joint_states", JOINT_STATE, bytes(store.serialize_cdr(message, JOINT_STATE)), sample.stamp_ns)
 
     log = saved(tmp_path / "log.mcap", scene, [*(joint_entry(each) for each in wheels), entry(wheels[0])])
-    settings = ["motion.left_joint=left", "motion.right_joint=right"]
+    settings = ["motion.wheel_joints=['left', 'right']"]
     reader = LogReader(log, motion=motion_topics(load_config(None, settings)))
     read = [message for message in reader.messages() if isinstance(message, WheelSample)]
     assert len(read) > 50 and not reader.warnings
@@ -175,12 +175,12 @@ def test_wheels_are_joints_where_these_are_named(scene: Path, samples: list[Moti
         assert (sample.velocity_mps, sample.yaw_rate_radps) == pytest.approx(
             (expected.velocity_mps, expected.yaw_rate_radps), abs=1e-9
         )
-    reader = LogReader(log, motion=motion_topics(load_config(None, ["motion.left_joint=l", "motion.right_joint=r"])))
+    reader = LogReader(log, motion=motion_topics(load_config(None, ["motion.wheel_joints=['l', 'r']"])))
     assert len(list(reader.messages())) == 2 * PAIRS
-    assert reader.warnings[0].startswith("none of ") and "motion.left_joint" in reader.warnings[0]
+    assert reader.warnings[0].startswith("none of ") and "motion.wheel_joints" in reader.warnings[0]
     reader = LogReader(log, motion=motion_topics(load_config()))
     assert len([message for message in reader.messages() if isinstance(message, WheelSample)]) == 1
-    for wrong in (["motion.left_joint=l"], ["motion.left_joint=l", "motion.right_joint=l"]):
+    for wrong in (["motion.wheel_joints=['l']"], ["motion.wheel_joints=['l', 'l']"]):
         with pytest.raises(OmnidError, match="expected the names of two joints"):
             motion_topics(load_config(None, wrong))
 

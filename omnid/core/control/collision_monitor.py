@@ -52,8 +52,8 @@ class CollisionSettings:
         Meta(ge=0.2, le=10),
         "time to collision that it keeps: its speed is at most the distance to where it must stop, divided by this, s",
     ] = 1.5
-    slow_m: Annotated[float, Meta(ge=0, le=10), "an obstacle nearer than this ahead slows it down to slow_mps, m"] = 0.5
-    slow_side_m: Annotated[float, Meta(ge=0, le=10), "the same beside its way, m"] = 0.12
+    slow_m: float = 0.5  # an obstacle nearer than this ahead slows it down to slow_mps, m
+    slow_side_m: float = 0.12  # the same beside its way, m
     slow_mps: Annotated[float, Meta(ge=0.01, le=10), "speed near obstacles and into the unknown, m/s"] = 0.2
     unknown: Annotated[
         Literal["stop", "slow", "ignore"],

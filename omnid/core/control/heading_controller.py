@@ -23,8 +23,8 @@ class HeadingLimits:
     velocity_mps: Annotated[float, Meta(ge=0.001, le=10), "highest speed, m/s"] = 0.5
     acceleration_mps2: Annotated[float, Meta(ge=0.001, le=100), "highest acceleration, m/s^2"] = 0.5
     yaw_rate_radps: Annotated[float, Meta(ge=0.001, le=20), "highest yaw rate, rad/s"] = 1.0
-    yaw_acceleration_radps2: Annotated[float, Meta(ge=0.001, le=200), "highest yaw acceleration, rad/s^2"] = 3.0
-    gain_hz: Annotated[float, Meta(ge=0.001, le=50), "yaw rate per heading error, 1/s"] = 1.5
+    yaw_acceleration_radps2: float = 3.0  # highest yaw acceleration, rad/s^2
+    gain_hz: float = 1.5  # yaw rate per heading error, 1/s
 
     def __post_init__(self) -> None:
         """Raise OmnidError unless each number is finite and above 0."""

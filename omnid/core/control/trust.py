@@ -35,7 +35,7 @@ class TrustSettings:
         "the wheels stop when the standard deviation of the seen velocity stays higher, m/s; 0: never",
     ] = 0.2
     yaw_rate_sigma_radps: Annotated[float, Meta(ge=0, le=20), "the same of the yaw rate, rad/s; 0: never"] = 0.4
-    sigma_s: Annotated[float, Meta(ge=0, le=10), "time for which a standard deviation may be higher, s"] = 0.3
+    sigma_s: float = 0.3  # time for which a standard deviation may be higher, s
     odometry_reset: Annotated[Literal["stop", "ignore"], "when odometry has lost its map and begins again"] = "stop"
     motor_fault: Annotated[Literal["stop", "ignore"], "when the motor controller reports a fault"] = "stop"
     battery_v: Annotated[

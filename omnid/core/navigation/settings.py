@@ -19,23 +19,12 @@ class PursuitSettings:
         "acceleration and deceleration that are planned, m/s^2; below that of controller.heading",
     ] = 0.3
     yaw_rate_radps: Annotated[float, Meta(ge=0.02, le=10), "highest yaw rate on a path, rad/s"] = 0.8
-    lookahead_s: Annotated[
-        float, Meta(ge=0.1, le=10), "distance of the point that is driven to, as time at the speed, s"
-    ] = 1.2
-    lookahead_m: Annotated[
-        tuple[Annotated[float, Meta(ge=0.05, le=10)], Annotated[float, Meta(ge=0.05, le=10)]],
-        "least and largest distance of that point, m",
-    ] = (0.35, 0.9)
-    slow_radius_m: Annotated[
-        float, Meta(ge=0.05, le=10), "curves of a smaller radius are driven more slowly, in proportion, m"
-    ] = 0.7
-    slow_obstacle_m: Annotated[
-        float, Meta(ge=0, le=5), "nearer than that to an obstacle, beside the base, it drives more slowly, m"
-    ] = 0.6
-    least_mps: Annotated[float, Meta(ge=0.005, le=1), "least speed where curves or obstacles slow it down, m/s"] = 0.05
-    delay_s: Annotated[
-        float, Meta(ge=0, le=1), "from the exposure of the images to the motion that they lead to, s"
-    ] = 0.1
+    lookahead_s: float = 1.2  # distance of the point that is driven to, as time at the speed, s
+    lookahead_m: tuple[float, float] = (0.35, 0.9)  # least and largest distance of that point, m
+    slow_radius_m: float = 0.7  # curves of a smaller radius are driven more slowly, in proportion, m
+    slow_obstacle_m: float = 0.6  # nearer than that to an obstacle, beside the base, it drives more slowly, m
+    least_mps: float = 0.05  # least speed where curves or obstacles slow it down, m/s
+    delay_s: float = 0.1  # from the exposure of the images to the motion that they lead to, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +40,7 @@ class NavigationSettings:
         "distance to obstacles beside the path that is kept, beyond what the collision "
         "monitor demands (controller.collision), m",
     ] = 0.1
-    corridor_m: Annotated[
-        float, Meta(ge=0, le=20), "how far beside the path it may go around obstacles, m; 0: it stays on it and waits"
-    ] = 0.8
+    corridor_m: float = 0.8  # how far beside the path it may go around obstacles, m; 0: it stays on it and waits
     give_way_s: Annotated[
         float,
         Meta(ge=0.5, le=3600),
@@ -63,11 +50,11 @@ class NavigationSettings:
     give_way_m: Annotated[
         float, Meta(ge=0, le=20), "how far it drives back at most, m; 0: it stays where it is blocked"
     ] = 3.0
-    stuck_s: Annotated[float, Meta(ge=1, le=3600), "wait for progress, with the way free, before it fails, s"] = 15.0
+    stuck_s: float = 15.0  # wait for progress, with the way free, before it fails, s
     unlocalised_m: Annotated[
         float, Meta(ge=0, le=1000), "way in the map that it drives by odometry alone before it stops, m"
     ] = 3.0
     unlocalised_s: Annotated[float, Meta(ge=1, le=86_400), "wait for the pose in the map before it fails, s"] = 60.0
-    map_sigma_m: Annotated[float, Meta(ge=0.01, le=10), "largest sigma of the pose in the map, m"] = 0.3
+    map_sigma_m: float = 0.3  # largest sigma of the pose in the map, m
     reach_m: Annotated[float, Meta(ge=1, le=100_000), "goals and paths that begin farther away are refused, m"] = 100.0
     routes: Annotated[str, "folder of the routes; it is made if it is missing"] = "routes"

@@ -108,7 +108,7 @@ def refusal_of_map(situation: Situation, map_sigma_m: float) -> str:
         )
     if not in_map.sigma_m <= map_sigma_m:
         return (
-            f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than navigation.map_sigma_m = "
+            f"the pose in the map is uncertain by {in_map.sigma_m:.2f} m, more than "
             f"{map_sigma_m:g}: drive it a little where the map was made"
         )
     return ""

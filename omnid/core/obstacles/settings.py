@@ -27,21 +27,14 @@ class RingSettings:
         "obstacle, of the ring and of the map, m: lower ones are floor, higher ones "
         "are passed below",
     ] = (0.06, 1.7)
-    tilt_deg: Annotated[
-        float,
-        Meta(ge=0, le=10),
-        "sigma of the tilt of the base against the floor: in the map the margin above the floor grows with the range",
-    ] = 0.5
+    # sigma of the tilt of the base against the floor: in the map the margin above the floor grows with the range
+    tilt_deg: float = 0.5
     max_range_m: Annotated[
         float,
         Meta(ge=1.5, le=50),
         "longest range of an obstacle, m; it must reach beyond the nearest floor that both cameras see",
     ] = 6.0
-    min_points: Annotated[
-        int,
-        Meta(ge=1, le=1000),
-        "matched points that make an obstacle of the map, within 3 degrees and the noise of the range",
-    ] = 6
+    min_points: int = 6  # matched points that make an obstacle of the map, within 3 degrees and the noise of the range
 
     def __post_init__(self) -> None:
         """Raise OmnidError unless the heights are in order, and the lowest can be told from the floor."""

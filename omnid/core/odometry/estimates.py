@@ -22,38 +22,23 @@ class OdometryLimits:
     """Number of landmarks and keyframes, and the thresholds of the acceptance test and of the tracking state."""
 
     features: Annotated[int, Meta(ge=20, le=10_000), "landmarks wanted in a keyframe"] = 500
-    refresh: Annotated[
-        float, Meta(ge=0, le=1), "a keyframe is added when less than this share of the last one's landmarks is left"
-    ] = 0.9
+    refresh: float = 0.9  # a keyframe is added when less than this share of the last one's landmarks is left
     # Defaults of times lie in the middle between two pairs at 10 Hz, so that the jitter of stamps changes nothing.
-    sparse_s: Annotated[
-        float, Meta(ge=0, le=100), "time after which a keyframe is added where the features wanted are not reached, s"
-    ] = 0.45
+    sparse_s: float = 0.45  # time after which a keyframe is added where the features wanted are not reached, s
     keyframes: Annotated[int, Meta(ge=1, le=50), "keyframes in the local map; 1: frame to frame"] = 8
-    min_inliers: Annotated[int, Meta(ge=4, le=10_000), "inliers below which a pose is refused"] = 20
-    min_inlier_ratio: Annotated[
-        float,
-        Meta(ge=0, le=1),
-        "inliers, as a share of the tracked landmarks, below which a pose is refused; likewise those that the upper "
-        "camera shows, as a share of the inliers",
-    ] = 0.4
-    good_inliers: Annotated[int, Meta(ge=4, le=10_000), "inliers below which a pose is degraded"] = 50
-    good_inlier_ratio: Annotated[
-        float,
-        Meta(ge=0, le=1),
-        "inlier ratio below which other yaw angles are tried, and share of the inliers in the upper camera below which "
-        "a pose is degraded",
-    ] = 0.6
+    min_inliers: int = 20  # inliers below which a pose is refused
+    # inliers, as a share of the tracked landmarks, below which a pose is refused; likewise those that the upper
+    # camera shows, as a share of the inliers
+    min_inlier_ratio: float = 0.4
+    good_inliers: int = 50  # inliers below which a pose is degraded
+    # inlier ratio below which other yaw angles are tried, and share of the inliers in the upper camera below which a
+    # pose is degraded
+    good_inlier_ratio: float = 0.6
     max_speed_mps: Annotated[float, Meta(ge=0.1, le=100), "poses that imply a higher speed are refused, m/s"] = 5.0
-    lost_s: Annotated[
-        float, Meta(ge=0, le=100), "time from the first of consecutive refused frames after which the state is lost, s"
-    ] = 0.15
-    restart_s: Annotated[
-        float,
-        Meta(ge=0, le=1000),
-        "time from the first frame with enough corners that matches no landmark while lost, after which the map is "
-        "started again, s",
-    ] = 0.85
+    lost_s: float = 0.15  # time from the first of consecutive refused frames after which the state is lost, s
+    # time from the first frame with enough corners that matches no landmark while lost, after which the map is
+    # started again, s
+    restart_s: float = 0.85
     max_gap_s: Annotated[float, Meta(ge=0.01, le=60), "a pose after a longer time without frames is degraded, s"] = 0.5
     bridge_s: Annotated[
         float,

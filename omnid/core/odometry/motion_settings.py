@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from calib import se3
@@ -24,26 +23,23 @@ class MotionSensorSettings:
     wheel_topic: Annotated[
         str,
         "topic of a log with nav_msgs/msg/Odometry of the wheels; empty: the only one whose "
-        "name contains 'wheel'. With left_joint: of JointState; empty: the only one",
+        "name contains 'wheel'. With wheel_joints: of JointState; empty: the only one",
     ] = ""
-    left_joint: Annotated[
-        str,
-        "name of the left wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, "
-        "which then stands for the Odometry of the wheels; empty: none",
-    ] = ""
-    right_joint: Annotated[str, "name of the right one; radius and track are those of motor.drive"] = ""
+    wheel_joints: Annotated[
+        tuple[str, ...],
+        "names of the left and the right wheel in sensor_msgs/msg/JointState, of a log or cmd/joint_states, which then "
+        "stands for the Odometry of the wheels; radius and track are those of motor.drive; empty: none",
+    ] = ()
     imu_topic: Annotated[str, "topic of a log with sensor_msgs/msg/Imu; empty: the only one"] = ""
-    imu_roll_deg: Annotated[
-        float,
-        Meta(ge=-360, le=360),
-        "orientation of the IMU on the base: roll about x, deg; not applied to messages in the frame base_link",
-    ] = 0.0
-    imu_pitch_deg: Annotated[float, Meta(ge=-360, le=360), "... then pitch about y, deg"] = 0.0
-    imu_yaw_deg: Annotated[float, Meta(ge=-360, le=360), "... then yaw about z, deg"] = 0.0
+    imu_rpy_deg: Annotated[
+        tuple[float, float, float],
+        "orientation of the IMU on the base: roll about x, then pitch about y, then yaw about z, deg; not applied to "
+        "messages in the frame base_link",
+    ] = (0.0, 0.0, 0.0)
 
     @property
     def R_base_imu(self) -> NDArray[np.float64]:
         """Rotation (3, 3) from the axes of the IMU to those of the base."""
-        roll, pitch, yaw = np.radians([self.imu_roll_deg, self.imu_pitch_deg, self.imu_yaw_deg])
+        roll, pitch, yaw = np.radians(self.imu_rpy_deg)
         turns = ([0, 0, yaw], [0, pitch, 0], [roll, 0, 0])
         return np.asarray(np.linalg.multi_dot([se3.rotation_exp(turn) for turn in turns]))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
 
 import cv2
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from omnid.core.types.panorama import PaddedPanorama
@@ -26,10 +24,10 @@ MIN_EIGENVALUE = 1e-4  # Of the window's gradients; OpenCV's default: below it t
 class KltSettings:
     """Settings of the pyramidal Lucas-Kanade tracker and of the forward-backward check."""
 
-    window_px: Annotated[int, Meta(ge=5, le=61), "side of the tracking window, px"] = 15
-    levels: Annotated[int, Meta(ge=0, le=MAX_LEVELS), "pyramid levels above the image"] = 3
-    max_error_px: Annotated[float, Meta(ge=0.01, le=10), "largest forward-backward error of a track, px"] = 0.5
-    iterations: Annotated[int, Meta(ge=1, le=200), "iterations on each pyramid level"] = 20
+    window_px: int = 15  # side of the tracking window, px
+    levels: int = 3  # pyramid levels above the image
+    max_error_px: float = 0.5  # largest forward-backward error of a track, px
+    iterations: int = 20  # iterations on each pyramid level
 
 
 def track(

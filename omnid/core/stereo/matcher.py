@@ -12,7 +12,6 @@ from typing import Annotated, Literal, Protocol, TypeVar
 
 import cv2
 import numpy as np
-from msgspec import Meta
 from numpy.typing import NDArray
 
 from omnid.core.stereo.anchors import AnchorPropagation, Candidates
@@ -74,33 +73,17 @@ class MatchingSettings:
         Literal["auto", "sad", "enhanced", "semiglobal"],
         "chooses among several candidates; auto: enhanced for the paper's odometry, else semiglobal",
     ] = "auto"
-    window_px: Annotated[int, Meta(ge=3, le=15), "side of the matching window, px; odd"] = 9
-    disparities: Annotated[
-        int,
-        Meta(ge=8, le=512),
-        "largest number of disparities searched, px; fewer where stereo.min_range_m needs fewer",
-    ] = 128
-    max_difference: Annotated[
-        float, Meta(ge=0, le=255), "largest mean difference of grey levels in the window of a match"
-    ] = 12.0
-    runner_up_ratio: Annotated[
-        float,
-        Meta(ge=1, le=10),
-        "enhanced: a runner-up's SAD is at most so many times the lowest one, plus runner_up_difference",
-    ] = 2.0
-    runner_up_difference: Annotated[
-        float, Meta(ge=0, le=255), "enhanced: mean difference of grey levels; a point without a runner-up is an anchor"
-    ] = 4.0
-    edge_threshold: Annotated[
-        int, Meta(ge=0, le=1020), "least Sobel response of an edge, 8 per grey level and pixel"
-    ] = 40
-    max_points: Annotated[int, Meta(ge=100, le=1_000_000), "largest number of edge pixels matched in a pair"] = 30_000
-    sigma_px: Annotated[
-        float, Meta(ge=0, le=10), "standard deviation of the Gaussian blur before matching, px; 0: none"
-    ] = 0.8
-    max_candidates: Annotated[
-        int, Meta(ge=2, le=64), "enhanced: largest number of candidates compared for one pixel"
-    ] = 8
+    window_px: int = 9  # side of the matching window, px; odd
+    disparities: int = 128  # largest number of disparities searched, px; fewer where stereo.min_range_m needs fewer
+    max_difference: float = 12.0  # largest mean difference of grey levels in the window of a match
+    # enhanced: a runner-up's SAD is at most so many times the lowest one, plus runner_up_difference
+    runner_up_ratio: float = 2.0
+    # enhanced: mean difference of grey levels; a point without a runner-up is an anchor
+    runner_up_difference: float = 4.0
+    edge_threshold: int = 40  # least Sobel response of an edge, 8 per grey level and pixel
+    max_points: int = 30_000  # largest number of edge pixels matched in a pair
+    sigma_px: float = 0.8  # standard deviation of the Gaussian blur before matching, px; 0: none
+    max_candidates: int = 8  # enhanced: largest number of candidates compared for one pixel
 
 
 class CandidateSearch(Protocol):

@@ -21,9 +21,9 @@ def test_a_minimal_file_has_what_a_robot_needs_and_changes_nothing(omnid: Comman
     assert load_config(file) == Config()
     text = file.read_text()
     assert "# lower = " in text and "[motor.drive]" in text and len(text.splitlines()) < 120
-    changed = omnid("config", "--minimal", "--set", "bus.robot=rover", "--set", "stereo.noise_px=0.7").out
+    changed = omnid("config", "--minimal", "--set", "bus.robot=rover", "--set", "stereo.min_range_m=0.7").out
     file.write_text(changed)
-    assert load_config(file) == load_config(None, ["bus.robot=rover", "stereo.noise_px=0.7"])
+    assert load_config(file) == load_config(None, ["bus.robot=rover", "stereo.min_range_m=0.7"])
     assert '\nrobot = "rover"\n' in changed
 
 

@@ -151,12 +151,12 @@ print(json.dumps({"reported": reported, "before": before, "locked": locked_kb(),
 
 def test_prepare_applies_the_settings() -> None:
     done = answer("""
-refused = prepare(RealtimeSettings(lock_memory=False, switch_interval_ms=2.0, longest_run_ms=300))
+refused = prepare(RealtimeSettings(lock_memory=False, longest_run_ms=300))
 print(json.dumps({"frozen": gc.get_freeze_count(), "switch_s": sys.getswitchinterval(), "refused": refused,
                   "run": resource.getrlimit(resource.RLIMIT_RTTIME)[0]}))
 """)
     assert done.frozen > 1000 and done.refused == []
-    assert (done.switch_s, done.run) == (pytest.approx(2e-3), 300_000)
+    assert (done.switch_s, done.run) == (pytest.approx(1e-3), 300_000)
 
 
 @allowed
