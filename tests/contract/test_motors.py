@@ -36,15 +36,15 @@ SHORT_S = 0.05
 def test_drives_turns_and_stops(name: str) -> None:
     with connected_motor(name) as (motor, simulated):
         simulated.base.limits = INSTANT
-        assert until(lambda: motor.send(ARC).watchdog_expired or simulated.pose[2] > 0.5)
-        x_m, y_m, heading_rad = simulated.pose
+        assert until(lambda: motor.send(ARC).watchdog_expired or simulated.base.pose[2] > 0.5)
+        x_m, y_m, heading_rad = simulated.base.pose
         assert ((x_m**2 + (y_m - 0.8) ** 2) ** 0.5) == pytest.approx(0.8, rel=0.02)  # a circle of v / w = 0.8 m
         assert simulated.base.velocity_mps == pytest.approx(0.72, rel=0.02)
         assert until(lambda: delayed(motor).velocity_mps == pytest.approx(0.4, rel=0.2))
-        assert simulated.pose[2] >= heading_rad
+        assert simulated.base.pose[2] >= heading_rad
         motor.send(stop_command(0))
         assert until(lambda: simulated.base.velocity_mps == simulated.base.yaw_rate_radps == 0.0)
-        assert simulated.errors == motor.errors == motor.replaced_by_stop == motor.garbage == motor.bad_frames == 0
+        assert simulated.base.errors == motor.errors == motor.replaced_by_stop == motor.garbage == motor.bad_frames == 0
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -54,7 +54,11 @@ def test_close_stops_the_wheels(name: str) -> None:
         assert simulated.base.commanded_mps != [0.0, 0.0]
         motor.close()
         motor.close()
-        assert simulated.base.commanded_mps == [0.0, 0.0] and not simulated.watchdog_expired and simulated.errors == 0
+        assert (
+            simulated.base.commanded_mps == [0.0, 0.0]
+            and not simulated.base.watchdog_expired
+            and simulated.base.errors == 0
+        )
         with pytest.raises(DriverError, match="is closed"):
             motor.send(FORWARD)
 
@@ -66,11 +70,11 @@ def test_watchdog_stops_a_late_host_and_a_stop_comes_before_motion(name: str) ->
     with connected_motor(name, watchdog_ms=watchdog_ms) as (motor, simulated):
         motor.send(stop_command(0))
         motor.send(FORWARD)
-        assert until(lambda: simulated.watchdog_expired and simulated.base.velocity_mps == 0.0)
+        assert until(lambda: simulated.base.watchdog_expired and simulated.base.velocity_mps == 0.0)
         assert motor.send(FORWARD).watchdog_expired, "sends a stop instead, and reports it"
         assert simulated.base.commanded_mps == [0.0, 0.0] and motor.replaced_by_stop >= 1
         assert until(lambda: motor.send(FORWARD) is not None and simulated.base.commanded_mps != [0.0, 0.0])
-        assert simulated.base.unsafe_resumes == 0 and simulated.errors == 0
+        assert simulated.base.unsafe_resumes == 0 and simulated.base.errors == 0
         assert motor.connections > 1, "it is set up again: it may have been switched off and on"
 
 
@@ -121,9 +125,9 @@ def test_stops_are_sent_while_no_replies_come(name: str) -> None:
         simulated.drop_replies = True
         assert until(lambda: type(send_error(motor)) is NoReplyError)
         for _ in range(3):
-            before = simulated.commands
+            before = simulated.base.commands
             send_error(motor)
-            assert until(lambda before=before: simulated.commands > before)  # type: ignore[misc]
+            assert until(lambda before=before: simulated.base.commands > before)  # type: ignore[misc]
             assert simulated.base.commanded_mps == [0.0, 0.0]
 
 
@@ -160,7 +164,7 @@ def test_recovers_from_garbage(name: str) -> None:
         assert motor.garbage + motor.bad_frames + motor.errors > 0
         simulated.garbage = b""
         assert until(lambda: first_status(motor) is not None and simulated.base.commanded_mps != [0.0, 0.0])
-        assert simulated.errors == 0, "received garbage was not sent back"
+        assert simulated.base.errors == 0, "received garbage was not sent back"
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -221,7 +225,7 @@ def test_an_unplugged_controller_is_an_error_and_reconnects(name: str, tmp_path:
             second.expire()  # from now on a first command other than a stop is an error
             port.symlink_to(second.port)
             assert until(lambda: first_status(motor) is not None and second.base.commanded_mps != [0.0, 0.0])
-            assert motor.connections == 2 and second.errors == 0
+            assert motor.connections == 2 and second.base.errors == 0
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -129,9 +129,9 @@ def test_motor_gets_the_commands_and_stops_at_the_end(omnid: Command, scene: Pat
         sets = (word for setting in setpoint for word in ("--set", setting))
         result = omnid.replay(scene / "log.mcap", "--realtime", "--motor", motor.port, *sets, rig=scene / "rig.toml")
         assert result.code == 0, result.err
-        assert motor.commands > 20 and motor.errors == 0
-        assert motor.pose[0] > 0.1, "the wheels have turned"
-        assert motor.last_command is not None and is_stop(motor.last_command)
+        assert motor.base.commands > 20 and motor.base.errors == 0
+        assert motor.base.pose[0] > 0.1, "the wheels have turned"
+        assert motor.base.last_command is not None and is_stop(motor.base.last_command)
         wait_until(lambda: motor.base.velocity_mps == 0)
     finally:
         motor.close()

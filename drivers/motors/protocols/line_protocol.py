@@ -38,6 +38,7 @@ import binascii
 import math
 import re
 from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
 
 from drivers.errors import DriverError
 from drivers.motor import MotorStatus, VelocityCommand
@@ -49,32 +50,32 @@ MAX_LINE = 64  # bytes
 _CRC_START = 0xFFFF
 
 _LINE = re.compile(rb"\$([VSWA](?:,-?[0-9]{1,6}){1,8})\*([0-9A-Fa-f]{4})\r?\n?")
-_SEQ = (0, SEQ_COUNT - 1)
-_VELOCITY = (-10_000, 10_000)
-_HEADING = (-3142, 3142)
-_YAW_RATE = (-20_000, 20_000)
-_BATTERY = (-1, 100_000)
-_FAULT = (0, 65535)
-_CONTACT = (0, 3)
-_BUMPER, _CLIFF = 1, 2
-_TIME = (20, 10_000)
-_RANGES = {
-    "V": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE),
-    "S": (_SEQ, _VELOCITY, _HEADING, _YAW_RATE, _BATTERY, _FAULT, (0, 1), _CONTACT),
-    "W": (_TIME,),
-    "A": (_TIME,),
-}
-_NAMES = (
-    ("seq", "(a count)"),
-    ("velocity", "mm/s"),
-    ("heading", "mrad"),
-    ("yaw rate", "mrad/s"),
-    ("battery", "mV"),
-    ("fault", "(a number)"),
-    ("expired", "(a flag)"),
-    ("contact", "(two bits)"),
+_BUMPER, _CLIFF = 1, 2  # bits of the contact
+
+
+class _Field(NamedTuple):
+    """A number of a line with its range."""
+
+    name: str
+    unit: str
+    low: int
+    high: int
+
+
+_MOTION: Final = (
+    _Field("seq", "(a count)", 0, SEQ_COUNT - 1),
+    _Field("velocity", "mm/s", -10_000, 10_000),
+    _Field("heading", "mrad", -3142, 3142),
+    _Field("yaw rate", "mrad/s", -20_000, 20_000),
 )
-_TIME_NAME = (("watchdog time", "ms"),)
+_STATE: Final = (
+    _Field("battery", "mV", -1, 100_000),
+    _Field("fault", "(a number)", 0, 65535),
+    _Field("expired", "(a flag)", 0, 1),
+    _Field("contact", "(two bits)", 0, 3),
+)
+_TIME: Final = (_Field("watchdog time", "ms", 20, 10_000),)
+_FIELDS: Final = {"V": _MOTION, "S": (*_MOTION, *_STATE), "W": _TIME, "A": _TIME}
 
 
 class ProtocolError(DriverError):
@@ -172,42 +173,29 @@ def _milli(name: str, value: float) -> int:
 
 
 def _check(kind: str, numbers: list[int]) -> None:
-    ranges = _RANGES[kind]
-    if kind == "S" and len(numbers) == len(ranges) - 1:
+    fields = _FIELDS[kind]
+    if kind == "S" and len(numbers) == len(fields) - 1:
         numbers = [*numbers, 0]  # firmware without contacts
-    if len(numbers) != len(ranges):
-        raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(ranges)}; check the firmware")
-    names = _NAMES if len(ranges) > 1 else _TIME_NAME
-    for (name, unit), number, (low, high) in zip(names, numbers, ranges, strict=False):
+    if len(numbers) != len(fields):
+        raise ProtocolError(f"motor line {kind} has {len(numbers)} numbers, not {len(fields)}; check the firmware")
+    for (name, unit, low, high), number in zip(fields, numbers, strict=True):
         if not low <= number <= high:
             raise ProtocolError(f"motor {name} {number:.6g} is outside {low} .. {high} {unit}; keep it inside")
 
 
 def _message(kind: str, numbers: list[int]) -> LineMessage:
-    if kind == "W":
-        return WatchdogRequest(numbers[0])
-    if kind == "A":
-        return WatchdogReply(numbers[0])
-    seq = numbers[0]
+    if kind in "WA":
+        return (WatchdogRequest if kind == "W" else WatchdogReply)(numbers[0])
     velocity_mps, heading_rad, yaw_rate_radps = (milli / 1000 for milli in numbers[1:4])
     if kind == "V":
-        return VelocityMessage(seq, VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
-    battery_mv, fault, expired = numbers[4:7]
-    contact = numbers[7] if len(numbers) > 7 else 0
+        return VelocityMessage(numbers[0], VelocityCommand(0, velocity_mps, heading_rad, yaw_rate_radps))
+    battery_mv, fault, expired, *others = numbers[4:]
     battery_v = math.nan if battery_mv < 0 else battery_mv / 1000
-    return StatusMessage(
-        seq,
-        MotorStatus(
-            velocity_mps,
-            heading_rad,
-            yaw_rate_radps,
-            bool(expired),
-            fault,
-            battery_v,
-            bool(contact & _BUMPER),
-            bool(contact & _CLIFF),
-        ),
+    bumper, cliff = (bool(sum(others) & bit) for bit in (_BUMPER, _CLIFF))
+    status = MotorStatus(
+        velocity_mps, heading_rad, yaw_rate_radps, bool(expired), fault, battery_v, bumper=bumper, cliff=cliff
     )
+    return StatusMessage(numbers[0], status)
 
 
 class LineFramer:

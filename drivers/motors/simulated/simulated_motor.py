@@ -81,31 +81,6 @@ class SimulatedMotor:
         """The simulated base."""
         return self.controller.base
 
-    @property
-    def commands(self) -> int:
-        """Number of valid commands received."""
-        return self.base.commands
-
-    @property
-    def errors(self) -> int:
-        """Number of errors in the received bytes, numbers and sequence."""
-        return self.base.errors
-
-    @property
-    def pose(self) -> Pose:
-        """Present x [m], y [m], heading [rad] of the base."""
-        return self.base.pose
-
-    @property
-    def watchdog_expired(self) -> bool:
-        """True if the watchdog has stopped the wheels."""
-        return self.base.watchdog_expired
-
-    @property
-    def last_command(self) -> VelocityCommand:
-        """The last commanded motion, with stamp and heading 0."""
-        return self.base.last_command
-
     def expire(self) -> None:
         """Let the watchdog stop the wheels at once."""
         self._expiring.set()

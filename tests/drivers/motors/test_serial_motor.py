@@ -118,17 +118,17 @@ def test_seq_wraps_around(simulated: SimulatedMotor) -> None:
     with contextlib.closing(motor):
         for i in range(100):
             motor.send(VelocityCommand(i, 0.001 * i, 0.1 * i, -0.02 * i))
-        assert simulated.commands == 101 and simulated.errors == 0 and motor.garbage == motor.bad_frames == 0
+        assert simulated.base.commands == 101 and simulated.base.errors == 0 and motor.garbage == motor.bad_frames == 0
 
 
 def test_an_invalid_command_sends_nothing(simulated: SimulatedMotor) -> None:
     with contextlib.closing(SerialMotor(simulated.port, timeout_s=REPLY_S)) as motor:
-        before = simulated.commands
+        before = simulated.base.commands
         with pytest.raises(DriverError, match="velocity is nan"):
             motor.send(VelocityCommand(0, math.nan, 0.0, 0.0))
-        assert simulated.commands == before
+        assert simulated.base.commands == before
         motor.send(stop_command(0))
-        assert simulated.commands == before + 1 and simulated.errors == 0
+        assert simulated.base.commands == before + 1 and simulated.base.errors == 0
 
 
 def opens_as_another_user(port: str) -> bool:
@@ -321,7 +321,7 @@ def test_a_full_output_buffer_is_an_error_and_close_returns() -> None:
             motor.send(VelocityCommand(0, 0.5, 0.0, 0.0))
         motor.close()
         controller.reading.set()
-    assert simulated.last_command == stop_command(0)
+    assert simulated.base.last_command == stop_command(0)
 
 
 def fill(port: str) -> None:

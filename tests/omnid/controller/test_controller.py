@@ -280,21 +280,21 @@ def test_a_simulated_motor_that_holds_headings_follows_headings_and_rates(setpoi
     with contextlib.closing(SimulatedMotor()) as twin, real_controller(twin) as controller:
         if setpoint.heading_rad is not None:
             goal_rad = setpoint.heading_rad - 0.7
-            run_until(controller, twin, setpoint, lambda: abs(twin.pose[2] - goal_rad) < 0.02)
+            run_until(controller, twin, setpoint, lambda: abs(twin.base.pose[2] - goal_rad) < 0.02)
         else:
             # On a busy machine a late tick lets the base reach the last heading, where it waits for the next one.
             run_until(
                 controller,
                 twin,
                 setpoint,
-                lambda: twin.pose[2] > 0.4 and twin.base.yaw_rate_radps == pytest.approx(0.4, abs=0.2),
+                lambda: twin.base.pose[2] > 0.4 and twin.base.yaw_rate_radps == pytest.approx(0.4, abs=0.2),
             )
         controller.stop(time.monotonic_ns())
-        heading_rad, slowed = twin.pose[2], time.monotonic() + PATIENCE_S
-        while not (is_stop(twin.last_command) and twin.base.yaw_rate_radps == 0) and time.monotonic() < slowed:
+        heading_rad, slowed = twin.base.pose[2], time.monotonic() + PATIENCE_S
+        while not (is_stop(twin.base.last_command) and twin.base.yaw_rate_radps == 0) and time.monotonic() < slowed:
             controller.tick()
             time.sleep(0.02)
-        assert abs(twin.pose[2] - heading_rad) < 0.35, "it does not turn on to the void goal"
+        assert abs(twin.base.pose[2] - heading_rad) < 0.35, "it does not turn on to the void goal"
 
 
 def test_slows_down_at_the_end_whatever_the_setpoint(driving: Bench) -> None:

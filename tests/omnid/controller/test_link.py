@@ -252,7 +252,7 @@ def test_slows_down_when_the_daemon_is_killed(tmp_path: Path) -> None:
             owner.kill()
         wait_until(lambda: not base.drives and base.line.notes[-1].wheels_mps == (0.0, 0.0), "the stop")
         slowed_down(base)
-        assert not base.twin.watchdog_expired, "the process stopped it, not the watchdog"
+        assert not base.twin.base.watchdog_expired, "the process stopped it, not the watchdog"
         wait_until(lambda: not _has_open(base), "the end of the process")
 
 

@@ -22,7 +22,7 @@ def test_simulates_every_protocol(protocol: str) -> None:
     with ExitStack() as closing:
         driver, twin = open_motor(config, closing)
         driver.send(VelocityCommand(0, 0.4, 0.0, 0.2))
-        assert twin is not None and twin.errors == 0
+        assert twin is not None and twin.base.errors == 0
         assert twin.base.commanded_mps == pytest.approx([0.35, 0.45], rel=0.02)
     assert twin.base.commanded_mps == [0.0, 0.0], "closing stops the wheels"
 

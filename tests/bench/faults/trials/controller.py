@@ -84,7 +84,7 @@ def silent(setting: Setting) -> Outcome:
     with driving(setting) as (_, operator, base):
         base.twin.drop_input = True
         wait_until(lambda: int(operator.values("wheels").get("errors", 0)) > 3, "errors counted")
-        wait_until(lambda: base.twin.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
+        wait_until(lambda: base.twin.base.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
         status = f"wheels: {operator.message('wheels')}"
         operator.stop_sending()
         base.twin.drop_input = False

@@ -54,7 +54,7 @@ def controller_killed(setting: Setting) -> Outcome:
         os.kill(daemon.controller_pid, signal.SIGKILL)
         _, err = daemon.process.communicate(timeout=PATIENCE_S)
         assert daemon.process.returncode == 2 and "Traceback" not in err, err
-        wait_until(lambda: base.twin.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
+        wait_until(lambda: base.twin.base.watchdog_expired and base.line.base.velocity_mps == 0, "its watchdog's stop")
     status = next(line for line in err.splitlines() if "controller process" in line)
     return Outcome("one line, exit 2", "the motor controller's watchdog", status)
 
@@ -65,7 +65,7 @@ def stuck(setting: Setting) -> Outcome:
     with driving(setting) as (daemon, operator, base):
         daemon.process.send_signal(signal.SIGSTOP)
         expect_stop(base)
-        assert not base.twin.watchdog_expired, "stopped by the controller process, not by the watchdog"
+        assert not base.twin.base.watchdog_expired, "stopped by the controller process, not by the watchdog"
         operator.stop_sending()
         time.sleep(0.2)
         since_s = time.monotonic()
@@ -87,7 +87,7 @@ def overloaded(setting: Setting) -> Outcome:
         for pid in processes:
             os.kill(pid, signal.SIGSTOP)
         time.sleep(2.0)
-        assert base.twin.watchdog_expired and not base.drives, "the motor controller's own watchdog"
+        assert base.twin.base.watchdog_expired and not base.drives, "the motor controller's own watchdog"
         operator.stop_sending()
         time.sleep(0.2)
         since_s = time.monotonic()
