@@ -115,13 +115,10 @@ def replay(job: Job) -> dict[str, Any]:
         if code is not None and code < 0:
             raise RuntimeError(f"{job.log}: the program was ended by signal {-code}")
         lines = (attempt / "messages.txt").read_text("utf-8", "replace").strip().splitlines()
-        result: dict[str, Any] = {
-            "log": str(job.log),
-            "key": job.key,
-            "status": "failed" if code is None else DONE.get(code, "failed"),
-            "error": "",
-        }
-        if code not in DONE:
+        result: dict[str, Any] = {"log": str(job.log), "key": job.key, "status": "failed", "error": ""}
+        if code in (0, 1):
+            result["status"] = DONE[code]
+        else:
             last = one_line(lines[-1]).removeprefix("omnid: ") if lines else f"exit code {code}"
             result["error"] = f"more than {job.timeout_s:g} s" if code is None else last
         result["replay"] = summary

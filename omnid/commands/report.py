@@ -27,17 +27,17 @@ def run(args: argparse.Namespace) -> int:
     from calib.rig_file import write_file
     from omnid.formats.tum import read_tum
     from omnid.plain_text import plain
+    from omnid.report.recorded_run import read_run
     from omnid.report.report import report_html
-    from omnid.report.report_data import collect_report_data
     from omnid.sinks.files import check_outputs, on_stdout
 
     inputs = [("the log that is read", args.log)] + ([("the truth", args.truth)] if args.truth else [])
     check_outputs([("--output", args.output)], inputs)
     truth = read_tum(args.truth) if args.truth else None
-    data = collect_report_data(args.log, args.topic, keep_poses=truth is not None)
-    html = report_html(args.log, data, truth)
+    recorded = read_run(args.log, args.topic)
+    html = report_html(recorded, truth)
     write_file(args.output, html.encode("utf-8", "replace"))  # a file's name may be no text
     output = sys.stderr if on_stdout([("--output", args.output)]) else sys.stdout
-    line = f"{args.output}: {data.poses.poses} poses of {data.topic}, {len(html) / 1e6:.2f} MB"
+    line = f"{args.output}: {len(recorded.t_s)} poses of {recorded.topic}, {len(html) / 1e6:.2f} MB"
     print(plain(line), file=output)
     return 0

@@ -1,209 +1,75 @@
 "use strict";
-// Charts of a report: values at the pointer, one time in all of them, zoom by dragging. Without it the page is complete.
+// Charts of a report: values at the pointer, one time in all of them, zoom by dragging, the robot's place on the plan.
 (() => {
-  const shades = document.getElementById("shades");
-  if (!shades) return;
-  const [start, end, secondsPerUnit] = shades.dataset.clock.split(" ").map(Number);
-  const [left, right, top, bottom] = shades.dataset.box.split(" ").map(Number);
-  const all = [start, end];
-  const TOUCH_PX = 6;  // less is a tap, not a drag
-  const NEAR_PX = 9;  // from the pointer to the end of a line whose value is shown
-  let span = all;  // of the charts, in the unit of their time
+  const run = JSON.parse(document.querySelector("[data-run]").dataset.run);
+  const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#666", "#e69f00"], DASHES = [[], [6, 3], [2, 2]];
+  const FILLS = {1: "#e69f0033", 2: "#d55e0044"};  // behind the lines, while degraded and lost
+  const SECONDS = [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 14400];
+  const HEIGHT_PX = 190;
+  const charts = [];
 
-  const element = (parent, name, attributes) => {
-    const made = document.createElementNS(shades.namespaceURI, name);
-    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-    return parent.appendChild(made);
+  const clock = (t) => {
+    if (run.end < 300) return `${+t.toFixed(2)} s`;
+    const whole = Math.round(Math.abs(t)), two = (n) => String(n).padStart(2, "0");
+    const minutes = Math.floor(whole / 60) % 60;
+    return `${t < 0 ? "-" : ""}${Math.floor(whole / 3600)}:${two(minutes)}:${two(whole % 60)}`;
   };
-  const points = (path) => path.getAttribute("d").slice(1).split(/[ML]/).map((pair) => pair.split(" ").map(parseFloat));
-  const nearest = (sorted, value, of) => {
-    let low = 0, high = sorted.length - 1;
-    while (low < high) {
-      const middle = (low + high) >> 1;
-      if (of(sorted[middle]) < value) low = middle + 1; else high = middle;
+  const number = (v) => v == null ? "" : String(+v.toPrecision(4));
+
+  const range = (_, low, high) => {  // of linear values, with some room
+    const room = (high - low) * 0.07 || Math.abs(high) * 0.1 || 1;
+    return [low - (low === 0 ? 0 : room), high + room];
+  };
+  const shade = (u) => {
+    const {left, top, width, height} = u.bbox;
+    for (const [from, to, rank] of run.spans) {
+      const a = Math.max(left, u.valToPos(from, "x", true)), b = Math.min(left + width, u.valToPos(to, "x", true));
+      u.ctx.fillStyle = FILLS[rank];
+      if (b > a) u.ctx.fillRect(a, top, Math.max(1, b - a), height);
     }
-    return low > 0 && value - of(sorted[low - 1]) < of(sorted[low]) - value ? low - 1 : low;
   };
-  const roundStep = (least) => {
-    const decade = 10 ** Math.floor(Math.log10(least));
-    return decade * [1, 2, 5, 10].find((digit) => digit * decade >= least * (1 - 1e-9));
+  const share = (u, scale) => {  // the zoom of one chart is that of all
+    const {min, max} = u.scales.x;
+    if (scale === "x") for (const other of charts)
+      if (other !== u && (other.scales.x.min !== min || other.scales.x.max !== max)) other.setScale("x", {min, max});
   };
-  const at = (event, svg) => new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
-
-  // Views over time: the charts, which show the span, and the timeline, which always shows all.
-  const views = [...document.querySelectorAll("figure.chart svg[data-y], figure.lanes > svg")].map((svg) => {
-    const chart = "y" in svg.dataset, box = chart ? [left, right] : svg.dataset.x.split(" ").map(Number);
-    const [y0, y1] = chart ? [top, bottom] : [8, svg.viewBox.baseVal.height - 34];
-    const band = element(svg, "rect", {class: "drag", y: y0, height: y1 - y0, width: 0});
-    const cursor = element(svg, "path", {class: "cursor", d: `M0 ${y0}V${y1}`, visibility: "hidden"});
-    return {svg, chart, box, band, cursor, lines: null};
-  });
-  const shown = (view) => view.chart ? span : all;
-  const px = (view, t) => view.box[0] + (t - shown(view)[0]) / (shown(view)[1] - shown(view)[0]) * (view.box[1] - view.box[0]);
-  const time = (view, x) => {
-    const share = Math.min(1, Math.max(0, (x - view.box[0]) / (view.box[1] - view.box[0])));
-    return shown(view)[0] + share * (shown(view)[1] - shown(view)[0]);
-  };
-
-  const value = (view, y) => {
-    const [low, high, log] = view.svg.dataset.y.split(" ").map(Number), share = (bottom - y) / (bottom - top);
-    const found = log ? low * (high / low) ** share : low + share * (high - low);
-    const smallest = log ? Math.abs(found) / 100 : (high - low) / 1000;  // what the drawn line resolves
-    const digits = Math.max(0, -Math.floor(Math.log10(smallest)));
-    return digits > 6 ? found.toExponential(1) : found.toFixed(digits);
-  };
-  const lines = (view) => view.lines ??= [...view.svg.querySelectorAll("[data-name]")].map((group) => (
-    {name: group.dataset.name, pieces: [...group.querySelectorAll("path")].map(points)}));
-  const between = (piece, x) => {  // the height of a line there
-    const found = piece.findIndex((p) => p[0] >= x), after = Math.max(1, found < 0 ? piece.length - 1 : found);
-    const [a, b] = [piece[after - 1], piece[after]];
-    return b ? a[1] + Math.min(1, Math.max(0, (x - a[0]) / (b[0] - a[0] || 1))) * (b[1] - a[1]) : a[1];
-  };
-
-  function readout(view, t) {
-    const scale = (right - left) / (all[1] - all[0]), x = left + (t - all[0]) * scale;  // as drawn, before the zoom
-    const near = NEAR_PX * (span[1] - span[0]) / (all[1] - all[0]);
-    return lines(view).flatMap((line) => {
-      const piece = line.pieces.find((points) => points[0][0] - near <= x && x <= points[points.length - 1][0] + near);
-      return piece ? [`${line.name} ${value(view, between(piece, x))}`.trim()] : [];
-    });
-  }
-  const label = (t) => `${(t).toFixed(Math.max(0, 2 - Math.floor(Math.log10(span[1] - span[0]))))} ${shades.dataset.unit}`;
 
   // The plan: the place of the robot at a time, and the time of a place.
-  const plan = document.querySelector("figure.plan > svg");
-  const path = plan && plan.querySelector("[data-t]");
-  const stamps = path ? path.dataset.t.split(" ").map((t) => Number(t) / secondsPerUnit) : [];
-  const places = path ? points(path) : [];
-  const robot = plan && element(plan, "circle", {class: "robot", r: 6, visibility: "hidden"});
-
-  const say = (figure, words) => {
-    const place = figure.querySelector("output > span");
-    if (place) place.textContent = words.join(" · ");
+  const plan = document.querySelector("[data-plan]");
+  const path = plan ? JSON.parse(plan.dataset.plan) : [];  // rows of t, and x and y in shares of the image
+  const robot = plan && plan.querySelector("i");
+  const place = (t) => {
+    if (!plan) return;
+    let low = 0, high = path.length - 1;
+    while (low < high) { const middle = (low + high) >> 1; if (path[middle][0] < t) low = middle + 1; else high = middle; }
+    robot.hidden = t == null;
+    [robot.style.left, robot.style.top] = [`${100 * path[low][1]}%`, `${100 * path[low][2]}%`];
   };
-  function point(t) {
-    for (const view of views) {
-      const inside = t >= shown(view)[0] && t <= shown(view)[1];
-      view.cursor.setAttribute("visibility", inside ? "visible" : "hidden");
-      if (inside) view.cursor.setAttribute("transform", `translate(${px(view, t)} 0)`);
-      say(view.svg.parentNode, inside ? [label(t), ...readout(view, t)] : []);
-    }
-    if (!robot) return;
-    const [x, y] = places[nearest(stamps, t, (value) => value)];
-    robot.setAttribute("cx", x);
-    robot.setAttribute("cy", y);
-    robot.setAttribute("visibility", "visible");
-  }
-  function leave() {
-    for (const view of views) {
-      view.cursor.setAttribute("visibility", "hidden");
-      say(view.svg.parentNode, []);
-    }
-    if (robot) robot.setAttribute("visibility", "hidden");
-    if (plan) say(plan.parentNode, []);
-  }
+  if (plan) plan.addEventListener("pointermove", (event) => {
+    const box = plan.getBoundingClientRect();
+    const off = (row) => Math.hypot((event.clientX - box.left) - row[1] * box.width, (event.clientY - box.top) - row[2] * box.height);
+    const [t] = path.reduce((best, row) => off(row) < off(best) ? row : best);
+    place(t);
+    if (charts.length) charts[0].setCursor({left: charts[0].valToPos(t, "x"), top: 0});
+  });
 
-  function zoom(from, to) {
-    leave();
-    const part = (to - from) / (end - start);
-    span = part > 1e-6 && part < 1 ? [from, to] : all;
-    const scale = (all[1] - all[0]) / (span[1] - span[0]);
-    const move = left - scale * (left + (span[0] - all[0]) / (all[1] - all[0]) * (right - left));
-    const step = roundStep((span[1] - span[0]) / 8), ticks = [];
-    for (let k = Math.ceil(span[0] / step - 1e-9); k <= span[1] / step + 1e-9; k++) ticks.push(k * step);
-    for (const view of views) {
-      if (!view.chart) {
-        const zoomed = span !== all;
-        view.band.setAttribute("x", px(view, span[0]));
-        view.band.setAttribute("width", zoomed ? px(view, span[1]) - px(view, span[0]) : 0);
-        continue;
-      }
-      view.band.setAttribute("width", 0);
-      view.svg.querySelector(".zoom").setAttribute("transform", `matrix(${scale} 0 0 1 ${move} 0)`);
-      view.svg.querySelector(".columns").setAttribute("d", ticks.map((t) => `M${px(view, t)} ${top}V${bottom}`).join(""));
-      const axis = view.svg.querySelector(".time");
-      axis.replaceChildren();
-      element(axis, "path", {class: "axis", d: ticks.map((t) => `M${px(view, t)} ${bottom}v4`).join("")});
-      ticks.forEach((t, k) => {
-        const last = k === ticks.length - 1;
-        const text = element(axis, "text", {x: px(view, t), y: bottom + 17, "text-anchor": last ? "end" : "middle"});
-        text.textContent = `${Number(t.toFixed(9))}${last ? ` ${shades.dataset.unit}` : ""}`;
-      });
-    }
-    button.hidden = span === all && !plan?.dataset.zoomed;
+  for (const figure of document.querySelectorAll("[data-chart]")) {
+    const {lines, log, unit} = JSON.parse(figure.dataset.chart);
+    const data = uPlot.join(lines.map(({points}) => [points.map((p) => p[0]), points.map((p) => p[1])]));
+    const series = lines.map(({name}, k) => ({
+      label: name || unit || "value", stroke: COLOURS[k], dash: DASHES[k % 3], width: 1.5, points: {show: data[0].length < 40},
+      value: (_, v) => number(v),
+    }));
+    const chart = new uPlot({
+      width: figure.clientWidth, height: HEIGHT_PX,
+      scales: {x: {time: false, min: run.start, max: run.end}, y: {distr: log ? 3 : 1, ...(log ? {} : {range})}},
+      axes: [{size: 32, incrs: SECONDS, values: (_, ticks) => ticks.map(clock), space: 60},
+             {size: 68, values: (_, ticks) => ticks.map((v) => v == null ? "" : String(+v.toPrecision(6)))}],
+      series: [{label: "time", value: (_, t) => t == null ? "" : clock(t)}, ...series],
+      cursor: {sync: {key: "run"}, drag: {x: true, y: false}},
+      hooks: {drawClear: [shade], setScale: [share], setCursor: [(u) => { if (u.cursor.left >= 0) place(u.posToVal(u.cursor.left, "x")); }]},
+    }, data, figure);
+    charts.push(chart);
+    new ResizeObserver(() => chart.setSize({width: figure.clientWidth, height: HEIGHT_PX})).observe(figure);
   }
-
-  // A drag selects: a span of time, or a part of the plan. `select` is called with both ends in the figure's px.
-  function dragged(svg, hover, draw, select) {
-    let first = null;
-    svg.addEventListener("pointerdown", (event) => {
-      if (event.isPrimary && event.button === 0) { first = at(event, svg); hover(first); }
-    });
-    svg.addEventListener("pointermove", (event) => {
-      const now = at(event, svg);
-      hover(now);
-      if (!first || !event.isPrimary) return;
-      if (!svg.hasPointerCapture(event.pointerId)) svg.setPointerCapture(event.pointerId);
-      draw(first, now);
-    });
-    const finish = (event) => {
-      const now = at(event, svg), from = first;
-      first = null;
-      draw(now, now);
-      if (from && event.type === "pointerup" && Math.hypot(now.x - from.x, now.y - from.y) > TOUCH_PX) select(from, now);
-    };
-    svg.addEventListener("pointerup", finish);
-    svg.addEventListener("pointercancel", finish);
-    svg.addEventListener("pointerleave", () => { if (!first) leave(); });
-    svg.addEventListener("dblclick", showAll);
-  }
-  const addReadout = (svg) => {
-    const output = document.createElement("output");
-    output.append(document.createElement("span"));
-    svg.before(output);
-  };
-  for (const view of views) {
-    if (view.chart) addReadout(view.svg);
-    const inside = (p) => px(view, time(view, p.x));
-    dragged(view.svg, (p) => point(time(view, p.x)), (a, b) => {
-      view.band.setAttribute("x", Math.min(inside(a), inside(b)));
-      view.band.setAttribute("width", Math.abs(inside(b) - inside(a)));
-    }, (a, b) => zoom(...[time(view, a.x), time(view, b.x)].sort((s, t) => s - t)));
-  }
-  if (plan) {
-    const whole = plan.getAttribute("viewBox"), frame = element(plan, "rect", {class: "drag", width: 0, height: 0});
-    const corner = (a, b) => [Math.min(a.x, b.x), Math.min(a.y, b.y), Math.abs(a.x - b.x), Math.abs(a.y - b.y)];
-    plan.showPart = (box) => {
-      plan.setAttribute("viewBox", box || whole);
-      plan.dataset.zoomed = box ? "1" : "";
-      plan.style.setProperty("--px", plan.viewBox.baseVal.width / Number(whole.split(" ")[2]));
-    };
-    const [x0, y0, pxPerM] = plan.dataset.m.split(" ").map(Number);
-    addReadout(plan);
-    dragged(plan, (p) => {
-      const distances = places.map(([x, y]) => Math.hypot(x - p.x, y - p.y));
-      const near = stamps[distances.reduce((best, d, k) => d < distances[best] ? k : best, 0)];
-      point(near);
-      say(plan.parentNode, [`x ${(x0 + p.x / pxPerM).toFixed(2)} m, y ${(y0 - p.y / pxPerM).toFixed(2)} m`, label(near)]);
-    }, (a, b) => ["x", "y", "width", "height"].forEach((name, k) => frame.setAttribute(name, corner(a, b)[k])), (a, b) => {
-      const [x, y, width, height] = corner(a, b), shape = plan.viewBox.baseVal.height / plan.viewBox.baseVal.width;
-      const wide = Math.max(width, height / shape, 8);
-      plan.showPart(`${x + width / 2 - wide / 2} ${y + (height - wide * shape) / 2} ${wide} ${wide * shape}`);
-      button.hidden = false;
-    });
-  }
-  const button = document.createElement("button");
-  button.textContent = "show all";
-  button.className = "all";
-  button.hidden = true;
-  function showAll() {
-    plan?.showPart(null);
-    zoom(...all);
-  }
-  button.addEventListener("click", showAll);
-  const hint = document.createElement("p");
-  hint.className = "hint";
-  hint.textContent = "Point at a chart: values, and the place on the plan. Drag across a chart or the plan: zoom; double-click: all.";
-  (document.querySelector("figure.plan") || document.querySelector("h2")).after(hint);
-  document.body.append(button);
 })();

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import re
 from collections.abc import Sequence
 from html import escape
@@ -11,8 +12,6 @@ from typing import Final
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from omnid.report.page_script import policy
 
 Image = NDArray[np.uint8]
 
@@ -34,25 +33,24 @@ td.bar{text-align:left;min-width:220px}.bar span{background:#777;height:.7em;dis
 body>* img{filter:invert(1) hue-rotate(180deg)}}"""
 # Control characters except tab and newline, which a terminal would obey where the page is printed.
 _CONTROL: Final = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-_REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
 
 
 def page(title: str, parts: Sequence[str], style: str = "", script: str = "") -> str:
-    """Return an HTML page of parts, which are HTML; style is appended to STYLE. It may run the script, and no other."""
+    """Return an HTML page of parts, which are HTML; style is appended to STYLE. It may run the script, and no other.
+
+    A page shows text from logs of unknown origin: it loads nothing, and runs only the script with this digest.
+    """
+    script = _CONTROL.sub("\N{REPLACEMENT CHARACTER}", script)
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+    allowed = f"; script-src 'sha256-{digest}'" if script else ""
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:{allowed}"
     text = (
         f"<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><meta http-equiv='Content-Security-Policy' "
-        f"content=\"{policy(script)}\"><meta name='viewport' content='width=device-width'>"
+        f"content=\"{policy}\"><meta name='viewport' content='width=device-width'>"
         f"<title>{escape(title)}</title><style>{STYLE}{style}</style></head>"
         f"<body>{''.join(parts)}{f'<script>{script}</script>' if script else ''}</body></html>\n"
     )
-    return _CONTROL.sub(_REPLACEMENT, text)
-
-
-def tiles(figures: Sequence[str], shown: int) -> str:
-    """Return small figures in rows; those after the first `shown` can be unfolded."""
-    rest = figures[shown:]
-    more = f"<details><summary>{len(rest)} more</summary><div class='tiles'>{''.join(rest)}</div></details>"
-    return f"<div class='tiles'>{''.join(figures[:shown])}</div>{more if rest else ''}"
+    return _CONTROL.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def folded(title: str, text: str) -> str:
@@ -82,14 +80,13 @@ def note(text: str) -> str:
     return f"<p class='note'>{escape(text)}</p>"
 
 
-def grid(figures: Sequence[str]) -> str:
-    """Return figures side by side where there is room."""
-    return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
+def embedded(image: Image, kind: str = "jpeg") -> str:
+    """Return the tag of an image; kind: jpeg, or png for drawings."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if kind == "jpeg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]
+    data = cv2.imencode(f".{kind}", image, options)[1]
+    return f"<img src='data:image/{kind};base64,{base64.b64encode(data.tobytes()).decode()}' alt=''>"
 
 
-def figure(image: Image, caption: str, quality: int = JPEG_QUALITY) -> str:
+def figure(image: Image, caption: str) -> str:
     """Return an embedded image with a caption."""
-    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    source = base64.b64encode(data.tobytes()).decode()
-    img_tag = f"<img src='data:image/jpeg;base64,{source}' alt=''>"
-    return f"<figure>{img_tag}<figcaption>{escape(caption)}</figcaption></figure>"
+    return f"<figure>{embedded(image)}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -8,9 +8,9 @@ from pathlib import Path
 from calib.rig import Rig
 from drivers.logs.log_reader import LogReader
 from omnid.formats.tum import Trajectory
-from omnid.report.page_script import chart_script
+from omnid.report.charts import style_and_script
+from omnid.report.recorded_run import read_run
 from omnid.report.report import report_html
-from omnid.report.report_data import collect_report_data
 from omnid.runs.log_rig import attached_rig
 
 SAMPLE = Path(__file__).parents[3] / "omnid" / "sample"
@@ -50,13 +50,13 @@ class Page(HTMLParser):
 
 
 def html_of(path: Path, truth: Trajectory | None = None) -> str:
-    return report_html(path, collect_report_data(path, keep_poses=truth is not None), truth)
+    return report_html(read_run(path), truth)
 
 
 def assert_harmless(page: Page) -> None:
     """Assert that nothing in the page is executed or fetched."""
     names = {tag for tag, _ in page.tags}
-    assert len(page.scripts) == 1 and page.scripts[0] == chart_script(), "omnid's own, which the policy allows"
+    assert len(page.scripts) == 1 and page.scripts[0] == style_and_script()[1], "omnid's own, which the policy allows"
     assert not names & {"iframe", "object", "embed", "link", "base", "form", "foreignobject"}
     for tag, attributes in page.tags:
         assert not any(name.startswith("on") for name in attributes), (tag, attributes)

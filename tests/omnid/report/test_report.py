@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import random
 import re
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from calib import se3
+from calib.rig import Rig
+from calib.rig_file import rig_toml
 from omnid.cli import main
 from omnid.errors import OmnidError
-from omnid.formats.tum import Trajectory
-from omnid.report.report import report_html
-from omnid.report.report_data import collect_report_data
+from omnid.formats.tum import Trajectory, tum_row
+from omnid.recordings.evaluation import evaluate
+from omnid.report.charts import thinned
+from omnid.report.recorded_run import RecordedRun, read_run
+from omnid.report.report import MAX_EVENTS, _Truth, report_html
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import ODOMETRY, PLACES, SUMMARY, stage_name
-from tests.omnid.report.pages import SAMPLE, Page, assert_harmless, html_of
+from omnid.transport.status_names import ODOMETRY, PAIRING, PLACES, SUMMARY, WHEELS, Key, camera_name, stage_name
+from tests.omnid.report.pages import SAMPLE, Page, assert_harmless, attached_rig_of_sample, html_of
 from tests.omnid.report.recorded_logs import (
+    Entry,
+    T_odom_base,
     at,
     cloud,
+    corrupt_chunks,
     drive,
     map_pose,
     odom,
@@ -32,6 +45,11 @@ from tests.omnid.report.recorded_logs import (
 
 TERMINAL = "x\x1b[31m\x07\x9b2J"
 EVIL = "<script>alert('x')</script>\"'&<img src=x onerror=y>"
+STARTED_AGAIN = ("state", "the robot was started again, with a new odom")
+
+
+def event_texts(found: RecordedRun) -> list[tuple[str, str]]:
+    return [(event.source, event.text) for event in found.events()]
 
 
 def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -59,8 +77,13 @@ def test_command_writes_one_complete_page(tmp_path: Path, capsys: pytest.Capture
         "no settings are attached".capitalize(),
     ):
         assert words in page.text, words
-    assert any(tag == "image" for tag, _ in page.tags)  # the map
-    assert "://" not in out.read_text("utf-8")
+    images = [attributes["src"] or "" for tag, attributes in page.tags if tag == "img"]
+    assert len(images) == 1 and images[0].startswith("data:image/png")  # the plan
+    head = out.read_text("utf-8").partition("<title>")[0]
+    digest = base64.b64encode(hashlib.sha256(page.scripts[0].encode()).digest()).decode()
+    policy = f"default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src 'sha256-{digest}'"
+    assert f"http-equiv='Content-Security-Policy' content=\"{policy}\"" in head
+    assert "The MIT License" in page.scripts[0], "of uPlot"
 
 
 def test_a_log_of_images_is_refused_with_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -94,9 +117,9 @@ def test_a_hostile_log_is_shown_as_text(tmp_path: Path) -> None:
     html = html_of(log, Trajectory(np.array([at(k) for k in range(5)]), np.tile(np.eye(4), (5, 1, 1))))
     page = Page(html)
     assert_harmless(page)
-    assert "<b>x" not in html and html.count("<script") == 1 and "<b>log" not in html
+    assert "<b>x" not in html and html.count("<script>") == 1 and "<b>log" not in html
     assert page.text.count(EVIL) > 5
-    assert page.text.count("rig.toml: <img src=x") == 2  # in a remark and in a warning
+    assert page.text.count("unknown key '<img src=x") == 2  # the rig's unknown key, in a remark and in a warning
 
 
 def test_a_very_large_log_gives_a_small_page(tmp_path: Path) -> None:
@@ -118,11 +141,10 @@ def test_a_very_large_log_gives_a_small_page(tmp_path: Path) -> None:
                 )
             )
     entries.append(cloud(2999, np.random.default_rng(1).uniform(-9, 9, (200_000, 3))))
-    data = collect_report_data(save(tmp_path / "log.mcap", entries))
-    html = report_html(tmp_path / "log.mcap", data)
-    assert len(html) < 3_000_000
-    assert len(data.events.in_order()) <= 32 * 40 and data.events.left_out["others"] > 100
-    assert re.search(r"and \d+ more: ", Page(html).text)
+    found = read_run(save(tmp_path / "log.mcap", entries))
+    html = report_html(found)
+    assert len(html) < 3_000_000 and len(found.events()) > MAX_EVENTS
+    assert re.search(r"and \d+ more", Page(html).text)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -172,17 +194,244 @@ def test_prints_no_control_characters_of_a_log(hostile: Path, capsys: pytest.Cap
     assert not set(shown) & {chr(code) for code in (*range(9), *range(11, 32), *range(127, 160))}
 
 
+def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> None:
+    camera = camera_name("upper")
+    entries = [
+        status(-20, DiagnosticStatus(ODOMETRY, 3, "no pose yet", {}), DiagnosticStatus(PAIRING, 1, "none", {})),
+        *run(100, lost=range(80, 85), missing=range(30, 50)),
+        state(60, "tracking", resets=1),
+        status(
+            61, DiagnosticStatus(camera, 0, "streaming", {"drops": "3"}), DiagnosticStatus(WHEELS, 0, "driving", {})
+        ),
+        status(
+            71,
+            DiagnosticStatus(camera, 2, "lost since 1.0 s", {"drops": "3"}),
+            DiagnosticStatus(WHEELS, 1, "the pose is lost", {"stopped, the pose is lost": "1"}),
+        ),
+        status(
+            81,
+            DiagnosticStatus(camera, 2, "lost since 2.0 s", {"drops": "8"}),
+            DiagnosticStatus(WHEELS, 0, "driving", {"stopped, the pose is lost": "1"}),
+        ),
+        state(4, "tracking"),  # recorded late
+    ]
+    found = read_run(save(tmp_path / "log.mcap", entries))
+    assert np.unique(found.ranks, return_counts=True)[1].tolist() == [75, 5]
+    assert event_texts(found) == [
+        ("pairing", "none"),
+        ("poses", "none for 2.10 s"),
+        ("state", "odometry was reset, with an unknown gap"),
+        ("upper camera", "lost since 1.0 s"),
+        ("wheels", "the pose is lost"),
+        ("wheels", "stopped, the pose is lost"),
+        ("state", "lost"),
+        ("upper camera", "images dropped"),
+        ("wheels", "driving"),
+        ("state", "tracking"),
+    ]
+    text = Page(report_html(found)).text
+    for words in ("images dropped (5)", "1resets", "lost here", "none for 2.10 s"):
+        assert words in text, words
+
+
+def straight(first: int, count: int) -> list[Entry]:
+    """A drive of 0.1 m from pose to pose, from the origin of a new odom on; first: number of its first pose."""
+    return [odom(first + k, se3.transform(np.eye(3), [0.1 * k, 0.0, 0.0])) for k in range(count)]
+
+
+def length(pose: float, length_m: float, resets: int = 0) -> Entry:
+    """A periodic report."""
+    values: dict[str, str] = {Key.RESETS: str(resets), Key.LENGTH_M: f"{length_m:.2f}"}
+    return status(pose, DiagnosticStatus(ODOMETRY, 0, "tracking", values))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "resets"),
+    [
+        # The length falls, a while after the start, and as the first pose comes.
+        ([length(9, 0.9)], {9: length(69, 0.85), 10: length(70, 0.95)}, 0),
+        ([length(9, 0.9)], {0: length(60, 0.0)}, 0),
+        # The number of resets falls, and is that of the new run.
+        ([state(9, "tracking", 2)], {0: state(60, "tracking", 0)}, 0),
+        ([state(9, "tracking", 2)], {0: state(60, "tracking", 0), 5: state(65, "tracking", 1)}, 1),
+        # Both kinds of report say so.
+        ([length(9, 0.9, 2), state(9, "tracking", 2)], {0: state(60, "tracking", 0), 9: length(69, 0.3)}, 0),
+    ],
+)
+def test_a_robot_that_was_started_again_during_the_recording_has_not_jumped_to_its_new_origin(
+    tmp_path: Path, before: list[Entry], after: dict[int, Entry], resets: int
+) -> None:
+    """A path of 1.9 m, a pause without poses, and one of 1.9 m from the origin of a new odom."""
+    entries = [*straight(-10, 20), *before]
+    for k, pose in enumerate(straight(60, 20)):
+        entries += [pose, *([after[k]] if k in after else [])]
+    found = read_run(save(tmp_path / "a.mcap", entries))
+    assert found.length_m() == pytest.approx(2 * 1.9) and found.restarts == [20]
+    assert event_texts(found).count(STARTED_AGAIN) == 1 and sum(count for _, count in found.resets) == resets
+
+
+def test_a_gap_and_late_status_are_no_restart(tmp_path: Path) -> None:
+    """The way during the gap counts; a report that was recorded late has fewer resets than the one before."""
+    entries = [*straight(0, 10), length(9, 0.9), state(9, "tracking", 1)]
+    entries += [odom(60, se3.transform(np.eye(3), [5.0, 0.0, 0.0])), length(60, 5.0, 1), state(8, "tracking", 0)]
+    found = read_run(save(tmp_path / "a.mcap", entries))
+    assert found.length_m() == pytest.approx(5.0) and STARTED_AGAIN not in event_texts(found)
+
+
+def test_what_is_invalid_is_left_out_and_counted(tmp_path: Path) -> None:
+    far = np.eye(4)
+    far[0, 3] = 1e12
+    stray = (at(10), "/omnid/odom", "nav_msgs/msg/Odometry", odom(10**6)[3])
+    entries = [*run(10), (at(10), *odom(10, far)[1:]), stray, (at(11), *odom(5, np.eye(4))[1:]), odom(12)]
+    found = read_run(save(tmp_path / "log.mcap", entries))
+    assert (len(found.t_s), found.unreadable, found.late) == (11, 2, 1)
+    text = Page(report_html(found)).text
+    assert "2 messages were left out" in text and "1 poses were left out" in text
+    log = save(tmp_path / "a.mcap", run(60))
+    corrupt_chunks(log)
+    found = read_run(log)
+    assert found.corrupt == 2 and 40 < len(found.t_s) < 60
+    page = report_html(found)
+    assert "2 corrupt chunks or records were skipped." in page and "MB, cut or corrupt. Poses" in page
+    single = save(tmp_path / "b.mcap", [odom(0), map_pose(1, np.eye(4))], {"omnid.toml": b"a." * 20_000 + b"a = 1"})
+    assert not len(read_run(single).map_poses) and "settings cannot be read" in html_of(single)
+
+
+def test_shows_stages_latencies_and_what_a_foreign_log_lacks(tmp_path: Path) -> None:
+    def second(k: int) -> tuple[DiagnosticStatus, ...]:
+        odometry = {"inliers": str(200 + k), "tracked": "300", "rate_hz": "9.5"}
+        odometry |= {"capture_to_pose_p50_ms": "81.25", "capture_to_pose_p99_ms": "163.00"}
+        stereo = {"processed": str(10 * k), "dropped": str(k), "work_p50_ms": "31.5", "work_max_ms": "52.1"}
+        stage = DiagnosticStatus(stage_name("stereo"), 0, "", stereo)
+        return DiagnosticStatus(ODOMETRY, 0, "tracking", odometry), stage
+
+    entries = [*run(100), *(status(10 * k, *second(k)) for k in range(10))]
+    text = Page(html_of(save(tmp_path / "log.mcap", entries))).text
+    words = ("81.2 / 163 ms", "31.5", "52.1", "stereo, dropped", "inliers of the pose", "messages dropped (9)")
+    assert [word for word in words if word not in text] == [] and "no status of the daemon" not in text
+
+    entries = [odom(k, topic="/wheels/odometry", sigma_m=0.0) for k in range(30)]
+    text = Page(html_of(save(tmp_path / "foreign.mcap", entries))).text
+    words = (
+        "Run of wheels",
+        "does not hold the state",
+        "they were not set",
+        "no numbers of landmarks",
+        "no status of the daemon",
+        "holds no images",
+        "o rig.toml is attached",
+        "holds no map",
+        "holds no commands",
+    )
+    assert [word for word in words if word not in text] == []
+
+
 def test_the_path_in_the_map_is_drawn_beside_that_of_odometry_and_its_correction_over_time(tmp_path: Path) -> None:
     moved = se3.exp([0.3, 0.4, 0, 0, 0, 0.1])
     poses = [entry for k in range(60) for entry in (odom(k), map_pose(k, np.eye(4) if k < 30 else moved))]
     places = status(59, DiagnosticStatus(PLACES, 0, "localized", {"keyframes": "12", "loops": "3"}))
-    data = collect_report_data(save(tmp_path / "a.mcap", [*poses, places]))
-    corrections = data.map_poses.moved_m.points()
-    assert corrections[0][1] == pytest.approx(0, abs=1e-9) and 0.3 < corrections[-1][1] < 0.7
-    assert data.map_poses.turned_deg.points()[-1][1] == pytest.approx(np.degrees(0.1), abs=1e-6)
-    assert data.map_poses.sigma_m.points()[-1][1] == pytest.approx(np.sqrt(3e-4))
-    page = Page(report_html(tmp_path / "a.mcap", data))
-    assert "In the map" in page.text and "in the map" in page.text and "keyframes12" in page.text.replace("\n", "")
-    assert sum(attributes.get("class") == "pm" for _, attributes in page.tags) == 2  # the path and its key
-    plain = report_html(tmp_path / "b.mcap", collect_report_data(save(tmp_path / "b.mcap", run())))
-    assert "In the map" not in plain and "class='pm'" not in plain
+    found = read_run(save(tmp_path / "a.mcap", [*poses, places]))
+    _, moved_m, turned_rad, sigma_m = found.map_poses.T
+    assert moved_m[0] == pytest.approx(0, abs=1e-9) and 0.3 < moved_m[-1] < 0.7
+    assert turned_rad[-1] == pytest.approx(0.1) and sigma_m[-1] == pytest.approx(np.sqrt(3e-4))
+    text = Page(report_html(found)).text
+    assert "In the map" in text and "in the map" in text and "keyframes12" in text.replace("\n", "")
+    assert "In the map" not in html_of(save(tmp_path / "b.mcap", run()))
+
+
+def test_compares_with_the_truth_as_eval_does(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The rig is displaced and rotated on its base, and the truth has another world frame."""
+    rig = attached_rig_of_sample()
+    T_base_rig, T_world_odom = se3.exp([0.3, -0.1, 0.5, 0.1, 0.2, 1.0]), se3.exp([5, -3, 1, 0, 0, 2.0])
+    text = rig_toml(Rig(rig.lower, rig.upper, T_base_rig, rig.topics)).encode()
+    log = save(tmp_path / "log.mcap", run(100), {"rig.toml": text})
+    drift = [se3.exp([0.001 * k, 0, 0, 0, 0, 0.0005 * k]) for k in range(100)]
+    T_odom_rig = np.array([se3.inverse(T_base_rig) @ T_odom_base(k) @ T_base_rig for k in range(100)])
+    truth = Trajectory(np.array([at(k) for k in range(100)]), T_world_odom @ T_odom_rig @ np.array(drift))
+    found, expected = _Truth(read_run(log), truth), evaluate(Trajectory(truth.stamps_ns, T_odom_rig), truth)
+    assert found.metrics.ate_rmse_m == pytest.approx(expected.ate_rmse_m, rel=1e-6)
+    assert found.position_m.max() == pytest.approx(expected.ate_max_m, rel=1e-6)
+    assert found.heading_rad[-1] == pytest.approx(expected.heading_end_rad, rel=1e-6)
+    assert found.base_xy[0] == pytest.approx((0, 0), abs=1e-9)
+    assert found.base_xy[-1] == pytest.approx(T_odom_base(99)[:2, 3], abs=0.2)
+    assert "Against the truth" in Page(html_of(log, truth)).text
+    other = tmp_path / "truth.txt"
+    other.write_text("\n".join(tum_row(k * 10**9, np.eye(4)) for k in range(5)))
+    assert main(["report", str(log), "--truth", str(other), "-o", str(tmp_path / "out.html")]) == 2
+    assert "do both use the same clock" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("height_m", "low"), [(0.9, "0.8"), (1.5, "1")])
+def test_the_plan_draws_what_is_above_the_floor_where_the_rig_states_its_height(
+    tmp_path: Path, height_m: float, low: str
+) -> None:
+    """The floor filled the plans of robots whose cameras are lower than a metre."""
+    attached = {"rig.toml": rig_toml(attached_rig_of_sample().at_height(height_m)).encode()}
+    log = save(tmp_path / "a.mcap", [*run(3), cloud(2, np.zeros((5, 3)))], attached)
+    assert f"those from {low} m below the rig's height at the start to 1.5 m above" in Page(html_of(log)).text
+
+
+def test_shows_a_panorama_of_a_log_with_images(tmp_path: Path) -> None:
+    """The log holds the sample's first images, and poses."""
+    entries = run(20)
+    with (SAMPLE / "log.mcap").open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            if message.log_time > at(19):
+                break
+            entries.append((message.log_time, channel.topic, schema.name, message.data))
+    log = save(tmp_path / "log.mcap", entries, {"rig.toml": rig_toml(attached_rig_of_sample()).encode()})
+    page = Page(html_of(log))
+    assert [tag for tag, _ in page.tags].count("img") == 2 and "panorama at the first pose" in page.text
+
+
+def test_thinning_keeps_spikes_and_gaps() -> None:
+    t_s, values = np.arange(100_000) * 0.01, np.zeros(100_000)
+    values[[777, 50_001]] = 5.0, -7.0
+    t_s[80_000:] += 500.0
+    points = thinned(t_s, values)
+    assert len(points) < 1000 and {5.0, -7.0, None} <= {value for _, value in points}
+    assert thinned(t_s[:3], values[:3]) == [(0.0, 0.0), (0.01, 0.0), (0.02, 0.0)]
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.fixture(params=[(390, 844), (1440, 900)], ids=["phone", "desk"])
+def page(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
+    """The report of 10 s whose speed rises by 0.01 m/s each pose, in a browser, where no error occurs."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    entries = [odom(k, speed_mps=0.01 * k) for k in range(100)] + [drive(k, 0.4) for k in range(0, 100, 5)]
+    (tmp_path / "run.html").write_text(html_of(save(tmp_path / "run.mcap", entries)), "utf-8")
+    with playwright.sync_playwright() as tools:
+        browser = tools.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        found = browser.new_page(viewport=dict(zip(("width", "height"), request.param, strict=True)))
+        errors: list[str] = []
+        found.on("pageerror", lambda error: errors.append(str(error)))
+        found.on("console", lambda message: errors.append(message.text))
+        found.goto((tmp_path / "run.html").as_uri())
+        yield found
+        browser.close()
+    assert errors == []
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+def test_the_pointer_shows_values_and_the_place_on_the_plan_and_a_drag_zooms_all_charts(page: Any) -> None:
+    charts = page.locator(".u-over")
+    assert charts.count() > 4
+    speed = page.locator("figure.chart", has_text="Forward speed")
+    over = speed.locator(".u-over")
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    time_s, measured, _ = map(float, re.findall(r"-?[\d.]+", speed.locator(".u-legend").text_content()))
+    assert 4 < time_s < 6 and measured == pytest.approx(0.1 * time_s, abs=0.011)
+    assert page.locator(".sheet i").is_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= page.viewport_size["width"]
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.4 * box["width"], box["y"] + 0.5 * box["height"], steps=3)
+    page.mouse.up()
+    page.mouse.move(box["x"] + 0.5 * box["width"], box["y"] + 0.5 * box["height"])
+    time_s = float(re.findall(r"-?[\d.]+", speed.locator(".u-legend").text_content())[0])
+    assert 3.2 < time_s < 3.7, "the middle of the drag"

@@ -1,0 +1,88 @@
+"""Charts over time, drawn by uPlot: one time, one zoom and one cursor for all; a table of values stands under each."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from functools import cache
+from html import escape
+from importlib.resources import files
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from omnid.report.page import table
+
+Array = NDArray[np.float64]
+COLUMNS: Final = 400  # of a chart, in each of which the lowest and the highest value are kept
+MAX_CURVES: Final = 6
+LARGEST: Final = 1e9  # values beyond are invalid
+
+
+class Curve(NamedTuple):
+    """A line of a chart."""
+
+    name: str
+    t_s: Array  # (N,) rising
+    values: Array  # (N,); NaN: unknown
+
+
+def chart(title: str, curves: Sequence[Curve], *, unit: str = "", log: bool = False, note: str = "") -> str:
+    """Return a figure; "" where all curves are empty."""
+    shown = []
+    for name, t_s, values in curves:
+        valid = (np.abs(values) <= LARGEST) & ((values > 0) | (not log))
+        if valid.any():
+            shown.append(Curve(name, t_s[valid], values[valid]))
+    if not shown:
+        return ""
+    lines = [{"name": name, "points": thinned(t_s, values)} for name, t_s, values in shown[:MAX_CURVES]]
+    data = escape(json.dumps({"lines": lines, "log": log, "unit": unit}, separators=(",", ":")))
+    rows = [
+        (escape(name), *(f"{value:.4g}" for value in (v[0], v.min(), v.mean(), v.max(), v[-1]))) for name, _, v in shown
+    ]
+    summary = table(("", "first", "lowest", "mean", "highest", "last"), rows)
+    caption = f"<b>{escape(title)}</b>{f' [{escape(unit)}]' if unit else ''}"
+    footnote = f"<small>{escape(note)}</small>" if note else ""
+    return (
+        f"<figure class='chart'><figcaption>{caption}</figcaption><div data-chart=\"{data}\"></div>{footnote}"
+        f"<details><summary>values</summary>{summary}</details></figure>"
+    )
+
+
+def thinned(t_s: Array, values: Array) -> list[tuple[float, float | None]]:
+    """Return at most two points for each column, the lowest and the highest, and None in gaps of six usual steps."""
+    if not len(t_s):
+        return []
+    step = -(-len(t_s) // (2 * COLUMNS))
+    if step > 1:
+        starts = np.arange(0, len(t_s), 2 * step)
+        middles = np.minimum(starts + step, len(t_s) - 1)
+        bounds = [bound.reduceat(values, starts) for bound in (np.minimum, np.maximum)]
+        t_s, values = t_s[np.column_stack([starts, middles])].ravel(), np.column_stack(bounds).ravel()
+    steps_s = np.diff(t_s)
+    is_gap = steps_s > 6.0 * float(np.median(steps_s)) if len(steps_s) > 2 else np.zeros(len(steps_s), bool)
+    points: list[tuple[float, float | None]] = []
+    for index, (t, value) in enumerate(zip(t_s.tolist(), values.tolist(), strict=True)):
+        if index and is_gap[index - 1]:
+            points.append((round((t_s[index - 1] + t) / 2, 3), None))
+        points.append((round(t, 3), float(f"{value:.6g}") if math.isfinite(value) else None))
+    return points
+
+
+def grid(figures: Sequence[str]) -> str:
+    """Return figures side by side where there is room."""
+    return f"<div class='grid2'>{''.join(figures)}</div>" if any(figures) else ""
+
+
+@cache
+def style_and_script() -> tuple[str, str]:
+    """Return the style and the script that draw the charts."""
+    found = (files("omnid.report") / "uplot.html").read_text("utf-8").strip()
+    licence, _, rest = found.partition("--><style>")
+    style, _, script = rest.partition("</style><script>")
+    licence = licence.removeprefix("<!--").strip()
+    own = (files("omnid.report") / "charts.js").read_text("utf-8")
+    return style, f"/* {licence} */\n{script.removesuffix('</script>')}\n{own}"

@@ -1,0 +1,347 @@
+"""A recorded run, read once into arrays: poses, states, commands, status entries; and the events that follow from them.
+
+Times are in s since the first pose. A pose takes 300 bytes: an hour at 30 Hz 32 MB.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib import se3
+from calib.errors import CalibError
+from calib.rig import Rig
+from calib.rig_file import parse_rig
+from drivers.logs.log import LogInfo
+from drivers.logs.open_log import log_info
+from omnid.formats.tum import POSITION_LIMIT_M
+from omnid.recordings.odometry_topic import choose_odometry_topic, no_pose
+from omnid.recordings.recording_reader import CLOUD, DRIVE, ODOMETRY, STATUS, TWIST_COMMAND, RecordingReader
+from omnid.tracking_state import TrackingState
+from omnid.transport import status_names
+from omnid.transport.decode import Cloud, Diagnostics, PoseInMap
+from omnid.transport.records import DiagnosticStatus, OdometryRecord, TwistRecord
+from omnid.transport.status_names import Key, short_name
+from omnid.transport.topics import MAP_POSE
+
+Array = NDArray[np.float64]
+STATES: Final = tuple(TrackingState)
+UNKNOWN: Final = -1  # rank of a state that is not recorded
+GOOD, WARNING, ERROR = range(3)
+MAX_CLOCK_OFFSET_S: Final = 3600.0  # change of the offset between stamps and times of logging
+MAX_PARTS, MAX_VALUES, MAX_TEXT = 64, 64, 160  # entries, values of one, characters: a log of unknown origin
+_COUNTERS: Final[Mapping[str, str]] = {  # of faults, with the text of the event when one rises
+    Key.DROPS: "images dropped",
+    Key.DROPPED: "messages dropped",
+    Key.MISSED: "deadlines missed",
+    Key.ERRORS: "errors",
+    Key.LOSSES: "camera lost",
+    Key.RESTARTS: "stream restarted",
+    Key.BROKEN: "images that cannot be decoded",
+    Key.EXPIRIES: "watchdog expired",
+    Key.UNPAIRED_LOWER: "lower images without a partner",
+    Key.UNPAIRED_UPPER: "upper images without a partner",
+}
+_COUNTER_PREFIXES: Final = (status_names.STOPPED_PREFIX, status_names.REFUSED_PREFIX)  # of counters
+_DIGITS: Final = str.maketrans("", "", "0123456789")
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened."""
+
+    start_s: float
+    end_s: float
+    level: int
+    source: str
+    text: str
+    count: int = 0  # by which a counter rose; 0: no counter
+
+
+@dataclass(slots=True)
+class RecordedRun:
+    """Everything that the report shows of a recording. N poses."""
+
+    path: Path
+    info: LogInfo
+    topic: str  # of the odometry
+    robot: str
+    attachments: Mapping[str, bytes]
+    rig: Rig | None
+    rig_fault: str  # why there is no rig
+    start_ns: int  # stamp of the first pose
+    frames: tuple[str, str]  # of the odometry
+    t_s: Array  # (N,) rising
+    T_odom_base: Array  # (N, 4, 4)
+    variances: Array  # (N, 6) of x y z rx ry rz
+    velocity: Array  # (N, 6) m/s, rad/s
+    statuses: list[tuple[float, list[DiagnosticStatus]]]  # messages in the order of the file
+    map_poses: Array  # (M, 4) t, position's and heading's correction by the map [m, rad], sigma [m]
+    map_xy: Array  # (M, 2) m
+    drives: dict[str, Array]  # (K, 3) t, m/s, rad/s by topic: DRIVE, TWIST_COMMAND
+    cloud: Cloud | None  # the newest
+    unreadable: int  # messages left out: not of their type, with a stamp far from the time of logging, out of range
+    late: int  # poses left out: not later than the one before
+    corrupt: int  # chunks and records of the file left out
+    ranks: NDArray[np.int64] = field(init=False)  # (N,) of the state in STATES, UNKNOWN: not recorded
+    newest: dict[str, DiagnosticStatus] = field(init=False)  # of each part, with the newest of all its values
+    by_name: dict[str, list[tuple[float, DiagnosticStatus]]] = field(init=False)  # times and entries of each part
+    restarts: list[int] = field(default_factory=list)  # first poses after each start of the daemon but the first
+    restarted_s: list[float] = field(default_factory=list)  # times of the reports of these starts
+    resets: list[tuple[float, int]] = field(default_factory=list)  # times and numbers of resets of odometry
+
+    def __post_init__(self) -> None:
+        """Find the state of each pose, the newest values of each part, starts and resets."""
+        self.newest, self.by_name = {}, {}
+        for t_s, status in ((t_s, status) for t_s, message in self.statuses for status in message):
+            self.by_name.setdefault(status.name, []).append((t_s, status))
+            values = self.newest[status.name].values if status.name in self.newest else {}
+            merged = dict([*{**values, **status.values}.items()][:MAX_VALUES])
+            self.newest[status.name] = DiagnosticStatus(status.name, status.level, status.message, merged)
+        # An entry with `state` has the stamp of the first pose in it; others tell the state of an earlier pose.
+        entries = self.entries(status_names.ODOMETRY)
+        entries = [(t, status) for t, status in entries if Key.STATE in status.values] or entries
+        found = [(t, status_names.tracking_state(status.message, status.values)) for t, status in entries]
+        known = sorted((t, STATES.index(state)) for t, state in found if state is not None)
+        ranks = np.array([UNKNOWN, *(rank for _, rank in known)])
+        self.ranks = ranks[np.searchsorted([t for t, _ in known], self.t_s + 1e-9, side="right")]
+        self._starts_and_resets()
+
+    @property
+    def T_base_rig(self) -> Array:
+        """Pose of the rig on the robot; the identity where it is unknown."""
+        return np.eye(4) if self.rig is None else self.rig.T_base_rig
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last pose."""
+        return float(self.t_s[-1])
+
+    @property
+    def reports(self) -> int:
+        """Number of messages with the entries of all parts."""
+        return sum(len(message) > 1 for _, message in self.statuses)
+
+    def entries(self, name: str) -> Sequence[tuple[float, DiagnosticStatus]]:
+        """Return the entries of a part with their times, in the order of the file."""
+        return self.by_name.get(name, [])
+
+    def series(self, name: str, key: str) -> tuple[Array, Array]:
+        """Return times and values of a number of a part."""
+        found = [(t_s, status_names.number(status.values.get(key, ""))) for t_s, status in self.entries(name)]
+        known = sorted((t_s, value) for t_s, value in found if value is not None)
+        return np.array([t_s for t_s, _ in known]), np.array([value for _, value in known])
+
+    def values(self, name: str) -> Mapping[str, str]:
+        """Return the newest values of a part."""
+        return self.newest[name].values if name in self.newest else {}
+
+    def gaps(self) -> Array:
+        """Return begin and end (G, 2) of the times without a pose: half a second, and five periods."""
+        steps_s = np.diff(self.t_s)
+        longest_s = max(0.5, 5.0 * float(np.median(steps_s))) if len(steps_s) > 2 else 0.5
+        return np.column_stack([self.t_s[:-1], self.t_s[1:]])[steps_s > longest_s]
+
+    def length_m(self) -> float:
+        """Return the length of the path; the step from one odom to the next is no part of it."""
+        steps_m = np.linalg.norm(np.diff(self.T_odom_base[:, :3, 3], axis=0), axis=1)
+        steps_m[[index - 1 for index in self.restarts]] = 0.0
+        return float(steps_m.sum())
+
+    def events(self) -> list[Event]:
+        """Return the events in the order of time."""
+        found = [Event(a, b, WARNING, "poses", f"none for {b - a:.2f} s") for a, b in self.gaps()]
+        for index in np.flatnonzero(np.diff(self.ranks, prepend=UNKNOWN)):
+            rank, t_s = int(self.ranks[index]), float(self.t_s[index])
+            if index or rank != 0:  # a run that begins well is no event
+                text = STATES[rank] if rank >= 0 else "unknown"
+                found.append(Event(t_s, t_s, (GOOD, WARNING, ERROR)[max(rank, 0)], "state", text))
+        text = "odometry was reset, with an unknown gap"
+        found += [Event(t_s, t_s, ERROR, "state", text, count if count > 1 else 0) for t_s, count in self.resets]
+        text = "the robot was started again, with a new odom"
+        found += [Event(t_s, t_s, WARNING, "state", text) for t_s in self.restarted_s]
+        for name in self.newest:
+            found += self._message_events(name) if name not in (status_names.ODOMETRY, status_names.SUMMARY) else ()
+            found += self._counter_events(name)
+        return sorted(found, key=lambda event: event.start_s)
+
+    def _starts_and_resets(self) -> None:
+        """Find the starts of the daemon, with a new odom, and the resets of odometry.
+
+        A smaller number of resets, or a shorter path, tells of a start; reports of each kind come in order. The new
+        odom begins after the longest gap since the last report that the daemon ran on, or after the next gap.
+        """
+        before, since_s, newest = dict[bool, tuple[float, float, float]](), -math.inf, -1
+        gaps = self.gaps()
+        for t_s, status in self.entries(status_names.ODOMETRY):
+            resets = status_names.count(status.values.get(Key.RESETS, ""))
+            length_m = status_names.number(status.values.get(Key.LENGTH_M, ""))
+            if resets is None:
+                continue
+            now = (t_s, float(resets), -1.0 if length_m is None else length_m)
+            last = before.get(length_m is None, now)
+            if now[0] >= last[0]:
+                if now[1] < last[1] or now[2] < last[2]:
+                    inside = gaps[(gaps[:, 1] > since_s) & (gaps[:, 1] <= t_s)]
+                    longest = inside[np.argsort(inside[:, 0] - inside[:, 1], kind="stable")][:1]
+                    chosen = longest if len(longest) else gaps[gaps[:, 1] > t_s][:1]
+                    self.restarts += np.searchsorted(self.t_s, chosen[:, 1]).tolist()
+                    self.restarted_s.append(t_s)
+                    before.clear()
+                    newest = 0
+                elif length_m is not None or False not in before:
+                    since_s = t_s
+                before[length_m is None] = now
+            if resets > newest >= 0:
+                self.resets.append((t_s, resets - newest))
+            newest = max(resets, newest)
+
+    def _message_events(self, name: str) -> Iterator[Event]:
+        """Yield the changes of a part's message; a change of digits only is none."""
+        before = None
+        for t_s, status in self.entries(name):
+            message = status.message.translate(_DIGITS)
+            if message and message != before and (before is not None or status.level > 0):
+                level = (GOOD, WARNING, ERROR, ERROR)[min(status.level, 3)]
+                yield Event(t_s, t_s, level, short_name(name), status.message)
+            before = message
+
+    def _counter_events(self, name: str) -> Iterator[Event]:
+        """Yield the rises of a part's counters of faults; the first value is from before the recording.
+
+        One that rises again with the next report but one is the same event.
+        """
+        for key in self.values(name):
+            if not (key in _COUNTERS or key.startswith(_COUNTER_PREFIXES)):
+                continue
+            times_s, counts = self.series(name, key)
+            if (
+                key.startswith(_COUNTER_PREFIXES)
+                and self.statuses
+                and len(times_s)
+                and times_s[0] > self.statuses[0][0]
+            ):
+                times_s, counts = np.insert(times_s, 0, times_s[0]), np.insert(counts, 0, 0.0)  # it has appeared
+            newest: Event | None = None
+            for (before, count), t_s in zip(pairwise(counts), times_s[1:], strict=True):
+                if count > before:
+                    rise = int(count - before)
+                    if newest is not None and t_s - newest.end_s <= 2.5:
+                        newest = replace(newest, end_s=t_s, count=newest.count + rise)
+                    else:
+                        if newest is not None:
+                            yield newest
+                        newest = Event(t_s, t_s, WARNING, short_name(name), _COUNTERS.get(key, key), rise)
+            if newest is not None:
+                yield newest
+
+
+def read_run(path: Path, topic: str | None = None) -> RecordedRun:
+    """Read a recording; topic: of the odometry, see choose_odometry_topic.
+
+    Raise OmnidError where there is no odometry in it, DriverError where there is no log.
+    """
+    found = log_info(path)
+    reader = RecordingReader(found, choose_odometry_topic(found, topic))
+    # 1. All messages; poses whose stamps are far from the time of logging, or that are out of range, are left out.
+    poses, map_poses = list[OdometryRecord](), list[PoseInMap]()
+    statuses, names = list[tuple[int, list[DiagnosticStatus]]](), set[str]()
+    drives: dict[str, list[TwistRecord]] = {}
+    cloud: Cloud | None = None
+    offset_ns: int | None = None  # from the stamps of the poses to the times of logging
+    out_of_range = late = 0
+    for message in reader.messages((ODOMETRY, MAP_POSE, STATUS, CLOUD, DRIVE, TWIST_COMMAND)):
+        match message.content:
+            case OdometryRecord() as pose:
+                offset_ns = message.log_time_ns - pose.stamp_ns if offset_ns is None else offset_ns
+                is_near = abs(message.log_time_ns - pose.stamp_ns - offset_ns) <= MAX_CLOCK_OFFSET_S * 1e9
+                if not (is_near and (np.abs(pose.T_odom_base[:3, 3]) <= POSITION_LIMIT_M).all()):
+                    out_of_range += 1
+                elif poses and pose.stamp_ns <= poses[-1].stamp_ns:
+                    late += 1
+                else:
+                    poses.append(pose)
+            case PoseInMap() as in_map if (np.abs(in_map.T_map_base[:3, 3]) <= POSITION_LIMIT_M).all():
+                map_poses.append(in_map)
+            case Diagnostics(stamp_ns, entries):
+                bounded = [_bounded(status) for status in entries]
+                names |= {status.name for status in bounded[: MAX_PARTS - len(names)]}
+                statuses.append((stamp_ns, [status for status in bounded if status.name in names]))
+            case Cloud():
+                cloud = message.content
+            case TwistRecord():
+                drives.setdefault(message.name, []).append(message.content)
+    if not poses:
+        raise no_pose(path, reader.topic)
+    # 2. Their arrays.
+    start_ns, rig_toml = poses[0].stamp_ns, reader.attachments.get("rig.toml")
+    rig, fault = None, "no rig.toml is attached"
+    if rig_toml is not None:
+        try:
+            rig = parse_rig(rig_toml)
+        except CalibError as error:
+            fault = f"the attached rig.toml cannot be read: {error}"
+
+    def seconds(stamp_ns: int) -> float:
+        return (stamp_ns - start_ns) * 1e-9
+
+    corrections, map_xy = _corrections(map_poses, poses, start_ns)
+    return RecordedRun(
+        path=path,
+        info=found,
+        topic=reader.topic,
+        robot=reader.robot,
+        attachments=reader.attachments,
+        rig=rig,
+        rig_fault=fault,
+        start_ns=start_ns,
+        frames=poses[0].frames,
+        t_s=np.array([seconds(pose.stamp_ns) for pose in poses]),
+        T_odom_base=np.array([pose.T_odom_base for pose in poses]),
+        variances=np.array([np.diag(pose.covariance) for pose in poses]),
+        velocity=np.array([pose.velocity for pose in poses]),
+        statuses=[(seconds(stamp_ns), entries) for stamp_ns, entries in statuses],
+        map_poses=corrections,
+        map_xy=map_xy,
+        drives={
+            name: np.array([(seconds(twist.stamp_ns), twist.velocity_mps, twist.yaw_rate_radps) for twist in twists])
+            for name, twists in drives.items()
+        },
+        cloud=cloud,
+        unreadable=reader.unreadable.total() + out_of_range,
+        late=late,
+        corrupt=reader.corrupt,
+    )
+
+
+def _corrections(map_poses: Sequence[PoseInMap], poses: Sequence[OdometryRecord], start_ns: int) -> tuple[Array, Array]:
+    """Return rows of t, correction in m and rad, sigma, and positions in the map, where odometry has the same stamp.
+
+    The correction is the pose in the map relative to that of odometry: the part of map -> odom seen at the robot.
+    """
+    by_stamp = {pose.stamp_ns: pose.T_odom_base for pose in poses}
+    both = [(pose, by_stamp[pose.stamp_ns]) for pose in map_poses if pose.stamp_ns in by_stamp]
+    if not both:
+        return np.zeros((0, 4)), np.zeros((0, 2))
+    T_map, T_odom = np.array([pose.T_map_base for pose, _ in both]), np.array([T for _, T in both])
+    moved_m = np.linalg.norm(T_map[:, :2, 3] - T_odom[:, :2, 3], axis=1)
+    sigma_m = root(np.array([np.diag(pose.covariance)[:3].sum() for pose, _ in both]))
+    t_s = np.array([(pose.stamp_ns - start_ns) * 1e-9 for pose, _ in both])
+    return np.column_stack([t_s, moved_m, se3.yaw(T_map @ se3.inverse(T_odom)), sigma_m]), T_map[:, :2, 3]
+
+
+def root(variances: Array) -> Array:
+    """Return standard deviations; NaN for a variance that is not positive, which means that it was not set."""
+    return np.sqrt(np.where(variances > 0, variances, np.nan))
+
+
+def _bounded(status: DiagnosticStatus) -> DiagnosticStatus:
+    values = {key[:MAX_TEXT]: value[:MAX_TEXT] for key, value in [*status.values.items()][:MAX_VALUES]}
+    return DiagnosticStatus(status.name[:MAX_TEXT], status.level, status.message[:MAX_TEXT], values)
