@@ -1,4 +1,4 @@
-"""Commands from the network: valid ones are accepted, all others are refused and counted."""
+"""What may command, by tables: commands, requests to the navigation, samples of wheels and gyro."""
 
 from __future__ import annotations
 
@@ -6,25 +6,87 @@ import math
 import random
 import struct
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.stores import ros2_humble as ros
 
+from drivers.logs.ros_messages import JointWheels
+from drivers.motion import GyroSample, MotionSample, WheelSample
 from omnid.core.control.arming import OLDER_THAN_STOP, ArmRequest
 from omnid.core.control.command_sources import TimedSetpoint
 from omnid.core.control.contacts import BUMPER, CLIFF
 from omnid.core.control.heading_controller import Setpoint
+from omnid.core.navigation.requests import (
+    GoalRequest,
+    NavigationCommand,
+    NavigationFrame,
+    NavigationVerb,
+    PathRequest,
+    RouteAction,
+    RouteRequest,
+)
+from omnid.errors import OmnidError
 from omnid.transport import codec
-from omnid.transport.codec import bool_cdr
+from omnid.transport.codec import bool_cdr, header_message, message_cdr
 from omnid.transport.commands import LONGEST_PAYLOAD, CommandReceiver
+from omnid.transport.motion_codec import IMU_SCHEMA, JOINT_SCHEMA, gyro_cdr, wheel_cdr
+from omnid.transport.navigation_codec import (
+    PlanarGoal,
+    goal_cdr,
+    goal_from_cdr,
+    path_cdr,
+    path_from_cdr,
+    string_cdr,
+    string_from_cdr,
+)
+from omnid.transport.navigation_commands import LONGEST_PAYLOAD as LONGEST_PATH
+from omnid.transport.navigation_commands import MOST_WAITING, NavigationReceiver, RequestQueue
 from omnid.transport.records import TwistRecord
 from omnid.transport.requests import Answer, Request
-from omnid.transport.stamps import StampRule
+from omnid.transport.sensor_receiver import SensorReceiver
+from omnid.transport.stamps import EARLY, NOT_RISING, TOO_OLD, UNSTAMPED, USED_BEFORE, RefusedStamp, StampRule
+from omnid.transport.topics import IMU, JOINT_STATES, SENSOR_TOPICS, WHEEL_ODOM
 
 STALE_S = 0.5
 STORE: Any = get_typestore(Stores.ROS2_HUMBLE)
+OFFSET_NS = 10**18
+WHEELS, GYRO = WheelSample(5 * 10**9, 0.25, -0.5), GyroSample(6 * 10**9, 0.125, -0.25, 0.5, of_base=True)
+
+
+# Stamps.
+
+
+def refusal(rule: StampRule, stamp_ns: int, topic: str = "cmd/twist") -> str:
+    """Return the reason for which a stamp is refused, empty where it is accepted."""
+    try:
+        rule.check_arm(stamp_ns) if topic == "cmd/arm" else rule.check(topic, stamp_ns)
+    except RefusedStamp as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize("topic", ["cmd/twist", "cmd/arm"])
+@pytest.mark.parametrize(("later_s", "reason"), [(0.0, ""), (-30.0, ""), (30.0, ""), (-90.0, TOO_OLD), (90.0, EARLY)])
+def test_synchronised_clocks_differ_by_the_longest_age(topic: str, later_s: float, reason: str) -> None:
+    rule = StampRule(60.0)
+    assert refusal(rule, now_ns(later_s), topic) == reason
+    assert refusal(rule, 0, topic) == UNSTAMPED
+
+
+def test_stamps_of_other_clocks_rise_in_each_topic_and_begin_again_after_an_arming() -> None:
+    rule = StampRule(60.0, synchronised=False)
+    assert [refusal(rule, stamp) for stamp in (5, 6, 6, 3, 7)] == ["", "", NOT_RISING, NOT_RISING, ""]
+    assert refusal(rule, 1, "cmd/heading") == "" and refusal(rule, 0) == UNSTAMPED
+    assert refusal(rule, 9, "cmd/arm") == "" and refusal(rule, 4) == NOT_RISING, "not accepted yet"
+    rule.accept_arm(9)
+    assert refusal(rule, 4) == "" and refusal(rule, 9, "cmd/arm") == USED_BEFORE and refusal(rule, 8, "cmd/arm") == ""
+
+
+# Commands.
 
 
 class AcceptedCommands:
@@ -62,10 +124,6 @@ class AcceptedCommands:
         self.contacts.append((contact, holds))
 
 
-def receive(receiver: CommandReceiver, *message: Any) -> Answer | None:
-    return receiver.receive(Request(*message))
-
-
 @pytest.fixture
 def accepted() -> AcceptedCommands:
     return AcceptedCommands()
@@ -79,50 +137,73 @@ def twist(velocity_mps: float = 0.3, rate_radps: float = -0.2, frame: str = "bas
     return codec.twist_stamped_cdr(now_ns(later_s), frame, velocity_mps, rate_radps)
 
 
+def plain_twist(velocity_mps: float = 0.3, rate_radps: float = -0.2) -> bytes:
+    types = STORE.types
+    vectors = [types["geometry_msgs/msg/Vector3"](*v) for v in ((velocity_mps, 0.0, 0.0), (0.0, 0.0, rate_radps))]
+    return bytes(STORE.serialize_cdr(types["geometry_msgs/msg/Twist"](*vectors), "geometry_msgs/msg/Twist"))
+
+
+def heading(velocity_mps: float = 0.4, heading_rad: float = 1.5) -> bytes:
+    return codec.heading_cdr(now_ns(), velocity_mps, heading_rad)
+
+
+def arm(later_s: float = 0.0) -> bytes:
+    return codec.header_cdr(now_ns(later_s))
+
+
+def stamped(stamp: bytes) -> bytes:
+    return twist()[:4] + stamp + twist()[12:]
+
+
 def test_valid_commands_are_accepted(accepted: AcceptedCommands) -> None:
     before_ns = time.monotonic_ns()
     accepted.receive("cmd/twist", twist())
-    accepted.receive("cmd/heading", codec.heading_cdr(now_ns(), 0.4, 1.5))
-    assert accepted.setpoints == [Setpoint(0.3, None, -0.2), Setpoint(0.4, 1.5)]
-    assert before_ns <= accepted.arrivals_ns[0] <= accepted.arrivals_ns[1] <= time.monotonic_ns()
-    assert accepted.receiver.accepted == 2 and accepted.receiver.refused == {}
-
-
-def test_a_stop_may_have_any_payload(accepted: AcceptedCommands) -> None:
-    for payload in (b"", b"\xff" * 100_000, twist()):
-        accepted.receive("cmd/stop", payload)
-    assert accepted.stops == accepted.receiver.stops == 3 and accepted.setpoints == []
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_refuses_numbers_that_are_not_finite(accepted: AcceptedCommands, value: float) -> None:
-    accepted.receive("cmd/twist", twist(velocity_mps=value))
-    accepted.receive("cmd/twist", twist(rate_radps=value))
-    accepted.receive("cmd/heading", codec.heading_cdr(now_ns(), value, 0.0))
-    accepted.receive("cmd/heading", codec.heading_cdr(now_ns(), 0.1, value))
-    assert accepted.setpoints == [] and accepted.receiver.refused == {"not finite": 4}
-
-
-@pytest.mark.parametrize("value", [1e300, -1e9, 1001.0])
-def test_refuses_numbers_out_of_range(accepted: AcceptedCommands, value: float) -> None:
-    accepted.receive("cmd/twist", twist(velocity_mps=value))
-    accepted.receive("cmd/twist", twist(rate_radps=value))
-    accepted.receive("cmd/heading", codec.heading_cdr(now_ns(), 0.1, value))
-    assert accepted.setpoints == [] and accepted.receiver.refused == {"out of range": 3}
-
-
-def test_refuses_other_frames_and_accepts_an_empty_one(accepted: AcceptedCommands) -> None:
-    accepted.receive("cmd/twist", twist(frame="odom"))
-    accepted.receive("cmd/twist", twist(frame="map" * 100))
-    assert accepted.setpoints == [] and accepted.receiver.refused == {"wrong frame": 2}
+    accepted.receive("cmd/heading", heading())
     accepted.receive("cmd/twist", twist(frame=""))
-    assert accepted.receiver.accepted == 1
+    accepted.receive("cmd/twist", plain_twist(), sent_ns=now_ns())
+    moving = Setpoint(0.3, None, -0.2)
+    assert accepted.setpoints == [moving, Setpoint(0.4, 1.5), moving, moving]
+    assert before_ns <= accepted.arrivals_ns[0] <= accepted.arrivals_ns[1] <= time.monotonic_ns()
+    assert accepted.receiver.accepted == 4 and accepted.receiver.refused == {}
 
 
-@pytest.mark.parametrize("later_s", [-0.6, -30.0, -59.0, -66.0, -1e8])
-def test_refuses_commands_that_are_too_old(accepted: AcceptedCommands, later_s: float) -> None:
-    accepted.receive("cmd/twist", twist(later_s=later_s))
-    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 1}
+NOT_FINITE = [(lambda value=value: twist(velocity_mps=value)) for value in (math.nan, math.inf, -math.inf)]
+FAR = [(lambda value=value: twist(rate_radps=value)) for value in (1e300, -1e9, 1001.0)]
+OLD = [(lambda later_s=later_s: twist(later_s=later_s)) for later_s in (-0.6, -30.0, -59.0, -66.0, -1e8)]
+
+
+@pytest.mark.hazard("H06")
+@pytest.mark.parametrize(
+    ("reason", "topic", "makes"),
+    [
+        ("not finite", "cmd/twist", NOT_FINITE),
+        ("not finite", "cmd/heading", [lambda: heading(math.nan, 0.0), lambda: heading(0.1, math.inf)]),
+        ("not finite", "cmd/twist", [lambda: twist(rate_radps=math.nan)]),
+        ("out of range", "cmd/twist", [*FAR, lambda: twist(velocity_mps=1e9)]),
+        ("out of range", "cmd/heading", [lambda: heading(0.1, 1001.0)]),
+        ("wrong frame", "cmd/twist", [lambda: twist(frame="odom"), lambda: twist(frame="map" * 100)]),
+        ("too old", "cmd/twist", [*OLD, lambda: stamped(struct.pack("<iI", -(2**31), 2**32 - 1))]),
+        ("too old", "cmd/twist", [lambda: stamped(b"\xff" * 8)]),
+        ("no stamp", "cmd/twist", [lambda: stamped(bytes(8)), plain_twist]),
+        ("too long", "cmd/twist", [lambda: twist() + bytes(LONGEST_PAYLOAD)]),
+        ("malformed", "cmd/twist", [lambda: b"{}", lambda: b""]),
+        ("unknown topic", "cmd/autopilot/twist", [twist]),
+        ("unknown topic", "cmd/planner/stop", [twist]),
+        ("malformed", "cmd/arm", [lambda: b"", lambda: b"\xff" * 40]),
+        ("too old", "cmd/arm", [lambda: arm(-1.0)]),
+        ("stamp in the future", "cmd/arm", [lambda: arm(5.0)]),
+        ("no stamp", "cmd/arm", [lambda: codec.header_cdr(0)]),
+        ("too long", "cmd/arm", [lambda: bytes(LONGEST_PAYLOAD + 1)]),
+    ],
+)
+def test_all_other_commands_are_refused_and_counted(
+    accepted: AcceptedCommands, reason: str, topic: str, makes: list[Callable[[], bytes]]
+) -> None:
+    for make in makes:
+        answer = accepted.receive(topic, make(), id=7)
+        assert answer is None or (not answer.done and answer.text.startswith(reason))
+    assert accepted.receiver.refused == {reason: len(makes)}
+    assert not accepted.setpoints and not accepted.arms and not accepted.stops
 
 
 @pytest.mark.hazard("H06")
@@ -132,49 +213,26 @@ def test_refuses_commands_of_the_future(accepted: AcceptedCommands, later_s: flo
     assert accepted.setpoints == [] and accepted.receiver.refused == {"stamp in the future": 1}
 
 
-INVALID_STAMPS = (struct.pack("<iI", 0, 0), struct.pack("<iI", -(2**31), 2**32 - 1), b"\xff" * 8)
+def test_a_stop_may_have_any_payload(accepted: AcceptedCommands) -> None:
+    for payload in (b"", b"\xff" * 100_000, twist()):
+        accepted.receive("cmd/stop", payload)
+    assert accepted.stops == accepted.receiver.stops == 3 and accepted.setpoints == []
 
 
-def test_refuses_invalid_stamps(accepted: AcceptedCommands) -> None:
-    for stamp in INVALID_STAMPS:
-        payload = bytearray(twist())
-        payload[4:12] = stamp
-        accepted.receive("cmd/twist", bytes(payload))
-    assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 2, "no stamp": 1}
-
-
-def plain_twist(velocity_mps: float = 0.3, rate_radps: float = -0.2) -> bytes:
-    types = STORE.types
-    vectors = [types["geometry_msgs/msg/Vector3"](*v) for v in ((velocity_mps, 0.0, 0.0), (0.0, 0.0, rate_radps))]
-    return bytes(STORE.serialize_cdr(types["geometry_msgs/msg/Twist"](*vectors), "geometry_msgs/msg/Twist"))
-
-
-def test_a_plain_twist_has_the_stamp_of_its_sending(accepted: AcceptedCommands) -> None:
-    accepted.receive("cmd/twist", plain_twist(), sent_ns=now_ns())
-    assert accepted.setpoints == [Setpoint(0.3, None, -0.2)]
+def test_a_plain_twist_without_stamp_counts_where_the_clocks_differ(accepted: AcceptedCommands) -> None:
     accepted.receive("cmd/twist", plain_twist(), sent_ns=now_ns(-1.0))
-    accepted.receive("cmd/twist", plain_twist())
-    accepted.receive("cmd/twist", plain_twist(math.nan), sent_ns=now_ns())
-    assert len(accepted.setpoints) == 1
-    assert accepted.receiver.refused == {"too old": 1, "no stamp": 1, "not finite": 1}
-
-
-def test_a_plain_twist_without_stamp_counts_where_the_clocks_differ() -> None:
-    accepted = AcceptedCommands(synchronised=False)
-    for _ in range(3):
-        accepted.receive("cmd/twist", plain_twist())
-    assert accepted.setpoints == [Setpoint(0.3, None, -0.2)] * 3
-    for sent_ns in (20, 10):
-        accepted.receive("cmd/twist", plain_twist(), sent_ns=sent_ns)
-    assert accepted.receiver.refused == {"stamp does not rise": 1}
+    assert accepted.receiver.refused == {"too old": 1}
+    other = AcceptedCommands(synchronised=False)
+    for sent_ns in (0, 0, 0, 20, 10):
+        other.receive("cmd/twist", plain_twist(), sent_ns=sent_ns)
+    assert len(other.setpoints) == 4 and other.receiver.refused == {"stamp does not rise": 1}
 
 
 def test_refusals_are_reported_with_what_to_do() -> None:
     lines: list[str] = []
     receiver = CommandReceiver(AcceptedCommands(), StampRule(STALE_S), report=lines.append)
-    receive(receiver, "cmd/twist", plain_twist())
-    receive(receiver, "cmd/twist", b"{}")
-    receive(receiver, "cmd/" + "\n\x1b[2J" * 50, twist())
+    for topic, payload in (("twist", plain_twist()), ("twist", b"{}"), ("\n\x1b[2J" * 50, twist())):
+        receiver.receive(Request(f"cmd/{topic}", payload))
     assert lines[0].startswith("a command on cmd/twist is refused: no stamp; fill in the stamp")
     assert 'bus.command_clock = "arrival"' in lines[0]
     assert lines[1].startswith("a command on cmd/twist is refused: malformed; twist takes TwistStamped or Twist")
@@ -191,14 +249,6 @@ def test_refuses_a_stream_that_is_replayed_after_66_s(accepted: AcceptedCommands
     for payload in stream(now_ns(-66.0)):
         accepted.receive("cmd/twist", payload)
     assert accepted.setpoints == [] and accepted.receiver.refused == {"too old": 5}
-
-
-@pytest.mark.parametrize("later_s", [-1e9, -3600.0, 3600.0])
-def test_takes_commands_of_another_clock_where_it_is_configured(later_s: float) -> None:
-    accepted = AcceptedCommands(synchronised=False)
-    for payload in stream(now_ns(later_s)):
-        accepted.receive("cmd/twist", payload)
-    assert accepted.receiver.accepted == 5 and accepted.receiver.refused == {}
 
 
 @pytest.mark.hazard("H06")
@@ -220,12 +270,6 @@ def test_a_refused_command_does_not_move_the_sequence() -> None:
     accepted.receive("cmd/twist", codec.twist_stamped_cdr(10**15, "base_link", math.nan, 0.0))
     accepted.receive("cmd/twist", stream(10**12, 1)[0])
     assert accepted.receiver.accepted == 1
-
-
-def test_refuses_long_payloads_without_decoding_them(accepted: AcceptedCommands) -> None:
-    good = twist()
-    accepted.receive("cmd/twist", good + bytes(LONGEST_PAYLOAD + 1 - len(good)))
-    assert accepted.receiver.refused == {"too long": 1}
 
 
 def damaged(rng: random.Random, good: bytes) -> bytes:
@@ -262,36 +306,14 @@ def test_counts_a_thousand_damaged_payloads(accepted: AcceptedCommands, seed: in
         assert setpoint.heading_rad is None or abs(setpoint.heading_rad) <= 1000
 
 
-def test_refuses_messages_of_another_type(accepted: AcceptedCommands) -> None:
-    accepted.receive("cmd/twist", codec.heading_cdr(now_ns(), 0.1, 0.2))
-    accepted.receive("cmd/twist", codec.pose_stamped_cdr(now_ns(), np.eye(4)))
-    assert accepted.setpoints == [] and sum(accepted.receiver.refused.values()) == 2
-
-
-def arm(later_s: float = 0.0) -> bytes:
-    return codec.header_cdr(now_ns(later_s))
-
-
-def test_a_request_to_arm_is_validated_like_commands(accepted: AcceptedCommands) -> None:
-    before_ns, receiver = time.monotonic_ns(), accepted.receiver
-    assert accepted.receive("cmd/arm", arm(), id=7) is None, "the controller answers"
-    assert [request.id for request in accepted.arms] == [7]
-    assert before_ns <= accepted.arms[0].arrival_ns <= time.monotonic_ns() and receiver.arms == 1
-    for bad in (b"", arm(-1.0), arm(5.0), b"\xff" * 40, bytes(LONGEST_PAYLOAD + 1), codec.header_cdr(0)):
-        answer = accepted.receive("cmd/arm", bad)
-        assert answer is not None and not answer.done and answer.text.partition(";")[0] in receiver.refused
-    assert len(accepted.arms) == 1
-    assert receiver.refused == {"malformed": 2, "too old": 1, "no stamp": 1, "stamp in the future": 1, "too long": 1}
-
-
 @pytest.mark.hazard("H48")
 def test_is_not_armed_beside_a_robot_of_the_same_name() -> None:
     unique, accepted = [False], AcceptedCommands()
     receiver = CommandReceiver(accepted, StampRule(STALE_S), is_unique=lambda: unique[0])
-    receive(receiver, "cmd/arm", arm())
+    receiver.receive(Request("cmd/arm", arm()))
     assert accepted.arms == [] and receiver.refused == {"another robot has this name": 1}
     unique[0] = True
-    receive(receiver, "cmd/arm", arm())
+    receiver.receive(Request("cmd/arm", arm()))
     assert len(accepted.arms) == 1
 
 
@@ -301,41 +323,34 @@ def test_a_request_that_was_sent_before_the_stop_and_comes_after_it_is_refused(a
     accepted.receive("cmd/stop", b"")
     accepted.receive("cmd/arm", early)
     assert accepted.arms == [] and accepted.receiver.refused == {OLDER_THAN_STOP: 1}
-    accepted.receive("cmd/arm", arm())
-    assert len(accepted.arms) == 1
+    before_ns = time.monotonic_ns()
+    assert accepted.receive("cmd/arm", arm(), id=7) is None, "the controller answers"
+    assert accepted.arms[0].id == 7 and before_ns <= accepted.arms[0].arrival_ns <= time.monotonic_ns()
+    assert len(accepted.arms) == accepted.receiver.arms == 1
 
 
-def test_arming_lets_the_stamps_of_another_clock_begin_again() -> None:
+def test_arming_lets_the_stamps_of_another_clock_begin_again_and_counts_once() -> None:
     """A stamp far in the future would lock its topic until the restart."""
     accepted = AcceptedCommands(synchronised=False)
-    receiver = accepted.receiver
-    receive(receiver, "cmd/twist", codec.twist_stamped_cdr(2**31 * 10**9 - 1, "base_link", 0.3, 0.0))
+    accepted.receive("cmd/twist", codec.twist_stamped_cdr(2**31 * 10**9 - 1, "base_link", 0.3, 0.0))
     for payload in stream(10**12):
-        receive(receiver, "cmd/twist", payload)
-    assert len(accepted.setpoints) == 1 and receiver.refused == {"stamp does not rise": 5}
-    receive(receiver, "cmd/arm", codec.header_cdr(10**12))
+        accepted.receive("cmd/twist", payload)
+    assert len(accepted.setpoints) == 1 and accepted.receiver.refused == {"stamp does not rise": 5}
+    accepted.receive("cmd/arm", codec.header_cdr(10**12))
     for payload in stream(10**12):
-        receive(receiver, "cmd/twist", payload)
+        accepted.receive("cmd/twist", payload)
     assert len(accepted.setpoints) == 6 and len(accepted.arms) == 1
-
-
-def test_a_recorded_request_to_arm_of_another_clock_is_refused() -> None:
-    accepted = AcceptedCommands(synchronised=False)
-    for stamp_ns in (10**15, 10**12, 10**12, 10**15):
+    for stamp_ns in (10**15, 10**11, 10**11, 10**15):
         accepted.receive("cmd/arm", codec.header_cdr(stamp_ns), id=stamp_ns)
-    assert [request.id for request in accepted.arms] == [10**15, 10**12], "also of a clock that began again"
-    assert accepted.receiver.refused == {"stamp was used before": 2}
+    assert [request.id for request in accepted.arms[1:]] == [10**15, 10**11], "also of a clock that began again"
+    assert accepted.receiver.refused["stamp was used before"] == 2
 
 
 def test_the_topic_names_the_source(accepted: AcceptedCommands) -> None:
-    for key in ("cmd/twist", "cmd/operator/twist", "cmd/planner/twist", "cmd/autopilot/twist", "cmd/planner/stop"):
+    for key in ("cmd/twist", "cmd/operator/twist", "cmd/planner/twist"):
         accepted.receive(key, twist(), "somebody")
-    assert [(command.source, command.sender) for command in accepted.commands] == [
-        ("operator", "somebody"),
-        ("operator", "somebody"),
-        ("planner", "somebody"),
-    ]
-    assert accepted.receiver.refused == {"unknown topic": 2} and accepted.stops == 0
+    assert [command.source for command in accepted.commands] == ["operator", "operator", "planner"]
+    assert all(command.sender == "somebody" for command in accepted.commands)
 
 
 def test_the_arrival_is_that_of_the_message_not_of_its_decoding(
@@ -404,3 +419,265 @@ def test_an_old_release_that_is_sent_again_does_not_release_where_clocks_differ(
     for payload, sent_ns in ((bool_cdr(False), 10), (bool_cdr(True), 11), (bool_cdr(False), 10)):
         accepted.receive("cmd/bumper", payload, "", sent_ns)
     assert [holds for _, holds in accepted.contacts] == [False, True, True]
+
+
+# Requests to the navigation.
+
+
+class Received:
+    """A receiver and what came of it."""
+
+    def __init__(self, *, synchronised: bool = True) -> None:
+        self.commands: list[NavigationCommand] = []
+        self.lines: list[str] = []
+        self.answer: Answer | None = None  # of the newest message
+        self.stamps = StampRule(0.5, synchronised=synchronised)
+        self.receiver = NavigationReceiver(self.commands.append, self.stamps, report=self.lines.append)
+
+    def send(self, topic: str, payload: bytes, sent_ns: int = 0) -> NavigationCommand | None:
+        """Return the command that a message leads to."""
+        before = len(self.commands)
+        self.answer = self.receiver.receive(Request(f"cmd/{topic}", payload, "", sent_ns, 5))
+        return self.commands[-1] if len(self.commands) > before else None
+
+
+def goal(stamp_ns: int, x: float = 1.5, y: float = -2.0, heading: float | None = 0.5, frame: str = "map") -> bytes:
+    return goal_cdr(PlanarGoal(stamp_ns, frame, x, y, heading))
+
+
+def test_messages_of_the_navigation_round_trip() -> None:
+    found = goal_from_cdr(goal(12_000_000_034))
+    assert found[:4] == (12_000_000_034, "map", 1.5, -2.0) and found.heading_rad == pytest.approx(0.5)
+    assert goal_from_cdr(goal(5, heading=None)).heading_rad is None
+    xy = np.array([[0.0, 0.0], [1.0, 0.5], [2.0, 0.0]])
+    path = path_from_cdr(path_cdr(7, "odom", xy, -1.0))
+    assert path[:2] == (7, "odom") and path.heading_rad == pytest.approx(-1.0)
+    np.testing.assert_array_equal(path.xy, xy)
+    assert path_from_cdr(path_cdr(7, "odom", xy)).heading_rad is None
+    assert string_from_cdr(string_cdr("repeat hall")) == "repeat hall"
+
+
+def test_requests_are_passed_on() -> None:
+    received, now_ns = Received(), time.time_ns()
+    command = received.send("goal", goal(now_ns))
+    assert command is not None and (command.stamp_ns, command.id) == (now_ns, 5) and received.answer is None
+    assert command.request == GoalRequest(NavigationFrame.MAP, 1.5, -2.0, pytest.approx(0.5))
+    command = received.send("path", path_cdr(now_ns, "odom", [[0, 0], [1, 1]]))
+    assert command is not None and isinstance(command.request, PathRequest)
+    verbs = [received.send("navigation", string_cdr(verb), time.time_ns()).request for verb in NavigationVerb]
+    assert verbs == list(NavigationVerb)
+    assert received.send("route", string_cdr("repeat hall loops=2"), time.time_ns()).request == RouteRequest(
+        RouteAction.REPEAT, "hall", False, 2
+    )
+    assert not received.lines and received.receiver.accepted == 6
+
+
+@pytest.mark.hazard("H27")
+@pytest.mark.parametrize("age_s", [-2.0, 2.0, 3600.0])
+def test_a_goal_of_another_time_is_refused_and_a_halt_is_not(age_s: float) -> None:
+    received, sent_ns = Received(), time.time_ns() - round(age_s * 1e9)
+    assert received.send("goal", goal(sent_ns)) is None
+    assert received.send("goal", goal(0)) is None, "it has no stamp"
+    assert received.send("route", string_cdr("repeat hall"), sent_ns) is None
+    assert received.send("navigation", string_cdr("resume"), sent_ns) is None
+    for topic, text in (("navigation", "cancel"), ("navigation", "pause"), ("route", "stop")):
+        assert received.send(topic, string_cdr(text), sent_ns) is not None
+    assert received.receiver.refused == {"cmd/goal": 2, "cmd/route": 1, "cmd/navigation": 1}
+    assert all("bus.command_clock" in line and "\n" not in line for line in received.lines)
+    assert Received(synchronised=False).send("goal", goal(sent_ns)) is not None
+
+
+@pytest.mark.hazard("H27")
+@pytest.mark.parametrize("synchronised", [True, False])
+@pytest.mark.parametrize(
+    ("topic", "text"), [("route", "repeat hall"), ("route", "teach hall"), ("navigation", "resume")]
+)
+def test_what_begins_a_motion_needs_a_stamp_and_what_ends_one_does_not(
+    topic: str, text: str, synchronised: bool
+) -> None:
+    received, now_ns = Received(synchronised=synchronised), time.time_ns()
+    assert received.send(topic, string_cdr(text)) is None and "no stamp" in received.lines[0]
+    assert received.send(topic, string_cdr(f"{text} stamp=0")) is None
+    command = received.send(topic, string_cdr(f"{text} stamp={now_ns}"))
+    assert command is not None and command.stamp_ns == now_ns
+    assert received.send(topic, string_cdr(text), now_ns + 10) is not None
+    for end_topic, end in (("navigation", "cancel"), ("navigation", "pause"), ("route", "stop"), ("route", "finish")):
+        assert received.send(end_topic, string_cdr(end)) is not None
+
+
+@pytest.mark.hazard("H27")
+def test_requests_of_another_clock_that_are_recorded_and_sent_again_are_refused() -> None:
+    """A request to arm lets the stamps begin again, as of another sender."""
+    received, recorded = Received(synchronised=False), string_cdr("repeat hall stamp=1000")
+    assert received.send("route", recorded) is not None
+    assert received.send("route", recorded) is None and "does not rise" in received.lines[0]
+    assert received.send("goal", goal(1000)) is not None and received.send("goal", goal(1000)) is None
+    received.stamps.accept_arm(5)
+    assert received.send("route", recorded) is not None
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload"),
+    [
+        ("goal", goal_cdr(PlanarGoal(1, "map", math.nan, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "map", math.inf, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "map", 2e6, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "base_link", 1.0, 0.0, 0.0))),
+        ("goal", goal_cdr(PlanarGoal(1, "", 1.0, 0.0, 0.0))),
+        ("goal", b""),
+        ("goal", b"\0" * 4097),
+        ("path", b"\0" * (LONGEST_PATH + 1)),
+        ("path", path_cdr(1, "map", np.zeros((10_001, 2)))),
+        ("path", path_cdr(1, "map", [[0.0, 0.0], [0.0, math.nan]])),
+        ("navigation", string_cdr("dance")),
+        ("route", string_cdr("teach ../../etc/passwd")),
+        ("route", b"teach a"),
+    ],
+)
+def test_what_is_no_request_is_refused(topic: str, payload: bytes) -> None:
+    received = Received(synchronised=False)
+    assert received.send(topic, payload) is None
+    assert received.answer is not None and not received.answer.done and received.answer.text in received.lines[0]
+    assert received.receiver.refused.total() == 1 and len(received.lines) == 1
+    assert received.receiver.status().values[f"refused, cmd/{topic}"] == "1"
+
+
+@pytest.mark.hazard("H33")
+def test_damaged_messages_never_raise_and_lead_to_finite_goals() -> None:
+    rng, received = random.Random(4), Received(synchronised=False)
+    good = {
+        "goal": goal(1),
+        "path": path_cdr(1, "map", [[0, 0], [1, 0], [2, 1]]),
+        "route": string_cdr("repeat a"),
+        "navigation": string_cdr("cancel"),
+    }
+    for _ in range(2000):
+        topic = rng.choice(list(good))
+        damaged = bytearray(good[topic])
+        for _ in range(rng.randint(1, 8)):
+            damaged[rng.randrange(len(damaged))] = rng.randrange(256)
+        received.send(topic, bytes(damaged[: rng.randint(0, len(damaged))]) if rng.random() < 0.3 else bytes(damaged))
+    for command in received.commands:
+        if isinstance(command.request, GoalRequest):
+            assert abs(command.request.x_m) <= 1e6 and abs(command.request.y_m) <= 1e6
+    assert received.receiver.refused.total() + received.receiver.accepted == 2000
+
+
+def test_a_tilted_goal_is_refused() -> None:
+    payload = bytearray(goal(1, heading=0.0))
+    payload[-32:-24] = np.float64(0.7071).tobytes()  # x of the quaternion
+    payload[-8:] = np.float64(0.7071).tobytes()
+    with pytest.raises(OmnidError, match="about z"):
+        goal_from_cdr(bytes(payload))
+
+
+def test_the_queue_gives_all_requests_even_where_a_batch_is_dropped() -> None:
+    queue = RequestQueue()
+    commands = [NavigationCommand(NavigationVerb.PAUSE, k) for k in range(3)]
+    for command in commands:
+        queue.put(command)
+    batches = queue.batches()
+    next(batches)  # dropped by an inbox
+    assert list(next(batches)) == commands
+    queue.end()
+    assert list(next(batches)) == []
+    assert list(batches) == []
+
+
+def test_the_queue_keeps_the_newest_of_too_many() -> None:
+    queue = RequestQueue()
+    for k in range(MOST_WAITING + 5):
+        queue.put(NavigationCommand(NavigationVerb.PAUSE, k))
+    assert [command.arrival_ns for command in next(queue.batches())] == list(range(5, MOST_WAITING + 5))
+
+
+# Samples of wheels and gyro.
+
+
+@pytest.fixture
+def lines() -> list[str]:
+    return []
+
+
+def receiver(taken: list[MotionSample], lines: list[str], *topics: str) -> SensorReceiver:
+    joints = JointWheels("left", "right", 0.1, 0.5)
+    return SensorReceiver(taken.append, OFFSET_NS, frozenset(topics or SENSOR_TOPICS), lines.append, joints)
+
+
+def test_samples_arrive_in_the_time_of_the_images(lines: list[str]) -> None:
+    taken: list[MotionSample] = []
+    sensors = receiver(taken, lines)
+    sensors.receive(WHEEL_ODOM, wheel_cdr(WHEELS, WHEELS.stamp_ns + OFFSET_NS))
+    sensors.receive(IMU, gyro_cdr(GYRO, GYRO.stamp_ns + OFFSET_NS))
+    assert taken == [WHEELS, GYRO] and not lines and not sensors.refused
+
+
+def test_an_imu_that_measures_no_rates_is_no_gyro_that_stands(lines: list[str]) -> None:
+    """By sensor_msgs/msg/Imu the first number of a covariance is -1 where nothing is measured."""
+    message = STORE.deserialize_cdr(gyro_cdr(GYRO, OFFSET_NS + 5), IMU_SCHEMA)
+    message.angular_velocity_covariance = np.array([-1.0, *[0.0] * 8])
+    taken: list[MotionSample] = []
+    sensors = receiver(taken, lines)
+    sensors.receive(IMU, bytes(STORE.serialize_cdr(message, IMU_SCHEMA)))
+    assert not taken and sensors.refused[IMU] == 1 and "no angular velocity" in lines[0]
+
+
+def joint_cdr(names: list[str], velocities: list[float], stamp_ns: int = OFFSET_NS + 7) -> bytes:
+    message = ros.sensor_msgs__msg__JointState(
+        header_message(stamp_ns, ""), names, np.zeros(len(names)), np.array(velocities), np.zeros(0)
+    )
+    return message_cdr(message, JOINT_SCHEMA)
+
+
+def test_wheels_are_joints_where_these_are_named(lines: list[str]) -> None:
+    taken: list[MotionSample] = []
+    joints = JointWheels("left", "right", 0.1, 0.5)
+    sensors = SensorReceiver(taken.append, OFFSET_NS, frozenset([JOINT_STATES]), lines.append, joints)
+    sensors.receive(JOINT_STATES, joint_cdr(["arm", "right", "left"], [9.0, 6.0, 4.0]))
+    assert taken == [WheelSample(7, pytest.approx(0.5), pytest.approx(0.4))]
+    sensors.receive(JOINT_STATES, joint_cdr(["arm"], [9.0]))
+    assert len(taken) == 1 and not lines, "other joints have messages of their own"
+    for names, velocities in ((["left"], [1.0]), (["left", "right"], []), (["left", "right"], [1.0, np.nan])):
+        sensors.receive(JOINT_STATES, joint_cdr(names, velocities))
+    sensors.receive(JOINT_STATES, joint_cdr(["left", "right"], [1.0, 1.0], stamp_ns=0))
+    assert len(taken) == 1 and sensors.refused[JOINT_STATES] == 4
+    assert len(lines) == 1 and "no velocity of left or of right" in lines[0]
+
+
+@pytest.mark.hazard("H15")
+def test_samples_from_the_network_are_checked(lines: list[str]) -> None:
+    """No stamp, absurd or infinite rates, another source in use, damaged bytes: counted, one line for each topic."""
+    taken: list[MotionSample] = []
+    sensors = receiver(taken, lines)
+    bad = [
+        wheel_cdr(WHEELS, 0),
+        wheel_cdr(WheelSample(1, 1000.0, 0.0), OFFSET_NS),
+        wheel_cdr(WheelSample(1, np.inf, 0.0), OFFSET_NS),
+        wheel_cdr(WheelSample(1, np.nan, 0.0), OFFSET_NS),
+        wheel_cdr(WHEELS, OFFSET_NS) + bytes(10_000),
+        b"",
+    ]
+    for payload in bad:
+        sensors.receive(WHEEL_ODOM, payload)
+    assert taken == [] and sensors.refused[WHEEL_ODOM] == len(bad) and len(lines) == 1
+    only_imu = receiver(taken, lines, IMU)
+    only_imu.receive(WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS))
+    assert taken == [] and "motion.wheels" in lines[-1]
+
+
+def test_damaged_bytes_never_raise_and_give_finite_samples(lines: list[str]) -> None:
+    rng, taken = random.Random(3), list[MotionSample]()
+    sensors = receiver(taken, lines)
+    for topic, payload in (
+        (WHEEL_ODOM, wheel_cdr(WHEELS, OFFSET_NS + 1)),
+        (IMU, gyro_cdr(GYRO, OFFSET_NS + 1)),
+        (JOINT_STATES, joint_cdr(["left", "right"], [1.0, 2.0])),
+    ):
+        for _ in range(2000):
+            data = bytearray(payload[: rng.randrange(len(payload) + 1)] if rng.random() < 0.3 else payload)
+            for _ in range(rng.randrange(1, 6)):
+                if data:
+                    data[rng.randrange(len(data))] = rng.randrange(256)
+            sensors.receive(topic, bytes(data))
+    rates = [sample.velocity_mps if isinstance(sample, WheelSample) else sample.z_radps for sample in taken]
+    assert len(taken) > 500 and np.isfinite(rates).all() and np.abs(rates).max() <= 100
