@@ -43,8 +43,3 @@ def test_check_lists_what_differs(omnid: Command, tmp_path: Path) -> None:
     )
     file.write_text("[bus]\nrobots = 'rover'\n")
     assert "did you mean bus.robot?" in omnid.refused("config", "check", file)
-
-
-@pytest.mark.parametrize("words", [("check",), ("print", "x.toml"), ("check", "none.toml")])
-def test_refuses_a_missing_or_superfluous_file(omnid: Command, words: tuple[str, ...]) -> None:
-    assert omnid.refused("config", *words)

@@ -100,13 +100,6 @@ def test_a_signal_leaves_a_whole_recording(tmp_path: Path, scene: Path, number: 
     assert path.suffix == ".mcap" and count == 20 + rest.count("\n")
 
 
-def test_refuses_wrong_input_in_one_line(omnid: Command, tmp_path: Path) -> None:
-    code, _, err = omnid("record", tmp_path / "log", "--set", "cameras.lower=/dev/no/such")
-    assert code == 2 and re.search(r"/dev/no/such", err) and "Traceback" not in err
-    assert not os.path.exists(tmp_path / "log")
-    assert "rig.toml" in omnid.refused("record", "--rig", tmp_path / "rig.toml")
-
-
 def test_info_shows_the_content_of_a_log(omnid: Command, tmp_path: Path) -> None:
     noise = [Entry("/chatter", "std_msgs/msg/String", text("hello"), START_NS)]
     path = write_log(tmp_path / "log.mcap", [*pairs(11), *noise], [("rig.toml", bytes(2000))])
@@ -136,10 +129,6 @@ def test_info_of_a_log_that_is_being_written(omnid: Command, tmp_path: Path) -> 
             log.write(*entry)
         code, out, _ = omnid("log", "info", tmp_path / "log.mcap")
         assert code == 0 and "being written" in out and "recover" not in out
-
-
-def test_a_removed_command_says_what_to_use(omnid: Command, tmp_path: Path) -> None:
-    assert "`mcap recover`" in omnid.refused("log", "recover", tmp_path / "log.mcap")
 
 
 def test_any_bytes_give_no_traceback(omnid: Command, tmp_path: Path) -> None:

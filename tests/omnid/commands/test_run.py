@@ -11,6 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from tests.omnid.transport.bus_fixtures import free_endpoint
+from tests.replay.command import Command
 
 SAMPLE = Path(str(files("omnid.sample") / "log.mcap"))
 
@@ -51,3 +52,9 @@ def _read(master: int) -> bytes:
         return os.read(master, 4096)
     except OSError:  # the program has ended
         return b""
+
+
+def test_a_log_is_read_by_its_topics(omnid: Command) -> None:
+    exchanged = ("--lower", "/upper/image_raw/compressed", "--upper", "/lower/image_raw/compressed")
+    listen = f'bus.listen=["{free_endpoint()}"]'
+    assert "exchange --lower and --upper" in omnid("run", "--log", SAMPLE, "--once", "--set", listen, *exchanged).err

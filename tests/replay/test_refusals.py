@@ -1,0 +1,142 @@
+"""Wrong input of commands: refused in one line that names it, with exit code 2, before anything is written."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.drivers.logs.mcap_logs import Entry, text, write_log
+from tests.replay.command import Command
+from tests.replay.edited import images, save
+
+# Words of a command -> a part of the line; {log}, {rig} are right ones, other files are those of `folder`.
+TABLE = (
+    # Files that are no logs, or logs that cannot be used.
+    ("replay {folder}/absent.mcap --rig {rig}", "absent.mcap"),
+    ("replay {folder}/empty.mcap --rig {rig}", "empty.mcap"),
+    ("replay {folder}/text.mcap --rig {rig}", "text.mcap"),
+    ("replay {folder}/bytes.mcap --rig {rig}", "bytes.mcap"),
+    ("replay {folder}/chatter.mcap --rig {rig}", "no image topics"),
+    ("replay {folder}/cut.mcap --rig {rig}", "`omnid log info`"),
+    ("replay {folder}/lower.mcap --rig {rig}", "no upper camera"),
+    ("replay {folder}/upper.mcap --rig {rig}", "no lower camera"),
+    ("replay {folder}/loop --rig {rig} --tum {folder}/x", "loop"),
+    ("replay {folder}/" + "x" * 300 + " --rig {rig} --tum {folder}/x", "xxx"),
+    ("replay - --rig {rig} --tum {folder}/x", "-"),
+    # Rigs.
+    ("replay {log}", "omnid calibrate import"),
+    ("replay {log} --rig {folder}/broken.toml", "broken.toml"),
+    ("replay {log} --rig {folder}/size.toml", "images are 256x256"),
+    ("replay {log} --rig {folder}/bare.toml", "images are 256x256"),
+    ("replay {log} --rig {folder}/narrow.toml", "share no view between -50.0 and 40.0 degrees of elevation"),
+    ("replay {log} --rig {folder}/number.toml", "keys and numbers of at most 400 characters"),
+    ("replay {log} --rig {folder}/deep.toml", "a key of at most 9 parts"),
+    ("replay {log} --rig {folder}/huge.toml", "at most 67108864 in all"),
+    ("replay {log} --rig {folder}/camchain.yaml", "`omnid calibrate import {folder}/camchain.yaml -o rig.toml`"),
+    ("replay {log} --rig {log}", "without --rig the one attached to the log is used"),
+    ("replay {log} --rig {folder}/absent.toml", "`omnid calibrate import` or"),
+    ("calibrate import {rig} -o {folder}/x", "use it as it is, --rig {rig}"),
+    ("calibrate import {folder}/camchain.yaml -o -", "-"),
+    ("record --rig {folder}/absent.toml", "absent.toml"),
+    # Outputs.
+    ("replay {log} --rig {rig} --cloud /dev/null", "device"),
+    ("replay {log} --tum {folder}/x --record {folder}/absent/x", "no folder"),
+    ("replay {log} --tum {folder}/x --plan {folder}", "folder"),
+    ("replay {log} --tum {folder}/x --cloud /proc/x", "--cloud /proc/x"),
+    ("replay {log} --tum {folder}/x --cloud {folder}/x", "--tum"),
+    ("replay {log} --record {log}", "the log that is read"),
+    ("replay {log} --rig {rig} --record {folder}/loop", "loop"),
+    # Settings and words.
+    ("replay {log} --rig {rig} --set panorama.width_px=64", "panorama"),
+    ("replay {log} --set stereo.matching.methods=sad", "did you mean stereo.matching.method?"),
+    ("replay {log} --set stereo.min_range_m=near", "stereo.min_range_m: expected a number from 0.01 to 100"),
+    ("replay {log} --set pair.tolerance_ms=-1", "pair.tolerance_ms"),
+    ("replay {log} --set nonsense", "expected section.key=value"),
+    ("replay {log} --set odometry.method=magic", "'paper'"),
+    ("replay {log} --method magic", "expected one of default, paper"),
+    ("replay {log} --start-s=-1", "expected a time of 0 s or more"),
+    ("replay {log} --seconds 0", "expected a time above 0 s"),
+    ("replay {log} --rig {rig} --map {log}", "expected a map of places"),
+    ("replay {log} --map {folder}/x.ply", "--cloud FILE.ply"),
+    ("replay {log} --rig {rig} --motor {folder}/tty", "motor port"),
+    ("replay", "the following arguments are required"),
+    ("", "command"),
+    ("fly", "unknown command 'fly'"),
+    ("--what", "see omnid --help"),
+    ("eval {rig}", "the following arguments are required"),
+    ("eval {folder}/loop {truth}", "loop"),
+    ("run --once", "add --log"),
+    ("run --log {log} --rig {rig} --lower /front", "no topic '/front'"),
+    ("run --lower /dev/null --upper /dev/zero --rig {folder}/absent.toml", "absent.toml"),
+    ("simulate room --size 10", "--size 10: expected 64 to 2048 px"),
+    ("simulate room --seed=-1", "expected 0 or more"),
+    ("demo --drive --seed=-1", "expected 0 or more"),
+    ("record --rig {rig} --lower /dev/no-camera --upper /dev/null", "/dev/no-camera"),
+    ("cameras --lower /front", "belongs to --snapshot DIR"),
+    ("config check", "name the file"),
+    ("config print {folder}/x.toml", "takes no file"),
+    ("config check {folder}/absent.toml", "absent.toml"),
+    ("goto 1", "expected X Y [YAW]"),
+    ("goto 1 nan", "finite"),
+    ("goto 1 2 --cancel", "takes no pose"),
+    ("route repeat a --loops 0", "expected 1 to"),
+    ("route teach a/b", "a/b"),
+    ("motor test", "name its port by --motor"),
+    ("listen --seconds=-1", "is not a duration"),
+    ("web --tls-key {rig}", "belong together"),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Files that are refused."""
+    made = tmp_path_factory.mktemp("wrong")
+    for name, content in (("empty", b""), ("text", b"omnid\n" * 1000), ("bytes", bytes(range(256)) * 64)):
+        (made / f"{name}.mcap").write_bytes(content)
+    write_log(made / "chatter.mcap", [Entry("/chatter", "std_msgs/msg/String", text("hello"), 10**18)])
+    (made / "cut.mcap").write_bytes((scene / "log.mcap").read_bytes()[:2000])
+    for camera in ("lower", "upper"):
+        save(made / f"{camera}.mcap", [image for image in images(scene / "log.mcap") if image.camera == camera])
+    rig = (scene / "rig.toml").read_text()
+    other = rig.replace("size = [256, 256]", "size = [640, 640]")
+    rigs = {
+        "broken": "schema = 1\n[lower]\nmodel = 7\n",
+        "size": other,
+        "bare": "\n\n".join(table for table in other.split("\n\n") if ".mask]" not in table) + "\n",
+        "narrow": re.sub(r"fu = -?", "fu = -9000", rig),
+        "number": re.sub(r"xi = .*", "xi = 0x" + "f" * 9000, rig),
+        "deep": re.sub(r"schema = 1", "a." * 20_000 + "a = 1", rig),
+        "huge": re.sub(r"size = .*", "size = [32767, 32767]", rig),
+    }
+    for name, content in rigs.items():
+        (made / f"{name}.toml").write_text(content)
+    (made / "camchain.yaml").write_text("cam0: {}\n")
+    (made / "loop").symlink_to(made / "loop")
+    return made
+
+
+@pytest.mark.parametrize(("words", "part"), TABLE, ids=[f"{words[:50]}-{part[:20]}" for words, part in TABLE])
+def test_a_wrong_input_is_refused_in_one_line(omnid: Command, scene: Path, folder: Path, words: str, part: str) -> None:
+    names = {"log": scene / "log.mcap", "rig": scene / "rig.toml", "truth": scene / "truth.txt", "folder": folder}
+    before = sorted(folder.iterdir())
+    assert part.format(**names) in omnid.refused(*words.format(**names).split())
+    assert sorted(folder.iterdir()) == before and not Path("-").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["replay none.mcap", "replay {log} --rig none.toml", "calibrate drive none.mcap --rig {rig} -o a.toml"],
+)
+def test_a_first_start_refuses_a_wrong_path_before_it_compiles(tmp_path: Path, scene: Path, words: str) -> None:
+    """A compilation takes a minute on a busy machine."""
+    filled = words.format(log=scene / "log.mcap", rig=scene / "rig.toml").split()
+    environment = {**os.environ, "OMNID_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run(
+        [sys.executable, "-m", "omnid", *filled], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1, done.stderr
