@@ -25,8 +25,6 @@ ANSWER_S: Final = 1.0  # A stop is repeated for this time: a busy computer delay
 LEAST_COMMANDS: Final = 2  # Commands of a motion: the driver may send a stop in place of the first one.
 RIGHT_SCALE: Final = 0.03  # difference of the number of turns that is not corrected
 LARGEST_TURNS: Final = 1000.0
-MIXES_ITSELF: Final = "line"
-_SIDES: Final = {"l": "left", "r": "right", "b": "both", "n": "none", "a": "again"}
 
 Ask = Callable[[str], str]  # prints a question, returns the answer
 
@@ -55,7 +53,7 @@ class WiringTest:
 
         move_s: time for which a motor turns alone, in each direction. rest_s: after each motion.
         """
-        if config.protocol == MIXES_ITSELF:
+        if config.protocol == "line":
             raise OmnidError(
                 "motor.protocol is 'line': its controller divides the speed between the wheels itself, so "
                 "the wiring is set there; see whether it is right by `omnid drive`"
@@ -98,25 +96,24 @@ class WiringTest:
                 f"Motor {channel} turned one way and back. Name the wheel that moved (l left, r right, "
                 "b both, n none, a again): "
             )
-            side = _SIDES.get(answer[:1].lower(), "again")
-            if side == "none":
-                raise OmnidError(
-                    f"motor {channel} did not move: check power, cable, emergency stop and motor.protocol"
-                    ", or try a higher --speed"
-                )
-            if side == "both":
-                raise OmnidError(
-                    f"motor {channel} moved both wheels: are they coupled, or do both controllers have "
-                    "one address (motor.drive.can_id)?"
-                )
-            if side != "again":
-                break
-        return Seen(side, self._yes(f"Did the {side} wheel turn forwards first, as for driving forwards (y or n)? "))
-
-    def _yes(self, question: str) -> bool:
+            match answer[:1].lower():
+                case "l" | "r" as letter:
+                    side = "left" if letter == "l" else "right"
+                    break
+                case "n":
+                    raise OmnidError(
+                        f"motor {channel} did not move: check power, cable, emergency stop and motor.protocol"
+                        ", or try a higher --speed"
+                    )
+                case "b":
+                    raise OmnidError(
+                        f"motor {channel} moved both wheels: are they coupled, or do both controllers have "
+                        "one address (motor.drive.can_id)?"
+                    )
+        question = f"Did the {side} wheel turn forwards first, as for driving forwards (y or n)? "
         while (answer := self._ask(question)[:1].lower()) not in ("y", "n"):
             pass
-        return answer == "y"
+        return Seen(side, answer == "y")
 
     def _scaled(self, motor: SerialMotor, drive: DriveSettings) -> DriveSettings:
         """Turn both wheels by a number of turns, ask for the true number, and correct the gear by their ratio."""
@@ -174,20 +171,13 @@ def wiring(first: Seen, second: Seen) -> dict[str, bool]:
 
 
 def toml_with(text: str, section: str, values: Mapping[str, str]) -> str:
-    """Return a TOML text with keys of a section set; all other lines stay as they are."""
-    lines = text.splitlines()
-    header = re.compile(rf"\s*\[\s*{re.escape(section)}\s*\]\s*(#.*)?")
-    begin = next((number for number, line in enumerate(lines) if header.fullmatch(line)), None)
-    if begin is None:
-        gap = [""] if lines else []
-        added = [f"{key} = {value}" for key, value in values.items()]
-        return "\n".join([*lines, *gap, f"[{section}]", *added]) + "\n"
-    sections = (number for number in range(begin + 1, len(lines)) if lines[number].lstrip().startswith("["))
-    end = next(sections, len(lines))
-    missing = dict(values)
-    for number in range(begin + 1, end):
-        key = lines[number].partition("=")[0].strip()
-        if key in missing:
-            lines[number] = f"{key} = {missing.pop(key)}"
-    added = [f"{key} = {value}" for key, value in missing.items()]
-    return "\n".join([*lines[: begin + 1], *added, *lines[begin + 1 :]]) + "\n"
+    """Return a TOML text with keys of a section set, at the section's beginning; all other lines stay as they are."""
+    lines = "".join(f"{key} = {value}\n" for key, value in values.items())
+    header = re.search(rf"^[ \t]*\[\s*{re.escape(section)}\s*\][ \t]*(#.*)?\n?", text, re.MULTILINE)
+    if header is None:
+        before = f"{text.rstrip()}\n\n" if text.strip() else ""
+        return f"{before}[{section}]\n{lines}"
+    following = re.compile(r"^\s*\[", re.MULTILINE).search(text, header.end())
+    end = following.start() if following else len(text)
+    others = re.sub(rf"^[ \t]*({'|'.join(values)})[ \t]*=.*\n?", "", text[header.end() : end], flags=re.MULTILINE)
+    return f"{text[: header.start()]}{header[0].rstrip()}\n{lines}{others}{text[end:]}"

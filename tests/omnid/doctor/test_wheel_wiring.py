@@ -175,8 +175,9 @@ def test_the_command_asks_prints_and_writes(tmp_path: Path) -> None:
 def test_a_section_is_set_where_it_is_or_added() -> None:
     assert toml_with("", "a.b", {"x": "1"}) == "[a.b]\nx = 1\n"
     assert toml_with("[a]\ny = 2\n", "a.b", {"x": "1"}) == "[a]\ny = 2\n\n[a.b]\nx = 1\n"
+    assert toml_with("[a.b] # mine", "a.b", {"x": "1"}) == "[a.b] # mine\nx = 1\n"
     assert toml_with("[a.b]\n x=3 # old\ny = 2\n[c]\nx = 4\n", "a.b", {"x": "1", "z": "5"}) == (
-        "[a.b]\nz = 5\nx = 1\ny = 2\n[c]\nx = 4\n"
+        "[a.b]\nx = 1\nz = 5\ny = 2\n[c]\nx = 4\n"
     )
 
 
