@@ -48,8 +48,8 @@ PUBLISH_S: Final = 0.5
         "calibrate live --log boards.mcap --corners 6x7 --square-mm 30",
     ),
     description="Search the board in the images of both cameras as they come. Pairs in which it stands still at a "
-    "new place are written to DIR; the terminal and the page (`omnid web`) show where it has been, what is "
-    "missing, and when it is enough. Stop the daemon first: it holds the cameras. Exit code 1: not enough yet.",
+    "new place are written to DIR; the terminal says what is missing and when it is enough, the page (`omnid web`) "
+    "also shows where it has been. Stop the daemon first: it holds the cameras. Exit code 1: not enough yet.",
 )
 def run(args: argparse.Namespace) -> int:
     """Search until Ctrl-C, or until the end of the log; return 0 if there is enough for a calibration."""
@@ -104,7 +104,7 @@ def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
 
 def _of_cameras(config: Config, closing: ExitStack) -> Iterator[tuple[Image, Image]]:
     from drivers.cameras.v4l2_camera import V4l2Camera
-    from omnid.calibration.camera_pairs import newest_pairs
+    from omnid.calibration.live_boards import newest_pairs
     from omnid.engine.logging_setup import log
 
     config.cameras.require_two_devices()
@@ -130,34 +130,30 @@ def _bus(config: Config, closing: ExitStack) -> Bus | None:
 
 
 class _Progress:
-    """Shows the newest outcome: a screen on a terminal, else a line for each pair that is kept."""
+    """Shows the newest outcome: one line on a terminal, which the next one replaces, else one for each kept pair."""
 
     def __init__(self, boards: LiveBoards, bus: Bus | None) -> None:
         self._boards, self._bus = boards, bus
         self._published_s = -PUBLISH_S
 
     def __call__(self, outcome: PairOutcome) -> None:
-        from omnid.calibration.coverage_screen import table
-        from omnid.monitor.screen import CLEAR, fitted
-
+        missing = "; ".join(self._boards.missing()) or "enough"
         if sys.stdout.isatty():
-            size = shutil.get_terminal_size()
-            lines = fitted(table(self._boards, outcome, "Ctrl-C ends"), size.columns, size.lines)
-            print(CLEAR + "\n".join(lines), flush=True)
+            width = shutil.get_terminal_size().columns - 1
+            print("\r" + f"{self._boards.pairs} ({outcome}): {missing}"[:width].ljust(width), end="", flush=True)
         elif outcome == "kept":
-            print(f"{self._boards.pairs}: {'; '.join(self._boards.missing()) or 'enough'}", flush=True)
-        self._publish(outcome)
+            print(f"{self._boards.pairs}: {missing}", flush=True)
+        if self._bus is not None and time.monotonic() >= self._published_s + PUBLISH_S:
+            self._publish(self._bus, outcome)
 
-    def _publish(self, outcome: PairOutcome) -> None:
-        from omnid.calibration.coverage_screen import status
+    def _publish(self, bus: Bus, outcome: PairOutcome) -> None:
+        from omnid.calibration.live_boards import status
         from omnid.transport.codec import diagnostics_cdr
 
-        if self._bus is None or time.monotonic() < self._published_s + PUBLISH_S:
-            return
         self._published_s = time.monotonic()
-        if self._bus.needs_router:
-            self._bus.connect()
-        self._bus.publish("status", diagnostics_cdr(time.time_ns(), [status(self._boards, outcome)]))
+        if bus.needs_router:
+            bus.connect()
+        bus.publish("status", diagnostics_cdr(time.time_ns(), [status(self._boards, outcome)]))
 
 
 def _write(folder: Path, number: int, pair: tuple[Image, Image]) -> None:
