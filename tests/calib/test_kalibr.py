@@ -123,29 +123,6 @@ def test_combines_one_imu_transform_with_the_chain() -> None:
         np.testing.assert_allclose(rig.upper.T_cam_rig, BOTH[1], atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("topics", "lower_is_cam0"),
-    [
-        (("/lower/image", "/upper/image"), True),
-        (("/upper/image", "/lower/image"), False),
-        (("/cam_top/image", ""), False),
-        (("", "/rig/Top"), True),
-        (("/bottom", "/x"), True),
-        (("/desktop/a", "/desktop/b"), True),
-        (("/follower/a", "/laptop/b"), True),
-    ],
-)
-def test_identifies_the_lower_camera_by_topic_or_height(topics: tuple[str, str], lower_is_cam0: bool) -> None:
-    rig = parse_kalibr(chain(BOTH, None, topics))
-    np.testing.assert_array_equal(rig.lower.T_cam_rig, BOTH[not lower_is_cam0])
-
-
-def test_height_is_that_of_the_viewpoint() -> None:
-    """The z of T_cam_imu of a camera whose z axis points up decreases with its height."""
-    low, high = (se3.inverse(se3.transform(np.eye(3), (0.0, 0.0, z))) for z in (0.5, 0.7))
-    assert parse_kalibr(chain((high, low), None)).lower.viewpoint[2] == pytest.approx(0.5)
-
-
 def warnings_of(text: str, **names: str) -> list[str]:
     lines: list[str] = []
     parse_kalibr(text, "c.yaml", warn=lines.append, **names)
@@ -183,28 +160,6 @@ def test_warns_of_axes_of_an_imu_that_no_rig_has(R_imu_rig: Array, off: str | No
     T_upper_rig = se3.transform(np.eye(3), (0.0, 0.0, -0.2))
     lines = warnings_of(chain((T_rig_imu, T_upper_rig @ T_rig_imu), None, NAMED))
     assert not lines if off is None else (len(lines) == 1 and off in lines[0] and "remove T_cam_imu" in lines[0])
-
-
-@pytest.mark.parametrize(
-    ("shifts", "delay_s"),
-    [((0.01, 0.04), 0.03), ((0.04, 0.01), -0.03), ((0.01, 0.0104), 0.0), ((None, 0.04), 0.0), ((None, None), 0.0)],
-)
-def test_the_shifts_of_both_clocks_are_the_delay_of_the_upper_camera(
-    shifts: tuple[float | None, float | None], delay_s: float
-) -> None:
-    """Kalibr: t_imu = t_cam + shift. The camera of the larger shift was exposed later than its equal stamp says."""
-    text = chain(BOTH, None, NAMED)
-    for index, shift in enumerate(shifts):
-        text = text.replace(f"cam{index}:", f"cam{index}:" + (f"\n  timeshift_cam_imu: {shift}" if shift else ""))
-    assert parse_kalibr(text).times.upper_delay_s == pytest.approx(delay_s, abs=1e-12)
-    swapped = parse_kalibr(text, lower="cam1")
-    assert swapped.times.upper_delay_s == pytest.approx(-delay_s, abs=1e-12)
-
-
-def test_refuses_a_delay_that_no_cameras_have() -> None:
-    text = chain(BOTH, None, NAMED).replace("cam0:", "cam0:\n  timeshift_cam_imu: 0.0")
-    with pytest.raises(CalibError, match=r"c.yaml: timeshift_cam_imu: times of exposure: .*found 1.7e\+09"):
-        parse_kalibr(text.replace("cam1:", "cam1:\n  timeshift_cam_imu: 1.7e9"), "c.yaml")
 
 
 def test_uses_the_named_lower_and_upper_cameras() -> None:

@@ -83,14 +83,3 @@ def test_finds_the_minimum_from_a_start_at_which_full_steps_fail() -> None:
     start = np.array([9.0, 0.1, 0.1, 0.1])
     assert problem.moved(start, *problem.normal_equations(start, 1.0).step(0.0)) is None
     np.testing.assert_allclose(minimise(problem, start, ENDING), truth, rtol=1e-6)
-
-
-def test_ends_after_its_steps_and_stays_at_a_minimum() -> None:
-    truth, t = np.array([1.7, 2.0, -0.6, 5.0]), np.linspace(0, 3, 40)
-    problem = Decay(t, truth[1:, None] * np.exp(-truth[0] * t))
-    start = np.array([1.0, 1.0, 1.0, 1.0])
-    assert minimise(problem, start, Ending(steps=0, gain=1e-12)) is start
-    once, twice = (minimise(problem, start, Ending(steps=steps, gain=0.0)) for steps in (1, 2))
-    assert problem.cost(start, 1.0) > problem.cost(once, 1.0) > problem.cost(twice, 1.0) > 0
-    assert minimise(problem, start, Ending(steps=60, gain=1.0)) == pytest.approx(once)  # any gain is too small
-    np.testing.assert_array_equal(minimise(problem, truth, ENDING), truth)

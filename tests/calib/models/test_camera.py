@@ -1,4 +1,4 @@
-"""Both camera models: round trips, equations worked by hand, NaN for invalid points, masks."""
+"""Camera models: equations, round trips, numbers by hand, NaN for what is not seen, names."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.models.camera import Array, Mask, OmniCamera, inscribed_mask
+from calib.models.camera import Array, Mask, OmniCamera, field_of_view, inscribed_mask, whole_image
 from calib.models.equirectangular import EquirectangularCamera
 from calib.models.lens import DoubleSphereCamera, EquidistantCamera, ExtendedUnifiedCamera
+from calib.models.names import model_in_words, model_name, sees_directly, visible_part
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 
@@ -174,3 +175,98 @@ def test_mask_is_a_ring_without_the_zero_pixels_of_its_image() -> None:
     assert mask.contains(pixels).tolist() == [False, True, True, False, False, False]
     assert mask.contains(pixels, 2.0).tolist() == [False] * 6
     assert inscribed_mask(CAMERAS["omni xi 1.0"]).outer_px == pytest.approx(379.0)
+
+
+def test_omni_projection_equals_the_equations() -> None:
+    camera = UnifiedCamera(0.5, (-200.0, 300.0), (100.0, 50.0), (640, 480), (0.1, 0.2, 0.01, 0.02))
+    mx, my = (2 / 3) / (1 / 3 + 0.5), (-2 / 3) / (1 / 3 + 0.5)  # of the unit ray (2, -2, 1) / 3
+    r2 = mx * mx + my * my
+    radial = 1 + 0.1 * r2 + 0.2 * r2 * r2
+    x = mx * radial + 2 * 0.01 * mx * my + 0.02 * (r2 + 2 * mx * mx)
+    y = my * radial + 0.01 * (r2 + 2 * my * my) + 2 * 0.02 * mx * my
+    (pixel,) = camera.project(np.array([[4.0, -4.0, 2.0]]))
+    np.testing.assert_allclose(pixel, [100 - 200 * x, 50 + 300 * y], rtol=0, atol=1e-9)
+
+
+def test_omni_with_xi_zero_is_a_pinhole() -> None:
+    camera = UnifiedCamera(0.0, (100.0, 110.0), (50.0, 60.0), (640, 480))
+    np.testing.assert_allclose(camera.project(np.array([[1.0, 2.0, 4.0]])), [[75.0, 115.0]])
+    assert np.isnan(camera.project(np.array([[1.0, 2.0, -0.1]]))).all()
+
+
+def test_field_of_view_of_a_parabolic_mirror() -> None:
+    """A ring of radius rho of a parabolic mirror of focal length f lies at 2 atan(rho / f) from the axis."""
+    camera = UnifiedCamera(1.0, (-200.0, 200.0), (400.0, 380.0), (800, 760))
+    nearest, farthest = field_of_view(camera, Mask((400.0, 380.0), 60.0, 340.0))
+    assert nearest == pytest.approx(2 * math.atan(60 / 200), abs=1e-9)
+    assert farthest == pytest.approx(2 * math.atan(340 / 200), abs=1e-9)
+    assert all(map(math.isnan, field_of_view(camera, Mask((400.0, 380.0), 5000.0, 6000.0))))
+
+
+def test_lens_projections_equal_the_equations() -> None:
+    """One point (3, -4, 2): distance sqrt(29), distance from the axis 5."""
+    point, size = np.array([[3.0, -4.0, 2.0]]), (2000, 2000)
+    d1 = math.sqrt(29)
+    shifted = -0.2 * d1 + 2
+    under = 0.6 * math.sqrt(25 + shifted**2) + 0.4 * shifted
+    (pixel,) = DoubleSphereCamera(-0.2, 0.6, (300.0, 310.0), (900.0, 950.0), size).project(point)
+    np.testing.assert_allclose(pixel, [900 + 300 * 3 / under, 950 - 310 * 4 / under], rtol=0, atol=1e-9)
+    under = 0.6 * math.sqrt(1.2 * 25 + 4) + 0.4 * 2
+    (pixel,) = ExtendedUnifiedCamera(0.6, 1.2, (300.0, 310.0), (900.0, 950.0), size).project(point)
+    np.testing.assert_allclose(pixel, [900 + 300 * 3 / under, 950 - 310 * 4 / under], rtol=0, atol=1e-9)
+    t = math.atan2(5, 2)
+    radius = t + 0.01 * t**3 - 0.02 * t**5 + 0.003 * t**7 - 0.0004 * t**9
+    (pixel,) = EquidistantCamera((0.01, -0.02, 0.003, -0.0004), (300.0, 310.0), (900.0, 950.0), size).project(point)
+    np.testing.assert_allclose(pixel, [900 + 300 * radius * 0.6, 950 - 310 * radius * 0.8], rtol=0, atol=1e-9)
+
+
+def test_lenses_see_behind_them_as_far_as_their_model_goes() -> None:
+    sideways = np.array([[1.0, 0.0, -0.2], [1.0, 0.0, -5.0]])
+    for name in ("ds", "eucm", "equidistant"):
+        pixels = CAMERAS[name].project(sideways)
+        assert np.isfinite(pixels[0]).all(), name
+    assert np.isnan(CAMERAS["ds"].project(sideways)[1]).all()
+    folding = EquidistantCamera((-0.2, 0.0, 0.0, 0.0), (225.0, 225.0), (380.0, 390.0), (768, 770))
+    assert folding.widest_rad == pytest.approx(math.sqrt(1 / 0.6), abs=0.01)
+    assert np.isnan(folding.project(np.array([[1.0, 0.0, -1.0]]))).all()
+
+
+def test_projects_the_axis_to_the_centre_and_invalid_points_to_nan(camera: OmniCamera) -> None:
+    axis = camera.lift(np.array([camera.center]))
+    assert abs(axis[0, 2]) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(camera.project(3 * axis), [camera.center], rtol=0, atol=1e-6)
+    nothing = np.array([[0, 0, 0], [np.nan, 1, 1], [1, np.inf, 1], -3 * axis[0]])
+    if isinstance(camera, EquirectangularCamera):  # it sees what is behind it
+        nothing = nothing[:3]
+    with np.errstate(invalid="ignore"):  # numpy's own warnings of infinite points
+        assert np.isnan(camera.project(nothing)).any(axis=1).all()
+        assert np.isnan(camera.lift(np.array([[np.nan, 3.0], [np.inf, 1.0]]))).any(axis=1).all()
+
+
+FOCAL, CENTER, SIZE = (200.0, 200.0), (320.0, 240.0), (640, 480)
+MIRROR = OcamCamera((-100.0, 0.0, 1e-3), (240.0, 320.0), (1.0, 0.0, 0.0), SIZE)
+DIRECT = OcamCamera((-100.0, 0.0, 1e-3), (240.0, 320.0), (1.0, 0.0, 0.0), SIZE, "direct")
+
+
+@pytest.mark.parametrize(
+    ("camera", "name", "is_direct"),
+    [
+        (MIRROR, "ocam", False),
+        (DIRECT, "ocam", True),
+        (UnifiedCamera(1.0, (-200.0, 200.0), CENTER, SIZE), "omni", False),
+        (UnifiedCamera(1.0, FOCAL, CENTER, SIZE), "omni", True),
+        (UnifiedCamera(0.0, (-200.0, 200.0), CENTER, SIZE), "omni", True),
+        (DoubleSphereCamera(0.0, 0.5, FOCAL, CENTER, SIZE), "ds", True),
+        (ExtendedUnifiedCamera(0.5, 1.0, FOCAL, CENTER, SIZE), "eucm", True),
+        (EquidistantCamera((0.0, 0.0, 0.0, 0.0), FOCAL, CENTER, SIZE), "equidistant", True),
+        (EquirectangularCamera(FOCAL, CENTER, SIZE), "equirectangular", True),
+    ],
+)
+def test_models_have_names_and_mirrors_a_disc(camera: OmniCamera, name: str, is_direct: bool) -> None:
+    assert model_name(camera) == name and sees_directly(camera) == is_direct
+    assert visible_part(camera) == (whole_image(camera) if is_direct else inscribed_mask(camera))
+
+
+def test_the_view_of_a_polynomial_is_part_of_its_name() -> None:
+    assert (model_in_words(MIRROR), model_in_words(DIRECT)) == ("ocam, mirror view", "ocam, direct view")
+    assert model_in_words(UnifiedCamera(0.0, FOCAL, CENTER, SIZE)) == "omni"

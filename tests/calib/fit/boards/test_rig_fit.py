@@ -1,4 +1,4 @@
-"""Calibration of a rig: exact and noisy corners, standard deviations, ambiguous and inconsistent views."""
+"""Calibration of a rig: exact and noisy corners, standard deviations, bent boards, ambiguous and inconsistent views."""
 
 from __future__ import annotations
 
@@ -9,23 +9,52 @@ import pytest
 
 from calib import se3
 from calib.boards.board import Board, BoardView
-from calib.boards.board_pose import ambiguous_orders, board_pose
+from calib.boards.board_pose import ambiguous_orders
+from calib.boards.print_shape import AS_DRAWN, PrintShape
 from calib.errors import CalibError
-from calib.fit.boards.rig_fit import RigCalibration, fit_rig
+from calib.fit.boards.rig_covariance import rig_covariance
+from calib.fit.boards.rig_fit import RigCalibration, fit_rig, rig_print_shape
 from calib.fit.boards.rig_problem import PairView
+from calib.models.camera import Array, Mask
 from calib.models.ocam import OcamCamera
-from tests.calib.fit.boards.rig_views import (
-    EVEN,
-    LOWER,
-    ODD,
-    RIG,
-    SQUARE,
-    T_UPPER_LOWER,
-    UPPER,
-    pairs,
-    with_upper_order,
-)
+from calib.models.unified import UnifiedCamera
+from calib.rig import MountedCamera, Rig
+from calib.rig_covariance import TRANSFORM_NAMES
+from calib.rig_frame import rig_between
 from tests.simulation.boards import board_poses_around_rig
+
+LOWER = UnifiedCamera(0.93, (-205.0, 206.2), (394.2, 380.9), (780, 768))
+
+
+UPPER = UnifiedCamera(0.97, (-207.0, 206.2), (391.2, 382.9), (780, 768))
+
+
+T_UPPER_LOWER = se3.transform(se3.rotation_exp([0.02, -0.015, 0.3]), [0.004, -0.006, 0.18])
+
+
+RIG = Rig(
+    MountedCamera(LOWER, np.eye(4), Mask(LOWER.center, 60.0, 372.0)),
+    MountedCamera(UPPER, T_UPPER_LOWER, Mask(UPPER.center, 60.0, 372.0)),
+)
+
+
+ODD, EVEN, SQUARE = Board(7, 6, 0.03), Board(8, 6, 0.03), Board(6, 6, 0.03)
+
+
+def pairs(board: Board, count: int = 10, noise_px: float = 0.0, seed: int = 0) -> list[PairView]:
+    rng = np.random.default_rng(seed)
+    made = []
+    for k, T in enumerate(board_poses_around_rig(RIG, board, count, seed=seed)):
+        both = [m.camera.project(se3.apply(m.T_cam_rig @ T, board.points)) for m in (RIG.lower, RIG.upper)]
+        lower, upper = (BoardView(f"p{k}", pixels + noise_px * rng.standard_normal(pixels.shape)) for pixels in both)
+        made.append(PairView(f"p{k}", (lower, upper)))
+    return made
+
+
+def with_upper_order(view: PairView, order: Array) -> PairView:
+    lower, upper = view.seen
+    assert upper
+    return replace(view, seen=(lower, replace(upper, pixels=upper.pixels[order])))
 
 
 def off(found: RigCalibration) -> tuple[float, float]:
@@ -101,11 +130,63 @@ def test_refuses_too_few_pairs() -> None:
         fit_rig(exchanged, ODD, (LOWER, UPPER))
 
 
-def test_estimates_the_board_pose_of_a_known_camera() -> None:
-    T = board_poses_around_rig(RIG, ODD, 1)[0]
-    pixels = LOWER.project(se3.apply(T, ODD.points))
-    pixels[5] = np.nan
-    found = board_pose(LOWER, pixels, ODD)
-    assert found is not None
-    np.testing.assert_allclose(found, T, atol=1e-9)
-    assert board_pose(LOWER, np.full((42, 2), np.nan), ODD) is None
+def test_refuses_ambiguous_board_orientations() -> None:
+    views = pairs(EVEN, 10)[:1] * 6
+    with pytest.raises(CalibError, match="looks the same upside down"):
+        fit_rig(views, EVEN, (LOWER, UPPER))
+
+
+def test_covariance_describes_errors_of_noisy_corners() -> None:
+    """The errors of the transform's parameters, whitened by the covariance, have a mean square of about 1."""
+    squares = []
+    for seed in range(8):
+        found = fit_rig(pairs(ODD, noise_px=0.1, seed=seed), ODD, (LOWER, UPPER))
+        rig = rig_between(found.lower, found.upper, se3.inverse(found.T_upper_lower))
+        covariance = rig_covariance(found, rig)
+        assert covariance.names[:2] == ("lower xi", "lower fu") and len(covariance.names) == 16
+        R_rect_lower = rig.T_rect_rig[:3, :3] @ rig.lower.T_cam_rig[:3, :3].T
+        T_lower_upper = se3.inverse(RIG.upper.T_cam_rig)
+        turn = se3.rotation_log(R_rect_lower @ T_lower_upper[:3, :3] @ found.T_upper_lower[:3, :3] @ R_rect_lower.T)
+        x, y, z = R_rect_lower @ T_lower_upper[:3, 3]
+        error = np.array([*turn, x / z, y / z, RIG.baseline_m - found.baseline_m])
+        squares.append(error @ np.linalg.solve(covariance.select(TRANSFORM_NAMES).matrix, error) / 6)
+    assert 0.5 < np.mean(squares) < 1.8
+
+
+NOISE_PX = 0.01
+BENT = PrintShape((0.8e-3, -0.5e-3, 0.3e-3, 0.0))
+STRETCHED = PrintShape((0.0, 0.0, 0.0, 0.004))
+
+
+def views_of(shape: PrintShape, seed: int = 0, count: int = 14) -> list[PairView]:
+    rng = np.random.default_rng(seed)
+    made = []
+    for k, T in enumerate(board_poses_around_rig(RIG, ODD, count, seed=seed)):
+        points = shape.points(ODD.points)
+        lower, upper = (
+            BoardView(f"p{k}", pixels + NOISE_PX * rng.standard_normal(pixels.shape))
+            for pixels in (m.camera.project(se3.apply(m.T_cam_rig @ T, points)) for m in (RIG.lower, RIG.upper))
+        )
+        made.append(PairView(f"p{k}", (lower, upper)))
+    return made
+
+
+def fitted(shape: PrintShape) -> tuple[RigCalibration, RigCalibration]:
+    """Return the rig fitted to a board as drawn, and to its shape."""
+    flat = fit_rig(views_of(shape), ODD, (LOWER, UPPER))
+    return flat, fit_rig(flat.views, ODD, (flat.lower, flat.upper), shape=rig_print_shape(flat))
+
+
+@pytest.mark.parametrize("shape", [BENT, STRETCHED, PrintShape((3e-3, 0.0, 0.0, 0.003))])
+def test_a_rig_finds_the_shape_and_fits_to_its_noise(shape: PrintShape) -> None:
+    flat, found = fitted(shape)
+    np.testing.assert_allclose(found.shape.values, shape.values, atol=3e-5)
+    assert found.fit.mean_px < 1.3 * NOISE_PX < 0.5 * flat.fit.mean_px
+    assert max(off(found)) < 0.2 * max(off(flat))
+
+
+@pytest.mark.parametrize("seeds", [range(3), pytest.param(range(3, 8), marks=pytest.mark.slow)])
+def test_flat_boards_stay_flat_and_their_rigs_the_same(seeds: range) -> None:
+    for seed in seeds:
+        flat = fit_rig(views_of(AS_DRAWN, seed), ODD, (LOWER, UPPER))
+        assert rig_print_shape(flat) == AS_DRAWN == flat.shape

@@ -5,24 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
-import scipy
 
-from calib import se3
 from calib.boards.board import Board
 from calib.fit.boards.rig_fit import RigCalibration, fit_rig
 from calib.fit.boards.rig_selection import START_M, START_TANGENTIAL, telecentric_if_as_good
-from calib.fit.boards.telecentric_mirror import RADIUS_LOG_SIGMA, RADIUS_NAME, TelecentricMirror, wavefront_parts
-from calib.fit.parameterisation import parameterise
-from calib.models.camera import Array
 from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
-from calib.models.wavefront import TERMS, WAVEFRONT_NAMES
+from calib.models.wavefront import TERMS
 from calib.rig import Rig
 from tests.bench.boards_chain import board_rig
 from tests.bench.rig_sigmas import projected_views
-from tests.simulation.mirrors import MirrorCamera
 
 RADIUS_M = 0.03
 BOARD = Board(5, 4, 0.08)  # as large as one of 9 x 6 corners, with fewer of them to fit
@@ -39,59 +32,6 @@ def mirror(horizon_px: float, center: tuple[float, float], size: tuple[int, int]
         tangential=START_TANGENTIAL,
         wavefront=(START_M,) * TERMS,
     )
-
-
-@pytest.mark.parametrize(
-    ("name", "shape"),
-    [
-        ("w_s", {"conic": 0.004}),
-        ("w_a", {"ellipticity": 0.003}),
-        ("w_x", {"tilt_rad": (0.003, 0.0)}),
-        ("w_y", {"tilt_rad": (0.0, 0.003)}),
-    ],
-)
-def test_a_ray_traced_mirror_has_the_wavefront_that_its_image_tells(name: str, shape: dict[str, float]) -> None:
-    """All terms of camera, pose and wavefront are fitted to the pixels of points near and far."""
-    traced = MirrorCamera(150.0, (320.0, 300.0), (640, 640), RADIUS_M, **shape)  # type: ignore[arg-type]
-    rng = np.random.default_rng(1)
-    up, azimuth = np.cos(np.deg2rad(rng.uniform(15, 110, 300))), rng.uniform(0, 2 * np.pi, 300)
-    along = np.sqrt(1 - up**2)
-    points = rng.choice([0.2, 0.4, 2.0], 300)[:, None] * np.column_stack(
-        [along * np.cos(azimuth), along * np.sin(azimuth), up]
-    )
-    pixels, side = traced.project(points), parameterise(mirror(150.0, (320.0, 300.0), (640, 640)), wavefront=True)
-    # Rows of the image are y of the mirror's frame, columns -x, and rays go up: x' = y, y' = -x, z' = z.
-    R = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-
-    def camera(steps: Array) -> OcamCamera:
-        found = side.camera_at(steps)
-        assert isinstance(found, OcamCamera)
-        return found
-
-    def errors(steps: Array) -> Array:
-        T = se3.exp(1e-3 * steps[-6:])
-        return np.asarray((camera(steps[:-6]).project_near(se3.apply(T, points @ R.T)) - pixels).ravel())
-
-    found = scipy.optimize.least_squares(errors, np.zeros(len(side.names) + 6), x_scale="jac")
-    assert np.abs(found.fun).max() < 5e-3
-    fitted, index = camera(found.x[:-6]), WAVEFRONT_NAMES.index(name)
-    assert abs(fitted.wavefront[index]) > 2e-5
-    assert fitted.wavefront[index] == pytest.approx(RADIUS_M * wavefront_parts(fitted)[index], rel=0.1)
-
-
-def test_the_parameterisation_starts_at_its_camera_and_gives_its_plain_parameters() -> None:
-    camera = replace(mirror(150.0, (320.0, 300.0), (640, 640)), wavefront=(1e-4, -2e-4, 3e-4, 0.0, 5e-5))
-    side = TelecentricMirror.about(camera)
-    none = np.zeros(len(side.names))
-    at = side.camera_at(none)
-    assert isinstance(at, OcamCamera) and side.names[-1] == RADIUS_NAME
-    np.testing.assert_allclose(at.wavefront, camera.wavefront, atol=1e-12)
-    np.testing.assert_allclose(side.plain_values(none)[-TERMS:], camera.wavefront, atol=1e-12)
-    assert side.plain_by_steps(none).shape == (len(none) - 1, len(none))
-    # A larger mirror has a larger wavefront.
-    larger = side.camera_at(np.append(none[:-1], 1.0))
-    assert isinstance(larger, OcamCamera)
-    np.testing.assert_allclose(larger.wavefront, np.array(camera.wavefront) * np.exp(RADIUS_LOG_SIGMA), atol=1e-12)
 
 
 def freely_fitted(rig: Rig, perfect: Rig, xi: float = 1.0, pairs: int = 12) -> RigCalibration:

@@ -1,4 +1,4 @@
-"""Detection of the mirror's rim: drawn and real ones, and None for images without a rim."""
+"""Masks: the mirror's rim, drawn and real, rims that moved, hub and struts in a stack of frames."""
 
 from __future__ import annotations
 
@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.masks.rim import circles_through, find_rim
+from calib.errors import CalibError
+from calib.masks.rim import find_rim
+from calib.masks.rim_check import rim_shift
+from calib.masks.stack_mask import find_mask
 from calib.models.camera import Mask
+from omnid.simulation.rendering.sensor import MountedSensor, Sensor
+from omnid.simulation.rendering.textures import value_noise
 
 Image = NDArray[np.uint8]
 CENTER, RADIUS = (391.3, 377.6), 340.7
@@ -49,12 +54,6 @@ def test_finds_a_hub_with_and_without_a_glint() -> None:
     assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
     cv2.circle(image, (391, 378), 20, 130, -1)
     assert_ring(find_rim(image, (384.0, 384.0)), inner=60.0)
-
-
-def test_finds_a_rim_cut_off_by_the_image() -> None:
-    mask = find_rim(drawn(outer=365.0)[90:-80], (384.0, 300.0))
-    assert mask is not None
-    assert (*mask.center, mask.outer_px) == pytest.approx((CENTER[0], CENTER[1] - 90, 363.5), abs=0.6)
 
 
 def test_finds_a_rim_with_a_third_covered() -> None:
@@ -111,8 +110,57 @@ def test_finds_the_rim_of_a_real_mirror(shared_data: Path) -> None:
     np.testing.assert_allclose(rings.mean(axis=0), (516.7, 384.1, 79.0, 451.7), atol=1.0)
 
 
-def test_circles_go_through_their_points_and_points_in_line_have_none() -> None:
-    points = np.random.default_rng(3).uniform(0, 500, (50, 3, 2))
-    u, v, radius = circles_through(points).T[:, :, None]
-    np.testing.assert_allclose(np.hypot(points[..., 0] - u, points[..., 1] - v) / radius, 1, rtol=1e-6)
-    assert not np.isfinite(circles_through(np.array([[[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]]))).any()
+@pytest.mark.parametrize(
+    ("moved", "radius", "fits"),
+    [((0.0, 0.0), 100.0, True), ((8.0, 3.0), 100.0, False), ((0.0, 0.0), 94.0, False), ((2.0, 0.0), 110.0, True)],
+)
+def test_detects_a_moved_rim(moved: tuple[float, float], radius: float, fits: bool) -> None:
+    v, u = np.indices((260, 260))
+    center = (130.0 + moved[0], 128.0 + moved[1])
+    grey = np.random.default_rng(0).integers(120, 200, (260, 260))
+    image = np.where(np.hypot(u - center[0], v - center[1]) <= radius, grey, 5).astype(np.uint8)
+    shift = rim_shift(image, Mask((130.0, 128.0), 0.0, 100.0))
+    assert shift is not None and shift.fits == fits
+    assert shift.moved_px == pytest.approx(moved, abs=0.5) and shift.wider_px == pytest.approx(radius - 100, abs=2.5)
+    assert rim_shift(image, None) is None and rim_shift(np.zeros_like(image), Mask((130.0, 128.0), 0, 100)) is None
+
+
+MIDDLE, RIM = (201.4, 197.2), 176.0
+SIZE = (400, 396)
+SENSOR = Sensor(strut_angles_deg=(20.0, 140.0, 260.0), strut_width=0.03, hub=0.08)
+
+
+def frames(count: int, sensor: Sensor = SENSOR) -> list[NDArray[np.uint8]]:
+    ring = Mask(MIDDLE, 0.0, RIM)
+    exposure, rng = MountedSensor.of(sensor, ring, SIZE), np.random.default_rng(2)
+    v, u = np.indices(SIZE[::-1])
+    inside = np.hypot(u - MIDDLE[0], v - MIDDLE[1]) <= RIM
+    worlds = [130 + 50 * value_noise(rng, SIZE, 60.0) for _ in range(count)]
+    return [exposure.expose(np.where(inside, world, 0).astype(np.float32), rng) for world in worlds]
+
+
+def test_masks_rim_hub_and_struts() -> None:
+    mask = find_mask(frames(10), (205.0, 200.0))
+    assert mask.image is not None
+    assert mask.center == pytest.approx(MIDDLE, abs=0.5) and mask.outer_px == pytest.approx(RIM - 1.5, abs=1.0)
+    hidden = MountedSensor.of(SENSOR, Mask(MIDDLE, 0.0, RIM), SIZE).hidden > 0.9
+    v, u = np.indices(SIZE[::-1])
+    radius = np.hypot(u - MIDDLE[0], v - MIDDLE[1])
+    assert (mask.image[hidden & (radius < RIM - 6)] == 0).mean() > 0.97
+    assert (mask.image[radius > RIM + 1] == 0).all()
+    clear = ~hidden & (radius < RIM - 6) & (radius > 45)
+    assert (mask.image[clear] > 0).mean() > 0.93
+
+
+def test_masks_no_strut_without_struts() -> None:
+    mask = find_mask(frames(10, Sensor()), (200.0, 198.0))
+    assert mask.image is not None
+    v, u = np.indices(SIZE[::-1])
+    assert (mask.image[np.hypot(u - MIDDLE[0], v - MIDDLE[1]) < RIM - 4] > 0).mean() > 0.995
+
+
+def test_refuses_few_frames_and_frames_without_a_rim() -> None:
+    with pytest.raises(CalibError, match="expected at least 5 frames of different views, found 3"):
+        find_mask(frames(3), MIDDLE)
+    with pytest.raises(CalibError, match="no rim of a mirror is found"):
+        find_mask([np.full((200, 200), 90, np.uint8)] * 6, (100.0, 100.0))
