@@ -199,7 +199,7 @@ def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> No
     entries = [
         status(-20, DiagnosticStatus(ODOMETRY, 3, "no pose yet", {}), DiagnosticStatus(PAIRING, 1, "none", {})),
         *run(100, lost=range(80, 85), missing=range(30, 50)),
-        state(60, "tracking", resets=1),
+        state(95, "tracking", resets=1),
         status(
             61, DiagnosticStatus(camera, 0, "streaming", {"drops": "3"}), DiagnosticStatus(WHEELS, 0, "driving", {})
         ),
@@ -220,7 +220,6 @@ def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> No
     assert event_texts(found) == [
         ("pairing", "none"),
         ("poses", "none for 2.10 s"),
-        ("state", "odometry was reset, with an unknown gap"),
         ("upper camera", "lost since 1.0 s"),
         ("wheels", "the pose is lost"),
         ("wheels", "stopped, the pose is lost"),
@@ -228,6 +227,7 @@ def test_states_gaps_resets_losses_and_messages_are_events(tmp_path: Path) -> No
         ("upper camera", "images dropped"),
         ("wheels", "driving"),
         ("state", "tracking"),
+        ("state", "odometry was reset, with an unknown gap"),
     ]
     text = Page(report_html(found)).text
     for words in ("images dropped (5)", "1resets", "lost here", "none for 2.10 s"):
