@@ -10,6 +10,7 @@ import argparse
 import glob
 import hashlib
 import json
+import logging
 import os
 import shutil
 import signal
@@ -222,8 +223,16 @@ def _client(scheduler: str | None, jobs: int) -> Any:
         distributed = import_module("distributed")
     except ImportError as error:
         raise OmnidError(f"batch needs dask.distributed: install the extra `fleet` into {sys.prefix}") from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # each connection and repetition is told
     if not scheduler:
-        return distributed.Client(processes=False, n_workers=1, threads_per_worker=jobs, dashboard_address=None)
+        here = "127.0.0.1:0"  # dask has web servers in any case, by default for all machines of the network
+        return distributed.Client(
+            processes=False,
+            n_workers=1,
+            threads_per_worker=jobs,
+            dashboard_address=here,
+            worker_dashboard_address=here,
+        )
     try:
         return distributed.Client(scheduler, timeout="10 s")
     except (OSError, TimeoutError, ValueError) as error:

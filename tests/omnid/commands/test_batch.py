@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from importlib import import_module
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
@@ -95,9 +96,12 @@ def test_a_program_that_is_killed_is_run_again_and_an_interrupted_batch_leaves_n
     log, out = short_log(tmp_path / "log.mcap", 2 * BYTES), tmp_path / "out"
     with start("batch", log, "--out", out) as batch:
         wait_until(lambda: bool(replays_of(log)))
+        listening = [at for at in import_module("psutil").Process(batch.pid).net_connections() if at.status == "LISTEN"]
+        assert {at.laddr.ip for at in listening} <= {"127.0.0.1"}
         os.kill(replays_of(log)[0], signal.SIGKILL)
         _, err = batch.communicate(timeout=DEADLINE_S)
     assert batch.returncode == 0 and result(out / "log.mcap")["status"] == "ok", err
+    assert err.count("\n") == 1 and err.startswith("1/1"), "one line a log, none of dask"
     shutil.rmtree(out)
     with start("batch", log, "--out", out) as batch:
         wait_until(lambda: bool(replays_of(log)))
