@@ -35,9 +35,7 @@ _MAX_PNG_CHUNKS = 1000
 _PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type
 _CHANNELS = {"mono8": 1, "mono16": 1, "bgr8": 3, "rgb8": 3, "bgra8": 4, "rgba8": 4, "yuyv": 2, "uyvy": 2, "nv12": 1}
 _LUMA = {"yuyv": 0, "uyvy": 1}  # index of the luma byte of the two bytes of a pixel
-# Bits of cameras whose samples are written to files of 16 bits as they are, not multiplied.
-_CAMERA_BITS = (10, 12)
-FILE_BITS = 16
+SAMPLE_BITS = (8, 10, 12, 16)  # bits of a camera that images of 16 bits a sample may hold
 _MAX_REASON, _MAX_ENCODING = 120, 40  # characters in an error message
 _TO_GRAY = {
     "bgr8": cv2.COLOR_BGR2GRAY,
@@ -60,6 +58,7 @@ class Frame:
     height: int = 0  # px
     step: int = 0  # bytes from row to row; 0: rows without padding
     bigendian: bool = False  # byte order of mono16
+    bits: int = 16  # one of SAMPLE_BITS: of these, mono16 and PNG of 16 bits a sample show the upper eight
 
 
 class FrameSource(Protocol):
@@ -75,7 +74,7 @@ class FrameSource(Protocol):
 def gray(frame: Frame) -> NDArray[np.uint8]:
     """Return the image as (H, W) uint8, C-contiguous and read-only; it never aliases a writable buffer.
 
-    Colours are converted with OpenCV's weights; of mono16 the upper byte is kept, of yuyv, uyvy and nv12 the luma.
+    Colours are converted with OpenCV's weights; of yuyv, uyvy and nv12 the luma is kept.
     An EXIF orientation is ignored, since the calibration belongs to the sensor's own axes. Raises FrameDecodeError for
     an image that is truncated, malformed or of an unknown encoding, and for a JPEG of which libjpeg notices that a part
     was lost: with restart markers nearly any, without them what leaves the rest of the image undecodable.
@@ -93,33 +92,14 @@ def coding_steps(frame: Frame) -> Steps:
     return quantisation_steps(np.frombuffer(frame.data, np.uint8).data) if frame.encoding == "jpeg" else ()
 
 
-def deep_samples(frame: Frame) -> NDArray[np.uint16] | None:
-    """Return the grey samples (H, W) of an image of 16 bits a sample, mono16 or PNG, None for one of eight.
-
-    Raises FrameDecodeError as `gray` does.
-    """
-    try:
-        if frame.encoding == "mono16":
-            return _pixels(frame).astype(np.uint16)
-        if frame.encoding != "png" or bytes(frame.data[_PNG_DEPTH]) != bytes([FILE_BITS]):
-            return None
-        return np.asarray(_decompress(frame, cv2.IMREAD_ANYDEPTH), np.uint16)
-    except (cv2.error, ValueError, TypeError, BufferError) as error:
-        raise _decode_error(frame, " ".join(str(error).split())[:_MAX_REASON]) from error
+def is_deep(frame: Frame) -> bool:
+    """True if an image has 16 bits a sample, of which Frame.bits are those of the camera."""
+    return frame.encoding == "mono16" or (frame.encoding == "png" and bytes(frame.data[_PNG_DEPTH]) == b"\x10")
 
 
-def bits_of_camera(largest: int) -> int:
-    """Return the bits of the samples of a camera, 10 or 12, by the largest one in all its images of 16 bits; else 16.
-
-    A file of 16 bits whose largest sample is below 1/16 of the possible ones would be black: it is taken for one of a
-    camera of fewer bits.
-    """
-    return next((bits for bits in _CAMERA_BITS if largest < 2**bits), FILE_BITS)
-
-
-def upper_eight_bits(deep: NDArray[np.uint16], bits: int) -> NDArray[np.uint8]:
-    """Return the upper eight of so many bits of each sample (H, W); larger samples become 255."""
-    return np.asarray(np.minimum(deep >> (bits - 8), 255), np.uint8)
+def upper_eight_bits(samples: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+    """Return the upper eight of so many bits of each sample (H, W) uint16; larger samples become 255."""
+    return np.asarray(np.minimum(samples >> (bits - 8), 255), np.uint8)
 
 
 def _decode_error(frame: Frame, reason: str) -> FrameDecodeError:
@@ -127,13 +107,13 @@ def _decode_error(frame: Frame, reason: str) -> FrameDecodeError:
     return FrameDecodeError(f"{frame.camera} frame {frame.seq} ({encoding!r}) cannot be decoded: {reason}")
 
 
-def _decompress(frame: Frame, depth: int = 0) -> NDArray[Any]:
-    """Return the grey image (H, W): uint8, or as in the file with depth IMREAD_ANYDEPTH."""
+def _decompress(frame: Frame) -> NDArray[np.uint8]:
+    """Return the grey image (H, W)."""
     data = np.frombuffer(frame.data, np.uint8)
     head = data[: len(_START_MARKER[frame.encoding])].tobytes()
     if head != _START_MARKER[frame.encoding]:
         raise _decode_error(frame, f"it starts with {head.hex() or 'nothing'}")
-    return _decoded_jpeg(frame, data) if frame.encoding == "jpeg" else _decoded_png(frame, data, depth)
+    return _decoded_jpeg(frame, data) if frame.encoding == "jpeg" else _decoded_png(frame, data)
 
 
 def _decoded_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -149,14 +129,14 @@ def _decoded_jpeg(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(image[..., 0])
 
 
-def _decoded_png(frame: Frame, data: NDArray[np.uint8], depth: int) -> NDArray[Any]:
+def _decoded_png(frame: Frame, data: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if not data.tobytes().rstrip(b"\0").endswith(_PNG_END):
         raise _decode_error(frame, f"its end is missing after {data.size} bytes")
     _require_samples(frame, *_png_size(data))
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | depth)
+    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image is None or image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise _decode_error(frame, "its content is corrupt")
-    return np.ascontiguousarray(image)
+    return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, frame.bits))
 
 
 def _require_samples(frame: Frame, width: int, height: int, channels: int) -> None:
@@ -201,7 +181,7 @@ def _unpack(frame: Frame) -> NDArray[np.uint8]:
     if _CHANNELS[frame.encoding] == 1 and pixels.dtype == np.uint8:
         return np.array(pixels, np.uint8, order="C") if pixels.flags.writeable else np.ascontiguousarray(pixels)
     if frame.encoding == "mono16":
-        return (pixels >> 8).astype(np.uint8)
+        return upper_eight_bits(pixels, frame.bits)
     return np.ascontiguousarray(cv2.cvtColor(np.ascontiguousarray(pixels), _TO_GRAY[frame.encoding]), np.uint8)
 
 

@@ -24,6 +24,10 @@ class CamerasConfig:
     pixel_format: Annotated[
         Literal["auto", "GREY", "NV12", "YUYV", "UYVY", "MJPG", "JPEG"], "pixel format of the images on USB"
     ] = "auto"
+    bits: Annotated[
+        Literal[8, 10, 12, 16],
+        "bits of the camera in the samples of logs that have 16: a camera of 10 bits may fill 10 of them, or all",
+    ] = 16
     auto_exposure: Annotated[
         Literal["keep", "on", "off", "rig"],
         "automatic exposure; 'rig': omnid run sets exposure and gain of both cameras "

@@ -37,14 +37,18 @@ class LogImages:
 
     @staticmethod
     def load(
-        path: Path, lower: str | None = None, upper: str | None = None, motion: MotionTopics | None = None
+        path: Path,
+        lower: str | None = None,
+        upper: str | None = None,
+        motion: MotionTopics | None = None,
+        bits: int = 16,
     ) -> LogImages:
         """Load the images of a log. lower, upper: topics, where their names do not identify the cameras.
 
-        motion: topics of wheels and IMU; None: they are not read. Raises DriverError where a camera has fewer than two
-        images, and beyond MAX_LOG_BYTES or MAX_SAMPLES.
+        motion: topics of wheels and IMU; None: they are not read. bits: see Frame. Raises DriverError where a camera
+        has fewer than two images, and beyond MAX_LOG_BYTES or MAX_SAMPLES.
         """
-        reader = LogReader(path, lower, upper, motion=motion)
+        reader = LogReader(path, lower, upper, motion=motion, bits=bits)
         samples: list[MotionSample] = []
         try:
             frames = list(_limited(reader.messages(), samples, path))

@@ -7,15 +7,15 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.frame import Camera, Frame
+from drivers.frame import SAMPLE_BITS, Camera, Frame, gray, is_deep
 from drivers.logs.log import LoggedMessage, RecordError
 from drivers.logs.open_log import open_log
 from drivers.logs.ros_messages import RosImage
-from drivers.logs.sample_bits import SampleBits
 from drivers.logs.topics import MotionChoice, MotionTopics, choose_motion_topics, choose_topics
 from drivers.motion import MotionSample, WheelSample
 
@@ -34,13 +34,31 @@ _COUNTERS = ("lower", "upper", *_WARNINGS)
 WHOLE = (0.0, math.inf)  # span of all of a log [s]
 
 
+class LogCameras(NamedTuple):
+    """Which images of a log are those of the cameras, and how they are read: the arguments of LogReader."""
+
+    lower: str | None = None  # topics; None: identified by their names
+    upper: str | None = None
+    bits: int = 16
+    rate_hz: float = 0.0
+
+    def reader(self, path: str | os.PathLike[str]) -> LogReader:
+        """Open a log."""
+        return LogReader(path, self.lower, self.upper, bits=self.bits, rate_hz=self.rate_hz)
+
+
+# Both topics, or more.
+AnyCameras: TypeAlias = tuple[str | None, str | None] | LogCameras
+
+
 class LogReader:
     """A FrameSource that streams a log once per call of frames().
 
-    path, rate_hz: as for `open_log`. lower, upper: topics, where their names do not identify the cameras. window:
-    number of frames that are held back to sort them by stamp. span_s: the part of the log that is read, from and until
-    so many seconds after the stamp of its first image. motion: topics of wheels and IMU; None: their samples are not
-    read. Raises DriverError where the path is no such log, or the topics of the two cameras are ambiguous.
+    path, rate_hz: as for `open_log`. bits: of the samples of images of 16 bits, see Frame. lower, upper: topics, where
+    their names do not identify the cameras. window: number of frames that are held back to sort them by stamp. span_s:
+    the part of the log that is read, from and until so many seconds after the stamp of its first image. motion: topics
+    of wheels and IMU; None: their samples are not read. Raises DriverError where the path is no such log, or the
+    topics of the two cameras are ambiguous.
 
     During and after frames() and messages(), `counts` has 'lower' and 'upper' (frames delivered), 'late', 'duplicate',
     'unstamped' (log time used), 'broken' (messages without a valid image), 'broken_motion' and 'broken_records' (chunks
@@ -57,9 +75,10 @@ class LogReader:
         window: int = 32,
         span_s: tuple[float, float] = WHOLE,
         motion: MotionTopics | None = None,
+        bits: int = 16,
         rate_hz: float = 0.0,
     ) -> None:
-        self._window, self._closed, self._span_s = window, False, span_s
+        self._window, self._closed, self._span_s, self._bits = window, False, span_s, bits
         self._log = open_log(path, rate_hz)
         self._motion = MotionChoice(frozenset())
         self._joints = motion.joints if motion else None
@@ -91,7 +110,7 @@ class LogReader:
             self._report()
 
     def _sorted(self) -> Iterator[Frame | MotionSample]:
-        buffer, samples = _ReorderBuffer(self._window, self.counts), _Samples()
+        buffer, samples = _ReorderBuffer(self._window, self._bits, self.counts), _Samples()
         cameras = {topic: camera for camera, topic in self._cameras.items()}
         for message in self._log.messages({*cameras, *self._motion.names}):
             if self._closed:
@@ -150,7 +169,7 @@ class LogReader:
         self.counts: Counter[str] = Counter(dict.fromkeys(_COUNTERS, 0))
         self.warnings: list[str] = [self._motion.warning] if self._motion.warning else []
         self.truncated = False
-        self._bits = SampleBits()
+        self._examined: set[str] = set()  # topics whose first image was
         self._fault = ""  # of the first message without a valid image
         self._motion_fault = ""  # of the first message of wheels or IMU that is not valid
         self._other_joints = 0  # messages of joints without the wheels
@@ -162,7 +181,8 @@ class LogReader:
         The image is copied out of its chunk, so that a frame that is held back does not keep the chunk in memory.
         """
         try:
-            image = self._bits.applied(logged.topic, logged.image())
+            image = logged.image()
+            self._examine(logged.topic, image)
         except (FrameDecodeError, RecordError) as error:
             self.counts["broken"] += 1
             self._fault = self._fault or str(error)
@@ -171,6 +191,19 @@ class LogReader:
         stamp_ns = image.stamp_ns or logged.log_time_ns
         self._widen("images", stamp_ns)
         return replace(image, stamp_ns=stamp_ns, data=memoryview(bytes(image.data)))
+
+    def _examine(self, topic: str, image: RosImage) -> None:
+        """Warn where the first image of a topic would be black, because its samples hold fewer bits than stated."""
+        if topic in self._examined:
+            return
+        self._examined.add(topic)
+        frame = image.frame(bits=self._bits)
+        with suppress(FrameDecodeError):  # who decodes the image says what is wrong with it
+            if self._bits == SAMPLE_BITS[-1] and is_deep(frame) and gray(frame).max() < 2**12 >> 8:
+                self.warnings.append(
+                    f"the first image of {topic!r} has samples of 16 bits, none above {2**12 - 1}: of a camera of 10 "
+                    "or 12 bits? State cameras.bits, or --bits"
+                )
 
     def _sample(self, logged: LoggedMessage) -> MotionSample | None:
         """Return a sample, None of a broken one."""
@@ -252,8 +285,8 @@ class _ReorderBuffer:
     before of its camera as 'duplicate'; 'lower' and 'upper' count the delivered frames.
     """
 
-    def __init__(self, window: int, counts: Counter[str]) -> None:
-        self._window = window
+    def __init__(self, window: int, bits: int, counts: Counter[str]) -> None:
+        self._window, self._bits = window, bits
         self._counts = counts
         self._heap: list[_WaitingImage] = []
         self._held_bytes = 0
@@ -284,4 +317,4 @@ class _ReorderBuffer:
         else:
             self._newest_ns = self._last_ns[oldest.camera] = oldest.stamp_ns
             self._counts[oldest.camera] += 1
-            yield oldest.image.frame(oldest.camera, self._counts[oldest.camera] - 1)
+            yield oldest.image.frame(oldest.camera, self._counts[oldest.camera] - 1, self._bits)

@@ -56,9 +56,12 @@ class RosImage:
     step: int = 0  # bytes from row to row
     bigendian: bool = False
 
-    def frame(self, camera: Camera = "lower", seq: int = 0) -> Frame:
-        """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters."""
-        layout = self.width, self.height, self.step, self.bigendian
+    def frame(self, camera: Camera = "lower", seq: int = 0, bits: int = 16) -> Frame:
+        """Return the image as a frame of a camera. To decode it, neither the camera nor the number matters.
+
+        bits: see Frame.
+        """
+        layout = self.width, self.height, self.step, self.bigendian, bits
         return Frame(seq, self.stamp_ns, camera, self.encoding, self.data, *layout)
 
 

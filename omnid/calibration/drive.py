@@ -27,8 +27,9 @@ from calib.models.ocam import has_wavefront
 from calib.rig import Rig, ShutterTimes
 from calib.rig_covariance import RigCovariance
 from calib.rig_file import read_rig
+from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import Progress, silent
-from omnid.calibration.drive_observations import Drives, Topics, collect
+from omnid.calibration.drive_observations import Drives, collect
 from omnid.calibration.drive_scale import level_turn, rescaled, scale_change, turned_about_lower
 from omnid.calibration.drive_start import straightened, with_masks
 from omnid.calibration.images import SIDES
@@ -153,7 +154,7 @@ class DriveCalibration:
 def calibrate_drive(
     logs: Sequence[str | PathLike[str]],
     rig: str | PathLike[str] | Rig,
-    topics: Topics = (None, None),
+    topics: AnyCameras = (None, None),
     progress: Progress = silent,
 ) -> DriveCalibration:
     """Return the rig that fits drives best, near the one given; OmnidError or CalibError where they do not suffice.
@@ -166,15 +167,16 @@ def calibrate_drive(
     # 1. Find the rims of the mirrors, and start with tangential terms and times of exposure. Wavefronts are parameters
     #    if boards have shown them: a drive alone shows them as well, but the central cameras that remain measured the
     #    lengths of other drives less well.
-    before = with_masks(paths[0], rig, topics)
+    cameras = LogCameras(*topics)
+    before = with_masks(paths[0], rig, cameras)
     distortion = START_DISTORTION if len(candidate_distortions(before)) > 1 else ()
     waves = any(has_wavefront(mounted.camera) for mounted in (before.lower, before.upper))
     parameters = RigParameters.about(before, distortion, TIMES, waves=waves)
     # 2. Straighten the panoramas until columns match, so that the odometry can track.
-    steps = straightened(paths[0], parameters, topics, config, progress)
+    steps = straightened(paths[0], parameters, cameras, config, progress)
     require_same_rig(parameters, steps, tracked=False)
     # 3. Track and adjust in rounds, until lengths change no more.
-    found, drives = _in_rounds(paths, parameters, steps, topics, config, progress)
+    found, drives = _in_rounds(paths, parameters, steps, cameras, config, progress)
     # 4. Choose the distortion terms by landmarks held out, and the times of exposure that differ from none.
     scores = tuple(_score(found, drives, terms, waves) for terms in candidate_distortions(before))
     for score in scores if len(scores) > 1 else ():
@@ -202,7 +204,12 @@ def calibrate_drive(
 
 
 def _in_rounds(
-    logs: Sequence[Path], parameters: RigParameters, steps: Array, topics: Topics, config: Config, progress: Progress
+    logs: Sequence[Path],
+    parameters: RigParameters,
+    steps: Array,
+    cameras: LogCameras,
+    config: Config,
+    progress: Progress,
 ) -> tuple[DriveAdjustment, Drives]:
     """Track and adjust until lengths change no more: each round tracks in panoramas of the rig of the one before.
 
@@ -210,7 +217,7 @@ def _in_rounds(
     """
     rig = parameters.at(steps)
     for number in range(1, MAX_ROUNDS + 1):
-        drives = collect(logs, rig, topics, config)
+        drives = collect(logs, rig, cameras, config)
         found = _adjusted(parameters, steps, drives)
         moved = scale_change(found, rig)
         steps, rig = found.state.steps, _with_times(found.rig, significant_times(found))

@@ -15,7 +15,7 @@ from calib import se3
 from calib.fit.drive.observations import DriveObservations, DriveState, KeyframeMotion
 from calib.rig import Rig
 from calib.se2_arrays import wrapped
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogCameras, LogReader
 from omnid.calibration.images import open_log
 from omnid.config import Config
 from omnid.core.rig.column_finding import RigState, match
@@ -32,7 +32,6 @@ from omnid.stages.synchronise import Synchronise
 from omnid.tracking_state import TrackingState
 
 Array = NDArray[np.float64]
-Topics = tuple[str | None, str | None]
 
 KEYFRAME_M, KEYFRAME_RAD = 0.12, np.deg2rad(8)
 MAX_KEYFRAMES = 80  # Most keyframes of all drives: on long drives they are farther apart.
@@ -59,10 +58,10 @@ class Drives:
         return len(self.state.T_rig_odom)
 
 
-def collect(logs: Sequence[Path], rig: Rig, topics: Topics, config: Config) -> Drives:
+def collect(logs: Sequence[Path], rig: Rig, cameras: LogCameras, config: Config) -> Drives:
     """Return the observations of drives; OmnidError where they are too short or too straight."""
     place = geometry(rig, config.panorama)
-    parts = [_drive(log, place, topics, config, MAX_KEYFRAMES // len(logs)) for log in logs]
+    parts = [_drive(log, place, cameras, config, MAX_KEYFRAMES // len(logs)) for log in logs]
     states, seen = [part.state for part in parts], [part.observations for part in parts]
     keyframes = np.cumsum([0, *(part.keyframes for part in parts)])
     landmarks = np.cumsum([0, *(len(state.points) for state in states)])
@@ -107,12 +106,12 @@ def observe_pairs(pairs: Sequence[FramePair], rig: Rig, config: Config) -> tuple
     return DriveState(T, points[used], np.zeros(0), KeyframeMotion.still(len(pairs))), observations
 
 
-def _drive(log: Path, place: Geometry, topics: Topics, config: Config, most: int) -> Drives:
+def _drive(log: Path, place: Geometry, cameras: LogCameras, config: Config, most: int) -> Drives:
     """Return keyframes of one drive, at most the given number, its landmarks, and their pixels in the images."""
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
     collector = DriveCollector(place, front_end.dense)
     newest = np.eye(4)
-    with closing(open_log(log, topics, place.rig)) as reader:
+    with closing(open_log(log, cameras, place.rig)) as reader:
         choice = KeyframeChoice(_spacing(reader, most))
         for update, twist in _with_twists(tracked_updates(reader, front_end, config, log)):
             newest = update.T_odom_rig

@@ -14,8 +14,9 @@ from calib.fit.drive.rig_parameters import RigParameters
 from calib.fit.drive.rig_prior import prior_information
 from calib.fit.rig_drift import apply_drift
 from calib.rig import Rig
+from drivers.logs.log_reader import LogCameras
 from omnid.calibration.board_search import Progress
-from omnid.calibration.drive_observations import Topics, observe_pairs
+from omnid.calibration.drive_observations import observe_pairs
 from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import check_rig, read_rig_pairs
 from omnid.config import Config
@@ -31,16 +32,18 @@ PAIR_ROUNDS = 3
 SYNCHRONOUS_S = 3e-3
 
 
-def with_masks(log: Path, rig: Rig, topics: Topics) -> Rig:
+def with_masks(log: Path, rig: Rig, cameras: LogCameras) -> Rig:
     """Return the rig with the masks of its mirrors, found in the images of a log where the rig has none."""
-    with closing(open_log(log, topics, rig)) as reader:
+    with closing(open_log(log, cameras, rig)) as reader:
         return with_rims(rig, reader.frames())
 
 
-def straightened(log: Path, parameters: RigParameters, topics: Topics, config: Config, progress: Progress) -> Array:
+def straightened(
+    log: Path, parameters: RigParameters, cameras: LogCameras, config: Config, progress: Progress
+) -> Array:
     """Return steps (P,) to a rig with which columns match, from where tracking works; OmnidError if there is none."""
     rig = parameters.rig
-    with closing(open_log(log, topics, rig)) as reader:
+    with closing(open_log(log, cameras, rig)) as reader:
         pairs = read_rig_pairs(reader, rig)
     finding = check_rig(pairs, rig, config.panorama).finding
     progress(finding.summary)

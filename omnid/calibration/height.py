@@ -12,7 +12,7 @@ from typing import Final
 from calib import se3
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.drive_observations import Topics
+from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.drive_start import with_masks
 from omnid.calibration.images import open_log
 from omnid.calibration.rig_check import read_rig_pairs
@@ -62,17 +62,18 @@ class HeightCalibration:
 
 
 def calibrate_height(
-    log: str | PathLike[str], rig: str | PathLike[str] | Rig, topics: Topics = (None, None)
+    log: str | PathLike[str], rig: str | PathLike[str] | Rig, topics: AnyCameras = (None, None)
 ) -> HeightCalibration:
     """Return height and tilt of a rig by pairs spread over a log; OmnidError where they do not show the floor.
 
     topics: of the lower and the upper camera. The tilt is against z of the base as the rig states it.
     """
     log, rig = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig))
-    with closing(open_log(log, topics, rig)) as reader:
+    cameras = LogCameras(*topics)
+    with closing(open_log(log, cameras, rig)) as reader:
         pairs = read_rig_pairs(reader, rig)
     config = Config()
-    front_end = FrontEnd(geometry(with_masks(log, rig, topics), config.panorama), config)
+    front_end = FrontEnd(geometry(with_masks(log, rig, cameras), config.panorama), config)
     view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]
     estimator, chosen = FloorEstimator(), pairs[:: -(-len(pairs) // MOST_PAIRS)]
     for pair in chosen:

@@ -1,8 +1,4 @@
-"""Images of two cameras for a calibration: lower_*, upper_* of a folder, or the pairs of a log.
-
-Files of 16 bits a sample may hold the 10 or 12 bits of a camera: where none of the images has a larger sample, all are
-read by the upper eight of these bits.
-"""
+"""Images of two cameras for a calibration: lower_*, upper_* of a folder, or the pairs of a log."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,9 +14,9 @@ from numpy.typing import NDArray
 
 from calib.rig import Rig
 from drivers.errors import DriverError, FrameDecodeError
-from drivers.frame import FILE_BITS, MAX_PIXELS, Frame, bits_of_camera, gray, upper_eight_bits
+from drivers.frame import MAX_PIXELS, Frame, gray, upper_eight_bits
 from drivers.logs.image_folder import IMAGE_SUFFIXES
-from drivers.logs.log_reader import LogReader
+from drivers.logs.log_reader import LogCameras, LogReader
 from drivers.logs.open_log import LOG_SUFFIXES
 from omnid.errors import OmnidError
 
@@ -34,6 +29,7 @@ TOLERANCE_NS = 10_000_000
 # Number of pairs of a log that are used, evenly spread: a board held by hand moves little between two of them.
 LOG_PAIRS = 100
 MAX_IMAGES = 400
+BY_NAME = LogCameras()
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,20 +46,20 @@ class PairedImages:
         return sorted({**self.sides[0], **self.sides[1]})
 
 
-def read_pairs(source: Path, lower: str | None = None, upper: str | None = None) -> PairedImages:
-    """Read the images of a folder or a log; lower and upper: a log's topics. Raises OmnidError without any pair.
+def read_pairs(source: Path, cameras: LogCameras = BY_NAME) -> PairedImages:
+    """Read the images of a folder or a log. Raises OmnidError without any pair.
 
     An instant whose images have all pixels of those of an earlier one is left out: it is no further view of a board,
     and would count the same errors again.
     """
     # 1. Read the images of both cameras.
     of_log = _is_log(source) or (source.is_dir() and any(map(_is_log, source.iterdir())))
-    if not of_log and (lower or upper):
+    if not of_log and (cameras.lower or cameras.upper):
         raise OmnidError(f"{source}: only a log has topics; found a folder of images")
     if of_log:
-        sides, topics = _of_log(source, lower, upper)
+        sides, topics = _of_log(source, cameras)
     else:
-        sides, topics = _of_folder(source), ("", "")
+        sides, topics = _of_folder(source, cameras.bits), ("", "")
     if not sides[0].keys() & sides[1].keys():
         counted = ", ".join(f"{len(side)} of the {name} camera" for name, side in zip(SIDES, sides, strict=True))
         raise OmnidError(
@@ -92,17 +88,17 @@ def _repeats(sides: Sequence[Images]) -> dict[str, str]:
     return found
 
 
-def _of_folder(folder: Path) -> tuple[Images, Images]:
+def _of_folder(folder: Path, bits: int) -> tuple[Images, Images]:
     if not folder.is_dir():
         raise OmnidError(
             f"{folder}: expected a log (.mcap, .db3, .bag) or a folder with images lower_*, upper_*; "
             f"found {'a file' if folder.exists() else 'no such file or folder'}"
         )
-    lower, upper = (_of_side(folder, side) for side in SIDES)
+    lower, upper = (_of_side(folder, side, bits) for side in SIDES)
     return lower, upper
 
 
-def _of_side(folder: Path, side: str) -> Images:
+def _of_side(folder: Path, side: str, bits: int) -> Images:
     """Return the images of one camera by the name of their instant: lower_001.png is that of 001."""
     paths = dict[str, Path]()
     for path in sorted(path for path in folder.glob(f"{side}_*") if path.suffix.lower() in IMAGE_SUFFIXES):
@@ -112,27 +108,14 @@ def _of_side(folder: Path, side: str) -> Images:
         raise OmnidError(f"{folder}: no images {side}_* in this folder; name them lower_001.png, upper_001.png ...")
     if len(paths) > MAX_IMAGES:
         raise OmnidError(f"calibrate: expected {MAX_IMAGES} images at most, found {len(paths)}; 40 are enough")
-    images = [np.asarray(_read(path), np.uint8) for path in paths.values()]
-    # The upper eight of 16 bits show which images hold fewer bits: only these are read again.
-    if bits_of_camera(256 * max(int(image.max()) for image in images) + 255) < FILE_BITS:
-        images = _by_the_bits_of_the_camera(list(paths.values()), images)
+    images = [_read(path, bits) for path in paths.values()]
     _require_one_size({path.name: image for path, image in zip(paths.values(), images, strict=True)})
     return dict(zip(paths, images, strict=True))
 
 
-def _by_the_bits_of_the_camera(paths: Sequence[Path], images: Sequence[Image]) -> list[Image]:
-    """Return images of 8 bits as they are, and those of 16 by the upper eight of the 10 or 12 bits of their camera."""
-    deep = [_read(path, cv2.IMREAD_ANYDEPTH) for path in paths]
-    bits = bits_of_camera(max((int(image.max()) for image in deep if image.dtype == np.uint16), default=0))
-    return [
-        upper_eight_bits(samples, bits) if samples.dtype == np.uint16 else image
-        for samples, image in zip(deep, images, strict=True)
-    ]
-
-
-def _read(path: Path, depth: int = 0) -> NDArray[Any]:
-    """Return a grey image (H, W): uint8, or as in the file with depth IMREAD_ANYDEPTH."""
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | depth
+def _read(path: Path, bits: int) -> Image:
+    """Return a grey image (H, W); of 16 bits a sample the upper eight of so many bits."""
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH
     try:
         data = np.frombuffer(path.read_bytes(), np.uint8)
         image = cv2.imdecode(data, flags) if data.size else None
@@ -140,11 +123,11 @@ def _read(path: Path, depth: int = 0) -> NDArray[Any]:
         raise OmnidError(f"{path}: cannot be read: {error.strerror or error}") from error
     except cv2.error:
         image = None
-    if image is None or image.size > MAX_PIXELS:
+    if image is None or image.size > MAX_PIXELS or image.dtype not in (np.uint8, np.uint16):
         raise OmnidError(
             f"{path}: expected an image (PNG, JPEG, TIFF ...) of at most {MAX_PIXELS} pixels, found none; leave it out"
         )
-    return np.ascontiguousarray(image)
+    return np.ascontiguousarray(image if image.dtype == np.uint8 else upper_eight_bits(image, bits), np.uint8)
 
 
 def _require_one_size(images: Images) -> None:
@@ -157,10 +140,10 @@ def _require_one_size(images: Images) -> None:
         raise OmnidError(f"calibrate: expected images of one camera, all of one size, found {shown}")
 
 
-def _of_log(log: Path, lower: str | None, upper: str | None) -> tuple[tuple[Images, Images], tuple[str, str]]:
+def _of_log(log: Path, cameras: LogCameras) -> tuple[tuple[Images, Images], tuple[str, str]]:
     """Return LOG_PAIRS pairs of a log, without those that cannot be decoded, and its topics."""
     sides: tuple[Images, Images] = ({}, {})
-    with closing(LogReader(log, lower, upper)) as reader:
+    with closing(cameras.reader(log)) as reader:
         stride = max(1, sum(1 for _ in paired(reader.frames())) // LOG_PAIRS)
         for number, pair in enumerate(paired(reader.frames())):
             if number % stride:
@@ -186,14 +169,13 @@ def paired(frames: Iterator[Frame], tolerance_ns: float = TOLERANCE_NS) -> Itera
             waiting = frame
 
 
-def open_log(log: Path, topics: tuple[str | None, str | None], rig: Rig | None) -> LogReader:
+def open_log(log: Path, cameras: LogCameras, rig: Rig | None) -> LogReader:
     """Open the log's two cameras: by the requested topics, by the rig's if the log has them, or by their names."""
-    rig_topics = rig.topics if rig else ("", "")
-    named = [requested or known or None for requested, known in zip(topics, rig_topics, strict=True)]
-    if rig and not any(topics):
+    if rig and not (cameras.lower or cameras.upper):
+        lower, upper = rig.topics
         with suppress(DriverError):
-            return LogReader(log, *named)
-    return LogReader(log, *topics)
+            return cameras._replace(lower=lower or None, upper=upper or None).reader(log)
+    return cameras.reader(log)
 
 
 def brightest(images: Iterable[Image]) -> Image:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from calib.panorama import remap_tables
 from calib.rig import MountedCamera, Rig
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.drive_observations import Topics, tracked_updates
+from drivers.logs.log_reader import AnyCameras, LogCameras
+from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.drive_start import with_masks
 from omnid.calibration.images import open_log
 from omnid.config import Config
@@ -55,7 +56,7 @@ class MaskCalibration:
 
 
 def calibrate_mask(
-    log: str | PathLike[str], rig: str | PathLike[str] | Rig, topics: Topics = (None, None)
+    log: str | PathLike[str], rig: str | PathLike[str] | Rig, topics: AnyCameras = (None, None)
 ) -> MaskCalibration:
     """Return the rig with masks of what is fixed to its cameras; OmnidError where the robot turns too little.
 
@@ -65,9 +66,10 @@ def calibrate_mask(
     log, rig = Path(log), rig if isinstance(rig, Rig) else read_rig(Path(rig))
     config = Config()
     # 1. What stays at all headings of the log, in the panoramas.
-    place = geometry(with_masks(log, rig, topics), config.panorama)
+    cameras = LogCameras(*topics)
+    place = geometry(with_masks(log, rig, cameras), config.panorama)
     front_end, parts = FrontEnd(place, config), FixedParts(place.cylinder)
-    with closing(open_log(log, topics, rig)) as reader:
+    with closing(open_log(log, cameras, rig)) as reader:
         for update in tracked_updates(reader, front_end, config, log):
             pair = update.depth.panoramas
             if update.state is not TrackingState.LOST and not pair.tiles.is_frozen:

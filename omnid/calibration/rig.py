@@ -28,6 +28,7 @@ from calib.models.ocam import OcamCamera, View
 from calib.rig import Rig
 from calib.rig_file import write_file, write_rig
 from calib.rig_frame import is_turned_over, rig_between
+from drivers.logs.log_reader import AnyCameras, LogCameras
 from omnid.calibration.board_search import AnyBoard, Progress, find_boards, select_diverse_views, silent
 from omnid.calibration.images import SIDES, Image, Images, PairedImages, brightest, read_pairs
 from omnid.calibration.rig_notes import GOOD_PART, MISFIT_PART, accuracy_warnings, missing_views
@@ -97,7 +98,7 @@ def calibrate_rig(
     source: str | PathLike[str],
     board: AnyBoard,
     *,
-    topics: tuple[str | None, str | None] = (None, None),
+    topics: AnyCameras = (None, None),
     model: ModelChoice = "auto",
     view: ViewChoice = "auto",
     with_struts: bool = False,
@@ -113,7 +114,7 @@ def calibrate_rig(
     image and each model. Raises OmnidError or CalibError where the images do not suffice.
     """
     # 1. Read the images, each once.
-    images = read_pairs(Path(source), *topics)
+    images = read_pairs(Path(source), LogCameras(*topics))
     for line in images.notes:
         progress(line)
     # 2. Find the board in all of them.

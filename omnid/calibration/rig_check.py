@@ -13,8 +13,8 @@ import numpy as np
 from calib.fit.rig_drift import apply_drift
 from calib.masks.rim_check import RimShift, rim_shift
 from calib.rig import Rig
-from drivers.logs.log_reader import LogReader
-from omnid.calibration.drive_observations import Topics, tracked_updates
+from drivers.logs.log_reader import LogCameras, LogReader
+from omnid.calibration.drive_observations import tracked_updates
 from omnid.calibration.images import SIDES, TOLERANCE_NS, brightest, open_log, paired
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import (
@@ -124,14 +124,14 @@ def _rim(name: str, rim: RimShift | None) -> str:
     )
 
 
-def check_log(log: Path, rig: Rig, topics: Topics) -> tuple[RigCheckResult, list[FramePair]]:
+def check_log(log: Path, rig: Rig, cameras: LogCameras) -> tuple[RigCheckResult, list[FramePair]]:
     """Check a rig by pairs spread over a log; return them as well. OmnidError where they show too little."""
-    with closing(open_log(log, topics, rig)) as reader:
+    with closing(open_log(log, cameras, rig)) as reader:
         pairs = read_rig_pairs(reader, rig)
     found = check_rig(pairs, rig, Config().panorama)
     if found.skewed:
         # The motion between the exposures would be taken for a drift.
-        found = replace(found, finding=moving_rig_finding(log, rig, topics, Config()))
+        found = replace(found, finding=moving_rig_finding(log, rig, cameras, Config()))
     if found.finding.state is RigState.UNCHECKED:
         raise OmnidError(
             f"calibrate drive: expected at least {MIN_MATCHES} points in both panoramas, found "
@@ -199,7 +199,7 @@ def check_rig(pairs: Sequence[FramePair], rig: Rig, config: PanoramaConfig) -> R
     return RigCheckResult(judge(together(found), rectification.cylinder), (rims[0], rims[1]), len(pairs), skew_s)
 
 
-def moving_rig_finding(log: Path, rig: Rig, topics: Topics, config: Config) -> RigFinding:
+def moving_rig_finding(log: Path, rig: Rig, cameras: LogCameras, config: Config) -> RigFinding:
     """Return what at most PAIRS pairs of cameras that are not synchronised say about the rig.
 
     The odometry finds the motion between the exposures, for which the pixels are corrected. OmnidError where no pose is
@@ -208,7 +208,7 @@ def moving_rig_finding(log: Path, rig: Rig, topics: Topics, config: Config) -> R
     place = geometry(rig, config.panorama)
     front_end = FrontEnd(place, config, RigHealth(place.cylinder, "warn"))
     found, number = list[Matches](), 0
-    with closing(open_log(log, topics, rig)) as reader:
+    with closing(open_log(log, cameras, rig)) as reader:
         stride = max(1, (reader.pair_estimate() or 0) // PAIRS)
         for update in tracked_updates(reader, front_end, config, log):
             exposure, seen = update.depth.exposure, update.depth.panoramas

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from calib.rig_file import read_rig, write_rig
 from omnid.commands.calibrate_options import HEIGHT, height, height_of, with_height
-from omnid.commands.options import cameras, command, option
+from omnid.commands.options import BITS, RATE, cameras, command, log_cameras, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -31,6 +31,8 @@ PARTS: Final = ("check", "height", "mask")
         "ruler; default: the one attached to the first log",
     ),
     *cameras("the {camera} camera's topic"),
+    BITS,
+    RATE,
     option(
         "--only",
         action="append",
@@ -101,12 +103,11 @@ def _check(args: argparse.Namespace) -> None:
 
 def _start(args: argparse.Namespace) -> Rig:
     """Return the rig to start from; refuse logs that cannot be read."""
-    from drivers.logs.log_reader import LogReader
     from omnid.runs.log_rig import attached_rig
 
     start = None if args.rig is None else read_rig(args.rig)
     for log in args.logs:
-        with closing(LogReader(log, args.lower, args.upper)) as reader:
+        with closing(log_cameras(args).reader(log)) as reader:
             start = start or attached_rig(reader, log)
     assert start is not None, "there is a log"
     return start
@@ -116,7 +117,7 @@ def _adjusted(args: argparse.Namespace, rig: Rig) -> Rig:
     """Return the rig that fits the drives best; the same one if none fits them better."""
     from omnid.calibration.drive import calibrate_drive
 
-    found = calibrate_drive(args.logs, rig, (args.lower, args.upper), lambda line: print(line, file=sys.stderr))
+    found = calibrate_drive(args.logs, rig, log_cameras(args), lambda line: print(line, file=sys.stderr))
     print("\n".join(found.lines()))
     if not found.is_better and not args.distance_m:
         print(f"{args.rig or 'the attached rig'} fits these drives as well as any rig")
@@ -141,7 +142,7 @@ def _checked(args: argparse.Namespace, rig: Rig) -> tuple[Rig, bool]:
     from omnid.calibration.rig_check import check_log, with_upper_corrected
     from omnid.core.rig.column_finding import RigState
 
-    found, pairs = check_log(args.logs[0], rig, (args.lower, args.upper))
+    found, pairs = check_log(args.logs[0], rig, log_cameras(args))
     print(found)
     if args.output is not None:
         rig, remains = with_upper_corrected(rig, pairs, found)
@@ -162,7 +163,7 @@ def _at_height(args: argparse.Namespace, rig: Rig) -> tuple[Rig, str]:
     if not is_wanted and (args.only is not None or rig.height_m() is not None):
         return rig, ""
     try:
-        found = calibrate_height(args.logs[0], rig, (args.lower, args.upper))
+        found = calibrate_height(args.logs[0], rig, log_cameras(args))
     except OmnidError as error:
         if is_wanted:
             raise
@@ -185,7 +186,7 @@ def _masked(args: argparse.Namespace, rig: Rig) -> Rig:
     if args.only is not None and "mask" not in args.only:
         return rig
     try:
-        found = calibrate_mask(args.logs[0], rig, (args.lower, args.upper))
+        found = calibrate_mask(args.logs[0], rig, log_cameras(args))
     except OmnidError as error:
         if args.only is not None:
             raise

@@ -18,6 +18,7 @@ from omnid.commands.options import SETTINGS, cameras, command, option, settings_
 from omnid.errors import OmnidError
 
 if TYPE_CHECKING:  # the help and other commands do not load these
+    from drivers.logs.log_reader import LogCameras
     from omnid.calibration.images import Image
     from omnid.calibration.live_boards import LiveBoards, PairOutcome
     from omnid.config import Config
@@ -95,10 +96,17 @@ def _taken_before(folder: Path | None, boards: LiveBoards) -> int:
     return max((int(name) for name in lower | upper if name.isascii() and name.isdigit()), default=0)
 
 
+def _cameras_of(args: argparse.Namespace) -> LogCameras:
+    from drivers.logs.log_reader import LogCameras
+
+    config = settings_of(args)
+    return LogCameras(args.lower, args.upper, config.cameras.bits, config.log.rate_hz)
+
+
 def _of_log(args: argparse.Namespace) -> Iterator[tuple[Image, Image]]:
     from omnid.calibration.images import read_pairs
 
-    pairs = read_pairs(args.log, args.lower, args.upper)
+    pairs = read_pairs(args.log, _cameras_of(args))
     return ((pairs.sides[0][name], pairs.sides[1][name]) for name in pairs.names)
 
 

@@ -12,7 +12,7 @@ from omnid.calibration.board_search import silent
 from omnid.calibration.rig import calibrate_rig
 from omnid.calibration.view_guess import VIEW_CHOICES, VIEW_HELP
 from omnid.commands.calibrate_options import BOARD, HEIGHT, board_of, height_of, with_height
-from omnid.commands.options import cameras, command, option
+from omnid.commands.options import BITS, RATE, cameras, command, log_cameras, option
 from omnid.errors import OmnidError
 from omnid.sinks.files import check_outputs
 
@@ -37,6 +37,8 @@ MODEL_HELP = (
         help="the measured distance of the mirrors: a result that differs by more than a tenth is refused",
     ),
     *cameras("a log's topic of the {camera} camera"),
+    BITS,
+    RATE,
     option("--model", choices=MODEL_CHOICES, default="auto", help=MODEL_HELP),
     option("--view", choices=VIEW_CHOICES, default="auto", help=VIEW_HELP),
     option(
@@ -66,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     found = calibrate_rig(
         args.images,
         board,
-        topics=(args.lower, args.upper),
+        topics=log_cameras(args),
         model=args.model,
         view=args.view,
         with_struts=args.mask,

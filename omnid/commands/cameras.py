@@ -110,7 +110,10 @@ def _images(args: argparse.Namespace) -> Iterator[tuple[Camera, list[Image]]]:
 def _of_log(args: argparse.Namespace, camera: Camera) -> Generator[Frame, None, None]:
     from drivers.logs.log_reader import LogReader
 
-    with closing(LogReader(args.log, args.lower, args.upper)) as reader:
+    config = settings_of(args)
+    with closing(
+        LogReader(args.log, args.lower, args.upper, bits=config.cameras.bits, rate_hz=config.log.rate_hz)
+    ) as reader:
         yield from (frame for frame in reader.frames() if frame.camera == camera)
 
 

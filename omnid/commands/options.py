@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from calib.rig import Rig
+    from drivers.logs.log_reader import LogCameras
     from omnid.config import Config
 
 PROFILES: Final = {
@@ -188,6 +189,13 @@ RATE: Final = option(
     setting="log.rate_hz",
     help="images per second of folders of images; default: by their names in nanoseconds, or the seconds in times.txt",
 )
+BITS: Final = option(
+    "--bits",
+    type=int,
+    choices=(8, 10, 12, 16),
+    default=16,
+    help="bits of the cameras in images of 16 bits a sample; default: 16",
+)
 TRUTH: Final = option("--truth", type=Path, metavar="FILE", help="the true path of the rig, TUM format")
 
 
@@ -216,6 +224,13 @@ def cameras(
 def log_with_rig(text: str) -> tuple[Option, ...]:
     """Declare LOG, --rig, --lower and --upper. text: the help of LOG."""
     return (option("log", type=Path, metavar="LOG", help=text), RIG, *cameras("the {camera} camera's topic"))
+
+
+def log_cameras(args: argparse.Namespace) -> LogCameras:
+    """Return the cameras of a log by --lower, --upper, --bits and --rate."""
+    from drivers.logs.log_reader import LogCameras
+
+    return LogCameras(args.lower, args.upper, args.bits, args.rate or 0.0)
 
 
 def rig_of(args: argparse.Namespace) -> Rig:

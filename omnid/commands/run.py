@@ -96,7 +96,7 @@ def _recorded(args: argparse.Namespace, config: Config) -> tuple[OpenCamera, Log
     from omnid.engine.logging_setup import log
     from omnid.runs.sensor_sources import motion_topics
 
-    images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config))
+    images = LogImages.load(args.log, args.lower, args.upper, motion_topics(config), config.cameras.bits)
     for warning in images.warnings:
         log(logging.WARNING, warning)
     clocks: defaultdict[int, LogClock] = defaultdict(LogClock)  # one for each time that both cameras are opened

@@ -192,6 +192,7 @@ class _Replay:
             window=log.reorder_frames,
             span_s=self._options.span_s,
             motion=motion,
+            bits=self._config.cameras.bits,
             rate_hz=log.rate_hz,
         )
         named = ("", "")
