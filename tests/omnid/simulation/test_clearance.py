@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnid.simulation import clearance
 from omnid.simulation.clearance import DriveRecord, clearance_m, footprints
 from omnid.simulation.rendering.shapes import box
 from omnid.simulation.rendering.surfaces import Rectangle
@@ -17,11 +16,6 @@ def upright(height_m: float, from_m: float = 0.0) -> Rectangle:
     """Return a wall along x from 0 to 2 at y 1."""
     top = np.array([0.0, 1.0, from_m + height_m])
     return Rectangle(top, np.array([2.0, 0, 0]), np.array([0, 0, -height_m]), np.zeros((8, 8), np.uint8), "wall")
-
-
-def test_a_wall_is_its_line_on_the_floor() -> None:
-    (segment,) = footprints([upright(1.0)], 0.5)
-    assert sorted(map(tuple, segment.tolist())) == [(0.0, 1.0), (2.0, 1.0)]
 
 
 @pytest.mark.parametrize("wall", [upright(0.01), upright(1.0, from_m=0.6)], ids=["a sill", "above the robot"])
@@ -45,11 +39,3 @@ def test_a_contact_is_reported_when_it_begins() -> None:
     for distance_m in (0.1, -0.01, -0.02, 0.1, 0.0):
         record.add_clearance(distance_m, (1.0, 2.0, 0.0))
     assert record.contacts == 2 and lines == ["contact with an obstacle at 1.00, 2.00 m in the world"] * 2
-
-
-def test_the_oldest_poses_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clearance, "MOST_POSES", 3)
-    record = DriveRecord(None)
-    for stamp_ns in range(5):
-        record.add_pose(stamp_ns, (0.0, 0.0, 0.0))
-    assert list(record.truth) == [2, 3, 4]
