@@ -29,7 +29,7 @@ def check_seconds(seconds: float | None) -> None:
 )
 def run(args: argparse.Namespace) -> int:
     """Show the robot until the end; return 1 if no pose was received."""
-    from omnid.monitor.follow import listen
+    from omnid.monitor.listen import listen
 
     check_seconds(args.seconds)
     return listen(settings_of(args).bus, args.tum, args.mcap, args.seconds, shows_load=args.load)

@@ -14,7 +14,7 @@ from omnid.errors import OmnidError
 from omnid.plain_text import plain
 from omnid.transport.decode import Diagnostics, Pose, decode_diagnostics, decode_pose
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.status_names import SIMULATION, Key
+from omnid.transport.status_names import SIMULATION, STAGE_PREFIX, Key
 
 NO_POSE_S: Final = 2.0  # Without a pose for this time, state and rate of the last poses are no longer shown.
 _INBOX_DEPTH: Final = 2000
@@ -148,3 +148,8 @@ class RobotState:
             gone = ", its daemon has ended or cannot be reached" if self.alive is False else ""
             return f"no pose for {self.time_since_pose_s:.0f} s{gone}"
         return plain(self.pose.state)
+
+
+def importance(status: DiagnosticStatus) -> tuple[int, bool, str]:
+    """Return a key by which entries are sorted: the worst first, stages last, then by name."""
+    return -(status.level % 4), status.name.startswith(STAGE_PREFIX), status.name

@@ -12,8 +12,7 @@ import numpy as np
 
 from calib import se3
 from omnid.engine.telemetry import Histogram
-from omnid.monitor.robot_state import RobotState
-from omnid.monitor.screen import importance
+from omnid.monitor.robot_state import RobotState, importance
 from omnid.plain_text import plain
 from omnid.transport.codec import OK
 from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
