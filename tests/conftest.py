@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import os
 import shutil
@@ -13,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from omnid.cli import limit_blas_threads
+from omnid.core.compiled import cache_folder, why_unusable
 from omnid.engine.kernel_cache import prepare_kernels
-from omnid.engine.kernel_store import cache_folder
 from tests.replay.edited import images, save
 from tests.simulation import build, write_log
 
@@ -54,7 +55,12 @@ def kernels(request: pytest.FixtureRequest) -> None:
     """
     os.environ["OMNID_CACHE_DIR"] = str(cache_folder())
     if any(item.path.parent != Path(__file__).parent for item in request.session.items):
-        prepare_kernels(lambda level, line: None)
+        if why_unusable(cache_folder()):
+            prepare_kernels(lambda level, line: None)
+            return
+        with (cache_folder() / "tests.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            prepare_kernels(lambda level, line: None)
 
 
 @pytest.fixture(scope="session")

@@ -1,97 +1,74 @@
-"""Functions compiled to machine code: the one way in which loops over pixels and landmarks become fast.
+"""Functions compiled to machine code by numba: the one way in which loops over pixels and landmarks become fast.
 
-A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only: the code
-kept on disk is made again when one of them changes (engine/kernel_store.py), and constants of other files would not be
-noticed. There is no second version in Python. Results are the same bytes in every run: no reordering of sums
-(fastmath), no threads inside. The global lock of Python is released meanwhile.
-
-numba makes the code (native_code.py); it is imported only where code is missing. What is kept runs without numba: LLVM
-loads it, and ctypes calls it. A function writes its results to arrays and returns nothing. It does not assign an array
-to an array (`a[:] = b`): the check of their shapes calls numba's run time, which is not there. Indices are not checked.
+A compiled function lies in a file `*_kernels.py`, which imports numpy, this module and other such files only: numba
+keeps the code on disk by the file of the function itself, so it would not notice a change of a function or a constant
+in another file. Therefore the code is kept in a folder that is named by a digest of all these files. There is no second
+version in Python. Results are the same bytes in every run: no reordering of sums (fastmath), no threads inside. The
+global lock of Python is released meanwhile. Indices are not checked. numba is imported with the first compilation.
 """
 
 from __future__ import annotations
 
-import ctypes
+import hashlib
 import inspect
-from collections.abc import Callable, Iterator, Sequence
+import os
+import platform
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any, Final, Generic, ParamSpec, TypeVar
-
-import numpy as np
-
-from omnid.core.kernel_arguments import Argument, arguments_of, c_type
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 KERNEL_FILES: Final = "*_kernels.py"
+PACKAGE: Final = Path(__file__).parents[1]
+# error_model: a division by zero gives inf or NaN as in numpy.
+OPTIONS: Final = {"nogil": True, "error_model": "numpy"}
+_OTHERS_MAY_WRITE: Final = 0o022
 _declared: list[Kernel[Any, Any]] = []
 
 
 class Kernel(Generic[P, R]):
-    """A function that is compiled before its first call, for the types of its signature."""
+    """A function that is compiled, or read from the disk, before its first call, for the types of its signature."""
 
-    def __init__(self, function: Callable[P, R], arguments: Sequence[Argument]) -> None:
-        self.function, self.arguments = function, arguments
-        self._compiled: Any = None
-        self._engine: Any = None  # has the code's memory
+    def __init__(self, function: Callable[P, R], signature: str, writes: tuple[str, ...]) -> None:
+        self.function, self.signature, self.writes = function, signature, writes
+        self._compiled: Callable[P, R] | None = None
         self.__doc__, self.__name__ = function.__doc__, function.__name__
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         """Call the function, which is compiled first if that was not done; TypeError for other types."""
         if self._compiled is None:
-            self.load(self.code())
-        values = inspect.signature(self.function).bind(*args, **kwargs).args if kwargs else args
-        try:
-            status = self._compiled(id(np.ndarray), *values)
-        except ctypes.ArgumentError as error:
-            raise TypeError(f"{self.symbol}: {error}") from error
-        if status:
-            self._fail(status)
-        return None  # type: ignore[return-value]  # native_code.py refuses a function that returns something
-
-    @property
-    def symbol(self) -> str:
-        """Name of the function in its code."""
-        return f"{self.function.__module__}.{self.function.__qualname__}"
+            self.compile(kept_folder())
+        return self._compiled(*args, **kwargs)  # type: ignore[misc]  # it is compiled now
 
     @property
     def is_compiled(self) -> bool:
         """True once the function is compiled."""
         return self._compiled is not None
 
-    def code(self) -> bytes:
-        """Compile the function for its signature and return its code, for this processor."""
-        from omnid.core.native_code import native_code
+    def compile(self, folder: Path | None) -> None:
+        """Compile the function, or read it from a folder, which keeps it; None: nothing is read or kept."""
+        if self._compiled is not None:
+            return
+        if folder is not None:
+            os.environ["NUMBA_CACHE_DIR"] = str(folder)
+        import numba
 
-        return native_code(self.function, self.symbol, self.arguments)
-
-    def load(self, code: bytes) -> None:
-        """Take code, which was compiled here or read from the disk."""
-        types = [ctypes.c_void_p, *map(c_type, self.arguments)]
-        self._engine = _loaded(code)
-        self._compiled = ctypes.CFUNCTYPE(ctypes.c_int32, *types)(self._engine.get_function_address(self.symbol))
-
-    def _fail(self, status: int) -> None:
-        """Raise the error that a call has returned: the number of a wrong array below zero, or numba's above."""
-        if status > 0:
-            raise MemoryError(f"{self.symbol}: no memory for its arrays")
-        wrong = self.arguments[-1 - status]
-        layout = ", contiguous" * wrong.is_contiguous + ", writable" * wrong.is_written
-        raise TypeError(f"{self.symbol}: {wrong.name} is no array of {wrong.dimensions} axes of {wrong.kind}{layout}")
-
-
-def _loaded(code: bytes) -> Any:
-    """Return LLVM's loader of this code only: inner functions of other codes may have the same names."""
-    import llvmlite.binding as llvm
-
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine(jit=True, codemodel="jitdefault")
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    return engine
+        if folder is not None:
+            numba.config.CACHE_DIR = str(folder)  # where another module has imported numba before
+        types = eval(self.signature, {}, vars(numba.types))
+        names = inspect.signature(self.function).parameters
+        wanted = [
+            # Arrays that are not written may be read-only ones.
+            kind.copy(readonly=True) if isinstance(kind, numba.types.Array) and name not in self.writes else kind
+            for kind, name in zip(types, names, strict=True)
+        ]
+        self._compiled = numba.njit(tuple(wanted), cache=folder is not None, **OPTIONS)(self.function)
 
 
 class Inner(Generic[P, R]):
@@ -109,10 +86,10 @@ class Inner(Generic[P, R]):
     @property
     def _numba_type_(self) -> Any:
         """The type by which numba compiles calls of this object."""
-        from omnid.core.native_code import inner_dispatcher
+        import numba
 
         if self._dispatcher is None:
-            self._dispatcher = inner_dispatcher(self.function)
+            self._dispatcher = numba.njit(**OPTIONS)(self.function)
         return self._dispatcher._numba_type_
 
 
@@ -124,7 +101,7 @@ def compiled(signature: str, writes: tuple[str, ...] = ()) -> Callable[[Callable
     """
 
     def decorate(function: Callable[P, R]) -> Kernel[P, R]:
-        kernel = Kernel(function, tuple(arguments_of(function, signature, writes)))
+        kernel = Kernel(function, signature, writes)
         _declared.append(kernel)
         return kernel
 
@@ -139,3 +116,54 @@ def inner(function: Callable[P, R]) -> Inner[P, R]:
 def declared() -> Iterator[Kernel[Any, Any]]:
     """Return the compiled functions of all files that were imported so far, in the order of their declaration."""
     return iter(tuple(_declared))
+
+
+def cache_folder() -> Path:
+    """Return the folder for what omnid can make again: of the service (systemd), of the user, or OMNID_CACHE_DIR."""
+    if own := os.environ.get("OMNID_CACHE_DIR"):
+        return Path(own)
+    if of_service := os.environ.get("CACHE_DIRECTORY", "").split(":")[0]:
+        return Path(of_service)
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if Path(base).is_absolute() else Path("~/.cache").expanduser()) / "omnid"
+
+
+def folder_of_state() -> Path:
+    """Return the folder for the code of these files, by these versions, for this processor."""
+    return cache_folder() / f"kernels-{_state()}"
+
+
+@cache
+def _state() -> str:
+    """Return a digest of all that decides about the code, and of what numba compares: the times of the files."""
+    import llvmlite.binding as llvm
+
+    settings = sorted(pair for pair in os.environ.items() if pair[0].startswith("NUMBA_") and "CACHE" not in pair[0])
+    processor = platform.machine(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    digest = hashlib.sha256(repr((sys.version, version("numba"), processor, settings, str(PACKAGE))).encode())
+    for path in (Path(__file__), *sorted(PACKAGE.rglob(KERNEL_FILES))):
+        digest.update(repr((path.name, path.stat().st_mtime_ns, path.read_bytes())).encode())
+    return digest.hexdigest()[:20]
+
+
+def why_unusable(folder: Path) -> str:
+    """Return why no code can be kept in the cache folder, which is made if needed; empty if it can.
+
+    What is read there is run. Other users are kept out by owner and mode; a program of the same user could change this
+    program as well.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        if status.st_uid != os.geteuid() or status.st_mode & _OTHERS_MAY_WRITE:
+            return "it belongs to another user, or others can write to it"
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
+
+
+def kept_folder() -> Path | None:
+    """Return the folder with the code of this state; None where there is none that only this user can write."""
+    folder = folder_of_state()
+    return folder if folder.is_dir() and not (why_unusable(cache_folder()) or why_unusable(folder)) else None

@@ -145,18 +145,17 @@ def compiled_functions(service: Path = CACHE) -> Iterator[Finding]:
         yield Finding(
             "warning",
             "compiled code",
-            f"cannot be kept in {kept.folder}: {kept.unusable}: every start takes some 20 s longer",
+            f"cannot be kept in {kept.folder}: {kept.unusable}: every start takes half a minute longer",
             "make that folder writable, or set OMNID_CACHE_DIR to another one",
         )
-    elif kept.missing:
+    elif kept.is_kept:
+        yield Finding("ok", "compiled code", f"kept in {kept.folder}")
+    else:
         yield Finding(
             "ok",
             "compiled code",
-            f"{kept.missing} functions will be compiled at the next start, which "
-            f"takes some 20 s, and be kept in {kept.folder}",
+            f"the next start compiles it, which takes half a minute, and keeps it in {kept.folder}",
         )
-    else:
-        yield Finding("ok", "compiled code", f"{kept.kept} functions in {kept.folder}")
 
 
 def _version(package: str) -> str:

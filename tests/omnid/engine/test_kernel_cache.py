@@ -1,52 +1,139 @@
-"""Compiled functions: made ready by programs of their own, and kept for other programs of the same sources."""
+"""Compiled functions kept on the disk: one program compiles them, later ones read them, and nothing else.
+
+A copy of omnid has two files with compiled functions, of which one calls the other, so that a test takes seconds.
+"""
 
 from __future__ import annotations
 
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from omnid.engine import kernel_store
-from tests.omnid.engine.kernel_programs import (
-    READ,
-    ROOT,
-    compilations,
-    run,
-)
+ROOT = Path(__file__).parents[3]
+CALLEE = """
+from omnid.core.compiled import inner
+
+@inner
+def part(value):
+    return value / 2
+"""
+CALLER = """
+from omnid.core.callee_kernels import part
+from omnid.core.compiled import compiled
+
+@compiled("(f8[::1], f8[::1])", writes=("out",))
+def parts(values, out):
+    for n in range(len(values)):
+        out[n] = part(values[n])
+"""
+PROGRAM = """
+import logging, sys
+if "deny" in sys.argv:
+    import ctypes
+    if ctypes.CDLL(None, use_errno=True).prctl(65, 1, 0, 0, 0) != 0:  # PR_SET_MDWE, PR_MDWE_REFUSE_EXEC_GAIN
+        sys.exit(77)
+from omnid.engine.kernel_cache import prepare_kernels
+prepare_kernels(lambda level, line: print(logging.getLevelName(level), line, flush=True))
+import numpy as np
+from omnid.core.caller_kernels import parts
+out = np.zeros(2)
+parts(np.array([3.0, 6.0]), out)
+print(out.tolist())
+"""
+HALVES = "[1.5, 3.0]"
 
 
-def test_functions_are_compiled_by_a_helper_and_kept(compiled_once: tuple[Path, str]) -> None:
-    cache, printed = compiled_once
-    lines = printed.splitlines()
-    assert lines[0].startswith("INFO compiling 1 functions") and lines[-2].startswith("INFO compiled in ")
-    assert lines[-1] == READ
-    kept = {path.name for path in cache.glob("kernels-*")}
-    assert len(kept) == kernel_store.MAX_FOLDERS + 1 and "kernels-100" in kept and "kernels-0" not in kept
-    assert not [*cache.glob("making-*")]
-
-
-def test_a_copy_of_the_same_sources_compiles_nothing(cache: Path, tmp_path: Path) -> None:
-    """As another virtual environment does, and an installation of a later day."""
-    copy = tmp_path / "copy"
-    for folder in ("omnid", "drivers", "calib", "tests/omnid/engine"):
+@pytest.fixture
+def copy(tmp_path: Path) -> Path:
+    """A folder with the copy of omnid."""
+    for package in ("omnid", "drivers", "calib"):
         shutil.copytree(
-            ROOT / folder,
-            copy / folder,
-            copy_function=shutil.copyfile,
-            ignore=shutil.ignore_patterns("__pycache__", "*.mcap"),
+            ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("__pycache__", "*.mcap", "*_kernels.py")
         )
-    (copy / "tests/__init__.py").touch()
-    done = run(cache, root=copy)
-    assert done.stdout == f"{READ}\n", done.stderr
-    source = copy / "tests/omnid/engine/sample_kernels.py"
-    source.write_text(source.read_text().replace("/ 2", "* 0.5"))
-    changed = run(cache, root=copy)
-    assert compilations(changed.stdout) == 1, changed.stderr
+    (tmp_path / "omnid/core/callee_kernels.py").write_text(CALLEE)
+    (tmp_path / "omnid/core/caller_kernels.py").write_text(CALLER)
+    return tmp_path
 
 
-def test_a_system_that_denies_compiled_code_is_named(tmp_path: Path) -> None:
-    done = run(tmp_path, "deny")
-    if done.returncode == 77:
+def started(copy: Path, cache: Path, *arguments: str) -> subprocess.Popen[str]:
+    environment = os.environ | {"OMNID_CACHE_DIR": str(cache), "PYTHONPATH": str(copy)}
+    command = [sys.executable, "-P", "-c", PROGRAM, *arguments]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, cwd=copy)
+
+
+def run(copy: Path, cache: Path, *arguments: str) -> list[str]:
+    """Return what a program prints."""
+    with started(copy, cache, *arguments) as program:
+        output, errors = program.communicate(timeout=300)
+    return (output + errors).splitlines()
+
+
+def files_in(folder: Path) -> set[Path]:
+    """Return the files below a folder, but for those of Python."""
+    return {path for path in folder.rglob("*") if path.is_file() and path.suffix != ".pyc"}
+
+
+def test_the_first_program_compiles_and_others_read_until_a_file_is_edited(copy: Path) -> None:
+    """Also one that only the callee is in, which numba itself would not notice."""
+    cache = copy / "cache"
+    with started(copy, cache) as one, started(copy, cache) as other:
+        outputs = [program.communicate(timeout=300)[0].splitlines() for program in (one, other)]
+    assert [output[-1] for output in outputs] == [HALVES, HALVES]
+    assert any(output[0].startswith("INFO compiling the loops") for output in outputs)
+    (kept,) = cache.iterdir()
+    assert kept.name.startswith("kernels-") and run(copy, cache) == [HALVES]
+    for index in range(9):
+        (cache / f"kernels-{index}").mkdir()
+        os.utime(cache / f"kernels-{index}", (index, index))
+    (copy / "omnid/core/callee_kernels.py").write_text(CALLEE.replace("/ 2", "/ 3"))
+    first, *_, last = run(copy, cache)
+    assert first.startswith("INFO compiling") and last == "[1.0, 2.0]"
+    assert len([*cache.iterdir()]) == 5 and kept.exists(), "code of few other states stays"
+
+
+def test_in_a_read_only_installation_without_a_cache_there_is_one_warning_and_no_file(copy: Path) -> None:
+    before = files_in(copy)
+    for path in (copy / "omnid").rglob("*"):
+        path.chmod(0o555)
+    warning, result = run(copy, Path("/proc/no/cache"))
+    assert warning.startswith("WARNING the compiled functions are not kept in /proc/no/cache: ") and result == HALVES
+    assert "set OMNID_CACHE_DIR" in warning
+    assert files_in(copy) == before
+
+
+def test_damaged_code_is_removed_and_compiled_again(copy: Path) -> None:
+    cache = copy / "cache"
+    run(copy, cache)
+    for path in cache.rglob("*.nb*"):
+        path.write_bytes(path.read_bytes()[:20])
+    warning, result = run(copy, cache)
+    assert warning.startswith("WARNING") and "damaged" in warning and result == HALVES
+    assert run(copy, cache)[0].startswith("INFO compiling") and run(copy, cache) == [HALVES]
+
+
+def test_code_that_others_could_have_written_is_not_read(copy: Path) -> None:
+    cache = copy / "cache"
+    run(copy, cache)
+    (kept,) = cache.iterdir()
+    kept.chmod(0o720)
+    assert run(copy, cache)[0].startswith("INFO compiling") and run(copy, cache) == [HALVES]
+    for mode, owner in ((0o702, -1), (0o700, 12345)):
+        cache.chmod(mode)
+        if owner >= 0 and os.geteuid() != 0:
+            continue
+        os.chown(cache, owner, -1)
+        warning, result = run(copy, cache)
+        assert "it belongs to another user, or others can write to it" in warning and result == HALVES
+
+
+def test_a_system_that_denies_compiled_code_is_named(copy: Path) -> None:
+    with started(copy, copy / "cache", "deny") as program:
+        _, errors = program.communicate(timeout=300)
+    if program.returncode == 77:
         pytest.skip("this kernel has no PR_SET_MDWE (Linux 6.3)")
-    assert "OmnidError: the system allows no code that is compiled at run time: remove MemoryDenyWrite" in done.stderr
+    assert "OmnidError: the system allows no code that is compiled at run time: remove MemoryDenyWrite" in errors
