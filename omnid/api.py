@@ -22,7 +22,7 @@ from calib.rig_file import read_rig
 from drivers.errors import DriverError
 from drivers.frame import Camera, Frame
 from omnid.config import Config, load_config, unused_settings
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.engine.threads import Lock
 from omnid.errors import OmnidError
@@ -32,8 +32,7 @@ from omnid.runs.run_result import RunResult
 from omnid.settings import dump, parse
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry, with_rims
-from omnid.stages.repeated_images import RepeatedImages
-from omnid.stages.skew import Skew
+from omnid.stages.synchronise import RepeatedImages, Skew
 
 FilePath: TypeAlias = str | PathLike[str]
 GreyImage: TypeAlias = NDArray[np.uint8]  # (H, W)

@@ -31,10 +31,10 @@ from omnid.core.rig.column_finding import (
 from omnid.core.rig.rig_health import RigHealth
 from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.decoder import Decoder
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
+from omnid.stages.synchronise import Decoder
 
 # Number of pairs that are used, spread over the log: some thousand matches of different places.
 PAIRS: Final = 24

@@ -103,7 +103,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def _start(args: argparse.Namespace) -> Rig:
     """Return the rig to start from; refuse logs that cannot be read."""
-    from omnid.runs.log_rig import attached_rig
+    from omnid.runs.session import attached_rig
 
     start = None if args.rig is None else read_rig(args.rig)
     for log in args.logs:

@@ -181,7 +181,7 @@ def _exported(
     from omnid.formats.plan import drawn_heights
     from omnid.formats.ply import write_ply
     from omnid.sinks.files import check_outputs, write_plan
-    from omnid.stages.floor import ADVICE
+    from omnid.stages.obstacles import ADVICE
 
     if not 0.005 <= args.cell <= 10:
         raise OmnidError(f"--cell {args.cell:g}: expected an edge of 0.005 to 10 m")

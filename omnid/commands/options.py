@@ -243,7 +243,7 @@ def rig_of(args: argparse.Namespace) -> Rig:
 def attached_rig_of(args: argparse.Namespace) -> Rig:
     """Return the rig that is attached to args.log. Raise OmnidError if there is none."""
     from drivers.logs.log_reader import LogReader
-    from omnid.runs.log_rig import attached_rig
+    from omnid.runs.session import attached_rig
 
     with closing(LogReader(args.log, args.lower, args.upper)) as reader:
         return attached_rig(reader, args.log)

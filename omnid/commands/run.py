@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.cameras.log_camera import LogCamera, LogMotion
     from drivers.frame import Camera
     from omnid.config import Config
-    from omnid.runs.live_robot import OpenCamera
+    from omnid.runs.live import OpenCamera
 
 
 @command(
@@ -60,8 +60,7 @@ def run(args: argparse.Namespace) -> int:
     use_one_malloc_arena()  # first: the next imports load numpy, which starts threads
     from omnid.config import unused_settings
     from omnid.engine.logging_setup import HANDLER, log
-    from omnid.runs.live import LiveRun
-    from omnid.runs.live_robot import ConnectedRobot
+    from omnid.runs.live import ConnectedRobot, LiveRun
 
     devices = {"cameras.lower": args.lower, "cameras.upper": args.upper}
     config = settings_of(args, devices if args.log is None else {})

@@ -19,7 +19,7 @@ AUTO, REAL_TIME = "auto", "1.0"
 
 if TYPE_CHECKING:  # the help and other commands do not load these
     from drivers.motors.simulated.simulated_base import Pose
-    from omnid.runs.live_robot import LiveRobot
+    from omnid.runs.live import LiveRobot
     from omnid.simulation.paced_robot import PacedRobot
     from omnid.simulation.realtime import RealtimeRobot, SimulatedGyro
     from omnid.simulation.robot import SimulatedRobot
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     geometry = config.motor.drive.geometry()
     with closing(RealtimeRobot(world, _robot(args), config.motor.protocol, geometry, args.seed, warn)) as robot:
         config = replace(config, motor=replace(config.motor, port=robot.port))
-        gyro = robot.open_gyro() if config.motion.imu != "off" else None
+        gyro = robot.open_gyro() if config.motion.imu == "auto" else None
         code = LiveRun(config, _connected(robot, gyro), log, robot.rig, show).run()
     return _end(args, robot, code)
 
@@ -114,7 +114,7 @@ def _connected(robot: RealtimeRobot, gyro: SimulatedGyro | None) -> LiveRobot:
     """Return the robot as the run sees it; cameras that are opened together have one clock."""
     from drivers.cameras.log_camera import LogClock
     from drivers.frame import Camera
-    from omnid.runs.live_robot import ConnectedRobot
+    from omnid.runs.live import ConnectedRobot
     from omnid.simulation.realtime import SimulatedCamera
 
     clocks: defaultdict[int, LogClock] = defaultdict(LogClock)

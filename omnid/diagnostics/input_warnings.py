@@ -7,9 +7,8 @@ from typing import Final
 
 from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
-from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.stages.repeated_images import FROZEN_IMAGES
-from omnid.stages.synchronise import Synchronise
+from omnid.diagnostics.run_summary import RunStatistics
+from omnid.stages.synchronise import FROZEN_IMAGES, Synchronise
 from omnid.tracking_state import TrackingState
 
 DARK_SHARE: Final = 0.1  # Share of dark pairs from which there is a warning.

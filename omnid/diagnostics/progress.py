@@ -7,7 +7,7 @@ import sys
 import time
 from typing import TextIO
 
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.messages import OdometryUpdate
 
 TERMINAL_PERIOD_S = 0.2

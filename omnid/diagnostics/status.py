@@ -13,7 +13,7 @@ from omnid.controller.statistics import ControllerState, ControllerStatistics
 from omnid.core.control.arming import STARTED
 from omnid.core.control.collision_monitor import remedy
 from omnid.core.control.safety_rules import ASKED, COMMAND_STALE, FAILED, IDLE, NOT_ARMED
-from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
+from omnid.diagnostics.run_summary import RunCounters, RunStatistics
 from omnid.engine.telemetry import Histogram, StageStats, Telemetry
 from omnid.messages import OdometryUpdate
 from omnid.stages.synchronise import Synchronise

@@ -10,8 +10,7 @@ from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRa
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
 from omnid.core.nanoseconds import S_PER_NS
-from omnid.light.exposure_law import STEP_S, ExposureLaw, ExposureState
-from omnid.light.grey_levels import GreyLevels, UsefulArea
+from omnid.light.exposure_law import STEP_S, ExposureLaw, ExposureState, GreyLevels, UsefulArea
 from omnid.messages import FramePair
 from omnid.transport.codec import OK, WARN
 from omnid.transport.records import DiagnosticStatus

@@ -24,16 +24,15 @@ from omnid.messages import (
     OdometryUpdate,
     PlaceUpdate,
 )
-from omnid.sinks.drive import LiveDrive, ReplayDrive, SimulatedWheels
+from omnid.sinks.drive import LiveDrive, ReplayDrive
 from omnid.sinks.encoder import Outgoing
-from omnid.stages.floor import CameraFloor
+from omnid.sinks.simulated_wheels import SimulatedWheels
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
-from omnid.stages.grid import MapGrid
 from omnid.stages.lockstep_drive import LockstepDrive
-from omnid.stages.mapping import Mapping, always
+from omnid.stages.mapping import MapGrid, Mapping, always
 from omnid.stages.navigation import NavigationStage
-from omnid.stages.obstacles import Obstacles
+from omnid.stages.obstacles import CameraFloor, Obstacles
 from omnid.stages.places import Places
 from omnid.stages.routes import RouteMap, Routes
 

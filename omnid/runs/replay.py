@@ -22,7 +22,7 @@ from omnid.config import Config
 from omnid.controller.motor import SIMULATED
 from omnid.core.places.place_map import PlaceMap
 from omnid.core.rig.rig_health import RigContradictedError
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.flow import Slot
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Sink, Stream
 from omnid.engine.kernel_cache import prepare_kernels
@@ -31,21 +31,20 @@ from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import Telemetry
 from omnid.errors import OmnidError
 from omnid.messages import MapUpdate, OdometryUpdate
-from omnid.runs.log_rig import attached_rig
 from omnid.runs.pipeline import RecordingSink, RunParts, Sinks, wire
 from omnid.runs.place_maps import RigPlaces, RunPlaces
 from omnid.runs.rig_checks import examined_rig
-from omnid.runs.run_report import RunReport
-from omnid.runs.run_result import RunFailedError, RunResult
+from omnid.runs.run_result import RunFailedError, RunReport, RunResult
 from omnid.runs.sensor_sources import motion_topics
-from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session
+from omnid.runs.session import LOG_POINTS, OPENCV_THREADS, Session, attached_rig
 from omnid.settings import dump
 from omnid.sinks.bus_sink import BusSink
-from omnid.sinks.drive import ReplayDrive, SimulatedWheels
+from omnid.sinks.drive import ReplayDrive
 from omnid.sinks.encoder import Outgoing
 from omnid.sinks.files import MapFile, PlanFile, TrajectoryFile, check_outputs, write_known
 from omnid.sinks.pose_collector import MapPoseCollector, PoseCollector
 from omnid.sinks.recorder import Recorder, SingleLog
+from omnid.sinks.simulated_wheels import SimulatedWheels
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.synchronise import Synchronise

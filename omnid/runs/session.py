@@ -5,29 +5,44 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
 from calib.models.names import sees_directly
 from calib.rig import Rig
-from calib.rig_file import rig_toml
+from calib.rig_file import parse_rig, rig_toml
 from drivers.frame import Frame
+from drivers.logs.log_reader import LogReader
 from omnid.config import Config
 from omnid.controller.link import ControllerLink
 from omnid.controller.messages import ControllerStart
 from omnid.core.control.collision_monitor import STOP
 from omnid.core.control.control_law import ControllerSettings
 from omnid.core.obstacles.column import FLOOR_FOCAL_PX
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.engine.process import handle_stop_signals
 from omnid.engine.realtime import RealtimeSettings
 from omnid.engine.telemetry import StageStats
 from omnid.engine.threads import returns_within
+from omnid.errors import OmnidError
 from omnid.settings import dump
 from omnid.sinks.encoder import Encoder, map_encoding
 from omnid.stages.geometry import Geometry, geometry, with_rims
 from omnid.transport.bus import Bus
+
+
+def attached_rig(reader: LogReader, log: Path) -> Rig:
+    """Return the rig of the rig.toml that is attached to the log; OmnidError if there is none."""
+    attached = reader.attachments().get("rig.toml")
+    if attached is None:
+        raise OmnidError(
+            f"{log}: no rig.toml is attached to the log; give one with --rig, made by `omnid calibrate "
+            "import camchain.yaml -o rig.toml`"
+        )
+    return parse_rig(attached, None, f"{log}: attached rig.toml")
+
 
 BUS_END_S: Final = 3.0
 ROUTER_S: Final = 2.0  # Time between two attempts of a client to reach its router for the first time.

@@ -12,7 +12,7 @@ from omnid.simulation.rendering.polished_floor import PolishedFloor
 from omnid.simulation.rendering.ray_caster import render_grey
 from omnid.simulation.rendering.sensor import Floats, MountedSensor, Sensor
 from omnid.simulation.rendering.surfaces import Scene
-from omnid.simulation.world import World
+from omnid.simulation.world_file import World
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Final, Generic, Literal, TypeAlias, TypeVar
 
 import cv2
 import numpy as np
@@ -36,11 +36,10 @@ from omnid.runs.pipeline import NavigationParts, RunParts, Sinks, WiredStages, w
 from omnid.runs.place_maps import RunPlaces
 from omnid.runs.route_files import RouteFiles
 from omnid.simulation.cameras import SimulatedCameras
-from omnid.simulation.lockstep_parts import LockstepRequests, Take
 from omnid.simulation.rendering.sensor import Sensor
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import START_NS, Tick, Vehicle
-from omnid.simulation.world import World
+from omnid.simulation.world_file import World
 from omnid.sinks.drive import NAVIGATION_SENDER
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import geometry
@@ -49,6 +48,41 @@ from omnid.stages.obstacles import controller_ring
 from omnid.stages.synchronise import Synchronise
 
 T = TypeVar("T")
+
+
+class LockstepRequests:
+    """Requests to the navigation, as a source that never waits: each turn yields the requests since the last one."""
+
+    def __init__(self) -> None:
+        self._waiting: list[NavigationCommand] = []
+        self._ended = False
+
+    def put(self, command: NavigationCommand) -> None:
+        """Add a request."""
+        self._waiting.append(command)
+
+    def end(self) -> None:
+        """End `batches`."""
+        self._ended = True
+
+    def batches(self) -> Iterator[list[NavigationCommand]]:
+        """Yield the requests of each turn, mostly none."""
+        while not self._ended:
+            taken, self._waiting = self._waiting, []
+            yield taken
+
+
+class Take(Generic[T]):
+    """A sink that calls a function."""
+
+    def __init__(self, take: Callable[[T], None]) -> None:
+        self._take = take
+
+    def process(self, message: T, /) -> None:
+        """Take a message."""
+        self._take(message)
+
+
 STOPPING_NS: Final = 2_000_000_000  # At the end the wheels come to rest within this time.
 Array = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from omnid.simulation.paced_link import Delivery, PacedLink
 from omnid.simulation.realtime import SAMPLES
 from omnid.simulation.robot import SimulatedRobot
 from omnid.simulation.vehicle import Tick, Vehicle
-from omnid.simulation.world import World
+from omnid.simulation.world_file import World
 from omnid.transport.codec import OK
 from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import SIMULATION, Key
@@ -186,7 +186,7 @@ class PacedRobot:
     def _is_given(self, sample: MotionSample) -> bool:
         """True if the settings ask for samples of this kind."""
         motion = self._config.motion
-        return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) != "off"
+        return (motion.imu if isinstance(sample, GyroSample) else motion.wheels) == "auto"
 
     def _frame(self, vehicle: Vehicle, camera: Camera, seq: int, stamp_ns: int) -> Frame:
         state = self._states[camera]

@@ -28,7 +28,7 @@ from omnid.simulation.clearance import DriveRecord, clearance_m, footprints
 from omnid.simulation.lockstep import with_masks
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
-from omnid.simulation.world import World
+from omnid.simulation.world_file import World
 
 POLL_S: Final = 0.002  # Time between two checks whether the motion up to an exposure is known.
 LONGEST_WAIT_S: Final = 0.2  # Longest wait for the motion up to an exposure; then the newest pose is taken.

@@ -23,7 +23,7 @@ from omnid.controller.statistics import TickReport
 from omnid.simulation.clearance import clearance_m, footprints
 from omnid.simulation.people import Walkers
 from omnid.simulation.robot import SimulatedRobot, traction
-from omnid.simulation.world import World
+from omnid.simulation.world_file import World
 
 Array = NDArray[np.float64]
 START_NS: Final = 1_000_000_000_000  # Start of the simulated clock.

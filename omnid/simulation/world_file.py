@@ -30,7 +30,19 @@ from omnid.simulation.people import Person
 from omnid.simulation.rendering import textures
 from omnid.simulation.rendering.shapes import CEILING_M, Point, Random, box, painted, posters
 from omnid.simulation.rendering.surfaces import Rectangle
-from omnid.simulation.world import World
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The floor is at z = 0 and the robot starts at x, y [m] with a heading [rad]."""
+
+    name: str
+    standing: tuple[Rectangle, ...]
+    people: tuple[Person, ...] = ()
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    brightness: float = 1.0  # factor on the grey of all images
+    is_polished: bool = False  # the floor mirrors the objects on it
+
 
 MAX_BYTES: Final = 1 << 18
 LARGEST_M: Final = 60.0  # side of a world: its textures must fit into memory

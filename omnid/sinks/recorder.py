@@ -10,7 +10,7 @@ from typing import Final, Protocol, TypeAlias
 from drivers.frame import Frame
 from drivers.logs.mcap_writer import LogWriter
 from drivers.logs.rotating_log import RotatingLogState
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.errors import OmnidError
 from omnid.messages import OdometryUpdate, PlaceUpdate
 from omnid.sinks.encoder import Encoder, Outgoing, OutgoingMessage, StateReports, static_frames, status_report

@@ -8,8 +8,7 @@ from omnid.config import Config
 from omnid.core.rig.rig_health import RigHealth
 from omnid.load_level import Load, full_load
 from omnid.messages import FramePair, OdometryUpdate, Panoramas, StereoDepth
-from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.dense_stereo import DenseStereo
+from omnid.stages.dense_depths import DenseDepths, DenseStereo
 from omnid.stages.dewarp import Dewarp
 from omnid.stages.geometry import Geometry
 from omnid.stages.motion_inbox import MOST_WAITING

@@ -17,7 +17,7 @@ from calib.rig import MountedCamera, Rig
 from drivers.frame import Camera, Frame
 from omnid.config import PanoramaConfig
 from omnid.core.types.stereo_model import StereoModel
-from omnid.stages.decoder import Decoder
+from omnid.stages.synchronise import Decoder
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from omnid.core.mapping.point_scan import ScanLimits, point_scan
 from omnid.core.mapping.range_scan import MAX_RANGE_M, SECTORS, FreeRanges, RangeScan, seen_from
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import DensePoints, ObstacleRing
-from omnid.stages.floor import CameraFloor
+from omnid.stages.obstacles import CameraFloor
 
 Array = NDArray[np.float64]
 

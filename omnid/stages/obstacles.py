@@ -1,4 +1,4 @@
-"""Obstacle stage: ring of the nearest obstacles around the base, from the columns of pairs."""
+"""Obstacles of a run: the floor, the grid around the base at each pair, and the ring that is given out."""
 
 from __future__ import annotations
 
@@ -7,18 +7,179 @@ from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calib import se3
+from calib.rig import Rig
 from calib.se2_arrays import planar, transform
 from omnid.config import ObstaclesConfig
 from omnid.core.control.collision_monitor import ControllerRing, MovingPoint
+from omnid.core.floor import Floor, FloorEstimator
+from omnid.core.frames import of_base
+from omnid.core.mapping.range_scan import SECTORS, FreeRanges
+from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
+from omnid.core.obstacles.fixed_parts import FixedParts
+from omnid.core.obstacles.grid import ObstacleGrid
+from omnid.core.obstacles.moving_tracker import MovingTracker
+from omnid.core.obstacles.narrow import narrow_m, nothing_narrow
+from omnid.core.obstacles.pair_views import FOCAL_PX
+from omnid.core.obstacles.settings import RingSettings
+from omnid.core.obstacles.unwatched import Unwatched, without
 from omnid.load_level import Load, LoadLevel, full_load
-from omnid.messages import ObstacleRing, OdometryUpdate
+from omnid.messages import DensePoints, ObstacleRing, OdometryUpdate, Panoramas
 from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import STAMP_JITTER_NS
-from omnid.stages.pair_rings import PairRings
 from omnid.tracking_state import TrackingState
+
+Array = NDArray[np.float64]
+
+ADVICE: Final = "state it by `omnid calibrate drive LOG --only height --rig rig.toml -o rig.toml`"
+
+
+class CameraFloor:
+    """The floor below the cameras; each stage has its own, fed with the depths that it uses: threads change nothing."""
+
+    def __init__(self, rig: Rig, floor_m: float) -> None:
+        """floor_m: height of the floor in the base frame (obstacles.ring.floor_m)."""
+        self._T_base_rig = rig.T_base_rig
+        self.view = se3.apply(rig.T_base_rig, rig.lower.viewpoint[None])[0]  # (3,) in the base frame
+        height_m = rig.height_m(floor_m)
+        self.stated = None if height_m is None else Floor(height_m)
+        self._estimator = FloorEstimator()
+
+    @property
+    def floor(self) -> Floor | None:
+        """The floor as it is known now; None: nothing may be called free."""
+        return self.stated or self._estimator.floor
+
+    @property
+    def wants_points(self) -> bool:
+        """True as long as `add` may change the floor."""
+        return self.stated is None and not self._estimator.is_final
+
+    def add(self, depth: DensePoints) -> None:
+        """Search for the floor in the points of a pair, where the rig does not state its height."""
+        if self.wants_points:
+            points = se3.apply(self._T_base_rig, depth.points) - self.view
+            self._estimator.add(points, depth.variance_m2)
+
+    def T_floor_rig(self, floor: Floor) -> Array:
+        """Return the transform (4, 4) from the rig to the level frame of the base, with the floor at z = 0."""
+        return np.asarray(floor.T_floor_base(self.view) @ self._T_base_rig)
+
+    def summary(self) -> str:
+        """Return one sentence about a height that the rig does not state; empty where it does."""
+        if self.stated is not None:
+            return ""
+        floor = self._estimator.floor
+        if floor is None:
+            return (
+                "the rig does not state the height of the cameras, and the images do not show the floor: map, grid "
+                f"and obstacles call nothing free; {ADVICE}"
+            )
+        return (
+            f"the rig does not state the height of the cameras: the images show the floor {floor.height_m:.2f} m "
+            f"(sigma {floor.sigma_m:.2f}) below the lower one, tilted by {math.degrees(floor.tilt_rad):.1f} deg "
+            f"(sigma {math.degrees(floor.sigma_rad):.1f}), which is used; {ADVICE}"
+        )
+
+
+# Ring of a pair while the floor is not known.
+UNKNOWN: Final = np.full(SECTORS, np.nan, np.float32)
+NOT_FREE: Final = np.zeros(SECTORS, np.float32)
+
+
+class PairRings:
+    """The obstacle grid of a run, the obstacles that move in it, and its ring at each pair that is added."""
+
+    def __init__(self, geometry: Geometry, settings: RingSettings) -> None:
+        self._geometry, self._settings = geometry, settings
+        self._of_floor: Floor | None = None  # floor for which the columns were made
+        self.fixed = FixedParts(geometry.cylinder)
+        self._left_out = self.fixed.pixels  # those of the columns
+        self._is_misled = False  # whether the grid holds what fixed parts have shown
+        self._columns: Columns | None = None
+        self._evidence: ColumnEvidence | None = None  # of the newest pair
+        self._grid = ObstacleGrid(FOCAL_PX * geometry.rig.baseline_m, settings)
+        self._tracker = MovingTracker()
+        self._unwatched = Unwatched(geometry.cylinder, geometry.rig.T_base_rig @ geometry.T_rig_rect)
+        self._resets = 0
+
+    def add(self, odometry: OdometryUpdate, camera_floor: CameraFloor) -> ObstacleRing:
+        """Add the evidence of a pair; return the ring at it, which is unknown while the floor or the pose is."""
+        # 1. Forget the grid and the tracks where odometry has begun again.
+        if odometry.reset_counter != self._resets:
+            self._grid.begin_again()
+            self._tracker.clear()
+            self._resets, self._is_misled = odometry.reset_counter, False
+        panoramas, self._evidence = odometry.depth.panoramas, None
+        T_odom_base = of_base(odometry, self._geometry.rig.T_base_rig)[0]
+        unwatched = self._unwatched.sectors(panoramas.tiles.unknown)
+        unknown = ObstacleRing(odometry.seq, odometry.stamp_ns, UNKNOWN, UNKNOWN, NOT_FREE, T_odom_base, (), unwatched)
+        if odometry.state is TrackingState.LOST:
+            # The grid stays: it holds again once odometry recognises its landmarks.
+            self._tracker.clear()
+            return unknown
+        self._leave_out_fixed_parts(panoramas, T_odom_base)
+        columns = self._columns_of(camera_floor, panoramas)
+        if columns is None:
+            return unknown
+        # 2. The evidence of the images, without their dead and blind parts.
+        lost = panoramas.tiles.lost_pixels(panoramas.visible.shape)
+        evidence = self._evidence = columns.evidence(panoramas.lower, panoramas.upper, lost)
+        # 3. The grid, its ring, and the moving obstacles.
+        pose = transform(planar(T_odom_base))
+        unseen = self._unwatched.directions(panoramas.tiles.unknown)
+        ring = without(self._grid.update(odometry.stamp_ns, pose, evidence), unwatched, unseen)
+        moving = self._tracker.update(odometry.stamp_ns, self._grid.viewpoint(pose), ring.arrivals)
+        return ObstacleRing(
+            odometry.seq, odometry.stamp_ns, ring.ranges_m, ring.sigma_m, ring.free_m, T_odom_base, moving, unwatched
+        )
+
+    @property
+    def narrow_m(self) -> FreeRanges:
+        """Least range (SECTORS,) [m] at which something narrow hides floor by the newest pair, inf: nothing does.
+
+        Sectors are those of the rectified frame.
+        """
+        if self._evidence is None or self._columns is None:
+            return nothing_narrow()
+        return narrow_m(self._evidence.floor, self._columns.at_1m)
+
+    def _leave_out_fixed_parts(self, panoramas: Panoramas, T_odom_base: Array) -> None:
+        """Learn what is fixed to a camera, and leave it out; frozen parts are the same at all headings, too."""
+        if panoramas.tiles.is_frozen:
+            return
+        if not self.fixed.observe(T_odom_base, panoramas.lower, panoramas.upper, panoramas.visible):
+            return
+        if self.fixed.pixels is not self._left_out:
+            self._left_out, self._of_floor, self._is_misled = self.fixed.pixels, None, True
+        if self._is_misled and self.fixed.is_on_the_spot:
+            # The floor too near to be seen is taken to be free again: a base that came here might know better.
+            self._grid.begin_again()
+            self._tracker.clear()
+            self._is_misled = False
+
+    def _columns_of(self, camera_floor: CameraFloor, panoramas: Panoramas) -> Columns | None:
+        """Return the columns for the floor and what is left out, None without a floor."""
+        floor = camera_floor.floor
+        if floor is not None and floor is not self._of_floor:
+            geometry, settings = self._geometry, self._settings
+            T_rect_floor = geometry.rig.T_rect_rig @ se3.inverse(camera_floor.T_floor_rig(floor))
+            plane = floor_plane(T_rect_floor)
+            self._of_floor = floor
+            self._columns = Columns(
+                geometry.cylinder,
+                geometry.rig.baseline_m,
+                plane,
+                settings.heights_m,
+                (NEAREST_M, settings.max_range_m),
+                panoramas.visible & ~self._left_out,
+            )
+            self._grid.set_floor(T_rect_floor, plane.height_m)
+        return self._columns
+
 
 # Least time between two rings; with the time from images to ring it stays below controller.collision.stale_s.
 SHED_PERIOD_NS: Final[Mapping[LoadLevel, int]] = {

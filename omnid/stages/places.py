@@ -18,10 +18,9 @@ from omnid.core.places.place_map import PlaceMap
 from omnid.load_level import Load, LoadLevel, full_load
 from omnid.messages import MapKeyframes, OdometryUpdate, PlaceUpdate, StereoDepth
 from omnid.stages.dense_depths import DenseDepths
-from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
 from omnid.stages.keyframe_scan import keyframe_free, keyframe_scan
-from omnid.stages.pair_rings import PairRings
+from omnid.stages.obstacles import CameraFloor, PairRings
 from omnid.tracking_state import MapState, TrackingState
 
 Array = NDArray[np.float64]

@@ -2,21 +2,160 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from statistics import median_low
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig import Rig
-from drivers.frame import Camera, Frame, coding_steps
+from drivers.errors import FrameDecodeError
+from drivers.frame import Camera, Frame, coding_steps, gray
 from drivers.motion import MotionSample
 from omnid.camera_config import PairConfig
+from omnid.errors import OmnidError
 from omnid.messages import FramePair
-from omnid.stages.decoder import Decoder, Image
 from omnid.stages.motion_inbox import MotionInbox
-from omnid.stages.repeated_images import RepeatedImages
-from omnid.stages.skew import Skew
+
+SKEW_GAIN: Final = 0.02  # weight of a new skew in the running mean: a memory of about 50 pairs
+RECENT: Final = 30  # pairs to which a line is fitted
+MIN_FITTED: Final = 8  # Of fewer pairs the median is taken.
+JUMP_NS: Final = 5_000_000  # A larger distance from the line means a lost image, or a camera that was started again.
+# Cameras that are triggered together have stamps that scatter about each other. Their mean difference is 0 unless it is
+# larger than twice the scatter and than the least that stamps resolve.
+SCATTERS: Final = 2.0
+LEAST_NS, LEAST_AT_START_NS = 1_000_000, 3_000_000
+
+
+class Skew:
+    """Statistics of the skew, the upper camera's stamp minus the lower's, in ns."""
+
+    def __init__(self) -> None:
+        self.mean_ns = math.nan  # running mean
+        self.max_ns = 0  # largest absolute value
+        self._settled_ns = math.nan  # running mean once it has averaged over its whole memory
+        self._pairs = 0
+        self._recent: deque[int] = deque(maxlen=RECENT)
+        self.exposure_ns = 0.0  # upper minus lower exposure of the newest pair
+
+    def add(self, skew_ns: int) -> None:
+        """Add the skew of a pair."""
+        self._pairs += 1
+        gain = max(SKEW_GAIN, 1 / self._pairs)
+        self.mean_ns = skew_ns if self._pairs == 1 else self.mean_ns + gain * (skew_ns - self.mean_ns)
+        self.max_ns = max(self.max_ns, abs(skew_ns))
+        if self._pairs == round(1 / SKEW_GAIN):
+            self._settled_ns = self.mean_ns
+        self.exposure_ns = self._between_exposures(skew_ns)
+
+    @property
+    def drift_ns(self) -> float:
+        """Change of the running mean since it had settled; NaN before."""
+        return self.mean_ns - self._settled_ns
+
+    def _between_exposures(self, skew_ns: int) -> float:
+        """Return the skew without the scatter of the stamps; 0 where the exposures may be simultaneous.
+
+        Free-running cameras drift against each other, so a line is fitted to the recent skews.
+        """
+        recent = self._recent
+        if recent and abs(skew_ns - recent[-1]) > JUMP_NS:
+            recent.clear()
+        recent.append(skew_ns)
+        if len(recent) < MIN_FITTED:
+            median = float(np.median(recent))
+            return median if abs(median) > LEAST_AT_START_NS else 0.0
+        # Least squares in closed form: sums of whole numbers are exact.
+        count, total, moment = len(recent), sum(recent), sum(index * each for index, each in enumerate(recent))
+        indices, squares = count * (count - 1) // 2, count * (count - 1) * (2 * count - 1) // 6
+        slope = (count * moment - indices * total) / (count * squares - indices**2)
+        start = (total - slope * indices) / count
+        newest = start + slope * (count - 1)
+        squared = sum((each - start - slope * index) ** 2 for index, each in enumerate(recent))
+        return newest if abs(newest) > max(SCATTERS * math.sqrt(squared / (count - 2)), LEAST_NS) else 0.0
+
+
+Image = NDArray[np.uint8]
+
+
+class Decoder:
+    """Grey images of the size that the rig was calibrated for.
+
+    `broken` counts the frames that could not be used, `fault` is the reason of the first of them.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._sizes: dict[Camera, tuple[int, int]] = {"lower": rig.lower.camera.size, "upper": rig.upper.camera.size}
+        self._fitted: set[Camera] = set()
+        self.broken = 0
+        self.fault = ""
+
+    def __call__(self, frame: Frame) -> Image | None:
+        """Return the image (H, W), or None for a frame that cannot be used.
+
+        OmnidError if a camera's first image has another size than the rig's camera.
+        """
+        try:
+            image = gray(frame)
+        except FrameDecodeError as error:
+            self._skip(str(error))
+            return None
+        found, expected = image.shape[::-1], self._sizes[frame.camera]
+        if found == expected:
+            self._fitted.add(frame.camera)
+            return image
+        if frame.camera not in self._fitted:
+            raise OmnidError(
+                f"the {frame.camera} camera's images are {found[0]}x{found[1]} px, the rig's are {expected[0]}x"
+                f"{expected[1]} px: give the rig of these cameras with --rig"
+            )
+        self._skip(f"{frame.camera} frame {frame.seq} is {found[0]}x{found[1]} px, unlike those before")
+        return None
+
+    def _skip(self, fault: str) -> None:
+        self.broken += 1
+        self.fault = self.fault or fault
+
+
+KEPT: Final = 4  # earlier images compared with: a driver that is stuck may hand out its buffers in turn
+SAMPLED_PX: Final = 16  # rows and columns of the first comparison: the noise of any real image differs there
+FROZEN_IMAGES: Final = 5  # repeated images in a row after which a camera counts as frozen: a single one may be a glitch
+
+
+class RepeatedImages:
+    """Compare the images of one camera with the KEPT ones before; all pixels must be equal.
+
+    An image repeats if it equals the one before, or if the last images equal those a period of up to KEPT images
+    earlier, all of that period. A log that is played forwards and backwards repeats one image at each end only.
+    """
+
+    def __init__(self) -> None:
+        self._earlier: deque[tuple[bytes, Image]] = deque(maxlen=KEPT)  # with samples of them, the newest first
+        self._equal = [0] * KEPT  # consecutive images that equal the one 1, 2 ... KEPT images earlier
+        self.count = 0  # repeated images in all
+        self.longest = 0  # most of them in a row
+        self._in_a_row = 0
+
+    @property
+    def frozen(self) -> bool:
+        """True if the newest images are repeated ones."""
+        return self._in_a_row >= FROZEN_IMAGES
+
+    def add(self, image: Image) -> bool:
+        """Take the next image (H, W); return True if it repeats earlier ones."""
+        sample = image[::SAMPLED_PX, ::SAMPLED_PX].tobytes()  # decides at once for images that are not equal
+        for index, (earlier_sample, earlier) in enumerate(self._earlier):
+            is_equal = sample == earlier_sample and np.array_equal(image, earlier)
+            self._equal[index] = self._equal[index] + 1 if is_equal else 0
+        self._earlier.appendleft((sample, image))
+        repeated = any(count > index for index, count in enumerate(self._equal))
+        self.count += repeated
+        self._in_a_row = self._in_a_row + 1 if repeated else 0
+        self.longest = max(self.longest, self._in_a_row)
+        return repeated
+
 
 MAX_WAITING = 4  # frames of a camera that wait for a partner: the other camera may be delivered a few periods later
 PERIOD_STEPS = 16  # recent steps between the stamps of a camera, whose median is its period

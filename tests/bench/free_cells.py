@@ -31,11 +31,11 @@ from omnid.core.places.place_views import grid
 from omnid.engine.telemetry import Telemetry
 from omnid.formats.tum import read_tum
 from omnid.messages import OdometryUpdate
-from omnid.runs.log_rig import attached_rig
 from omnid.runs.replay import ReplayOptions, run_log
+from omnid.runs.session import attached_rig
 from omnid.sinks.encoder import Outgoing
-from omnid.stages.floor import CameraFloor
 from omnid.stages.front_end import FrontEnd
+from omnid.stages.obstacles import CameraFloor
 from tests.bench.results import Cell, Column, ResultTable
 
 Array = NDArray[np.float64]

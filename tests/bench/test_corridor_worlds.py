@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from omnid.simulation.clearance import clearance_m, footprints
-from omnid.simulation.world import World
-from omnid.simulation.world_file import WorldOptions, parse_world
+from omnid.simulation.world_file import World, WorldOptions, parse_world
 from tests.bench.corridor_worlds import CROSSING, DOOR_M, LIKE_FLOOR, like_the_floor, world_text
 
 HALF_PERSON_M = 0.25

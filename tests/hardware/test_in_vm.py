@@ -23,7 +23,7 @@ from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from drivers.motors.simulated.simulated_line import SimulatedLine
 from drivers.motors.simulated.simulated_motor import LONGEST_ABSENCE_S
-from omnid.runs.log_rig import attached_rig
+from omnid.runs.session import attached_rig
 from omnid.stages.geometry import with_rims
 from tests.hardware.guest_report import names_in, passed, run_tests
 from tests.hardware.image import ROOT

@@ -24,8 +24,7 @@ from calib.rig_file import read_rig
 from drivers.cameras.log_camera import LogCamera, LogClock, LogImages
 from drivers.frame import Camera, Frame, gray
 from omnid.config import load_config
-from omnid.runs.live import LiveRun
-from omnid.runs.live_robot import ConnectedRobot
+from omnid.runs.live import ConnectedRobot, LiveRun
 
 TIME, TIME_NS = time.time, time.time_ns
 

@@ -15,7 +15,7 @@ from calib.rig_file import parse_rig
 from drivers.frame import Frame
 from drivers.logs.log_reader import LogReader
 from omnid.config import Config
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.messages import OdometryUpdate
 from omnid.runs.pipeline import Sinks, wire

@@ -19,7 +19,7 @@ from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.relocalisation import Relocaliser
 from omnid.formats.tum import Trajectory
 from omnid.settings import load
-from omnid.stages.dense_stereo import DenseStereo
+from omnid.stages.dense_depths import DenseStereo
 from omnid.stages.front_end import FrontEnd
 from omnid.stages.geometry import Geometry
 from omnid.stages.mapping import Mapping

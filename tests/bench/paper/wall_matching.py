@@ -15,7 +15,7 @@ from calib.models.camera import Array
 from omnid.config import Config
 from omnid.core.stereo.matcher import edge_pixels, smooth
 from omnid.messages import Panoramas
-from omnid.stages.dense_stereo import DenseStereo
+from omnid.stages.dense_depths import DenseStereo
 from omnid.stages.geometry import Geometry
 from tests.bench.paper.scenes import WALL_M
 from tests.bench.paper.truth import cast

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from omnid.diagnostics.floor_status import floor_status
+from omnid.diagnostics.part_status import floor_status
 from omnid.simulation.rendering.rigs import make_rig
-from omnid.stages.floor import CameraFloor
+from omnid.stages.obstacles import CameraFloor
 from omnid.transport.codec import OK, WARN
 from tests.omnid.stages.test_keyframe_scan import depth
 

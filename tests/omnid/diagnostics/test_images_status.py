@@ -6,8 +6,8 @@ import numpy as np
 
 from omnid.config import Config
 from omnid.core.stereo.tiles import ALL_LIVE, TILE_COLUMNS, TILE_ROWS, TileStates
-from omnid.diagnostics.images_status import LIVE, ImagesStatus
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.part_status import LIVE, ImagesStatus
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.messages import OdometryUpdate, StereoDepth
 from omnid.simulation.robot import make_robot
 from omnid.stages.geometry import geometry

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from omnid.diagnostics.progress import Progress
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 
 
 def line(seq: int, poses: int) -> str:

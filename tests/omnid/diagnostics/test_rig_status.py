@@ -7,7 +7,7 @@ import pytest
 from calib.panorama import fit_cylinder
 from omnid.core.rig.column_finding import RigState
 from omnid.core.rig.rig_health import RigHealth
-from omnid.diagnostics.rig_status import ADVICE, LEVELS, rig_status
+from omnid.diagnostics.part_status import ADVICE, LEVELS, rig_status
 from omnid.simulation.rendering.rigs import make_rig
 from omnid.transport.codec import ERROR, OK
 

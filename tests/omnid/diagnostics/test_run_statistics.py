@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 
 from calib import se3
-from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
+from omnid.diagnostics.run_summary import RunCounters, RunStatistics
 from omnid.messages import OdometryUpdate
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.test_frames import odometry

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 
-from omnid.diagnostics.run_statistics import RunCounters, RunStatistics
-from omnid.diagnostics.run_summary import run_summary, summary_entries
+from omnid.diagnostics.run_summary import RunCounters, RunStatistics, run_summary, summary_entries
 
 COUNTERS = RunCounters.of(RunStatistics(), 99, {f"unpaired_{number}": 10**number for number in range(9)})
 

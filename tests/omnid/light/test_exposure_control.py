@@ -11,7 +11,7 @@ from drivers.cameras.camera_state import CameraExposure, CameraState, ExposureRa
 from drivers.frame import Camera
 from omnid.camera_config import CamerasConfig
 from omnid.light.exposure_control import ExposureControl
-from omnid.light.grey_levels import UsefulArea
+from omnid.light.exposure_law import UsefulArea
 from omnid.messages import FramePair
 from omnid.transport.codec import OK, WARN
 from omnid.transport.records import DiagnosticStatus

@@ -7,7 +7,7 @@ import pytest
 
 from calib.panorama import fit_cylinder
 from calib.rig import Rig
-from omnid.light.grey_levels import UsefulArea
+from omnid.light.exposure_law import UsefulArea
 from omnid.messages import FramePair
 from tests.simulation.recipes import mild_rig
 

@@ -11,7 +11,7 @@ from omnid.formats.tum import Trajectory
 from omnid.report.charts import style_and_script
 from omnid.report.recorded_run import read_run
 from omnid.report.report import report_html
-from omnid.runs.log_rig import attached_rig
+from omnid.runs.session import attached_rig
 
 SAMPLE = Path(__file__).parents[3] / "omnid" / "sample"
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from drivers.cameras.camera_state import CameraState
 from drivers.frame import Camera, Frame
-from omnid.runs.live_robot import MASK_FRAMES, ConnectedRobot, first_frames
+from omnid.runs.live import MASK_FRAMES, ConnectedRobot, first_frames
 
 
 class Images:

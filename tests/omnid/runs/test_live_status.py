@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 
-from omnid.diagnostics.run_statistics import RunStatistics
-from omnid.runs.live_status import TerminalStatus
+from omnid.diagnostics.run_summary import RunStatistics
+from omnid.runs.live import TerminalStatus
 
 
 def test_a_run_is_ready_once_and_ends_with_a_summary() -> None:

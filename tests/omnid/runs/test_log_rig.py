@@ -11,7 +11,7 @@ from calib.errors import CalibError
 from calib.rig_file import rig_toml
 from drivers.logs.log_reader import LogReader
 from omnid.errors import OmnidError
-from omnid.runs.log_rig import attached_rig
+from omnid.runs.session import attached_rig
 from omnid.simulation.rendering.rigs import make_rig
 from tests.drivers.logs.mcap_logs import pairs, write_log
 

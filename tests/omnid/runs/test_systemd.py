@@ -18,7 +18,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import NEWEST, Graph
 from omnid.engine.telemetry import StageStats, Telemetry
 from omnid.runs.systemd import Service, notify, stalled_stages, watchdog_s

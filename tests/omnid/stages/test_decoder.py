@@ -8,7 +8,7 @@ import pytest
 from drivers.frame import Camera, Frame
 from omnid.errors import OmnidError
 from omnid.simulation.rendering.rigs import make_rig
-from omnid.stages.decoder import Decoder
+from omnid.stages.synchronise import Decoder
 
 SIDE_PX = 64
 IMAGE = np.arange(SIDE_PX**2, dtype=np.uint8).reshape(SIDE_PX, SIDE_PX).tobytes()

@@ -9,7 +9,7 @@ import pytest
 
 from omnid.config import Config
 from omnid.messages import Panoramas
-from omnid.stages.dense_stereo import DenseStereo
+from omnid.stages.dense_depths import DenseStereo
 from omnid.stages.geometry import geometry
 from tests.omnid.core.scenery import texture, wrapped
 from tests.simulation import make_rig

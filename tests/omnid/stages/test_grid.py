@@ -9,7 +9,7 @@ import numpy as np
 from omnid.core.mapping.scan_grid import KeyframeScans
 from omnid.load_level import LoadLevel
 from omnid.messages import PlaceUpdate
-from omnid.stages.grid import MapGrid
+from omnid.stages.mapping import MapGrid
 from omnid.tracking_state import MapState
 
 SECOND_NS = 10**9

@@ -12,8 +12,8 @@ from omnid.core.mapping.range_scan import SECTORS, azimuths
 from omnid.core.obstacles.settings import RingSettings
 from omnid.messages import DensePoints, ObstacleRing
 from omnid.simulation.rendering.rigs import make_rig
-from omnid.stages.floor import CameraFloor
 from omnid.stages.keyframe_scan import keyframe_free, keyframe_scan
+from omnid.stages.obstacles import CameraFloor
 from tests.omnid.core.test_floor import HEIGHT_M, plane, walls
 
 BOX_M, WALL_M = 1.4, 2.4

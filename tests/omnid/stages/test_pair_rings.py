@@ -14,9 +14,8 @@ from omnid.core.obstacles.settings import RingSettings
 from omnid.core.stereo.tiles import TILE_COLUMNS, TILE_ROWS, TileStates
 from omnid.messages import ObstacleRing, OdometryUpdate, Panoramas, StereoDepth
 from omnid.simulation.rendering.rigs import make_rig
-from omnid.stages.floor import CameraFloor
 from omnid.stages.geometry import Geometry
-from omnid.stages.pair_rings import PairRings
+from omnid.stages.obstacles import CameraFloor, PairRings
 from omnid.tracking_state import TrackingState
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,

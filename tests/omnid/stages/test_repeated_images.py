@@ -11,8 +11,7 @@ import pytest
 from calib.rig import Rig
 from drivers.frame import Camera, Frame
 from omnid.camera_config import PairConfig
-from omnid.stages.repeated_images import FROZEN_IMAGES, KEPT, RepeatedImages
-from omnid.stages.synchronise import Synchronise
+from omnid.stages.synchronise import FROZEN_IMAGES, KEPT, RepeatedImages, Synchronise
 from tests.simulation import build
 
 SIZE = 256

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from omnid.stages.skew import Skew
+from omnid.stages.synchronise import Skew
 
 MS = 1_000_000
 

@@ -11,7 +11,7 @@ import pytest
 
 from calib import se3
 from drivers.frame import Camera, Frame
-from omnid.diagnostics.run_statistics import RunStatistics
+from omnid.diagnostics.run_summary import RunStatistics
 from omnid.engine.graph import Graph
 from omnid.formats.tum import read_tum
 from omnid.messages import DensePoints, MapUpdate, OdometryUpdate

@@ -18,7 +18,7 @@ from omnid.camera_config import PairConfig
 from omnid.config import Config, PanoramaConfig
 from omnid.core.rig.column_finding import POINTS, RigState
 from omnid.core.rig.rig_health import MIN_PLACES, VIEWS, RigHealth
-from omnid.diagnostics.rig_status import rig_status
+from omnid.diagnostics.part_status import rig_status
 from omnid.engine.flow import NEWEST
 from omnid.engine.graph import Graph
 from omnid.messages import Panoramas
