@@ -19,7 +19,7 @@ from omnid.core.obstacles.settings import RingSettings
 from omnid.core.odometry.estimates import OdometryLimits
 from omnid.core.odometry.motion_settings import MotionSensorSettings
 from omnid.core.odometry.tracking import KltSettings
-from omnid.core.places.limits import PlaceLimits
+from omnid.core.places.place_map import PlaceLimits
 from omnid.core.stereo.matcher import MatchingSettings
 from omnid.engine.realtime import RealtimeSettings
 from omnid.errors import OmnidError

@@ -73,8 +73,7 @@ def _list() -> int:
 
 
 def _snapshot(args: argparse.Namespace) -> int:
-    from calib.atomic_file import write_file
-    from calib.rig_file import png
+    from calib.rig_file import png, write_file
     from omnid.calibration.snapshot import annotated, described, view_of, warnings
 
     try:

@@ -107,7 +107,7 @@ def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) 
     import tempfile
     from dataclasses import replace
 
-    from calib.atomic_file import write_file
+    from calib.rig_file import write_file
     from omnid.config import load_config
     from omnid.doctor.wheel_wiring import toml_with
 

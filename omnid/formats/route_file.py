@@ -12,7 +12,7 @@ import numpy as np
 from omnid.core.navigation.path import FARTHEST_M
 from omnid.core.navigation.requests import route_name
 from omnid.core.navigation.route import DECIMALS, MOST_POINTS, Route
-from omnid.core.places.keyframe_id import NO_KEYFRAME
+from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 from omnid.formats.whole_file import write_whole
 

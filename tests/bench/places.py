@@ -29,10 +29,9 @@ from calib.models.camera import Array
 from calib.rig import Rig
 from calib.rig_file import read_rig
 from omnid.cli import main as run_command
-from omnid.core.places.limits import PlaceLimits
 from omnid.core.places.localisation import MapLocaliser
 from omnid.core.places.map_pose import OdometryFrame
-from omnid.core.places.place_map import PlaceMap
+from omnid.core.places.place_map import PlaceLimits, PlaceMap
 from omnid.engine.kernel_cache import prepare_kernels
 from omnid.formats.place_file import read_places
 from omnid.formats.tum import Trajectory, read_tum

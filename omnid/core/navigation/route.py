@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.se2_arrays import composed, relative, wrapped
 from omnid.core.navigation.path import CORNER_RAD, MAX_LENGTH_M, DrivePath, drive_path
-from omnid.core.places.keyframe_id import NO_KEYFRAME
+from omnid.core.places.place_map import NO_KEYFRAME
 from omnid.errors import OmnidError
 
 Array = NDArray[np.float64]

@@ -23,6 +23,8 @@ from omnid.core.obstacles.cell_kernels import (
     FLOOR,
     FLOOR_LOW,
     FLOOR_PRIOR,
+    FREE_ODDS,
+    FREE_SHOWN,
     LIMIT,
     MOST_RATIO,
     SURFACE,
@@ -32,13 +34,12 @@ from omnid.core.obstacles.cell_kernels import (
     VISIBLE,
     VISIBLE_PRIOR,
     add_pair,
+    free_cells,
 )
 from omnid.core.obstacles.column import THIN_M, ColumnEvidence, floor_plane
 from omnid.core.obstacles.near_field import FLOORS, NearField, lose_before
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.state_kernels import FREE_ODDS, FREE_SHOWN, free_cells
-from omnid.core.obstacles.usual_floor import Arrivals, Hidden, UsualFloor, arrivals_at
-from omnid.core.obstacles.watch import FRESH_NS, NARROW_CELLS, Watch
+from omnid.core.obstacles.usual_floor import FRESH_NS, NARROW_CELLS, Arrivals, Hidden, UsualFloor, Watch, arrivals_at
 
 Floats = NDArray[np.float32]
 Bytes = NDArray[np.uint8]

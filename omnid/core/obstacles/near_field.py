@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from omnid.core.obstacles import near_field_kernels as kernels
-from omnid.core.obstacles.cell_kernels import FLOOR, SURFACE, TAKEN_ODDS
-from omnid.core.obstacles.state_kernels import FREE_ODDS
-from omnid.core.obstacles.watch import LEAST_FRESH, NARROW_CELLS, Watch
+from omnid.core.obstacles.cell_kernels import FLOOR, FREE_ODDS, SURFACE, TAKEN_ODDS
+from omnid.core.obstacles.usual_floor import LEAST_FRESH, NARROW_CELLS, Watch
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

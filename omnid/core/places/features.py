@@ -13,7 +13,7 @@ import numpy as np
 from omnid.core.odometry.corners import corners, nearby_disparity
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.descriptors import describe_patches
-from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceFeatures
 
 FEATURES: Final = 200  # kept of a frame; so that 1,000 keyframes have 34 MB; by trial on development seeds
 CORNERS: Final = 450  # detected, as the depth of some is not known; by trial on development seeds

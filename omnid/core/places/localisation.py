@@ -14,21 +14,23 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.mapping.scan_grid import KeyframeScans
-from omnid.core.places.ageing import Ageing
 from omnid.core.places.correction import MapCorrection
 from omnid.core.places.drift import relative_covariance
 from omnid.core.places.features import describe
-from omnid.core.places.fixed_places import FixedPlaces
-from omnid.core.places.hypotheses import Hypotheses, Hypothesis, length_m
-from omnid.core.places.keyframe_id import NO_KEYFRAME
-from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.map_parts import MapParts
+from omnid.core.places.hypotheses import Hypotheses, Hypothesis, SearchSchedule, length_m
+from omnid.core.places.map_parts import Ageing, FixedPlaces, MapParts
 from omnid.core.places.map_pose import UNKNOWN_PLACE, MapPose, OdometryFrame
-from omnid.core.places.place_features import NOTHING, PlaceFeatures
-from omnid.core.places.place_map import PlaceKeyframe, PlaceMap, by_odometry
+from omnid.core.places.place_map import (
+    NO_KEYFRAME,
+    NOTHING,
+    PlaceFeatures,
+    PlaceKeyframe,
+    PlaceLimits,
+    PlaceMap,
+    by_odometry,
+)
 from omnid.core.places.place_search import NEAR_M, Expected, PlaceSearch
 from omnid.core.places.recognition import MIN_MATCHES, Recognition
-from omnid.core.places.search_schedule import SearchSchedule
 from omnid.core.places.signature import Thumbnail, thumbnail
 from omnid.core.types.stereo_model import StereoModel
 from omnid.tracking_state import MapState

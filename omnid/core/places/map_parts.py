@@ -1,4 +1,4 @@
-"""Parts of a map: groups of keyframes whose poses are known relative to each other, but not to those of other parts.
+"""Parts of a map that links connect, keyframes that are out of date, and keyframes that stay fixed.
 
 A run that extends a saved map begins a part of its own, and so does odometry after a gap of unknown motion. A place
 that is recognised in another part joins the two.
@@ -6,11 +6,14 @@ that is recognised in another part joins the two.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from calib import se3
-from omnid.core.places.place_map import PlaceMap
+from omnid.core.places.place_map import UNUSED, KeyframeUse, PlaceMap
 
 Array = NDArray[np.float64]
 
@@ -69,3 +72,65 @@ class MapParts:
             return False
         self._part_of = {id: number for id, number in self._part_of.items() if id in kept}
         return True
+
+
+# Set by trial on development seeds, where a line gives no other reason.
+BESIDE_M: Final = 0.3  # A keyframe this near to a frame shows the same view, if nothing has changed.
+FOUND_INLIERS: Final = 20  # Inliers with which a keyframe counts as recognised.
+VISIT_M: Final = 3.0  # Length of path between two visits of a place.
+AGED_MISSES: Final = 3  # Consecutive visits at which a keyframe is missed, before the next one drops it.
+
+
+class Ageing:
+    """Counts for each keyframe of a map the visits at which it was found and missed.
+
+    One that was found at many visits is kept as long: light may come back that one season takes away.
+    """
+
+    def __init__(self, places: PlaceMap) -> None:
+        self._places = places
+        self._counted: dict[int, tuple[float, bool]] = {}  # path at the last visit, and whether it was found at it
+        self.aged = 0  # keyframes that left
+
+    def observe(self, position: Array, inliers: Mapping[int, int], path_m: float) -> None:
+        """Count the keyframes that were compared with a frame at a position (3,) in the map; drop those that aged.
+
+        inliers: of each keyframe that was compared. path_m: of the run so far.
+        """
+        ids = [id for id in inliers if id in self._places.keyframes]
+        beside = np.linalg.norm(self._places.positions(ids) - position, axis=1) < BESIDE_M
+        for id, is_beside in zip(ids, beside.tolist(), strict=True):
+            is_found = inliers[id] >= FOUND_INLIERS
+            if is_found or is_beside:
+                self._count(id, path_m, is_found=is_found)
+        self._counted = {id: last for id, last in self._counted.items() if id in self._places.keyframes}
+
+    def _count(self, id: int, path_m: float, *, is_found: bool) -> None:
+        """Count a keyframe once a visit: as found where one frame of the visit finds it."""
+        last_m, was_found = self._counted.get(id, (-np.inf, False))
+        same_visit = path_m - last_m < VISIT_M
+        self._counted[id] = path_m, is_found or (same_visit and was_found)
+        use = self._places.uses.get(id, UNUSED)
+        if is_found:
+            self._places.uses[id] = KeyframeUse(use.found + (not (same_visit and was_found)), 0)
+        elif not same_visit and use.missed >= max(AGED_MISSES, use.found):
+            self._places.drop(id)
+            self.aged += 1
+        elif not same_visit:
+            self._places.uses[id] = KeyframeUse(use.found, use.missed + 1)
+
+
+class FixedPlaces:
+    """Ids of keyframes in ascending order, their poses (K, 4, 4) and range scans."""
+
+    def __init__(self, places: PlaceMap, ids: Sequence[int]) -> None:
+        self.ids = ids
+        self.known = frozenset(ids)
+        self.poses: Array = np.array([places.poses[id] for id in ids]).reshape(-1, 4, 4)
+        self.scans = {id: places.keyframes[id].scan for id in ids}
+        self.free_m = {id: places.keyframes[id].free_m for id in ids}
+
+    def within(self, position: Array, reach_m: float) -> list[int]:
+        """Return the keyframes up to a distance of a position (3,), ascending."""
+        is_near = np.linalg.norm(self.poses[:, :3, 3] - position, axis=1) <= reach_m
+        return [self.ids[row] for row in np.flatnonzero(is_near).tolist()]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.places.hypotheses import angle_rad, length_m
-from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.places.recognition import RATIO, Recognition, distances, recognise
 from omnid.core.types.stereo_model import StereoModel
 

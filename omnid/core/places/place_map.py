@@ -4,15 +4,65 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 import scipy
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.places.drift import relative_covariance
-from omnid.core.places.place_features import PlaceFeatures
+
+NO_KEYFRAME: Final = -1  # Used in place of an id, because ids are never negative.
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceLimits:
+    """Distance and number of the keyframes that stay."""
+
+    keyframe_m: Annotated[
+        float, Meta(ge=0.05, le=10), "distance after which a keyframe is kept for the recognition of the place, m"
+    ] = 0.3
+    keyframe_deg: Annotated[float, Meta(ge=1, le=180), "turn after which a keyframe is kept, deg"] = 15.0
+    rate_hz: Annotated[
+        float,
+        Meta(ge=0.1, le=100),
+        "keyframes a second, at most: each is searched for in the map, which takes some 30 ms",
+    ] = 5.0
+    max_keyframes: Annotated[
+        int,
+        Meta(ge=2, le=100_000),
+        "keyframes kept, of some 35 kB each in memory; more drop those that others are nearest to",
+    ] = 2000
+
+
+DESCRIPTOR: Final = 128  # Bytes of a descriptor; exact: 8 directions in 4 x 4 cells.
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceFeatures:
+    """Features of a lower panorama whose depth is known: descriptors (N, 128), views (N, 3) [px].
+
+    A view is column, lower row, upper row.
+    """
+
+    descriptors: NDArray[np.uint8]
+    views: NDArray[np.float32]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the features take."""
+        return self.descriptors.nbytes + self.views.nbytes
+
+    def first(self, count: int) -> PlaceFeatures:
+        """Return the first of the features: the strongest ones, which are evenly spread."""
+        return PlaceFeatures(self.descriptors[:count], self.views[:count])
+
+
+# Features of a frame that shows none; exact.
+NOTHING: Final = PlaceFeatures(np.zeros((0, DESCRIPTOR), np.uint8), np.zeros((0, 3), np.float32))
+
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,7 @@ from calib import se3
 from omnid.core.places.features import FEATURES
 from omnid.core.places.hypotheses import angle_rad, length_m
 from omnid.core.places.place_comparison import compare, supported, unambiguous
-from omnid.core.places.place_features import PlaceFeatures
-from omnid.core.places.place_map import PlaceKeyframe, PlaceMap
+from omnid.core.places.place_map import PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.recognition import Recognition
 from omnid.core.places.signature import Signature, signature_of, similarities
 from omnid.core.types.stereo_model import StereoModel

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calib import se3
 from omnid.core.odometry.pose_estimation import gauss_newton, ransac
-from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.stereo.triangulation import point_covariance, triangulate, view
 from omnid.core.types.stereo_model import StereoModel
 

@@ -10,7 +10,7 @@ import pytest
 
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS, azimuths
-from omnid.core.obstacles.cell_kernels import ABOVE, FLOOR, LEAST_VISIBLE, SURFACE
+from omnid.core.obstacles.cell_kernels import ABOVE, FLOOR, FREE_ODDS, LEAST_VISIBLE, SURFACE
 from omnid.core.obstacles.cell_kernels import VISIBLE as VISIBLE_LAYER
 from omnid.core.obstacles.column import NEAREST_M, ColumnEvidence, Columns, floor_plane
 from omnid.core.obstacles.grid import CELL_M, CELLS, PRIOR, GridRing, ObstacleGrid
@@ -18,8 +18,7 @@ from omnid.core.obstacles.moving_tracker import MovingTracker
 from omnid.core.obstacles.near_field import lose_before
 from omnid.core.obstacles.pair_views import DIRECTIONS
 from omnid.core.obstacles.settings import RingSettings
-from omnid.core.obstacles.state_kernels import FREE_ODDS
-from omnid.core.obstacles.watch import FLOOD_MPS, FRESH_NS, NEVER, ONCE_FREE_NS
+from omnid.core.obstacles.usual_floor import FLOOD_MPS, FRESH_NS, NEVER, ONCE_FREE_NS
 from omnid.core.types.panorama import PaddedPanorama
 from tests.omnid.core.obstacles.drawn_floor import (
     BASELINE_M,

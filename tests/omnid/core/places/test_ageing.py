@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from omnid.core.places.ageing import AGED_MISSES, VISIT_M, Ageing
+from omnid.core.places.map_parts import AGED_MISSES, VISIT_M, Ageing
 from omnid.core.places.place_map import KeyframeUse, PlaceMap
 from tests.omnid.core.places.test_place_map import chain, pose
 

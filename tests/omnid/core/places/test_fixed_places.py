@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from omnid.core.places.fixed_places import FixedPlaces
+from omnid.core.places.map_parts import FixedPlaces
 from tests.omnid.core.places.test_map_parts import map_of
 
 

@@ -12,10 +12,10 @@ import pytest
 from calib import se3
 from omnid.core.mapping.range_scan import SECTORS
 from omnid.core.odometry.stereo_frame import StereoFrame
-from omnid.core.places.limits import PlaceLimits
+from omnid.core.places.hypotheses import SEARCHES
 from omnid.core.places.localisation import MapLocaliser
 from omnid.core.places.map_pose import MapPose, OdometryFrame
-from omnid.core.places.search_schedule import SEARCHES
+from omnid.core.places.place_map import PlaceLimits
 from omnid.tracking_state import MapState
 from tests.omnid.core.scenery import Array, RenderedCameras, motion_errors
 from tests.simulation import corridor

@@ -10,7 +10,7 @@ import pytest
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places.features import describe
 from omnid.core.places.place_comparison import VOTERS, votes
-from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceFeatures
 from tests.omnid.core.scenery import RenderedCameras
 from tests.simulation import corridor
 from tests.simulation.paths import planar_poses

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib import se3
-from omnid.core.places.place_features import PlaceFeatures
-from omnid.core.places.place_map import KeyframeUse, Link, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_map import KeyframeUse, Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 
 
 def keyframe(number: int, features: int = 10) -> PlaceKeyframe:

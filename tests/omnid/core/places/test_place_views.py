@@ -9,8 +9,7 @@ import numpy as np
 from calib import se3
 from calib.panorama import Cylinder
 from omnid.core.mapping.scan_grid import FREE, OCCUPIED
-from omnid.core.places.place_features import PlaceFeatures
-from omnid.core.places.place_map import Link, PlaceKeyframe, PlaceMap
+from omnid.core.places.place_map import Link, PlaceFeatures, PlaceKeyframe, PlaceMap
 from omnid.core.places.place_rig import PlaceRig
 from omnid.core.places.place_views import base_poses, drives, grid, landmarks, loops_xy, parts, paths_xy, summary
 from omnid.core.stereo.triangulation import view

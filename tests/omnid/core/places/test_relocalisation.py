@@ -13,7 +13,7 @@ from omnid.core.odometry.landmarks import Keyframe
 from omnid.core.odometry.stereo_frame import StereoFrame
 from omnid.core.places import relocalisation
 from omnid.core.places.features import describe
-from omnid.core.places.place_features import PlaceFeatures
+from omnid.core.places.place_map import PlaceFeatures
 from omnid.core.places.relocalisation import Relocaliser
 from tests.omnid.core.scenery import RenderedCameras, motion_errors
 from tests.simulation import corridor

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from calib import se3
-from omnid.core.places.limits import PlaceLimits
-from omnid.core.places.search_schedule import SEARCH_NS, SEARCHES, WAIT_FACTOR, SearchSchedule
+from omnid.core.places.hypotheses import SEARCH_NS, SEARCHES, WAIT_FACTOR, SearchSchedule
+from omnid.core.places.place_map import PlaceLimits
 from tests.omnid.core.places.test_place_map import keyframe
 
 S = 1_000_000_000
