@@ -6,7 +6,6 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -133,15 +132,6 @@ def test_a_stop_voids_setpoints_and_latches_until_armed(driving: Bench) -> None:
     assert driving.last.velocity_mps > 0.0
 
 
-def test_a_velocity_that_the_wheels_do_not_know_is_no_sample_of_them(driving: Bench) -> None:
-    send = driving.wheels.send
-    driving.wheels.send = lambda command: replace(send(command), velocity_mps=math.nan)  # type: ignore[method-assign]
-    send_both(driving)
-    assert driving.controller.tick().wheels is None
-    driving.wheels.send = send  # type: ignore[method-assign]
-    assert driving.controller.tick().wheels is not None
-
-
 @pytest.mark.hazard("H40")
 def test_stops_on_an_overloaded_host_and_voids_earlier_setpoints(driving: Bench) -> None:
     send_both(driving)
@@ -203,21 +193,6 @@ def test_drives_on_where_an_answer_is_late(driving: Bench) -> None:
         driving.tick()
     assert driving.controller.state.late == 1 and driving.controller.state.errors == 0
     assert driving.last.velocity_mps == 0.3 and driving.controller.state.reason == "" and driving.lines == []
-
-
-def test_continues_the_ramp_after_a_late_answer(driving: Bench) -> None:
-    """A command without an answer counts as a step of the ramp to the stop."""
-
-    def late(_: VelocityCommand) -> MotorStatus:
-        raise LateReplyError("motor on /dev/x gave no answer")
-
-    send, driving.wheels.send = driving.wheels.send, late  # type: ignore[method-assign]
-    driving.controller.end()
-    driving.tick()
-    assert not driving.controller.is_at_rest
-    driving.wheels.send = send  # type: ignore[method-assign]
-    driving.tick()
-    assert driving.last.velocity_mps == pytest.approx(0.3 - 2 * LIMITS.deceleration_mps2 * PERIOD_S)
 
 
 def test_holds_the_heading_in_odom(bench: Bench) -> None:

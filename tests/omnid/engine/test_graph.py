@@ -14,7 +14,7 @@ import pytest
 
 from omnid.engine.graph import LOSSLESS, NEWEST, Graph, Slot
 from omnid.errors import OmnidError
-from tests.omnid.engine.graph_parts import LONG_S, Action, Apply, Collect, Sums, both, fail_at, stopped_at
+from tests.omnid.engine.graph_parts import LONG_S, Apply, Collect, Sums, both, fail_at, stopped_at
 
 pytestmark = pytest.mark.usefixtures("no_thread_is_left", "default_signals")
 
@@ -168,18 +168,6 @@ def test_raises_an_error_with_the_name_of_its_stage(threaded: bool, place: str) 
     assert caught.value.__notes__ == ["in 'sink'" if place in ("finish", "sink") else "in 'source'"]
 
 
-def test_later_errors_are_notes_of_the_first() -> None:
-    class Second(Collect):
-        def finish(self) -> None:
-            raise OSError("the disk is full")
-
-    graph = Graph()
-    graph.sink("second", Second(), graph.stage("first", Apply(fail_at(3)), graph.source("numbers", lambda: range(9))))
-    with pytest.raises(ValueError, match="cannot take 3") as caught:
-        graph.run()
-    assert caught.value.__notes__ == ["in 'first'", "and then: OSError('the disk is full')"]
-
-
 @both
 def test_stop_from_another_thread_drains_and_finishes(threaded: bool) -> None:
     graph, sink, stopped = Graph(threaded=threaded), Collect(), threading.Event()
@@ -266,27 +254,6 @@ def test_a_second_ctrl_c_interrupts_an_inline_stage() -> None:
     assert sink.finished == 0
 
 
-def test_an_exception_from_another_signal_handler_joins_all_threads() -> None:
-    graph, sink = Graph(), Collect()
-
-    def too_long(*_: object) -> None:
-        raise TimeoutError("alarm")
-
-    old = signal.signal(signal.SIGALRM, too_long)
-    try:
-
-        def act() -> None:
-            os.kill(os.getpid(), signal.SIGALRM)
-            threading.Event().wait(0.05)  # still working when the main thread raises
-
-        numbers = graph.source("numbers", count)
-        graph.sink("sink", sink, graph.stage("pass", Apply(stopped_at(graph, 5, act)), numbers))
-        with pytest.raises(TimeoutError, match="alarm"):
-            graph.run()
-    finally:
-        signal.signal(signal.SIGALRM, old)
-
-
 def test_wake_ends_a_blocked_source() -> None:
     graph, sink, closed = Graph(), Collect(), threading.Event()
 
@@ -298,27 +265,6 @@ def test_wake_ends_a_blocked_source() -> None:
     graph.sink("sink", sink, graph.source("camera", camera, wake=closed.set))
     graph.run()
     assert (sink.got, sink.finished) == ([1], 1)
-
-
-@both
-def test_a_stop_before_the_run_ends_it_at_once(threaded: bool) -> None:
-    graph, sink = Graph(threaded=threaded), Collect()
-    graph.sink("sink", sink, graph.source("numbers", count))
-    graph.stop()
-    graph.run()
-    assert (sink.got, sink.finished) == ([], 1)
-
-
-@both
-def test_runs_leave_no_thread(threaded: bool) -> None:
-    before = set(threading.enumerate())
-    for _ in range(200):
-        graph, sink = Graph(threaded=threaded), Collect()
-        graph.sink("sink", sink, graph.stage("sums", Sums(), graph.source("numbers", lambda: range(5))))
-        graph.ticker("action", 1e-3, Action(enough=1))
-        graph.run()
-        assert sink.got == [1, 5, 4, -1]
-        assert set(threading.enumerate()) <= before
 
 
 def test_refuses_wrong_wiring() -> None:

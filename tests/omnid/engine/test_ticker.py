@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from functools import partial
 from itertools import count
 
 import pytest
@@ -42,23 +41,6 @@ def test_a_failing_ticker_is_closed_and_ends_the_run(threaded: bool) -> None:
         graph.run()
     assert caught.value.__notes__ == ["in 'motor'"]
     assert (action.calls, action.closed, sink.finished) == (3, 1, 1)
-
-
-def test_a_stop_ends_tickers_before_the_inboxes_are_empty() -> None:
-    graph, sink, action = Graph(), Collect(), Action(enough=1)
-    hourly, both_closed = Action(enough=1), threading.Barrier(3)
-    action.close = hourly.close = partial(both_closed.wait, LONG_S)  # type: ignore[method-assign, assignment]
-
-    def drain_slowly(message: int) -> int:
-        graph.stop()
-        both_closed.wait(LONG_S)  # tickers are closed while this message is in process
-        return message
-
-    graph.sink("sink", sink, graph.stage("slow", Apply(drain_slowly), graph.source("one", lambda: [1])))
-    graph.ticker("motor", 1e-3, action)
-    graph.ticker("hourly", 3600.0, hourly)
-    graph.run()
-    assert sink.got == [1]
 
 
 @pytest.mark.parametrize(
