@@ -75,7 +75,7 @@ def value_at(settings: object, path: str) -> object:
 
 def dump(settings: object) -> str:
     """Return commented TOML with the description, range and default of every key; `load` reads the same object."""
-    return "\n".join(_dumped(settings, type(settings)(), ())).strip("\n") + "\n"
+    return "\n".join(_lines(settings, type(settings)(), (), None)).strip("\n") + "\n"
 
 
 def dump_minimal(settings: object, wanted: Collection[str]) -> str:
@@ -83,7 +83,7 @@ def dump_minimal(settings: object, wanted: Collection[str]) -> str:
 
     wanted: dotted paths of keys that are listed in any case, commented out where they have their default.
     """
-    return "\n".join(_minimal(settings, type(settings)(), (), {*wanted, *changed(settings)})).strip("\n") + "\n"
+    return "\n".join(_lines(settings, type(settings)(), (), {*wanted, *changed(settings)})).strip("\n") + "\n"
 
 
 def _change(root: type, text: str) -> tuple[Path, object]:
@@ -145,35 +145,27 @@ def _insert(table: dict[str, Any], path: Path, value: object) -> None:
     table[path[-1]] = value
 
 
-def _dumped(settings: Any, default: Any, path: Path) -> Iterator[str]:
-    """Yield the lines of a section and of those within it; keys come first, because TOML wants them before tables."""
-    types = types_of(type(settings))
-    if path and not all(map(is_section, types.values())):
-        yield from ("", f"[{'.'.join(path)}]")
-    for name, kind in types.items():
-        if not is_section(kind):
-            yield f"# {_description(kind)}"
-            yield f"# {described(kind)}; default {_toml(getattr(default, name))}"
-            yield f"{name} = {_toml(getattr(settings, name))}"
-    for name, kind in types.items():
-        if is_section(kind):
-            yield from _dumped(getattr(settings, name), getattr(default, name), (*path, name))
+def _lines(settings: Any, default: Any, path: Path, wanted: Collection[str] | None) -> Iterator[str]:
+    """Yield the lines of a section and of those within it; keys come first, because TOML wants them before tables.
 
-
-def _minimal(settings: Any, default: Any, path: Path, wanted: Collection[str]) -> Iterator[str]:
-    """Yield the lines of the keys that are wanted, of a section and of those within it."""
+    wanted: the dotted paths of the keys that are listed, without their ranges; None: all, with them.
+    """
     types, lines = types_of(type(settings)), []
     for name, kind in types.items():
-        if ".".join((*path, name)) in wanted:
-            value = getattr(settings, name)
-            off = "# " if value == getattr(default, name) else ""
-            lines += [f"# {_description(kind)}", f"{off}{name} = {_toml(value)}"]
+        if is_section(kind) or (wanted is not None and ".".join((*path, name)) not in wanted):
+            continue
+        value, usual = getattr(settings, name), getattr(default, name)
+        lines.append(f"# {_description(kind)}")
+        if wanted is None:
+            lines.append(f"# {described(kind)}; default {_toml(usual)}")
+        is_off = wanted is not None and value == usual
+        lines.append(f"{'# ' if is_off else ''}{name} = {_toml(value)}")
     if lines and path:
         yield from ("", f"[{'.'.join(path)}]")
     yield from lines
     for name, kind in types.items():
         if is_section(kind):
-            yield from _minimal(getattr(settings, name), getattr(default, name), (*path, name), wanted)
+            yield from _lines(getattr(settings, name), getattr(default, name), (*path, name), wanted)
 
 
 def _description(kind: Any) -> str:

@@ -104,25 +104,20 @@ def _text_of(path: Path | None) -> str:
 
 def _write(path: Path, text: str, values: dict[str, str], drive: DriveSettings) -> None:
     """Set the values in the file, after a check that a reader gets these values and all others as before."""
-    import tempfile
     from dataclasses import replace
 
     from calib.rig_file import write_file
-    from omnid.config import load_config
+    from omnid.config import Config
     from omnid.doctor.wheel_wiring import toml_with
+    from omnid.settings import parse
 
-    after = toml_with(text, SECTION, values)
-    with tempfile.TemporaryDirectory() as folder:
-        tried, before = Path(folder) / "after.toml", Path(folder) / "before.toml"
-        tried.write_text(after, "utf-8")
-        before.write_text(text, "utf-8")
-        old = load_config(before)
-        changed = {name: getattr(drive, name) for name in values}
-        wanted = replace(old, motor=replace(old.motor, drive=replace(old.motor.drive, **changed)))
-        try:
-            same = load_config(tried) == wanted
-        except OmnidError:
-            same = False
+    after, old = toml_with(text, SECTION, values), parse(Config, text.encode(), origin=str(path))
+    changed = {name: getattr(drive, name) for name in values}
+    wanted = replace(old, motor=replace(old.motor, drive=replace(old.motor.drive, **changed)))
+    try:
+        same = parse(Config, after.encode(), origin=str(path)) == wanted
+    except OmnidError:
+        same = False
     if not same:
         raise OmnidError(f"--write {path}: the section [{SECTION}] cannot be set there: put the lines above into it")
     write_file(path, after.encode())
