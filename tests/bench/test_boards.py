@@ -7,9 +7,16 @@ import pytest
 
 from calib.boards.board import Board
 from calib.boards.board_finder import find_board
-from tests.bench.boards import DETECTORS, classify_detection, corner_orders, count, meets_requirement
-from tests.bench.boards_near import render_near_board
-from tests.bench.boards_rendered import HardBoard, render_hard_board
+from tests.bench.boards import (
+    DETECTORS,
+    HardBoard,
+    classify_detection,
+    corner_orders,
+    count,
+    meets_requirement,
+    render_hard_board,
+    render_near_board,
+)
 
 # Small images of every kind of mirror and of many walls.
 NUMBERS = (2, 14, 16, 23, 24, 25)

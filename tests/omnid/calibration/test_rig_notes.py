@@ -12,7 +12,7 @@ from calib.fit.boards.rig_problem import PairView
 from calib.fit.residual_structure import ResidualStructure
 from calib.fit.rig_uncertainty import DriveUncertainty
 from omnid.calibration.rig_notes import accuracy_warnings, missing_views
-from tests.bench.boards_chain import BOARD, board_poses, board_rig
+from tests.bench.calibration import BOARD, board_poses, board_rig
 
 RIG = board_rig(21, 0.0)[0]
 NOISE, MISFIT = ResidualStructure(0.01, 0.2), ResidualStructure(0.14, 0.2)

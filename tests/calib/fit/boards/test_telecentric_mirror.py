@@ -14,8 +14,7 @@ from calib.models.ocam import OcamCamera
 from calib.models.unified import UnifiedCamera
 from calib.models.wavefront import TERMS
 from calib.rig import Rig
-from tests.bench.boards_chain import board_rig
-from tests.bench.rig_sigmas import projected_views
+from tests.bench.calibration import board_rig, projected_views
 
 RADIUS_M = 0.03
 BOARD = Board(5, 4, 0.08)  # as large as one of 9 x 6 corners, with fewer of them to fit
