@@ -47,6 +47,7 @@ from calib.models.ocam import project_near
 from calib.rig import Rig
 from calib.rig_file import read_rig, write_rig
 from calib.rig_frame import rig_between
+from omnid.calibration.images import BY_NAME
 from omnid.calibration.rig_check import check_log
 from omnid.cli import main as omnid_main
 from omnid.core.rig.column_finding import RigState
@@ -319,7 +320,7 @@ def check(args: argparse.Namespace) -> None:
         rig = mild_rig(seed, SIZE // 2)
         with TemporaryDirectory() as folder:
             write_log(Path(folder), rig, paths.spline_path(seed, 12, 0.4), corridor(seed, 13.0), seed=seed)
-            finding = check_log(Path(folder) / "log.mcap", rig, (None, None))[0].finding
+            finding = check_log(Path(folder) / "log.mcap", rig, BY_NAME)[0].finding
         drift, ratio = finding.drift, math.nan
         if drift is not None:
             ratio = math.sqrt(drift.turn @ np.linalg.solve(drift.covariance[:3, :3], drift.turn) / 3)

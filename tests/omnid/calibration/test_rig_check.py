@@ -13,7 +13,7 @@ from calib import se3
 from calib.models.camera import Mask
 from calib.models.unified import UnifiedCamera
 from calib.rig_file import read_rig, write_rig
-from omnid.calibration.images import open_log
+from omnid.calibration.images import BY_NAME, open_log
 from omnid.calibration.rig_check import RigCheckResult, check_rig, read_rig_pairs
 from omnid.cli import main
 from omnid.config import PanoramaConfig
@@ -42,7 +42,7 @@ def drive(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def pairs(drive: Path) -> list[FramePair]:
     rig = read_rig(drive / "rig.toml")
-    return read_rig_pairs(open_log(drive / "log.mcap", (None, None), rig), rig)
+    return read_rig_pairs(open_log(drive / "log.mcap", BY_NAME, rig), rig)
 
 
 def check_rotated(drive: Path, pairs: list[FramePair], turn_deg: Turn) -> RigCheckResult:
@@ -54,7 +54,7 @@ def test_images_that_are_not_synchronous_make_pairs(tmp_path: Path) -> None:
     run = build("turns", 3, 128, 4)
     write_log(tmp_path, run.rig, run.poses, run.scene, readout=Readout(skew_ms=(40.0, 40.0)), supersample=1)
     rig = read_rig(tmp_path / "rig.toml")
-    found = read_rig_pairs(open_log(tmp_path / "log.mcap", (None, None), rig), rig)
+    found = read_rig_pairs(open_log(tmp_path / "log.mcap", BY_NAME, rig), rig)
     assert [pair.skew_s for pair in found] == pytest.approx([0.04] * 4)
 
 
