@@ -39,6 +39,7 @@ from omnid.sinks.recorder import Recorder
 from omnid.stages.geometry import Geometry
 from omnid.transport.bus import Bus
 from omnid.transport.records import DiagnosticStatus
+from omnid.transport.status_names import with_remedy
 
 StatusPublisher: TypeAlias = Callable[[list[DiagnosticStatus]], None]
 
@@ -82,7 +83,7 @@ def _status_on_bus(bus: Bus) -> StatusPublisher:
 
     def publish(statuses: list[DiagnosticStatus]) -> None:
         with suppress(OmnidError):  # the system's clock may be set to a time that no message can hold
-            message = status_report(time.time_ns(), statuses)
+            message = status_report(time.time_ns(), [with_remedy(status) for status in statuses])
             bus.publish(message.topic, message.payload)
 
     return publish

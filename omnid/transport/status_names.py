@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from enum import StrEnum
 from typing import Final, NamedTuple
 
 from omnid.core.control.safety_rules import ASKED
 from omnid.tracking_state import TrackingState
+from omnid.transport.records import DiagnosticStatus
 
 PREFIX: Final = "omnid: "
 ODOMETRY: Final = f"{PREFIX}odometry"
@@ -121,6 +123,27 @@ CAPTURE_TO_WHEEL: Final = "capture_to_wheel"
 TICK_LATE: Final = "tick_late"
 
 
+# The usual advice for each part that can warn; an entry with a remedy of its own keeps that.
+REMEDIES: Final = {
+    ODOMETRY: "stop, then drive back slowly to a place that it has seen; check light and mirrors",
+    PAIRING: "on the robot: omnid doctor",
+    WHEELS: "remove the cause, then arm; on the robot: omnid doctor",
+    BUS: "see bus.robot and bus.connect in the robot's configuration",
+    RECORDING: "make room on the disk, or change record.folder",
+    LOAD: "close other programs on the robot, or start it with --profile small",
+    EXPOSURE: "switch lights on, or set cameras.exposure_limit_ms",
+    FLOOR: "state the height of the cameras in the rig: omnid calibrate drive --only height",
+    IMAGES: "clean the mirrors, look for glare and darkness, check the cameras and their driver",
+    RIG: "omnid calibrate drive --only check on a recording; name the right rig.toml, or calibrate again",
+    MOTION: "check motor.drive in the configuration, and the grip of the wheels",
+    MAP_FILE: "make room on the disk, or change places.map",
+    NAVIGATION: "remove the cause that the robot names, then `omnid goto` or `omnid route repeat` again",
+    REQUESTS: "see the robot's log for the reason",
+    PLACES: "drive slowly to where the map was made; where everything has changed, make a new map",
+}
+_CAMERA_REMEDY: Final = "check its cable and its power; on the robot: omnid doctor"
+
+
 class TimeKey(NamedTuple):
     """Name and statistic of a measured time."""
 
@@ -148,6 +171,14 @@ def short_name(name: str) -> str:
     return name.removeprefix(PREFIX)
 
 
+def with_remedy(status: DiagnosticStatus) -> DiagnosticStatus:
+    """Return a status with the usual advice for its part, where it is not good and has no advice of its own."""
+    usual = _CAMERA_REMEDY if status.name.endswith(" camera") else REMEDIES.get(status.name, "")
+    if status.level == 0 or status.values.get(Key.REMEDY) or not usual:
+        return status
+    return replace(status, values={**status.values, Key.REMEDY: usual})
+
+
 def time_key(name: str, statistic: str) -> str:
     """Return the key of a measured time in ms: time_key("work", "p50") == "work_p50_ms"."""
     return f"{name}_{statistic}{_TIME_SUFFIX}"
@@ -172,12 +203,6 @@ def count(text: str) -> int | None:
     """Return a value as a count; None for any other text."""
     value = number(text)
     return int(value) if value is not None and value >= 0 and value.is_integer() else None
-
-
-def landmark_counts(values: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return inliers and tracked landmarks of the odometry's values; None in recordings of earlier versions."""
-    inliers, tracked = count(values.get(Key.INLIERS, "")), count(values.get(Key.TRACKED, ""))
-    return (inliers, tracked) if inliers is not None and tracked is not None else None
 
 
 def tracking_state(message: str, values: Mapping[str, str]) -> TrackingState | None:

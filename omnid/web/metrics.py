@@ -1,10 +1,15 @@
-"""Metrics in the text format of Prometheus (exposition format 0.0.4)."""
+"""Metrics for Prometheus."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Final
+
+from prometheus_client import CollectorRegistry, Metric, generate_latest
+from prometheus_client.core import CounterMetricFamily as Counter
+from prometheus_client.core import GaugeMetricFamily as Gauge
+from prometheus_client.registry import Collector
 
 from omnid.engine.telemetry import Histogram
 from omnid.monitor.robot_state import RobotState
@@ -14,90 +19,87 @@ from omnid.transport.status_names import number, short_name
 from omnid.web.browsers import Browsers
 from omnid.web.snapshot import LONGEST_VALUE, MOST_VALUES
 
-CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
-_QUANTILES: Final = (0.5, 0.99)
 _TEXTS: Final = {
     "dropped": "Messages of the robot that the inbox dropped",
     "stops": "Stops asked for",
     "arms": "Requests to arm",
 }
-Sample = tuple[Mapping[str, str], float]  # labels and value
+Samples = Iterable[tuple[tuple[str, ...], float]]  # values of the labels, and the value
 
 
-def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> str:
-    """Return all metrics; refused: requests by reason; counts: further counters, by name."""
-    return "".join(_lines(state, browsers, refused, counts))
+def metrics(state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> bytes:
+    """Return all metrics as text; refused: requests by reason; counts: further counters, by name."""
+
+    class Snapshot(Collector):
+        def collect(self) -> Iterator[Metric]:
+            yield from _of_robot(state)
+            yield from _of_server(browsers, refused, counts)
+
+    registry = CollectorRegistry(auto_describe=False)
+    registry.register(Snapshot())
+    return generate_latest(registry)
 
 
-def _lines(
-    state: RobotState, browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]
-) -> Iterator[str]:
-    yield from _metric("omnid_up", "gauge", "1 if the daemon's token is on the bus", [({}, float(state.alive is True))])
-    yield from _metric("omnid_pose_rate_hz", "gauge", "Poses received per second", [({}, state.rate_hz)])
-    yield from _metric("omnid_poses_total", "counter", "Poses received", [({}, state.poses)])
-    yield from _metric("omnid_poses_missed_total", "counter", "Skipped sequence numbers", [({}, state.missed)])
-    yield from _metric(
-        "omnid_messages_broken_total", "counter", "Messages that could not be decoded", [({}, state.broken)]
-    )
-    yield from _metric(
-        "omnid_tracking_state",
-        "gauge",
-        "1 for the state of the newest pose",
-        [({"state": str(name)}, float(state.state == name)) for name in TrackingState],
-    )
-    for name, text, histogram in (
-        ("omnid_pose_age_seconds", "From the images to the arrival of a pose", state.age),
-        ("omnid_network_seconds", "From the robot's network to the arrival of a pose", state.network),
-    ):
-        yield from _quantiles(name, text, histogram)
-    yield from _metric(
-        "omnid_status_level",
-        "gauge",
-        "0 good, 1 warning, 2 error, 3 stale",
-        [({"part": short_name(part.name)}, part.level) for part in state.statuses.values()],
-    )
-    yield from _metric("omnid_status_value", "gauge", "Numbers of the status", _values(state))
-    yield from _server(browsers, refused, counts)
+def _of_robot(state: RobotState) -> Iterator[Metric]:
+    yield _gauge("omnid_up", "1 if the daemon's token is on the bus", float(state.alive is True))
+    yield _gauge("omnid_pose_rate_hz", "Poses received per second", state.rate_hz)
+    yield _counter("omnid_poses", "Poses received", state.poses)
+    yield _counter("omnid_poses_missed", "Skipped sequence numbers", state.missed)
+    yield _counter("omnid_messages_broken", "Messages that could not be decoded", state.broken)
+    states = [((str(name),), float(state.state == name)) for name in TrackingState]
+    yield _labelled(Gauge, "omnid_tracking_state", "1 for the state of the newest pose", ["state"], states)
+    yield _quantiles("omnid_pose_age_seconds", "From the images to the arrival of a pose", state.age)
+    yield _quantiles("omnid_network_seconds", "From the robot's network to the arrival of a pose", state.network)
+    levels = [((short_name(part.name),), part.level) for part in state.statuses.values()]
+    yield _labelled(Gauge, "omnid_status_level", "0 good, 1 warning, 2 error, 3 stale", ["part"], levels)
+    values = [
+        ((short_name(part.name), key), value)
+        for part in state.statuses.values()
+        for key, text in list(part.values.items())[:MOST_VALUES]
+        if (value := number(text)) is not None
+    ]
+    yield _labelled(Gauge, "omnid_status_value", "Numbers of the status", ["part", "key"], values)
 
 
-def _server(browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> Iterator[str]:
+def _of_server(browsers: Browsers, refused: Mapping[str, int], counts: Mapping[str, int]) -> Iterator[Metric]:
     for name, count in counts.items():
-        yield from _metric(f"omnid_web_{name}_total", "counter", _TEXTS[name], [({}, count)])
-    yield from _quantiles(
+        yield _counter(f"omnid_web_{name}", _TEXTS[name], count)
+    yield _quantiles(
         "omnid_web_answer_seconds", "From a message to the answer of a browser that has drawn it", browsers.answer
     )
-    yield from _metric("omnid_web_browsers", "gauge", "Open pages", [({}, len(browsers))])
-    for name, text, label, counts in (
-        ("omnid_web_sent_total", "Messages sent to browsers", "channel", browsers.sent),
-        ("omnid_web_skipped_total", "Messages that a newer one replaced", "channel", browsers.skipped),
-        ("omnid_web_closed_total", "Pages that were disconnected", "reason", browsers.closed),
-        ("omnid_web_refused_total", "Requests that were refused", "reason", refused),
+    yield _gauge("omnid_web_browsers", "Open pages", len(browsers))
+    for name, text, label, counted in (
+        ("sent", "Messages sent to browsers", "channel", browsers.sent),
+        ("skipped", "Messages that a newer one replaced", "channel", browsers.skipped),
+        ("closed", "Pages that were disconnected", "reason", browsers.closed),
+        ("refused", "Requests that were refused", "reason", refused),
     ):
-        yield from _metric(name, "counter", text, [({label: key}, count) for key, count in counts.items()])
+        samples = (((key,), count) for key, count in counted.items())
+        yield _labelled(Counter, f"omnid_web_{name}", text, [label], samples)
 
 
-def _quantiles(name: str, text: str, histogram: Histogram) -> Iterator[str]:
-    yield from _metric(name, "gauge", text, [({"quantile": str(q)}, histogram.p(q)) for q in _QUANTILES])
+def _gauge(name: str, text: str, value: float) -> Metric:
+    return Gauge(name, text, value if math.isfinite(value) else None)
 
 
-def _values(state: RobotState) -> Iterator[Sample]:
-    for part in state.statuses.values():
-        for key, text in list(part.values.items())[:MOST_VALUES]:
-            value = number(text)
-            if value is not None:
-                yield {"part": short_name(part.name), "key": key}, value
+def _counter(name: str, text: str, value: float) -> Metric:
+    """Return a counter; its sample has the name with `_total`."""
+    return Counter(name, text, value)
 
 
-def _metric(name: str, kind: str, text: str, samples: Iterable[Sample]) -> Iterator[str]:
-    """Yield a metric; values that are not finite and labels that were there before are left out."""
-    yield f"# HELP {name} {text}\n# TYPE {name} {kind}\n"
-    seen = set()
-    for labels, value in samples:
-        shown = ",".join(f'{key}="{_escaped(label)}"' for key, label in labels.items())
-        if math.isfinite(value) and shown not in seen:
-            seen.add(shown)
-            yield f"{name}{{{shown}}} {value:.10g}\n" if shown else f"{name} {value:.10g}\n"
+def _quantiles(name: str, text: str, histogram: Histogram) -> Metric:
+    return _labelled(Gauge, name, text, ["quantile"], (((str(q),), histogram.p(q)) for q in (0.5, 0.99)))
 
 
-def _escaped(label: str) -> str:
-    return plain(label)[:LONGEST_VALUE].replace("\\", r"\\").replace('"', r"\"")
+def _labelled(
+    kind: type[Gauge] | type[Counter], name: str, text: str, labels: Sequence[str], samples: Samples
+) -> Metric:
+    """Return a metric with a sample for each set of labels; those that are not finite or come again are left out."""
+    found: dict[tuple[str, ...], float] = {}
+    for given, value in samples:
+        if math.isfinite(value):
+            found.setdefault(tuple(plain(label)[:LONGEST_VALUE] for label in given), value)
+    metric = kind(name, text, labels=labels)
+    for given, value in found.items():
+        metric.add_metric(given, value)
+    return metric

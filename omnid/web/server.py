@@ -18,6 +18,7 @@ from typing import Any, Final
 from urllib.parse import parse_qs
 
 import uvicorn
+from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
@@ -30,9 +31,7 @@ from omnid.errors import OmnidError
 from omnid.transport.bus_config import BusConfig, checked
 from omnid.web.access import Access, Guard, is_of_other_site, token_of
 from omnid.web.feed import RobotFeed
-from omnid.web.metrics import CONTENT_TYPE
-from omnid.web.robot_page import RobotPage
-from omnid.web.robot_requests import text_of
+from omnid.web.robot import RobotPage, text_of
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8447"
 STATIC: Final = Path(__file__).with_name("static")
@@ -139,7 +138,7 @@ def site(page: RobotPage, access: Access, *, secure: bool) -> Guard:
         return response
 
     async def metrics(_: Request) -> Response:
-        return PlainTextResponse(page.metrics(guard.refused), media_type=CONTENT_TYPE)
+        return PlainTextResponse(page.metrics(guard.refused), media_type=CONTENT_TYPE_LATEST)
 
     outer = [
         Route("/", index),

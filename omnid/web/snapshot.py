@@ -19,7 +19,6 @@ from omnid.transport.decode import Map, NavigationReport, Pose, PoseInMap
 from omnid.transport.scan_codec import Scan
 from omnid.transport.status_names import PLACES, WHEELS, Key, short_name
 from omnid.web.channels import compact, with_header
-from omnid.web.remedies import remedy_of
 
 PATH_FRAME: Final = "odom"
 FRAMES: Final = (PATH_FRAME, "map")  # Frames of a map that is drawn.
@@ -247,7 +246,9 @@ def _warnings(state: RobotState, link: str) -> list[dict[str, Any]]:
     elif state.alive is False:
         found.append(_warning(2, "robot", "its daemon has ended or cannot be reached", _ROBOT_GONE))
     parts = sorted((part for part in state.statuses.values() if part.level % 4 != OK), key=importance)
-    found += [_warning(part.level % 4, short_name(part.name), part.message, remedy_of(part)) for part in parts]
+    found += [
+        _warning(part.level % 4, short_name(part.name), part.message, part.values.get(Key.REMEDY, "")) for part in parts
+    ]
     return found[:MOST_WARNINGS]
 
 

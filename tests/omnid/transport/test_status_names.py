@@ -6,6 +6,7 @@ import pytest
 
 from omnid.tracking_state import TrackingState
 from omnid.transport import status_names
+from omnid.transport.records import DiagnosticStatus
 from omnid.transport.status_names import Key, TimeKey
 
 
@@ -39,9 +40,14 @@ def test_values_are_numbers_or_nothing(text: str, number: float | None, count: i
     assert status_names.number(text) == number and status_names.count(text) == count
 
 
-def test_landmark_counts_need_both_keys() -> None:
-    assert status_names.landmark_counts({Key.INLIERS: "12", Key.TRACKED: "40"}) == (12, 40)
-    assert status_names.landmark_counts({"landmarks": "12 of 40"}) is None, "earlier versions published a sentence"
+def test_every_part_that_can_warn_has_a_remedy() -> None:
+    names = {value for value in vars(status_names).values() if isinstance(value, str) and value.startswith("omnid: ")}
+    silent = {"omnid: ", *map("omnid: ".__add__, ("stage ", "summary", "calibration", "simulation", "threads"))}
+    for name in (*names - silent, status_names.camera_name("lower")):
+        assert status_names.with_remedy(DiagnosticStatus(name, 1, "", {})).values[Key.REMEDY], name
+    own = DiagnosticStatus(status_names.WHEELS, 1, "", {Key.REMEDY: "omnid arm"})
+    good = DiagnosticStatus(status_names.WHEELS, 0, "", {})
+    assert status_names.with_remedy(own) is own and status_names.with_remedy(good) is good
 
 
 def test_tracking_state_is_the_key_else_the_message() -> None:

@@ -1,9 +1,10 @@
-"""Metrics for Prometheus: values, labels, and what does not belong into them."""
+"""Metrics for Prometheus, read by the parser of its own client: values, labels, and what does not belong into them."""
 
 from __future__ import annotations
 
-import re
 import time
+
+from prometheus_client import parser
 
 from omnid.monitor.robot_state import ReceivedMessage, RobotState
 from omnid.tracking_state import TrackingState
@@ -14,7 +15,16 @@ from omnid.web.browsers import Browsers
 from omnid.web.metrics import metrics
 from tests.omnid.transport.bus_fixtures import odometry
 
-LINE = re.compile(r'[a-z_]+(\{[a-z]+="(\\.|[^"\\\n])*"(,[a-z]+="(\\.|[^"\\\n])*")*\})? -?[0-9.e+-]+')
+
+def samples(state: RobotState) -> dict[tuple[str, ...], float]:
+    """Return the values by their name and the values of their labels, in the order of these."""
+    text = metrics(state, Browsers([]), {"no token": 2}, {"dropped": 3, "stops": 0, "arms": 1}).decode()
+    found = [sample for family in parser.text_string_to_metric_families(text) for sample in family.samples]
+    by_name = {
+        (sample.name, *(sample.labels[label] for label in sorted(sample.labels))): sample.value for sample in found
+    }
+    assert len(by_name) == len(found)
+    return by_name
 
 
 def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
@@ -22,26 +32,22 @@ def test_numbers_of_the_status_with_labels_that_cannot_break_out() -> None:
     state.alive = True
     values = {"rate_hz": "29.5", "mode": "640x480", "bad": "nan", 'a"} 1\nomnid_up 0': "7", "back\\slash": "1e3"}
     state.add_diagnostics(Diagnostics(1, (DiagnosticStatus("omnid: odometry", 1, "x", values),)))
-    counts = {"dropped": 3, "stops": 0, "arms": 1}
-    lines = metrics(state, Browsers([]), {"no token": 2}, counts).splitlines()
-    samples = [line for line in lines if not line.startswith("#")]
-    assert all(LINE.fullmatch(line) for line in samples), samples
-    assert 'omnid_status_value{part="odometry",key="rate_hz"} 29.5' in samples and "omnid_up 1" in samples
-    assert 'omnid_status_value{part="odometry",key="back\\\\slash"} 1000' in samples
+    found = samples(state)
+    assert found["omnid_up",] == 1 and found["omnid_status_level", "odometry"] == 1
+    numbers = {labels[1]: value for labels, value in found.items() if labels[0] == "omnid_status_value"}
+    assert len(numbers) == 3 and numbers["rate_hz"] == 29.5 and numbers["back\\slash"] == 1000
+    assert found["omnid_web_refused_total", "no token"] == 2 and found["omnid_web_dropped_total",] == 3
+    assert not any("0.99" in labels for labels in found), "no latency is known yet"
     state.alive = None
-    assert "omnid_up 0" in metrics(state, Browsers([]), {}, {}).splitlines()
-    assert 'omnid_web_refused_total{reason="no token"} 2' in samples and "omnid_web_dropped_total 3" in samples
-    assert sum(line.startswith("omnid_status_value") for line in samples) == 3
-    assert not any("quantile" in line for line in samples), "no latency is known yet"
-    names = [line.split()[2] for line in lines if line.startswith("# TYPE")]
-    assert len(names) == len(set(names)) and {re.split(r"[{ ]", line)[0] for line in samples} <= set(names)
+    assert samples(state)["omnid_up",] == 0
 
 
 def test_the_state_of_the_newest_pose_is_one_and_the_others_nought() -> None:
     state, now_ns = RobotState(), time.time_ns()
     attachment = PoseAttachment(1, "tracking", 0, 50, 60, now_ns).to_bytes()
     state.process(ReceivedMessage(now_ns, "odom", odometry(1), attachment))
-    lines = metrics(state, Browsers([]), {}, {}).splitlines()
-    assert [line for line in lines if line.startswith("omnid_tracking_state")] == [
-        f'omnid_tracking_state{{state="{name}"}} {int(name == "tracking")}' for name in TrackingState
-    ]
+    found = samples(state)
+    assert {name: found["omnid_tracking_state", name] for name in TrackingState} == {
+        name: name == "tracking" for name in TrackingState
+    }
+    assert found["omnid_poses_total",] == 1

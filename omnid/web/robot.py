@@ -1,0 +1,281 @@
+"""What the page asks of the robot: stop, arm, the stick, goals, routes, the map; answered as `omnid stop` ... are.
+
+What lets the robot move (arm, goal, repeat, resume, the stick) carries the server's time in the newest state that the
+page has shown. So a request that waited in a network moves nothing, and the browser's clock does not matter. What ends
+a motion needs none. A browser that is closed sends nothing more, and the robot stops by its own deadline
+(controller.deadlines.command_s).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Final, NamedTuple
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+
+from omnid.client import Answer, Driver, Robot
+from omnid.core.control.velocity_limits import VelocityLimits
+from omnid.core.navigation.requests import NavigationRequest, may_begin_motion, navigation_verb, route_request
+from omnid.errors import OmnidError
+from omnid.monitor.stopping import stop
+from omnid.monitor.teleop import FIRST_SHARE, limits_of
+from omnid.transport.driver import ANSWER_S
+from omnid.web.feed import RobotFeed
+from omnid.web.metrics import metrics
+from omnid.web.snapshot import is_recent, server_ms
+
+# The longest request, a route with a name of 64 letters and its options, has less than half of these bytes.
+LONGEST_BODY: Final = 256
+# A connection whose body has not arrived after this time is ended, so that slow ones do not collect.
+BODY_S: Final = 5.0
+# Other pages are refused for this time after the last request of the page that drives: several of its requests may be
+# lost before another page takes over.
+HELD_S: Final = 1.0
+_NUMBER: Final = r"(-?\d{1,6}(?:\.\d{1,4})?)"
+_GOAL: Final = re.compile(rf"{_NUMBER} {_NUMBER}(?: {_NUMBER})? (\d{{1,15}})")
+_STAMPED: Final = re.compile(r"(.*?)(?: stamp=(\d{1,15}))?", re.DOTALL)
+_STICK: Final = re.compile(r"(-?[01](?:\.\d{1,4})?) (-?[01](?:\.\d{1,4})?) (\d{1,15}) ([0-9a-z]{1,16})")
+
+
+class StickRequest(NamedTuple):
+    """A request of the stick."""
+
+    forward: float  # -1 to 1
+    turn: float  # -1 to 1, counter-clockwise
+    stamp_ms: int  # the server's time in the newest state that the page has shown
+    page: str  # identifies an open page
+
+    @property
+    def moves(self) -> bool:
+        """True if it asks for a motion."""
+        return bool(self.forward or self.turn)
+
+
+class RobotPage:
+    """The answers about one robot. stops, arms: numbers of requests so far."""
+
+    def __init__(self, feed: RobotFeed) -> None:
+        self.feed = feed
+        self.stops = self.arms = 0
+        self._stop_ms = 0  # the server's time at the newest request to stop
+        self._stopping: asyncio.Task[Answer] | None = None
+        self._again = False  # a stop was asked for since the newest one was sent
+        self._busy: set[str] = set()  # kinds of the requests that wait for an answer, each in a thread
+        self._limits: tuple[tuple[int, int], VelocityLimits] | None = None  # ends and restarts before they were read
+        self._sending = False  # by the stick
+        self._page, self._held_until_s = "", -math.inf  # the page that drives
+        # Sending may block while the robot does not read; no request holds up a stop.
+        self._stop_thread, self._stick_thread = ThreadPoolExecutor(1), ThreadPoolExecutor(1)
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the addresses."""
+        return [
+            WebSocketRoute("/live", self.feed.browsers.serve),
+            _command_route("/stop", lambda _: self.stop()),
+            _command_route("/arm", self.arm),
+            _command_route("/drive", self.drive),
+            _command_route("/goal", self.goal),
+            _command_route("/route", lambda asked: self._asked_in_words("route", asked, route_request, Driver.route)),
+            _command_route(
+                "/navigation",
+                lambda asked: self._asked_in_words("navigation", asked, navigation_verb, Driver.navigate),
+            ),
+            _command_route("/map", lambda _: self._asked("map", Driver.save_map)),
+        ]
+
+    def metrics(self, refused: Mapping[str, int]) -> bytes:
+        """Return the metrics of the robot and of this server; refused: requests by reason."""
+        counts = {"dropped": self.feed.inbox.dropped, "stops": self.stops, "arms": self.arms}
+        return metrics(self.feed.state, self.feed.browsers, refused, counts)
+
+    @property
+    def is_stopping(self) -> bool:
+        """True while a stop is sent and not confirmed."""
+        return self._stopping is not None and not self._stopping.done()
+
+    async def stop(self) -> Answer:
+        """Stop the wheels, and wait until the robot confirms it, for at most 10 s after the newest request.
+
+        A stop is repeated until the robot's status confirms it; any number of browsers may ask for it.
+        """
+        self.stops += 1
+        self._stop_ms = server_ms()
+        self._again = True
+        if self._stopping is None or self._stopping.done():
+            self._stopping = asyncio.create_task(self._stop())
+        return await asyncio.shield(self._stopping)  # a browser that goes does not end it
+
+    async def _stop(self) -> Answer:
+        send = partial(stop, self.feed.bus)
+        while self._again:
+            self._again = False
+            try:
+                stopping = asyncio.get_running_loop().run_in_executor(
+                    self._stop_thread, lambda: send(connection=self.feed.robot)
+                )
+                answer = Answer(True, "the robot stops: its wheels stand until it is armed")
+                if not await stopping:
+                    answer = Answer(False, "the stop is NOT confirmed: use the emergency stop")
+            except OmnidError as error:
+                answer = Answer(False, f"the stop is NOT confirmed: use the emergency stop. {error}")
+        return answer
+
+    async def arm(self, request: Request) -> Answer:
+        """Ask the robot to arm; the text is the stamp. A request from before a stop is refused."""
+        if self.is_stopping:
+            return Answer(False, "a stop is not confirmed yet: arm after it")
+        stamp_ms = stamp_of(await text_of(request))
+        if stamp_ms < self._stop_ms:
+            return Answer(False, "a stop was asked for since: arm again if it is to move")
+        self.arms += 1
+        return await self._asked("arm", Driver.arm)
+
+    async def goal(self, request: Request) -> Answer:
+        """Pass on a goal in odom: see goal_of."""
+        goal = goal_of(await text_of(request))
+        return await self._asked("goal", lambda driver: driver.goal(*goal))
+
+    async def _asked_in_words(
+        self,
+        kind: str,
+        request: Request,
+        parse: Callable[[str], NavigationRequest],
+        ask: Callable[[Driver, str], Answer],
+    ) -> Answer:
+        """Pass on a request in the words of cmd/route or cmd/navigation, such as "repeat NAME stamp=STAMP"."""
+        found = _STAMPED.fullmatch(await text_of(request))
+        text, stamp = ("", None) if found is None else found.groups()
+        if may_begin_motion(parse(text)):
+            stamp_of(stamp or "")
+        return await self._asked(kind, lambda driver: ask(driver, text))
+
+    async def _asked(self, kind: str, ask: Callable[[Driver], Answer]) -> Answer:
+        """Ask the robot in a thread; refuse where another request of this kind still waits for its answer."""
+        robot = self._robot()
+        if kind in self._busy:
+            return Answer(False, "another request has no answer yet")
+        self._busy.add(kind)
+        try:
+            answer = await asyncio.to_thread(ask, robot.driver())
+        finally:
+            self._busy.discard(kind)
+        return answer if answer.done else Answer(False, f"{robot.name} refuses: {answer.text}")
+
+    def _robot(self) -> Robot:
+        """Return the connection. Raise OmnidError where there is none yet."""
+        if self.feed.robot is None:
+            raise OmnidError(f"There is no connection: {self.feed.link}")
+        return self.feed.robot
+
+    async def drive(self, asked: Request) -> Answer:
+        """Send the command that a request of the stick asks for, unless the last one has not ended."""
+        request = stick_request(await text_of(asked))
+        refusal = self._stick_refusal(request)
+        if refusal:
+            return Answer(False, refusal)
+        robot = self._robot()
+        self._page, self._held_until_s = request.page, time.monotonic() + HELD_S
+        self._sending = True
+        try:
+            limits = await self._limits_of(robot)
+            # The first request reads the robot's limits, which may take so long that the request is no longer recent.
+            if request.moves and not is_recent(request.stamp_ms):
+                return Answer(False, "the stick is ready now")
+            velocity_mps = FIRST_SHARE * request.forward * limits.velocity_mps
+            rate_radps = FIRST_SHARE * request.turn * limits.yaw_rate_radps
+            send = partial(robot.driver().twist, velocity_mps, rate_radps)
+            sending = asyncio.get_running_loop().run_in_executor(self._stick_thread, send)
+            await asyncio.wait([sending], timeout=ANSWER_S / 2)  # a robot that does not read is not waited for
+        finally:
+            self._sending = False
+        if not request.moves:
+            return Answer(True, "the stick is released: it stands")
+        return Answer(True, f"it drives by the stick: {velocity_mps:+.2f} m/s, {math.degrees(rate_radps):+.0f}°/s")
+
+    def _stick_refusal(self, request: StickRequest) -> str:
+        """Return why a request is refused, empty where it is not."""
+        if self.is_stopping:
+            return "a stop is not confirmed yet: drive after it"
+        if self._page != request.page and time.monotonic() < self._held_until_s:
+            return "another page drives"
+        if request.moves and not is_recent(request.stamp_ms):
+            return "the network is too slow to drive by it: the stick's request is more than 1 s late"
+        if self._sending:
+            return "the robot does not take the last command: is it overloaded?"
+        return ""
+
+    async def _limits_of(self, robot: Robot) -> VelocityLimits:
+        """Return the robot's limits, read at the first call after its start."""
+        state = self.feed.state
+        start = state.ends, state.restarts
+        if self._limits is None or self._limits[0] != start or state.alive is False:
+            self._limits = start, await asyncio.to_thread(limits_of, robot)
+        return self._limits[1]
+
+
+def _command_route(path: str, act: Callable[[Request], Awaitable[Answer]]) -> Route:
+    """Return the address of a command, which comes by POST; the answer is JSON, with status 409 if it was not done."""
+
+    async def respond(request: Request) -> Response:
+        try:
+            answer = await act(request)
+        except OmnidError as error:
+            answer = Answer(False, str(error))
+        return JSONResponse(answer._asdict(), 200 if answer.done else 409)
+
+    return Route(path, respond, methods=["POST"])
+
+
+def stick_request(text: str) -> StickRequest:
+    """Parse "FORWARD TURN STAMP PAGE". Raise OmnidError for anything else."""
+    found = _STICK.fullmatch(text)
+    if found is None or max(abs(float(found[1])), abs(float(found[2]))) > 1.0:
+        raise OmnidError('the stick sends "FORWARD TURN STAMP PAGE", the first two from -1 to 1')
+    return StickRequest(float(found[1]), float(found[2]), int(found[3]), found[4])
+
+
+def goal_of(text: str) -> tuple[float, float, float | None]:
+    """Return x, y [m] and the heading [rad] of a goal in odom; a heading of None leaves it open.
+
+    text: "X Y STAMP" or "X Y YAW STAMP" in m, m, deg. Raise OmnidError for any other text, and for a stamp that is too
+    old.
+    """
+    found = _GOAL.fullmatch(text)
+    if found is None:
+        raise OmnidError('a goal is "X Y STAMP" or "X Y YAW STAMP" in m, m, deg')
+    stamp_of(found[4])
+    return float(found[1]), float(found[2]), None if found[3] is None else math.radians(float(found[3]))
+
+
+def stamp_of(text: str) -> int:
+    """Return the stamp of a request: the server's time [ms] in the state that the page showed last.
+
+    Raise OmnidError for any other text, and for a stamp that is too old.
+    """
+    if not re.fullmatch(r"\d{1,15}", text):
+        raise OmnidError("a request that lets the robot move repeats server_ms, the server's time in the newest state")
+    if not is_recent(int(text)):
+        raise OmnidError("the request came too late: the page had no new state of the robot; ask again")
+    return int(text)
+
+
+async def text_of(request: Request, longest: int = LONGEST_BODY) -> str:
+    """Return the body of a request. Raise OmnidError above `longest` bytes, or if it does not arrive within BODY_S."""
+    body = bytearray()
+    try:
+        async with asyncio.timeout(BODY_S):
+            async for chunk in request.stream():
+                body += chunk
+                if len(body) > longest:
+                    raise OmnidError(f"a request of at most {longest} bytes was expected")
+    except TimeoutError:
+        raise OmnidError("the request did not come") from None
+    return body.decode("utf-8", "replace")
