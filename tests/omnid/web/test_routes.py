@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -101,49 +100,6 @@ def test_the_map_is_saved_when_it_is_asked_for(robot: tuple[WebServer, Navigator
     assert answer(robot, "/map", "x" * 100_000) == {"done": False, "text": "omnid refuses: that cannot be"}
     assert server.request("/map", "POST").status == 403 and server.request("/map", headers=server.bearer).status == 405
     assert server.request("/map", "POST", {**server.bearer, "Origin": "http://evil.example"}).status == 403
-
-
-@pytest.mark.parametrize(
-    ("path", "text"),
-    [
-        ("/route", ""),
-        ("/route", "teach ../../etc/passwd"),
-        ("/route", "repeat dock loops=-1"),
-        ("/route", "x" * 5000),
-        ("/navigation", "stop everything"),
-        ("/navigation", "\x00\xff"),
-    ],
-)
-def test_other_texts_never_leave_the_server(robot: tuple[WebServer, Navigator], path: str, text: str) -> None:
-    server, navigator = robot
-    before = len(navigator.asked)
-    found = server.request(path, "POST", server.bearer, text)
-    assert found.status == 409 and not json.loads(found.text)["done"] and len(navigator.asked) == before
-    assert server.request(path, "POST", {"Origin": f"http://{server.host}"}, text).status == 401
-    assert server.request(path, headers=server.bearer).status == 405
-
-
-def test_a_goal_reaches_the_robot_while_the_page_shows_its_state(robot: tuple[WebServer, Navigator]) -> None:
-    server, navigator = robot
-    given = answer(robot, "/goal", f"1.5 -0.25 90 {server.state_ms()}")
-    assert given == {"done": True, "text": "it drives there"}
-    goal = navigator.goals[-1]
-    assert (goal.frame, goal.x_m, goal.y_m) == ("odom", 1.5, -0.25)
-    assert goal.heading_rad == pytest.approx(math.pi / 2)
-    assert answer(robot, "/goal", f"1 2 {server.state_ms()}")["done"] and navigator.goals[-1].heading_rad is None
-    count = len(navigator.goals)
-    now_ms = server.state_ms()
-    for text in (
-        "1 2",
-        "1 2 3",
-        f"nan 2 {now_ms}",
-        f"1e9 2 {now_ms}",
-        f"1 2 {now_ms - 2000}",
-        f"1 2 {now_ms + 60_000}",
-        "",
-    ):
-        assert not answer(robot, "/goal", text)["done"], text
-    assert len(navigator.goals) == count
 
 
 @pytest.mark.hazard("H47")

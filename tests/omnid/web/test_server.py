@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import json
-import math
 import os
 import resource
 import shutil
@@ -15,7 +14,7 @@ import subprocess
 import sys
 import time
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from itertools import count
@@ -26,14 +25,12 @@ import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from calib import se3
 from drivers.frame import Frame
 from omnid.transport import codec, map_codec
 from omnid.transport.bus import Bus
 from omnid.transport.image_codec import image_cdr
 from omnid.transport.pose_attachment import PoseAttachment
 from omnid.transport.records import DiagnosticStatus
-from omnid.transport.scan_codec import scan_cdr
 from omnid.transport.status_names import BUS, WHEELS
 from tests.omnid.transport.bus_fixtures import free_endpoint, odometry
 from tests.omnid.transport.test_access import authority
@@ -153,16 +150,6 @@ def test_a_websocket_that_sends_anything_else_is_closed(server: WebServer, messa
     assert state_of(server)["robot"] == "rover"
 
 
-def test_an_answer_without_a_message_closes_the_websocket(server: WebServer) -> None:
-    with server.live(server.bearer) as live:
-        Shown(live).until("state")
-        with pytest.raises(ConnectionClosed):  # by the second or third answer: one may yet send, or not any more
-            for _ in range(3):
-                live.send("ok")
-            while True:
-                live.recv(PATIENCE_S)
-
-
 def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
     seq = count(1)
     grid = np.full((40, 30), -1, np.int8)
@@ -193,59 +180,6 @@ def test_poses_status_and_map_arrive(server: WebServer, bus: Bus) -> None:
         other = map_codec.grid_cdr(10**18, "elsewhere", grid, 0.1, (0.0, 0.0))
         received = shown.until("map", lambda: bus.publish("map", other), lambda found: found["frame"] == "elsewhere")
         assert (received["width"], received["body"]) == (0, b"")
-
-
-def test_obstacles_arrive_at_their_places_in_odom(server: WebServer, bus: Bus) -> None:
-    ranges = np.full(360, np.nan, np.float32)
-    ranges[270], ranges[180], ranges[0] = 1.0, 2.0, np.inf  # to the left, ahead, free behind
-    T = se3.transform(se3.rotation_exp([0.0, 0.0, math.pi / 2]), [5.0, 6.0, 0.0])
-    odom = codec.odometry_cdr(10**9 + 77, T, np.eye(6), np.zeros(6), np.eye(6))
-
-    def run() -> None:
-        bus.publish("odom", odom, PoseAttachment(3, "tracking", 0, 50, 60, time.time_ns()).to_bytes())
-        bus.publish("scan", scan_cdr(10**9 + 77, "base_link", ranges, ranges, (0.1, 6.0)))
-
-    with server.live(server.bearer) as live:
-        shown = Shown(live)
-        scan = shown.until("scan", run, lambda found: found["points"] and found["points"][0][1] > 5)
-        np.testing.assert_allclose(sorted(scan["points"]), [[4.0, 6.0], [5.0, 8.0]], atol=0.05)
-        assert scan["nearest"] == [1.0, pytest.approx(90.5)]
-        other = scan_cdr(10**9 + 77, "laser", ranges, ranges, (0.1, 6.0))
-        assert shown.until("scan", lambda: bus.publish("scan", other), lambda found: not found["points"])
-
-
-def test_a_map_in_its_own_frame_is_drawn_where_it_lies_in_odom(server: WebServer, bus: Bus) -> None:
-    T_odom_base = se3.transform(se3.rotation_exp([0.0, 0.0, 0.5]), [5.0, 6.0, 0.0])
-    T_odom_map = se3.transform(se3.rotation_exp([0.0, 0.0, -0.25]), [1.0, -2.0, 0.0])
-    odom = codec.odometry_cdr(10**9 + 55, T_odom_base, np.eye(6), np.zeros(6), np.eye(6))
-    in_map = se3.inverse(T_odom_map) @ T_odom_base
-    grid = map_codec.grid_cdr(10**9, "map", np.full((4, 3), 100, np.int8), 0.1, (-1.0, -2.0))
-
-    def run() -> None:
-        bus.publish("odom", odom)
-        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 55, in_map, np.eye(6)))
-        bus.publish("map_pose", codec.pose_with_covariance_cdr(10**9 + 56, np.eye(4), np.eye(6)))  # no pose of its time
-        bus.publish("map", grid)
-
-    with server.live(server.bearer) as live:
-        shown = Shown(live)
-        received = shown.until("map", run, lambda found: found["width"])
-        assert (received["frame"], received["x_m"], received["y_m"]) == ("map", -1.0, -2.0)
-        state = shown.until("state", run, lambda found: found["map_in_odom"])
-        assert state["map_in_odom"] == pytest.approx([1.0, -2.0, -0.25], abs=1e-6)
-
-
-def test_the_path_begins_again_with_the_daemon(server: WebServer, bus: Bus) -> None:
-    def path_of(seqs: Sequence[int]) -> list[list[float]]:
-        for seq in seqs:
-            publish(bus, seq)
-        with server.live(server.bearer) as live:
-            Shown(live).until("state", holds=lambda found: found["pose"]["x_m"] == 0.25 * seqs[-1])
-        with server.live(server.bearer) as live:
-            return list(Shown(live).until("path")["points"])
-
-    assert max(x for x, *_ in path_of(range(2000, 2040))) > 500
-    assert max(x for x, *_ in path_of(range(5))) <= 1.0
 
 
 @pytest.mark.hazard("H46")
