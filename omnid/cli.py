@@ -119,6 +119,7 @@ REMOVED: Final[Mapping[str, str]] = MappingProxyType(
         "replay --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "run --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
         "simulate --tags": "`apriltag_ros`, or the package `pupil-apriltags`, finds AprilTags",
+        "view --port": "-o FILE.rrd, which `rerun --serve-web FILE.rrd` serves at ports of your choice",
         "web --all": "one page for each robot, with --robot NAME and --listen HOST:PORT, in tabs of one browser",
         "web --recordings": "the page lists no recordings; `omnid report LOG` writes the same report",
     }
