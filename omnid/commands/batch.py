@@ -80,6 +80,8 @@ class Job:
 )
 def run(args: argparse.Namespace) -> int:
     """Run the jobs that have no result yet; return 1 where a log failed."""
+    if args.jobs < 1 or not 0 < args.timeout_s <= 1e6:  # the system waits for a program at most 2^31 ms
+        raise OmnidError("batch: expected --jobs of 1 or more, and --timeout-s above 0 and up to 1e6")
     jobs = _jobs(args)
     results = {job: result for job in jobs if (result := _stored(job))}
     if results:
